@@ -4,7 +4,7 @@
 #include "registers.h"
 
 #define HSI_HZ UINT32_C(16000000)
-/* How often it is asked whether the crystal runs: some 100 ms. */
+/* Number of checks whether the crystal runs: some 100 ms. */
 #define PATIENCE 200000
 
 static volatile uint32_t now_ms;
@@ -17,7 +17,7 @@ void tick(void)
     now_ms++;
 }
 
-/* Runs the core from the crystal, or from HSI where that does not come. */
+/* Runs the core from the crystal, or from HSI if the crystal does not start. */
 static uint32_t start_clock(void)
 {
     RCC_CR |= HSE_BYPASS ? RCC_CR_HSEBYP : 0;

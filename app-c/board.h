@@ -1,5 +1,5 @@
-/* The board: core clock, pins, LED and a clock of milliseconds. Which board it is says the header `BOARD`, chosen by the
- * build (boards/).
+/* The board: core clock, pins, LED and a clock of milliseconds. The build selects the board's
+ * header `BOARD` (boards/).
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -10,12 +10,12 @@
 extern "C" {
 #endif
 
-/* Sets them up. Gives the clock of core and buses, in Hz. */
+/* Sets the board up. Returns the clock of core and buses, in Hz. */
 uint32_t board_start(void);
-/* Milliseconds since then; runs over. */
+/* Milliseconds since board_start; the count wraps. */
 uint32_t board_now_ms(void);
 void board_toggle_led(void);
-/* Until the next interrupt, a millisecond at most. */
+/* Waits for the next interrupt, for a millisecond at most. */
 void board_wait(void);
 
 #ifdef __cplusplus

@@ -2,7 +2,9 @@
 
 #include "registers.h"
 
-/* The register of a bit timing with the sample point near 87.5 % (CiA 301) and as many quanta as fit (section 32.7.7), or 0. */
+/* The register value of a bit timing with the sample point near 87.5 % (CiA 301) and as many quanta
+ * as possible (section 32.7.7), or 0.
+ */
 static uint32_t bit_timing(uint32_t clock, uint32_t bit_rate)
 {
     if (bit_rate == 0 || clock % bit_rate != 0) {
@@ -19,7 +21,7 @@ static uint32_t bit_timing(uint32_t clock, uint32_t bit_rate)
     return 0;
 }
 
-/* An identifier in a filter bank of 16-bit lists: data frames with 11 bits. */
+/* An identifier in a filter bank with 16-bit lists: data frames with 11 bits. */
 static uint32_t listed(uint16_t id)
 {
     return (uint32_t)id << 5;
@@ -33,7 +35,7 @@ bool can_start(uint32_t clock, uint32_t bit_rate, uint16_t hear_1, uint16_t hear
     }
     RCC_APB1ENR |= RCC_APB1ENR_CAN1EN;
     (void)RCC_APB1ENR;
-    /* Out of sleep, into initialisation. */
+    /* Leaves sleep mode and enters initialisation. */
     CAN_MCR = CAN_MCR_INRQ | CAN_MCR_ABOM;
     while ((CAN_MSR & CAN_MSR_INAK) == 0) {
     }

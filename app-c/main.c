@@ -1,7 +1,7 @@
-/* A small CANopen node in C under coboot: an object dictionary, NMT and a heartbeat. What it does for its bootloader is in
- * coboot/; a program of your own takes that folder and the lines here that call it.
+/* A small CANopen node in C under coboot: an object dictionary, NMT and a heartbeat. The code for
+ * its bootloader is in coboot/; another program needs that folder and the lines here that call it.
  *
- * It uses registers and nothing else. Its core runs from the crystal, and the FPU stays off.
+ * It uses only registers. Its core runs from the crystal, and the FPU stays off.
  */
 #include BOARD
 
@@ -10,20 +10,22 @@
 #include "objects.h"
 #include "sdo.h"
 
-/* Of the program, its maker's. */
+/* The version of the program, set by its author. */
 #ifndef VERSION
 #define VERSION 1
 #endif
 
-/* Without a bootloader, or where it leaves the bit rate to be found out, which this program cannot do. */
+/* For a start without a bootloader, and for a bit rate that is to be detected: this program cannot
+ * detect it.
+ */
 #define DEFAULT_NODE_ID 1
 #define DEFAULT_BIT_RATE UINT32_C(125000)
 
-/* NMT states as a heartbeat tells them, and commands (CiA 301). */
+/* NMT states in a heartbeat, and NMT commands (CiA 301). */
 enum { BOOT_UP = 0, STOPPED = 4, OPERATIONAL = 5, PRE_OPERATIONAL = 127 };
 enum { START = 1, STOP = 2, ENTER_PRE_OPERATIONAL = 128, RESET_NODE = 129, RESET_COMMUNICATION = 130 };
 
-/* Whom this image is for: coflash and the bootloader refuse it for other devices. */
+/* The target of this image: coflash and the bootloader refuse it for other devices. */
 COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);
 
 struct coboot_program program;
@@ -101,7 +103,7 @@ static void handle(const struct can_frame *frame)
     }
 }
 
-/* Takes what has come. A request stays in the FIFO until its answer has room. */
+/* Takes the received frames. A request stays in the FIFO until there is room for its answer. */
 static void receive(void)
 {
     struct can_frame frame;
@@ -126,7 +128,7 @@ static void start_can(uint32_t clock)
     const uint16_t requests = (uint16_t)(0x600 + program.node_id);
 
     if (!can_start(clock, program.bit_rate, 0, requests)) {
-        /* The bootloader comes up with another bit rate. */
+        /* The bootloader will start with another bit rate. */
         program.bootloader_answers = false;
         (void)can_start(clock, DEFAULT_BIT_RATE, 0, requests);
     }

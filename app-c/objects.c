@@ -2,7 +2,7 @@
 
 #include "board.h"
 
-/* Looks for one of the tables' objects. */
+/* Finds an object in one of the tables. */
 static uint32_t find(uint16_t index, uint8_t sub, const struct object **found)
 {
     const struct object *const tables[] = { objects, more_objects };

@@ -1,4 +1,4 @@
-/* The object dictionary: what an SDO server reads and writes. */
+/* The object dictionary, for an SDO server. */
 #ifndef OBJECTS_H
 #define OBJECTS_H
 
@@ -11,31 +11,36 @@
 extern "C" {
 #endif
 
-/* SDO abort codes (CiA 301 table 22) besides those of coboot/program.h. */
+/* Further SDO abort codes (CiA 301 table 22), in addition to those of coboot/program.h. */
 #define ABORT_COMMAND UINT32_C(0x05040001)
 #define ABORT_LENGTH UINT32_C(0x06070010)
 
-/* A number that clients read, and may write where there is a function for it, which gives an abort code or COBOOT_ABORT_NONE. */
+/* A number that clients can read. They can write it if there is a function for that, which returns
+ * an abort code or COBOOT_ABORT_NONE.
+ */
 struct object {
     uint16_t index;
     uint8_t sub;
-    /* In bytes: 1, 2 or 4. */
+    /* The size in bytes: 1, 2 or 4. */
     uint8_t size;
     uint32_t *value;
     uint32_t (*write)(uint8_t sub, uint32_t value);
 };
 
-/* The application has these two: what coboot knows of it, with 1F51h, 1F56h and 1F57h; and all other objects, the last one
- * zeros.
+/* The application defines these two: coboot's state of the program, with 1F51h, 1F56h and 1F57h;
+ * and all other objects, the last one zeros.
  */
 extern struct coboot_program program;
 extern const struct object objects[];
-/* Objects that another file adds, the last one zeros. There need not be any. */
+/* Further objects from another file, the last one zeros. They are optional. */
 extern const struct object more_objects[] __attribute__((weak));
 
-/* The value of an element and its size in bytes; gives an abort code, or COBOOT_ABORT_NONE. */
+/* Reads the value of an element and its size in bytes; returns an abort code, or COBOOT_ABORT_NONE.
+ */
 uint32_t object_read(uint16_t index, uint8_t sub, uint32_t *value, uint8_t *size);
-/* Writes `len` bytes: 0 where the client does not say how many, more than 4 where they do not come in one frame. */
+/* Writes `len` bytes: 0 if the client does not give the number, more than 4 if they do not fit one
+ * frame.
+ */
 uint32_t object_write(uint16_t index, uint8_t sub, uint32_t value, size_t len);
 
 #ifdef __cplusplus

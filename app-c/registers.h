@@ -1,5 +1,6 @@
-/* The registers that this application uses, by their names in RM0090 (STM32F405 to F439) and RM0390 (STM32F446): where
- * both have one, they are the same. Those of the core are in the ARMv7-M manual, B3.
+/* The registers that this application uses, with their names in RM0090 (STM32F405 to F439) and
+ * RM0390 (STM32F446): a register in both manuals is the same. Those of the core are in the ARMv7-M
+ * manual, B3.
  */
 #ifndef REGISTERS_H
 #define REGISTERS_H

@@ -2,7 +2,7 @@
 
 #include "objects.h"
 
-/* Command specifiers of the client, and that of an abort. */
+/* Command specifiers of the client, and the specifier of an abort. */
 enum { DOWNLOAD = 1, UPLOAD = 2, ABORT = 4 };
 
 static uint32_t word_at(const uint8_t *bytes)

@@ -1,4 +1,4 @@
-/* From the jump into this program to `main`, and the vectors. */
+/* The start of this program, from the bootloader's jump to `main`, and the vectors. */
 #include "registers.h"
 
 extern uint32_t _stack_start, __data_start, __data_end, __bss_start, __bss_end;
@@ -11,7 +11,7 @@ int main(void);
 void tick(void);
 void reset(void);
 
-/* Whatever has no handler here starts the device again; what runs then is the bootloader's decision. */
+/* Resets the device on an exception without a handler; then the bootloader decides what runs. */
 static void unexpected(void)
 {
     SCB_AIRCR = SCB_AIRCR_RESET;
@@ -19,8 +19,9 @@ static void unexpected(void)
     }
 }
 
-/* Those of the core, and the interrupt lines of the chip, which the build names. The label stands behind the vectors, so
- * there is no room for more; the linker script compares the number with the chip's.
+/* The vectors of the core, and the interrupt lines of the chip, whose number comes from the build.
+ * The label follows the vectors, so more vectors do not fit; the linker script compares the number
+ * with the chip's.
  */
 enum { EXCEPTIONS = 16, VECTORS = EXCEPTIONS + INTERRUPT_LINES };
 
@@ -38,7 +39,7 @@ void reset(void)
 {
     /* The bootloader has set it; a debugger may not have. */
     SCB_VTOR = (uint32_t)(uintptr_t)vectors;
-    /* Volatile, or the compiler would call a library for these. */
+    /* Volatile: otherwise the compiler would call a library for these loops. */
     const volatile uint32_t *from = &__data_load;
     for (volatile uint32_t *to = &__data_start; to < &__data_end; to++, from++) {
         *to = *from;

@@ -1,5 +1,5 @@
-//! Gives the linker the numbers of the chosen board and the template of the image. For the bootloader
-//! it first builds the resident part, which is a separate program.
+//! Passes the numbers of the chosen board and the template of the image to the linker. For the
+//! bootloader it first builds the resident part, which is a separate program.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -25,11 +25,12 @@ fn main() {
     coboot_linker::link(&out, template);
     // Functions with identical code are merged.
     println!("cargo:rustc-link-arg-bins=--icf=all");
-    // Similar functions are placed near each other, so that copies have short distances. (The image
-    // is compressed, and copies from the resident part.)
+    // Similar functions are placed near each other, so that copies in the compressed image have
+    // short distances. (The image is compressed; it also copies from the resident part.)
     println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
     if template == "bootloader.x" && has("LOG_DEFMT") {
-        // The log strings of `defmt`, which are in the ELF file and not on the chip.
+        // The linker script for the log strings of `defmt`: they are in the ELF file, not on the
+        // chip.
         println!("cargo:rustc-link-arg-bins=-Tdefmt.x");
     }
     match template {
@@ -53,7 +54,7 @@ fn resident(package: &Path, out: &Path, layout: &Layout) {
     });
     let features: Vec<String> =
         features.chain(["resident".to_owned(), format!("bsp/chip-{}", layout.chip.line.name())]).collect();
-    // The folder of the outer build's profile; this build has its own lock.
+    // In the profile's folder of the outer build. The inner build has its own lock there.
     let target = out.ancestors().nth(3).expect("OUT_DIR lies deep in the target folder").join("resident");
     let triple = env::var("TARGET").expect("cargo sets it");
 
@@ -61,7 +62,7 @@ fn resident(package: &Path, out: &Path, layout: &Layout) {
     cargo.current_dir(&workspace).args(["rustc", "--quiet", "--package=bootloader", "--bin=resident"]);
     cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
     cargo.arg(features.join(",")).arg("--target-dir").arg(&target).args(["--", PACKS_WELL]);
-    // The settings that concern the outer build.
+    // The inner build keeps these settings; all others concern only the outer build.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
     let told = env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();

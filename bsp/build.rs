@@ -1,4 +1,4 @@
-//! Chooses the board: the variable `COBOOT_BOARD` names it, and `src/boards` has its file.
+//! Selects the board: the variable `COBOOT_BOARD` names it, and its file is in `src/boards`.
 
 use std::path::{Path, PathBuf};
 use std::{env, fs};

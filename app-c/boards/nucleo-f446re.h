@@ -8,7 +8,7 @@
 /* From the ST-LINK. */
 #define HSE_HZ UINT32_C(8000000)
 #define HSE_BYPASS 1
-/* What the device says of itself: the bootloader's words, too (bsp/src/nucleo_f446re.rs). */
+/* The device's identity, the same as the bootloader's (bsp/src/boards/nucleo_f446re.rs). */
 #define VENDOR_ID UINT32_C(0)
 #define PRODUCT_CODE UINT32_C(0x446E0064)
 #define REVISION UINT32_C(0x00010000)

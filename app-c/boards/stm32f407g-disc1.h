@@ -7,7 +7,7 @@
 #define LED_PIN 12
 #define HSE_HZ UINT32_C(8000000)
 #define HSE_BYPASS 0
-/* What the device says of itself: the bootloader's words, too (bsp/src/boards/stm32f407g_disc1.rs). */
+/* The device's identity, the same as the bootloader's (bsp/src/boards/stm32f407g_disc1.rs). */
 #define VENDOR_ID UINT32_C(0)
 #define PRODUCT_CODE UINT32_C(0x4007D151)
 #define REVISION UINT32_C(0x00010000)

@@ -10,10 +10,10 @@ enum {
     SET_SIGNATURE = 0x83,
     CLR_SIGNATURE = 0x84,
 };
-/* What 1F51h reads of a program (CiA 302-3). */
+/* Values that a read of 1F51h returns for a program (CiA 302-3). */
 enum { STOPPED = 0, RUNNING = 1, ABSENT = 3 };
 
-/* How many programs the device has: the value of a symbol of the linker. */
+/* The number of the device's programs, from the value of a symbol of the linker. */
 static uint8_t programs(void)
 {
     extern const uint8_t __programs;
@@ -39,11 +39,13 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
         program->serial_number = handoff.serial_number;
         program->number = handoff.program;
         program->fresh = coboot_is_fresh(&handoff);
-        /* One that listens for its bit rate first has no time to answer. */
+        /* A bootloader that detects its bit rate first has no time to answer. */
         program->bootloader_answers = handoff.bit_rate != 0;
     }
     program->gate = coboot_callgate();
-    /* What the bootloader has verified: the same number as in the bootloader. 0 where it knows of no download. */
+    /* The CRC that the bootloader has verified, the same as in the bootloader. 0 if it knows of no
+     * download.
+     */
     const bool known =
         program->gate != NULL && coboot_program_info(program->gate, program->number, &info) == COBOOT_STATUS_OK;
     program->crc = known ? info.crc : 0;
@@ -86,15 +88,15 @@ static uint32_t leave(struct coboot_program *program, uint32_t request, uint32_t
     return possible ? COBOOT_ABORT_NONE : COBOOT_ABORT_DEVICE_STATE;
 }
 
-/* The first 80h right behind a download in one go: masters that do not know SYS TEC's commands confirm with it what they
- * have just started.
+/* Handles the first 80h after a download and start in one go: masters that do not know SYS TEC's
+ * commands confirm the program with it.
  */
 static uint32_t confirm(struct coboot_program *program, uint32_t now_ms)
 {
     const int32_t status =
         program->gate != NULL ? coboot_confirm(program->gate, program->number) : COBOOT_STATUS_FAILED;
     if (status == COBOOT_STATUS_LOCKED) {
-        /* The bootloader stores it. Until then an 80h that comes again means the same. */
+        /* The bootloader stores it. Until then another 80h has the same meaning. */
         return leave(program, COBOOT_REQUEST_CONFIRM, program->number, now_ms);
     }
     program->fresh = false;
@@ -120,7 +122,9 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
         return own && program->fresh ? confirm(program, now_ms) : leave(program, COBOOT_REQUEST_STAY, 0, now_ms);
     case STOP:  /* The bootloader runs instead. */
     case CLEAR: /* The bootloader carries it out. */
-        /* Masters send the next request as soon as they see the answer, so that is the bootloader's, too. */
+        /* Masters send the next request at once after the answer, so the bootloader must send this
+         * answer.
+         */
         if (program->bootloader_answers) {
             const uint32_t owed = coboot_owed(sub, (uint8_t)value, program->node_id);
             return leave(program, COBOOT_REQUEST_OWED, owed, now_ms);
@@ -140,7 +144,7 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
 
 void coboot_program_restart(struct coboot_program *program, uint32_t now_ms)
 {
-    /* What a master was promised before comes first, and is a reset, too. */
+    /* An earlier promise to a master has priority; it leads to a reset, too. */
     (void)coboot_reentry_begin(&program->reentry, COBOOT_REQUEST_POWER_ON, 0, now_ms);
 }
 

@@ -1,6 +1,8 @@
-/* A program under coboot: how it came up, its objects 1F51h, 1F56h and 1F57h, and its way back.
+/* A program under coboot: its start, its objects 1F51h, 1F56h and 1F57h, and its return to the
+ * bootloader.
  *
- * It knows no CANopen stack: whichever it is, it asks coboot_program_read and coboot_program_write about the three objects.
+ * It works with any CANopen stack: the stack calls coboot_program_read and coboot_program_write for
+ * the three objects.
  */
 #ifndef COBOOT_PROGRAM_H
 #define COBOOT_PROGRAM_H
@@ -30,55 +32,61 @@ extern "C" {
 #define COBOOT_ABORT_DEVICE_STATE UINT32_C(0x08000022)
 
 struct coboot_program {
-    /* How it came up: from the bootloader where it left a handoff, otherwise what coboot_program_init was given. Bit rate in
-     * bit/s, 0 for a device that finds it out by listening.
+    /* Node-ID and bit rate at the start: the bootloader's if it left a handoff, otherwise the
+     * arguments of coboot_program_init. Bit rate in bit/s, 0 for a device that detects it by
+     * listening.
      */
     uint8_t node_id;
     uint32_t bit_rate;
     uint32_t serial_number;
-    /* Which of the device's programs it is, from 1 on. */
+    /* The number of the program in the device, from 1 on. */
     uint8_t number;
     /* Services of the bootloader, or a null pointer. */
     const struct coboot_callgate *gate;
 
-    /* The rest is program.c's own. */
+    /* Only program.c uses the rest. */
     uint32_t crc;
     /* The next 80h to this program confirms it. */
     bool fresh;
-    /* The bootloader comes up with this node-ID and bit rate, so that it can answer in this program's place. Set it to false
-     * where the program changes one of them.
+    /* The bootloader starts with this node-ID and bit rate, so that it can answer for this program.
+     * Set it to false if the program changes one of them.
      */
     bool bootloader_answers;
     struct coboot_reentry reentry;
 };
 
-/* First of all, before CAN is set up: reads the handoff and finds the callgate. */
+/* Reads the handoff and finds the callgate. Call it first, before CAN is set up. */
 void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate);
 
-/* An element of the three objects, and its size in bytes: what an SDO upload gives. COBOOT_ABORT_NO_OBJECT for every other
- * index.
+/* Reads an element of the three objects, and its size in bytes, for an SDO upload.
+ * COBOOT_ABORT_NO_OBJECT for every other index.
  */
 uint32_t coboot_program_read(const struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t *value,
                              uint8_t *size);
 
-/* An SDO download of the right size to one of the three objects: a command, if it is 1F51h. Call it before the download is
- * answered, and answer unless coboot_program_is_silent says not to. COBOOT_ABORT_DEVICE_STATE: the bootloader has to be
- * called first (80h).
+/* Handles an SDO download of the right size to one of the three objects; one to 1F51h is a command.
+ * Call it before the download is answered, and answer unless coboot_program_is_silent is true.
+ * COBOOT_ABORT_DEVICE_STATE: the bootloader must be called first (80h).
  *
- * This is the place to refuse in front of: a machine that is moving answers with that code itself, and stays.
+ * An application can refuse before this call: a machine that is moving answers with that code
+ * itself, and stays in the program.
  */
 uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t value,
                               uint32_t now_ms);
 
-/* NMT reset node: a reset that is not counted as a crash. It comes as soon as everything is on the bus. */
+/* Carries out NMT reset node: a reset that is not counted as a crash. It comes as soon as all
+ * frames are on the bus.
+ */
 void coboot_program_restart(struct coboot_program *program, uint32_t now_ms);
 
-/* Call it in the main loop, in thread mode, once per millisecond at least. `quiet`: no answer waits to be sent, and all
- * mailboxes are empty. It resets the chip when it is time.
+/* Call it in the main loop, in thread mode, at least once per millisecond. `quiet`: no answer waits
+ * to be sent, and all mailboxes are empty. It resets the chip when it is time.
  */
 void coboot_program_proceed(struct coboot_program *program, bool quiet, uint32_t now_ms);
 
-/* The program takes no request and sends nothing any more; what it was asked last the bootloader answers. */
+/* Whether the program must take no request and send nothing any more; the bootloader answers the
+ * last request.
+ */
 static inline bool coboot_program_is_silent(const struct coboot_program *program)
 {
     return program->reentry.silent;

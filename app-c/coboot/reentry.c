@@ -2,16 +2,16 @@
 
 #include "coboot.h"
 
-/* How long the device stays when its answer is on the bus: at least 10 ms (SYS TEC manual L-1112d_10, 4.5), and one that
- * may be almost over.
+/* The time between an answer on the bus and the reset: at least 10 ms (SYS TEC manual L-1112d_10,
+ * 4.5), and one more because the current millisecond may be almost over.
  */
 #define ANSWER_TO_RESET_MS 11
-/* The longest that it stays behind its first answer: a bus on which nobody acknowledges keeps it no longer, and neither
- * does a client that asks without end.
+/* The longest time after the first answer: neither a bus without acknowledgement nor a client with
+ * endless requests delays the reset longer.
  */
 #define ANSWERED_MOST_MS 500
-/* The longest that a command waits whose answer is owed, for a frame that is on its way. The client has its answer within
- * 25 ms.
+/* The longest time that a command with an owed answer waits for a frame that is being sent. The
+ * client has its answer within 25 ms.
  */
 #define OWED_MOST_MS 15
 
@@ -20,7 +20,8 @@ static bool has_passed(uint32_t time_ms, uint32_t now_ms)
     return (int32_t)(now_ms - time_ms) >= 0;
 }
 
-/* What a master relies on: that the bootloader comes up, or that something is stored. */
+/* Whether a master relies on the request: the bootloader must come up, or a value must be stored.
+ */
 static bool is_promise(uint32_t request)
 {
     return request != COBOOT_REQUEST_START && request != COBOOT_REQUEST_POWER_ON;
@@ -51,7 +52,7 @@ bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint
     if (first) {
         reentry->latest_ms = now_ms + ANSWERED_MOST_MS;
     }
-    /* Behind each answer comes the pause. */
+    /* A pause follows each answer. */
     reentry->phase = COBOOT_ANSWERS;
     return true;
 }

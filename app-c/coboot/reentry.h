@@ -1,4 +1,4 @@
-/* When a program leaves for the bootloader: rules over time, without the chip and without CAN. */
+/* When a program leaves for the bootloader: rules over time, without access to the chip or CAN. */
 #ifndef COBOOT_REENTRY_H
 #define COBOOT_REENTRY_H
 
@@ -22,27 +22,31 @@ enum coboot_phase {
     COBOOT_PAUSES,  /* everything is answered, and the pause behind it runs */
 };
 
-/* The way out. Begins as zeros. */
+/* The state of the return to the bootloader. All zeros at the start. */
 struct coboot_reentry {
     enum coboot_phase phase;
-    /* Nothing is said or served any more: the bootloader answers in this program's place. */
+    /* Nothing is sent or served any more: the bootloader answers for this program. */
     bool silent;
     /* A COBOOT_REQUEST_… and its argument. */
     uint32_t request, argument;
-    /* When the pause is over (COBOOT_PAUSES), and when the device leaves whatever waits to be sent. */
+    /* The end of the pause (COBOOT_PAUSES), and the latest time of the reset, even if frames wait
+     * to be sent.
+     */
     uint32_t pause_ends_ms, latest_ms;
 };
 
-/* A command was taken for which the device leaves. All requests but COBOOT_REQUEST_OWED are answered first: this program
- * serves for 10 ms behind that answer. With COBOOT_REQUEST_OWED it says nothing any more.
+/* Takes a command that makes the device leave. All requests but COBOOT_REQUEST_OWED are answered
+ * first: this program serves for 10 ms after that answer. With COBOOT_REQUEST_OWED it sends nothing
+ * any more.
  *
- * What a master was promised before holds: a device that it has called back comes up in the bootloader, although another
- * master restarts it meanwhile, and what is to be stored is stored. False where that forbids this request.
+ * An earlier promise to a master holds: a device that one master has called back comes up in the
+ * bootloader, even if another master restarts it meanwhile, and a value to be stored is stored.
+ * False if that forbids this request.
  */
 bool coboot_reentry_begin(struct coboot_reentry *reentry, uint32_t request, uint32_t argument, uint32_t now_ms);
 
-/* Call it as often as the CAN mailboxes change, once per millisecond at least. `quiet`: no answer waits to be sent, and all
- * mailboxes are empty. `now_ms` may run over.
+/* Call it after each change of the CAN mailboxes, at least once per millisecond. `quiet`: no answer
+ * waits to be sent, and all mailboxes are empty. `now_ms` may wrap.
  */
 enum coboot_next coboot_reentry_proceed(struct coboot_reentry *reentry, bool quiet, uint32_t now_ms);
 

@@ -1,8 +1,8 @@
-//! What the boot stage tells the RAM part of the bootloader.
+//! The boot stage's report to the RAM part of the bootloader.
 
 use shared_abi::warm_start::Owed;
 
-/// Why the bootloader runs, and what is left for it to do.
+/// The reason why the bootloader runs, and the work that is left for it.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct BootReport {
@@ -10,11 +10,12 @@ pub struct BootReport {
     pub reason: u8,
     /// The program that starts when the rescue window is over; 0 for none.
     pub held_program: u8,
-    /// How long the rescue window is, in ms.
+    /// Length of the rescue window, in ms.
     pub window_ms: u16,
-    /// The write of 1F51h that the application has left to be answered here; its node-ID is 0 for none.
+    /// The write of 1F51h that the application received and the bootloader answers; its node-ID is
+    /// 0 if there is none.
     pub owed: Owed,
-    /// The program that has brought the device back to the bootloader; 0 for none.
+    /// The program that returned control to the bootloader; 0 for none.
     pub returned: u8,
     /// Node-ID in force from this reset on; 255 for none.
     pub node_id: u8,

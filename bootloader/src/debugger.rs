@@ -1,5 +1,6 @@
-//! The debugger interface, 1025h, with the feature `debugger` alone: **everybody on the bus reads
-//! and writes this device's memory**. Without the feature nothing of it is there.
+//! The debugger interface, 1025h. It exists only with the feature `debugger`: **every node on the
+//! bus can then read and write this device's memory**. Without the feature the bootloader contains
+//! no code for it.
 
 #[cfg(not(feature = "debugger"))]
 use boot_core::canopen::od::Entry;
@@ -7,22 +8,22 @@ use boot_core::canopen::od::Entry;
 #[cfg(feature = "debugger")]
 pub use on::{Debugger, ENTRIES};
 
-/// Nothing.
+/// The interface without the feature: it does nothing.
 #[cfg(not(feature = "debugger"))]
 pub struct Debugger;
 #[cfg(not(feature = "debugger"))]
 impl Debugger {
-    /// Nothing.
+    /// An interface without function.
     pub const fn new() -> Self {
         Self
     }
 
-    /// The device as it is.
+    /// The device itself, unchanged.
     pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> &'a mut D {
         device
     }
 }
-/// No more objects.
+/// Without the feature the object dictionary has no additional objects.
 #[cfg(not(feature = "debugger"))]
 pub const ENTRIES: [Entry; 0] = [];
 
@@ -35,10 +36,10 @@ mod on {
     use bsp::LAYOUT;
     use shared_abi::memory_map::{may_read, may_write};
 
-    /// 1025h.
+    /// The entries of 1025h.
     pub const ENTRIES: [Entry; debugger::ENTRIES.len()] = debugger::ENTRIES;
 
-    /// The interface.
+    /// The debugger interface.
     pub struct Debugger(debugger::Debugger<Chip>);
 
     impl Debugger {
@@ -53,7 +54,7 @@ mod on {
         }
     }
 
-    /// All of its memory.
+    /// All memory of the chip.
     pub struct Chip;
 
     impl Memory for Chip {

@@ -1,8 +1,8 @@
-//! The flash controller (RM0090 section 3), at the level of its registers: starts operations and
-//! polls them. Resident part and RAM part both use it, in turn.
+//! The flash controller (RM0090 section 3), at register level: it starts operations and polls them.
+//! The resident part and the RAM part both use it, one at a time.
 //!
-//! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and leaves error
-//! flags standing.
+//! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and does not
+//! clear error flags.
 
 use core::task::Poll;
 
@@ -10,15 +10,15 @@ use boot_core::flash::{FlashFault, Operation};
 use bsp::{pac, LAYOUT};
 use shared_abi::geometry::Region;
 
-/// Section 3.6.1: the two words that open the control register.
+/// The two words that unlock the control register (section 3.6.1).
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
-/// `PSIZE` for words: the supply is 2.7 V or more (table 10).
+/// `PSIZE` for 32-bit words: the supply voltage is 2.7 V or more (table 10).
 const WORDS: u8 = 0b10;
 
 /// The memory-mapped flash.
 pub const FLASH: Region = LAYOUT.chip.flash;
 
-/// The controller and the flash that it guards. The control register is locked whenever no
+/// The controller and the flash that it controls. The control register is locked unless an
 /// operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
@@ -28,14 +28,14 @@ pub struct FlashController {
 impl FlashController {
     /// Takes the controller.
     ///
-    /// The caches of the flash have to be off while it is programmed: they would show words as they
-    /// were before (section 3.5.4). They are so after a reset, and a bootloader that runs from RAM
-    /// gains nothing by them.
+    /// The caches of the flash must be off while it is programmed: they would return the old words
+    /// (section 3.5.4). They are off after a reset. A bootloader that runs from RAM does not need
+    /// them.
     ///
     /// # Safety
-    /// Nobody else may use it until this is dropped.
+    /// Nothing else may use the controller until this value is dropped.
     pub unsafe fn steal() -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         Self { registers: unsafe { pac::FLASH::steal() } }
     }
 
@@ -44,12 +44,12 @@ impl FlashController {
         self.registers.sr().read().bsy().bit_is_set()
     }
 
-    /// Whether somebody is at work on the flash, or has opened the control register for it.
+    /// Whether an operation runs, or other code has unlocked the control register.
     pub fn is_in_use(&self) -> bool {
         self.is_busy() || self.registers.cr().read().lock().bit_is_clear()
     }
 
-    /// Copies bytes; addresses outside the flash read FFh.
+    /// Copies bytes; addresses outside the flash read as FFh.
     pub fn read(&self, address: u32, buffer: &mut [u8]) {
         for (byte, address) in buffer.iter_mut().zip(address..) {
             *byte = self.read_byte(address);
@@ -59,15 +59,16 @@ impl FlashController {
     /// The byte at an address, FFh outside the flash.
     pub fn read_byte(&self, address: u32) -> u8 {
         if FLASH.contains(address, 1) {
-            // SAFETY: the address is inside the memory-mapped flash, which is always readable;
-            // volatile, because the controller changes it behind the compiler's back.
+            // SAFETY: the address is inside the memory-mapped flash, which is always readable. The
+            // read is volatile, because the controller changes the memory without the compiler's
+            // knowledge.
             unsafe { (address as *const u8).read_volatile() }
         } else {
             u8::MAX
         }
     }
 
-    /// The word at a word-aligned address, FFFFFFFFh elsewhere.
+    /// The word at a word-aligned address, FFFFFFFFh for other addresses.
     #[inline(never)]
     pub fn read_word(&self, address: u32) -> u32 {
         if FLASH.contains(address, 4) && address.is_multiple_of(4) {
@@ -81,13 +82,13 @@ impl FlashController {
     /// Starts an operation.
     ///
     /// # Errors
-    /// If it is none of this flash.
+    /// If the operation is not valid for this flash.
     pub fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
         match operation {
             Operation::Erase(sector) => {
                 self.unlock();
                 self.registers.cr().write(|w| {
-                    // SAFETY: the geometry's codes are those that SNB takes (sections 3.9.7 and
+                    // SAFETY: the codes of the geometry are valid for SNB (sections 3.9.7 and
                     // 3.9.8).
                     unsafe { w.snb().bits(LAYOUT.chip.sector_code(sector.number)) };
                     w.lock().clear_bit().psize().set(WORDS).ser().set_bit().strt().set_bit()
@@ -107,7 +108,7 @@ impl FlashController {
         Ok(())
     }
 
-    /// The outcome of the operation that was started last; to be asked for once.
+    /// The result of the operation that was started last. Call it until it is ready, and not again.
     pub fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
         let status = self.registers.sr().read();
         if status.bsy().bit_is_set() {
@@ -125,17 +126,17 @@ impl FlashController {
         })
     }
 
-    /// Leaves no flag standing.
+    /// Clears all flags.
     pub fn clear_flags(&self) {
         let flags = self.registers.sr().read().bits();
-        // SAFETY: the flags of SR are cleared by writing them back.
+        // SAFETY: writing the flags of SR back clears them.
         self.registers.sr().write(|w| unsafe { w.bits(flags) });
     }
 
-    /// Opens the control register for one operation. (A `write` starts from the register's reset
-    /// value, in which LOCK is set: each write has to clear that.)
+    /// Unlocks the control register for one operation. (A `write` starts from the register's reset
+    /// value, in which LOCK is set: each write must clear that bit.)
     fn unlock(&mut self) {
-        // What an earlier operation left behind would be taken for the outcome of this one.
+        // Flags of an earlier operation would count as the result of this one.
         self.clear_flags();
         if self.registers.cr().read().lock().bit_is_set() {
             for key in KEYS {

@@ -1,13 +1,13 @@
-//! A few words for whoever ports the bootloader (SYS TEC manual L-1112d_10, 4.7). They are there
-//! with these features alone:
+//! Short log lines for a developer who ports the bootloader (SYS TEC manual L-1112d_10, 4.7). They
+//! exist only with these features:
 //!
-//! | feature | what a line is | where it goes |
+//! | feature | format of a line | output |
 //! |---|---|---|
-//! | `log-rtt` | text | to a debug probe, over RTT |
-//! | `log-defmt` | a frame of `defmt`, whose words stay in the ELF file | to a debug probe, over RTT |
-//! | `log-uart` | text | out of the board's UART |
+//! | `log-rtt` | text | a debug probe, over RTT |
+//! | `log-defmt` | a frame of `defmt`, whose words stay in the ELF file | a debug probe, over RTT |
+//! | `log-uart` | text | the board's UART |
 //!
-//! A line that finds no room where it goes is left out: nobody waits for who reads it.
+//! A line is left out if its output has no room: the bootloader never waits for a reader.
 
 #[cfg(feature = "log-defmt")]
 mod logger;
@@ -28,10 +28,10 @@ compile_error!("log-rtt and log-defmt both write to the one RTT buffer: choose o
 #[cfg(all(feature = "log-uart", feature = "virtual-can"))]
 compile_error!("log-uart and virtual-can both take the one UART: choose one of them");
 
-/// Whether anything is said.
+/// Whether log lines are written.
 pub const ON: bool = cfg!(any(feature = "log-rtt", feature = "log-uart", feature = "log-defmt"));
 
-/// Says something, and a number that goes with it.
+/// Logs words and a number.
 macro_rules! log {
     ($words:literal, $number:expr) => {
         if $crate::log::ON {
@@ -44,13 +44,13 @@ macro_rules! log {
 }
 pub(crate) use log;
 
-/// Writes a line to wherever text goes.
+/// Writes a line to the text outputs.
 pub fn line(words: &'static str, number: u32) {
     const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
     let digits = (0..8).rev().map(move |digit| DIGITS[(number >> (4 * digit) & 0xF) as usize]);
     let line = words.bytes().chain([b' ']).chain(digits).chain(*b"\r\n");
     #[cfg(feature = "log-rtt")]
-    // One line behind the other, whoever writes.
+    // Interrupts are off, so that lines of different tasks do not mix.
     cortex_m::interrupt::free(|_| {
         let mut message = rtt::Message::begin();
         message.put(line.clone());
@@ -61,8 +61,8 @@ pub fn line(words: &'static str, number: u32) {
     let _ = line;
 }
 
-/// A frame came in: says which command it is, if it is one. (A segment of a block transfer may look
-/// like one.)
+/// Logs the program-control command in a received frame, if there is one. (A segment of a block
+/// transfer can look like a command.)
 pub fn received(frame: &Frame) {
     if !ON {
         return;
@@ -77,7 +77,7 @@ pub fn received(frame: &Frame) {
     }
 }
 
-/// A frame goes out: says why the device refuses something, and which emergency it has.
+/// Logs the abort code or the emergency in a sent frame.
 pub fn sent(frame: &Frame) {
     if !ON {
         return;
@@ -94,9 +94,9 @@ pub fn sent(frame: &Frame) {
     }
 }
 
-/// Says how the last block or command of a program ended (1F57h), when that changes.
+/// Logs the result of a program's last block or command (1F57h), when it changes.
 pub fn status(device: &mut impl Objects, programs: u8) {
-    /// Program and what was said last of it.
+    /// The program and the status of the last line.
     static SAID: AtomicU32 = AtomicU32::new(0);
     const BUSY: u8 = 1;
     if !ON {
@@ -110,7 +110,7 @@ pub fn status(device: &mut impl Objects, programs: u8) {
         }
         let now = u32::from_le_bytes(word) & 0xFFFF | u32::from(sub) << 16;
         let before = SAID.load(Ordering::Relaxed);
-        // All is well with a program that nothing was said of.
+        // A status of 0 is logged only if the last line was about this program.
         if now != before && (word != [0; 4] || before >> 16 == u32::from(sub)) {
             SAID.store(now, Ordering::Relaxed);
             log!("1F57h; program and status", now);

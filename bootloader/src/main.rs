@@ -2,19 +2,19 @@
 //!
 //! | file | what it does | unsafe |
 //! |---|---|---|
-//! | `main.rs` | tasks: wiring only | no |
+//! | `main.rs` | the tasks: it only connects the other parts | no |
 //! | `product.rs` | the choices of a product | no |
-//! | `resident/` | what runs from flash: boot stage and callgate | jump, ABI |
+//! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
-//! | `services.rs`, `storage.rs` | what is asked of the resident part, and how | its ABI |
-//! | `boot_report.rs` | what the boot stage tells | no |
+//! | `services.rs`, `storage.rs` | the services of the resident part, and their use | its ABI |
+//! | `boot_report.rs` | the boot stage's report to the RAM part | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
-//! | `log.rs`, `log/` | a few words for whoever ports it (features `log-…`) | interrupts |
+//! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
 //! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
-//! | `memory.rs` | `memcpy` and its kin, small | assembly |
+//! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
-//! What the bootloader *is* stands in `boot-core` and `canopen`.
+//! The behaviour of the bootloader is in `boot-core` and `canopen`.
 #![no_std]
 #![no_main]
 
@@ -36,8 +36,8 @@ use shared_abi::warm_start::BootRequest;
 
 systick_monotonic!(Mono, 1_000);
 
-/// A fault or a panic (which ends in one) must not silence the device: start again, and stay
-/// reachable.
+/// A fault must not leave the device silent; a panic ends in a fault, too. The chip resets, and the
+/// bootloader stays reachable.
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     product::warm_start_cell().put(BootRequest::Fault);
@@ -75,12 +75,12 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
-    /// Frames that may wait for the protocol task. It has a higher priority than all that takes
-    /// long, so few do.
+    /// Frames that can wait for the protocol task. The task has a higher priority than all work
+    /// that takes long, so only few frames wait.
     const RX_QUEUE: usize = 32;
-    /// How often the protocol looks at its deadlines, in ms.
+    /// Period in which the protocol checks its deadlines, in ms.
     const TICK_MS: u32 = 2;
-    /// Programs of the layout, each a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
     const EXTRAS: Extras = Extras { sealed: cfg!(feature = "sealed"), ..PRODUCT.profile.extras };
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
@@ -121,26 +121,26 @@ mod app {
         slave: Slave,
         debugger: Debugger,
         pending_reset: PendingReset,
-        /// The write of 1F51h that the application has left to be answered here.
+        /// The write of 1F51h that the application received and the bootloader answers.
         owed: Owed,
-        /// The program that starts at the end of the rescue window, and its length in ms.
+        /// The program that starts at the end of the rescue window, and the window's length in ms.
         held: Option<(u8, u16)>,
         watchdog: Watchdog,
         led: bsp::Led,
     }
 
-    /// The device is about to reset.
+    /// The reset that the device is about to make.
     pub struct PendingReset {
         wanted: bool,
         request: BootRequest,
-        /// When; set once the answer is on the bus.
+        /// The time of the reset; it is set when the answer is on the bus.
         at: Option<Instant>,
     }
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: Room = Room::new(), store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
-        // SAFETY: the device's own are not used beside it.
+        // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
         let flash = unsafe { BootFlash::steal() };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
         #[cfg(feature = "log-uart")]
@@ -151,7 +151,7 @@ mod app {
         let report = start::boot_report();
         let node = NodeParameters {
             id: NodeId::new(report.node_id),
-            // The boot stage tells one that the controller can be set to.
+            // The boot stage reports only bit rates that the CAN controller can be set to.
             bit_rate: BitRate::from_index(report.bit_rate).unwrap_or(BitRate::Auto),
         };
         let slave_config = slave::Config {
@@ -207,8 +207,7 @@ mod app {
         )
     }
 
-    /// Works on the flash for as long as there is work, and sleeps otherwise; every task comes
-    /// first.
+    /// Works on the flash while there is work, and sleeps otherwise. Every task interrupts it.
     #[idle(shared = [bootloader])]
     fn idle(mut cx: idle::Context) -> ! {
         loop {
@@ -220,20 +219,21 @@ mod app {
             });
             match step {
                 Step::Programming | Step::Again => {}
-                // The monotonic wakes it every millisecond; a sector takes hundreds of them.
+                // The monotonic wakes the core every millisecond; the erase of a sector takes
+                // hundreds of them.
                 Step::Idle | Step::Erasing => cortex_m::asm::wfi(),
             }
         }
     }
 
-    /// Empties the controller's FIFO: three frames deep, so nothing may hold this task up.
+    /// Empties the controller's FIFO. The FIFO holds three frames, so nothing may delay this task.
     #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 3)]
     fn can_rx(mut cx: can_rx::Context) {
         cx.shared.can.lock(|can| line::receive(can, |frame| cx.local.received.enqueue(frame).is_ok()));
         rtic::pend(pac::Interrupt::CAN1_TX);
     }
 
-    /// Speaks CANopen: whenever a frame came in, a mailbox became free or time has passed.
+    /// Runs the CANopen slave: after each received frame, each sent frame and each tick.
     #[task(
         binds = CAN1_TX,
         shared = [can, bootloader],
@@ -246,7 +246,7 @@ mod app {
         let protocol::SharedResources { mut can, mut bootloader, .. } = cx.shared;
         let protocol::LocalResources { to_handle, slave, debugger, pending_reset, owed, held, .. } = cx.local;
         if let Some(at) = pending_reset.at {
-            // A frame that began now would be cut off by the reset.
+            // The reset would cut off a frame that began now, so nothing is sent any more.
             if now.has_reached(at) {
                 reset_with(pending_reset.request);
             }
@@ -259,10 +259,11 @@ mod app {
             #[cfg(feature = "debugger")]
             let device = &mut { device };
             slave.observe(status, now, device);
-            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
-            // waiting behind it.
+            // The slave sends what it has before it handles requests: a frame without room (a
+            // heartbeat on a busy bus) must not delay the requests.
             carry_out(slave, &mut can, now, device);
-            // What was asked of the application comes first, now that the boot-up is on its way.
+            // The request that the application left comes first, now that the boot-up is on its
+            // way.
             let Owed { program, value, node_id } = core::mem::replace(owed, Owed::NOTHING);
             let asked = NodeId::new(node_id).map(|node| {
                 Frame::full(CobId::sdo_request(node), [0x2F, 0x51, 0x1F, program, value, 0, 0, 0])
@@ -270,8 +271,8 @@ mod app {
             let mut next = asked.or_else(|| to_handle.dequeue());
             while let Some(frame) = next {
                 log::received(&frame);
-                // The filters let nothing in but network management and what is for this device, or
-                // for layer setting services.
+                // The filters pass only NMT and frames for this device or for layer setting
+                // services (LSS). All but NMT end the rescue window.
                 if frame.cob_id() != Some(CobId::NMT) {
                     *held = None;
                 }
@@ -288,20 +289,20 @@ mod app {
         });
         if let Some((program, window_ms)) = *held {
             if now.has_reached(Instant::from_millis(window_ms.into())) {
-                // Whether or not anybody is there to hear the boot-up.
+                // The program starts even if no other node acknowledges the boot-up.
                 *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };
                 return;
             }
         }
-        // What a host was told is done is not lost by a reset that comes too early.
+        // The stored values that a host was told of must not be lost by an early reset.
         if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
             pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
         }
     }
 
-    /// Does what the slave says, until it says nothing.
+    /// Carries out the slave's outputs until there are no more.
     fn carry_out(
         slave: &mut Slave,
         can: &mut impl Mutex<T = CanPort>,
@@ -318,7 +319,7 @@ mod app {
         }
     }
 
-    /// Lets time pass for the protocol, and shows life.
+    /// Drives the protocol, the watchdog and the LED.
     #[task(local = [led, watchdog], priority = 2)]
     async fn tick(cx: tick::Context) {
         let mut ticks = 0_u32;
@@ -333,7 +334,8 @@ mod app {
         }
     }
 
-    /// Out of the bootloader: the boot stage decides anew, on a clean chip.
+    /// Leaves the bootloader by a reset: the boot stage decides again, on a chip in its reset
+    /// state.
     fn reset_with(request: BootRequest) -> ! {
         product::warm_start_cell().put(request);
         SCB::sys_reset()

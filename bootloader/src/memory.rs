@@ -1,14 +1,14 @@
-//! Moving memory, in a tenth of the flash that the compiler's own versions take.
+//! Copy, move, fill and compare memory, in a tenth of the flash of the compiler's own versions.
 //!
-//! The linker prefers these to the weak symbols of `compiler_builtins`. They go byte by byte: what
-//! the bootloader moves is small, and the flash is the bottleneck. Written in assembly because a
-//! loop in Rust would be compiled into a call of itself.
+//! The linker prefers these functions to the weak symbols of `compiler_builtins`. They go byte by
+//! byte: the bootloader moves little memory, and its flash is scarce. They are in assembly because
+//! the compiler would turn a loop in Rust into a call of the function itself.
 
 use core::arch::global_asm;
 
-// The base procedure call standard (AAPCS): r0 destination, r1 source or value, r2 length; r0–r3
-// and r12 may be used. The run-time ABI (RTABI 4.3.4) has memset's arguments the other way round,
-// and no result.
+// The base procedure call standard (AAPCS): r0 is the destination, r1 the source or value, r2 the
+// length; r0–r3 and r12 may be changed. In the run-time ABI (RTABI 4.3.4) memset has its arguments
+// in the other order, and no result.
 global_asm!(
     ".section .text.memory, \"ax\"",
     ".syntax unified",
@@ -18,8 +18,8 @@ global_asm!(
     ".thumb_func",
     "\\name:",
     ".endm",
-    // Downwards if the source lies below the destination, so that an overlap is read before it is
-    // overwritten.
+    // It goes downwards if the source lies below the destination, so that the bytes in the overlap
+    // are read before they are overwritten.
     "function memmove",
     "function __aeabi_memmove",
     "function __aeabi_memmove4",

@@ -1,8 +1,8 @@
 //! The choices of a product: the only file that a product changes.
 //!
-//! Resident part and RAM part are both built from it. Names in brackets are those of the SYS TEC
-//! manual (L-1112d_10, chapter 4.6). A choice that contradicts another one fails the build, by
-//! name.
+//! The resident part and the RAM part are both built from it. Names in brackets are those of the
+//! SYS TEC manual (L-1112d_10, chapter 4.6). If choices contradict each other, the build fails with
+//! the names of the choices.
 #![allow(dead_code, reason = "each of the two programs uses some of it")]
 
 use core::ops::RangeInclusive;
@@ -24,20 +24,20 @@ use shared_abi::warm_start::Cell;
 #[path = "test_products.rs"]
 mod test_products;
 
-/// What a product may choose.
+/// The choices of a product.
 #[derive(Clone, Debug)]
 pub struct Product {
-    /// The dialect that it speaks where dialects contradict each other (docs/dialects.md).
+    /// The dialect of the product, where dialects contradict each other (docs/dialects.md).
     pub profile: Profile,
     /// The program that starts by itself after a reset, 1 to the number of programs; `None` for a
     /// device that waits for 1F51h = 1 (`BLCOP_USE_AUTOSTART_APP`, `BLCOP_APP_START_INDEX`).
     pub autostart: Option<u8>,
-    /// So many resets in a row by which the application ended without being asked to end in the
-    /// bootloader; at least 1.
+    /// The number of unrequested resets of the application in a row after which the device stays in
+    /// the bootloader; at least 1.
     pub max_crash_resets: u32,
-    /// How long a program that was never confirmed is held back when it would start by itself, in
-    /// ms: an SDO request to the node or any layer setting service keeps the device in the
-    /// bootloader meanwhile. 0 for no such window.
+    /// How long a program that was never confirmed is held back before it starts by itself, in ms.
+    /// In this time an SDO request to the node or any layer setting service keeps the device in the
+    /// bootloader. 0 for no such window.
     pub rescue_window_ms: u16,
     /// The same for a confirmed program.
     pub rescue_window_confirmed_ms: u16,
@@ -46,71 +46,75 @@ pub struct Product {
     /// Bit rates that the device may be set to, as indices of CiA 305 table 1: 0 for 1 Mbit/s to 8
     /// for 10 kbit/s (`BLCOP_MIN_BAUIDX`, `BLCOP_MAX_BAUIDX`).
     pub bit_rates: RangeInclusive<u8>,
-    /// Where node-ID and bit rate come from (`TgtGetNodeId`).
+    /// The source of node-ID and bit rate (`TgtGetNodeId`).
     pub node_source: NodeSource,
-    /// Whether a node says by a boot-up message that it is up (`BLCOP_SEND_BOOTUP`).
+    /// Whether the node sends a boot-up message (`BLCOP_SEND_BOOTUP`).
     pub boot_up_message: bool,
-    /// SDO requests come on this COB-ID and the node-ID on top, at most 780h (`BLCOP_BASE_REQUEST`).
+    /// Base of the COB-ID of SDO requests; the node-ID is added. At most 780h
+    /// (`BLCOP_BASE_REQUEST`).
     pub sdo_request_base: u16,
-    /// SDO answers go to this one and the node-ID on top, at most 780h (`BLCOP_BASE_RESPONSE`).
+    /// Base of the COB-ID of SDO answers; the node-ID is added. At most 780h
+    /// (`BLCOP_BASE_RESPONSE`).
     pub sdo_response_base: u16,
-    /// Whether the device may find out the bit rate by listening, where none is stored or told.
+    /// Whether the device may detect the bit rate by listening, if none is stored or set.
     pub auto_bit_rate: bool,
-    /// Whether an emergency follows each boot-up, which tells a master the bootloader from the
-    /// application.
+    /// Whether an emergency follows each boot-up. It shows a master that the bootloader runs, and
+    /// not the application.
     pub boot_up_emergency: bool,
     /// Period of the heartbeat until a master changes it (1017h), in ms; 0 for none.
     pub heartbeat_ms: u16,
-    /// Whether it speaks layer setting services (LSS, CiA 305).
+    /// Whether the device supports layer setting services (LSS, CiA 305).
     pub lss: bool,
-    /// Whether it starts in LSS configuration state, for a bus with one device to configure.
+    /// Whether the device starts in LSS configuration state, for a bus with one device to
+    /// configure.
     pub lss_start_in_configuration: bool,
-    /// Whether it says by "non-configured slave" that it has no node-ID.
+    /// Whether the device reports a missing node-ID by "non-configured slave".
     pub lss_announce: bool,
     /// Whether LSS may store node-ID and bit rate.
     pub lss_store: bool,
     /// Whether objects can be read by SDO block upload.
     pub block_upload: bool,
-    /// Whether vendor-ID and product code of a program have to be the device's
+    /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
     /// The product's own check of block 0 and of the label in the image (`TgtProcessAppInfoData`).
     pub check: fn(program: u8, control: &block_file::Control) -> Verdict,
     /// Whether programs may be changed now.
     pub programming_allowed: fn() -> bool,
-    /// When CLEAR of a program erases (`TgtCheckEraseApp`); `None` for what the profile does.
+    /// The time of the erase for CLEAR of a program (`TgtCheckEraseApp`); `None` for the profile's.
     pub erase: Option<fn(program: u8) -> Erase>,
-    /// Whether a program that is signed may be started now: a function that looks at a port pin, for
-    /// instance (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and
-    /// must leave what it uses as after a reset ([`bsp::inputs`] does).
+    /// Whether a signed program may be started now: for instance a function that reads a port pin
+    /// (`TgtCheckAppSig`). It runs in the boot stage, before any peripheral is set up, and must
+    /// leave the peripherals that it uses as after a reset ([`bsp::inputs`] does).
     pub start_allowed: fn(program: u8) -> bool,
-    /// Which CRC blocks and programs carry (`BLCOP_USE_CRC16`).
+    /// The CRC of blocks and programs (`BLCOP_USE_CRC16`).
     pub crc: CrcKind,
-    /// Bytes of flash that one step of a CRC covers, at least 64: the longest that work of the same
-    /// priority waits (`BLCOP_MAX_CRC_STEP_SIZE`).
+    /// Bytes of flash that one step of a CRC covers, at least 64. Other work of the same priority
+    /// waits for one step at most (`BLCOP_MAX_CRC_STEP_SIZE`).
     pub crc_step: u32,
-    /// Bytes of blocks that may wait for the flash, 1024 to what RAM is left
-    /// (`BLCOP_MAX_PROGRAM_BUFFER`). While a sector of 128 KiB is erased, a bus at 1 Mbit/s brings
-    /// some 55 KiB.
+    /// Size of the buffer for blocks that wait for the flash, in bytes: 1024 up to the free RAM
+    /// (`BLCOP_MAX_PROGRAM_BUFFER`). While a sector of 128 KiB is erased, a bus at 1 Mbit/s
+    /// delivers some 55 KiB.
     pub block_buffer: usize,
-    /// How long a task of the bootloader may be missing before the watchdog resets the chip, in ms,
-    /// 100 to 4000; `None` for no watchdog (`BLCOP_USE_WATCHDOG`).
+    /// The longest time without a check-in of a task of the bootloader before the watchdog resets
+    /// the chip, in ms, 100 to 4000; `None` for no watchdog (`BLCOP_USE_WATCHDOG`).
     pub watchdog_ms: Option<u16>,
-    /// A program has to feed the independent watchdog within this time, in ms, 1 to 4000, from its
-    /// first instruction on; `None` for a program that is started without one.
+    /// The time within which a program must feed the independent watchdog, from its first
+    /// instruction on, in ms, 1 to 4000; `None` to start programs without the watchdog.
     pub program_watchdog_ms: Option<u16>,
-    /// How long the device stays after the answer to its leaving is on the bus, in ms, at least 10:
-    /// clients want to see the answer before anything else happens.
+    /// How long the device waits for its reset after the answer is on the bus, in ms, at least 10:
+    /// clients expect to see the answer first.
     pub answer_to_reset_ms: u32,
-    /// The lowest security counter of a sealed image, whatever is stored (feature `sealed`).
+    /// The lowest accepted security counter of a sealed image, whatever is stored (feature
+    /// `sealed`).
     pub security_counter: u32,
-    /// Whether the security counter is raised when a program is confirmed, and not when it is
+    /// Whether the security counter is raised when a program is confirmed, instead of when it is
     /// installed (feature `sealed`).
     pub counter_with_confirmation: bool,
 }
 
 impl Product {
-    /// What a product is that chooses nothing.
+    /// A product with no choice of its own.
     pub const DEFAULT: Self = Self {
         profile: Profile::STANDARD,
         autostart: Some(1),
@@ -146,8 +150,8 @@ impl Product {
         counter_with_confirmation: false,
     };
 
-    /// Gives the product back if its choices go together; fails the build with the rule's name if
-    /// not.
+    /// Returns the product if its choices are consistent; otherwise it fails the build with the
+    /// message of the broken rule.
     pub const fn checked(self) -> Self {
         let programs = LAYOUT.programs.len();
         if let Some(number) = self.autostart {
@@ -232,7 +236,7 @@ impl Product {
         self
     }
 
-    /// How programs are downloaded: the profile's rules with the product's choices.
+    /// The policy for downloads: the profile's rules with the product's choices.
     pub const fn download(&self) -> Policy {
         Policy {
             identity: if self.identity_check {
@@ -263,7 +267,7 @@ impl Product {
         }
     }
 
-    /// What happens after a reset.
+    /// The policy for the decision after a reset.
     pub const fn decision(&self) -> decision::Policy {
         decision::Policy {
             autostart: self.autostart,
@@ -276,31 +280,32 @@ impl Product {
     }
 }
 
-/// Where node-ID and bit rate come from.
+/// The source of node-ID and bit rate.
 #[derive(Clone, Copy, Debug)]
 pub enum NodeSource {
-    /// From the parameters, where layer setting services stored them; the board's, or the profile's,
-    /// until then.
+    /// The parameters, where layer setting services (LSS) stored them; until then the board's or
+    /// the profile's values.
     Stored,
-    /// The board's, or the profile's, whatever is stored.
+    /// The board's or the profile's values, whatever is stored.
     Constant,
-    /// From a function that reads switches, for instance: the node-ID, and the bit rate as the index
-    /// of CiA 305 table 1. What is no node-ID stands for none (LSS may give one); what is no bit rate
-    /// of this device, for the board's. It runs in the boot stage, before any peripheral is set up,
-    /// and must leave what it uses as after a reset ([`bsp::inputs`] does).
+    /// A function, for instance one that reads switches. It returns the node-ID, and the bit rate
+    /// as the index of CiA 305 table 1. An invalid node-ID stands for none (LSS may set one). An
+    /// invalid bit rate, or one that this device does not support, stands for the board's. The
+    /// function runs in the boot stage, before any peripheral is set up, and must leave the
+    /// peripherals that it uses as after a reset ([`bsp::inputs`] does).
     Function(fn() -> (u8, u8)),
 }
 
-/// This product, or one that the repository builds beside it (`test_products.rs`).
+/// This product, or another one that the repository builds for its tests (`test_products.rs`).
 pub const PRODUCT: Product = test_products::or_this(PRODUCT_OF_THIS_FILE).checked();
 
-/// **What a product changes**: name the fields that differ from the default.
+/// **The fields that a product changes**: name the fields that differ from the default.
 const PRODUCT_OF_THIS_FILE: Product = Product { ..Product::DEFAULT };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;
 
-/// Where this product keeps its parameters. One with an EEPROM puts its own
+/// The store of this product's parameters. A product with an EEPROM puts its own
 /// [`boot_core::store::Parameters`] here.
 pub type Parameters = Journal;
 
@@ -309,7 +314,7 @@ pub fn parameters(flash: &impl Flash) -> Parameters {
     Journal::open(flash, LAYOUT.parameters)
 }
 
-/// Node-ID and bit rate of a device that was never told others.
+/// Node-ID and bit rate of a device that has none stored.
 const BOARD_NODE: NodeParameters = NodeParameters {
     id: match NODE_ID {
         NO_NODE_ID => None,
@@ -326,10 +331,10 @@ const BOARD_NODE: NodeParameters = NodeParameters {
         None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
     },
 };
-/// Stands for no node-ID (CiA 305).
+/// The value for no node-ID (CiA 305).
 pub const NO_NODE_ID: u8 = 255;
 
-/// Node-ID and bit rate in force from this reset on.
+/// Node-ID and bit rate that are valid from this reset on.
 pub fn node_parameters<F: Flash>(
     parameters: &impl boot_core::store::Parameters,
     flash: &F,
@@ -348,7 +353,7 @@ pub fn node_parameters<F: Flash>(
     }
 }
 
-/// Whether the board's CAN controller can run at this bit rate.
+/// Whether the product allows this bit rate and the board's CAN controller can run at it.
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
         BitRate::Auto => PRODUCT.auto_bit_rate,
@@ -363,7 +368,7 @@ pub const fn supports(rate: BitRate) -> bool {
 
 /// The warm-start cell of this board.
 pub fn warm_start_cell() -> Cell {
-    // SAFETY: the layout's warm-start region, checked to be RAM of that size that the linker keeps
-    // out of every image.
+    // SAFETY: the layout's warm-start region was checked to be RAM of that size, and the linker
+    // keeps every image out of it.
     unsafe { Cell::at(LAYOUT.warm_start.base as *mut _) }
 }

@@ -1,5 +1,5 @@
-//! The start-up in flash: the resident part decides; if it comes back, vectors, code and constants
-//! are in RAM, and `init` follows.
+//! The start-up in flash: it calls the boot stage in the resident part. If the boot stage returns,
+//! vectors, code and constants are in RAM, and `init` follows.
 
 use core::arch::global_asm;
 use core::cell::UnsafeCell;
@@ -17,21 +17,21 @@ const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin"));
 #[repr(C, align(4))]
 struct Resident([u8; BYTES.len()]);
 
-/// The resident part (`resident/main.rs`) at its place in flash; the linker script holds it to the
-/// address that it was linked for.
+/// The resident part (`resident/main.rs`) at its place in flash; the linker script places it at the
+/// address for which it was linked.
 #[used]
 #[no_mangle]
 #[link_section = ".callgate.resident"]
 static RESIDENT: Resident = Resident(*include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin")));
 
-/// Words of the resident part's header behind the callgate's table (`resident/main.rs`): the boot
-/// stage, and what is done about a fault.
+/// Offset of the boot stage in the resident part's header, behind the callgate's table
+/// (`resident/main.rs`).
 const STAGE: u32 = callgate::TABLE_SIZE;
-/// See [`STAGE`].
+/// Offset of the fault handler, see [`STAGE`].
 const FAULT: u32 = STAGE + 4;
 
-// The vectors of the core in flash. Until the RAM image runs no other exception can come than a
-// fault, and then the core has the table in RAM.
+// The vectors of the core in flash. Before the RAM image runs, the only possible exceptions are
+// faults. After that the core uses the table in RAM.
 global_asm!(
     ".section .core_vectors, \"a\"",
     ".word _stack_start",
@@ -62,7 +62,7 @@ global_asm!(
     fault = const FAULT,
 );
 
-// The header of the RAM image, as it is linked: not packed, without a CRC.
+// The header of the RAM image as the linker writes it: not packed, without a CRC.
 global_asm!(
     ".section .ram_image, \"a\"",
     ".word {magic}, 0, {services}, {raw}, __ram_image_size, __ram_image_size",
@@ -71,9 +71,9 @@ global_asm!(
     raw = const Method::Raw as u32,
 );
 
-// Reset calls `__pre_init` first of all, from flash. It switches the FPU on (the compiler may use
-// its registers to move data) and calls the boot stage, which comes back when the RAM image is in
-// its place; then vectors are taken from there.
+// Reset calls `__pre_init` first, from flash. It enables the FPU (the compiler may use its
+// registers to move data) and calls the boot stage. The boot stage returns when the RAM image is in
+// its place; then the core takes its vectors from there.
 global_asm!(
     ".section .boot, \"ax\"",
     ".global __pre_init",
@@ -104,18 +104,19 @@ global_asm!(
     report = sym BOOT_REPORT,
 );
 
-/// For `init`. It lies where the start-up clears nothing; before `init` the boot stage writes it.
+/// The report for `init`. It lies in memory that the start-up does not clear; the boot stage writes
+/// it before `init`.
 #[link_section = ".uninit.boot_report"]
 static BOOT_REPORT: Report = Report(UnsafeCell::new(MaybeUninit::uninit()));
 
 #[repr(transparent)]
 struct Report(UnsafeCell<MaybeUninit<BootReport>>);
 
-// SAFETY: nothing writes it when Rust code of the RAM part runs.
+// SAFETY: nothing writes it while Rust code of the RAM part runs.
 unsafe impl Sync for Report {}
 
-/// What the boot stage tells.
+/// The boot stage's report.
 pub fn boot_report() -> BootReport {
-    // SAFETY: `__pre_init` has handed its address to the boot stage, which has written it.
+    // SAFETY: `__pre_init` has passed its address to the boot stage, which has written it.
     unsafe { (*BOOT_REPORT.0.get()).assume_init() }
 }

@@ -1,5 +1,5 @@
-//! The flash and the store as the RAM part sees them: operations are started and polled here, all
-//! else is asked of the resident part ([`services`](crate::services)).
+//! The flash and the store for the RAM part: flash operations are started and polled here, and the
+//! resident part does everything else ([`services`](crate::services)).
 
 use core::mem::MaybeUninit;
 use core::task::Poll;
@@ -14,29 +14,29 @@ use crate::services::{outcome_code, Services, StoreState, StoreStep, OFFSET};
 
 /// The resident part's services.
 fn services() -> &'static Services {
-    // SAFETY: the linker script holds the resident part to the callgate's address, and its header
+    // SAFETY: the linker script places the resident part at the callgate's address, and its header
     // has the table at this offset.
     let services = unsafe { &*((LAYOUT.callgate() + OFFSET) as *const Services) };
-    // The boot stage has compared the versions; this finds a table at another place.
+    // The boot stage has compared the versions; this check finds a table at a wrong address.
     debug_assert_eq!(services.size as usize, size_of::<Services>());
     services
 }
 
-/// The flash.
+/// The flash, for the RAM part.
 pub struct BootFlash(FlashController);
 
 impl BootFlash {
     /// Takes the flash controller.
     ///
     /// # Safety
-    /// Nobody else may use it, or the CRC unit, until this is dropped.
+    /// Nothing else may use it, or the CRC unit, until this value is dropped.
     pub unsafe fn steal() -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         Self(unsafe { FlashController::steal() })
     }
 
-    /// The services, to be called while the flash is idle: code in flash stalls otherwise, and all
-    /// interrupts with it.
+    /// The services. The flash must be idle: otherwise code in flash stalls, and all interrupts
+    /// with it.
     fn idle_services(&self) -> &'static Services {
         debug_assert!(!self.0.is_busy(), "a service was called while the flash works");
         services()
@@ -48,7 +48,7 @@ impl Flash for BootFlash {
         self.0.read(address, buffer);
     }
 
-    // Asked for in many places, and checked each time.
+    // Not inlined: many functions call it, and each call has checks.
     #[inline(never)]
     fn read_word(&self, address: u32) -> u32 {
         self.0.read_word(address)
@@ -64,7 +64,7 @@ impl Flash for BootFlash {
 
     fn sector_at(&self, address: u32) -> Option<Sector> {
         let mut sector = MaybeUninit::uninit();
-        // SAFETY: the service writes the sector where it says that there is one.
+        // SAFETY: the service has written the sector if it returns true.
         unsafe {
             (self.idle_services().sector_at)(address, sector.as_mut_ptr()).then(|| sector.assume_init())
         }
@@ -79,20 +79,20 @@ impl Flash for BootFlash {
     }
 }
 
-/// What is stored.
+/// The stored values.
 pub struct Store(&'static mut StoreState);
 
 impl Store {
-    /// Finds what is stored. The flash must be idle.
+    /// Finds the stored values. The flash must be idle.
     pub fn open(state: &'static mut StoreState) -> Self {
-        // SAFETY: the state is ours alone.
+        // SAFETY: no other code uses the state.
         unsafe { (services().open)(state) };
         Self(state)
     }
 }
 
 impl Parameters for Store {
-    // A call is shorter: many look something up.
+    // Not inlined: many functions call it, and a call is shorter.
     #[inline(never)]
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
@@ -107,8 +107,8 @@ impl Parameters for Store {
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         let mut operation = MaybeUninit::uninit();
-        // SAFETY: the state comes from `open`; the service writes the operation where it says that
-        // there is one.
+        // SAFETY: the state comes from `open`; the service has written the operation if it returns
+        // `Start`.
         unsafe {
             match (services().next)(&mut *self.0, outcome_code(outcome), operation.as_mut_ptr()) {
                 StoreStep::Start => Next::Start(operation.assume_init()),

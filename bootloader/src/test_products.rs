@@ -1,10 +1,10 @@
-//! The products that this repository builds beside the one in `product.rs`: the dialects side by side,
-//! and choices that tests need. `COBOOT_PRODUCT` in the environment of a build names one. No product
-//! needs this file.
+//! The products that this repository builds for its tests, in addition to the one in `product.rs`:
+//! one for each dialect, and choices that tests need. `COBOOT_PRODUCT` in the environment of a
+//! build names one. A real product does not need this file.
 
 use super::{CrcKind, Erase, NodeSource, Product, Profile, Verdict};
 
-/// The product that the build asks for; this one where it names none.
+/// The product that the build names; `this` if it names none.
 pub const fn or_this(this: Product) -> Product {
     match option_env!("COBOOT_PRODUCT") {
         None => this,
@@ -13,7 +13,7 @@ pub const fn or_this(this: Product) -> Product {
     }
 }
 
-/// The one of this name.
+/// The product with this name.
 const fn named(this: Product, name: &str) -> Product {
     if equal(name, "paulus") {
         Product { profile: Profile::PAULUS, ..this }
@@ -22,7 +22,7 @@ const fn named(this: Product, name: &str) -> Product {
     } else if equal(name, "lift") {
         Product { profile: Profile::LIFT, ..this }
     } else if equal(name, "crc-16") {
-        // With a step so large that the tests see what a long computation costs.
+        // The step is so large that the tests see the cost of a long computation.
         Product { crc: CrcKind::Crc16, crc_step: 64 * 1024, ..this }
     } else if equal(name, "least") {
         Product {
@@ -35,8 +35,8 @@ const fn named(this: Product, name: &str) -> Product {
             ..this
         }
     } else if equal(name, "switches") {
-        // Node-ID and bit rate by the pins of port E, whether a program is valid by PC0, and nearly
-        // everything else as it is not by default.
+        // The pins of port E give node-ID and bit rate, PC0 tells whether a program may be started,
+        // and nearly every other choice differs from its default.
         Product {
             node_source: SWITCHES,
             start_allowed: |_| bsp::inputs('C') & 1 != 0,
@@ -66,8 +66,7 @@ const SWITCHES: NodeSource = NodeSource::Function(|| {
 });
 
 /// The product of a row of choices: a colon, then a digit for each field. `cargo xtask pairs` makes
-/// the rows and has the same fields in the same order; a digit that stands for no value fails the
-/// build.
+/// the rows; it has the same fields in the same order. A digit without a meaning fails the build.
 const fn of_choices(this: Product, row: &[u8]) -> Product {
     assert!(row.len() == 33, "COBOOT_PRODUCT: a row has a colon and 32 digits");
     Product {
@@ -112,7 +111,7 @@ const fn of_choices(this: Product, row: &[u8]) -> Product {
         program_watchdog_ms: if second(row, 28) { Some(1000) } else { None },
         answer_to_reset_ms: if second(row, 29) { 50 } else { 20 },
         max_crash_resets: if second(row, 30) { 1 } else { 3 },
-        // Without the feature `sealed` they change nothing.
+        // Without the feature `sealed` these two have no effect.
         security_counter: if second(row, 31) { 5 } else { 0 },
         counter_with_confirmation: second(row, 32),
     }

@@ -1,8 +1,8 @@
-//! The independent watchdog (RM0090 section 21), fed when every task has checked in (SYS TEC manual
-//! L-1112d_10, 3.4.8).
+//! The independent watchdog (RM0090 section 21). It is fed when every task has checked in (SYS TEC
+//! manual L-1112d_10, 3.4.8).
 //!
-//! A reset is what stops it: the bootloader leaves by one, so that a program starts without it
-//! unless `product.rs` says otherwise.
+//! Only a reset stops the watchdog. The bootloader starts a program through a reset, so the program
+//! starts without the watchdog unless `product.rs` says otherwise.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
@@ -10,27 +10,27 @@ use bsp::{pac, watchdog};
 
 use crate::product::PRODUCT;
 
-/// Who has to check in.
+/// The tasks that must check in.
 #[derive(Clone, Copy)]
 pub enum Task {
-    /// The protocol: every millisecond or two.
+    /// The protocol: it checks in every millisecond or two.
     Protocol,
-    /// The work on the flash, and with it `idle`.
+    /// The work on the flash, in `idle`.
     Flash,
 }
 
 static CHECKED_IN: [AtomicBool; 2] = [const { AtomicBool::new(false) }; 2];
 
-/// A task is alive.
+/// Records that a task is alive.
 pub fn check_in(task: Task) {
     CHECKED_IN[task as usize].store(true, Ordering::Relaxed);
 }
 
-/// The watchdog, running if the product has one.
+/// The watchdog; it runs if the product has one.
 pub struct Watchdog(pac::IWDG);
 
 impl Watchdog {
-    /// Takes it and starts it.
+    /// Takes the watchdog, and starts it if the product has one.
     pub fn new(registers: pac::IWDG) -> Self {
         if let Some(ms) = PRODUCT.watchdog_ms {
             watchdog::start(&registers, ms);
@@ -38,8 +38,8 @@ impl Watchdog {
         Self(registers)
     }
 
-    /// Feeds it if all tasks have checked in since they last did. To be called by the task that
-    /// drives the others.
+    /// Feeds the watchdog if all tasks have checked in since it was last fed. The task that drives
+    /// the others calls it.
     pub fn feed(&mut self) {
         if CHECKED_IN.iter().all(|task| task.load(Ordering::Relaxed)) {
             for task in &CHECKED_IN {

@@ -1,100 +1,102 @@
-//! What every board does with its bxCAN: bit timing, filters, frames, and the state of the
-//! controller (RM0090 section 32).
+//! The bxCAN driver for all boards: bit timing, filters, frames, and the state of the controller
+//! (RM0090 section 32).
 
 use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, StandardId};
 use embedded_can::Frame;
 pub use shared_abi::bit_timing::BitTiming;
 
-/// How the controller takes part in the bus.
+/// The controller's mode on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
-    /// Like any other.
+    /// It receives, acknowledges and sends.
     Normal,
-    /// It listens, and neither acknowledges nor disturbs.
+    /// It only listens; it neither acknowledges nor sends error frames.
     Silent,
 }
 
-/// What a controller that was asked for its errors tells (`CAN_ESR` and `CAN_MSR`, RM0090 section
-/// 32.9.2).
+/// The controller's error state (`CAN_ESR` and `CAN_MSR`, RM0090 section 32.9.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Errors {
     /// Bus-off.
     pub off: bool,
     /// Error passive.
     pub passive: bool,
-    /// It has seen the bus idle since it was configured, and takes part.
+    /// The controller has seen the bus idle since it was configured, and takes part.
     pub joined: bool,
-    /// What became of the last frame since the question before: nothing came, a good one, a bad
-    /// one.
+    /// The result of the last frame since the previous call: `None` without a frame, otherwise
+    /// whether it was good.
     pub last: Option<Result<(), ()>>,
 }
 
-/// Offsets of registers that `bxcan` keeps to itself, in bytes (RM0090 section 32.9.5).
+/// Offsets of registers that `bxcan` does not make public, in bytes (RM0090 section 32.9.5).
 const MCR: usize = 0x00;
 const MSR: usize = 0x04;
 const TSR: usize = 0x08;
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
-/// `CAN_MCR`: bus-off is left without being told to.
+/// `CAN_MCR`: the controller leaves bus-off without a command.
 const ABOM: u32 = 1 << 6;
-/// `CAN_MSR`: initialisation and sleep mode are left with the first 11 recessive bits.
+/// `CAN_MSR`: initialisation and sleep mode end with the first 11 recessive bits.
 const INAK_SLAK: u32 = 0b11;
-/// `CAN_TSR`: whether the frames of the three mailboxes are to be dropped; set until they are.
+/// `CAN_TSR`: requests to drop the frames of the three mailboxes; each bit is set until that is
+/// done.
 const ABRQ: u32 = 1 << 7 | 1 << 15 | 1 << 23;
-/// `CAN_RF0R`: a frame was lost because the FIFO was full; written with 1, it is cleared.
+/// `CAN_RF0R`: a frame was lost because the FIFO was full; writing 1 clears it.
 const FOVR0: u32 = 1 << 4;
 const EPVF: u32 = 1 << 1;
 const BOFF: u32 = 1 << 2;
-/// The last error code; 7 is written by software alone, 0 is a good frame.
+/// The last error code: only software writes 7; 0 is a good frame.
 const LEC: u32 = 7 << 4;
 
-/// The same of the filters, which the master has for itself and for the slave.
+/// Offsets of the filter registers. The master has the filters for itself and for the slave.
 const FMR: usize = 0x200;
 const FM1R: usize = 0x204;
 const FS1R: usize = 0x20C;
 const FFA1R: usize = 0x214;
 const FA1R: usize = 0x21C;
 const F0R1: usize = 0x240;
-/// `CAN_FMR`: the filters are being set, and nothing is received.
+/// `CAN_FMR`: the filters are being set; meanwhile nothing is received.
 const FINIT: u32 = 1 << 0;
 
-/// A controller, and where its acceptance filters are (RM0090 section 32.7.4).
+/// A controller and the place of its acceptance filters (RM0090 section 32.7.4).
 ///
 /// # Safety
-/// `MASTER` is the base of the registers of the controller that has the filters, which has a clock;
-/// whoever owns this controller owns its share of them.
+/// `MASTER` must be the base of the registers of the controller that has the filters, and that
+/// controller must have its clock. The owner of this controller must own its part of the filters,
+/// too.
 pub unsafe trait Controller: Instance {
-    /// The master of two controllers: this one or the other.
+    /// The master of the two controllers: this one or the other one.
     const MASTER: *mut RegisterBlock;
-    /// Whether it is the slave: the filter banks from `CAN_FMR.CAN2SB` on are its, those below are
-    /// the master's.
+    /// Whether this controller is the slave: it has the filter banks from `CAN_FMR.CAN2SB` on; the
+    /// master has those below.
     const IS_SLAVE: bool;
 }
 
-/// A bxCAN controller and the one frame that may wait for its mailboxes.
+/// A bxCAN controller and one frame that may wait for a mailbox.
 pub struct Port<I: Controller> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
-    /// A boot-up is on its way, which nothing may overtake, whatever its priority.
+    /// A boot-up is waiting; no frame may overtake it, whatever its priority.
     boot_up: bool,
     lost: Lost,
 }
 
-/// What a node says first is a state of 0 on this and its node-ID (CiA 301 section 7.2.8.3.3).
+/// Base of the COB-ID of boot-up (CiA 301 section 7.2.8.3.3); the node-ID is added, and the state
+/// is 0.
 const BOOT_UP: u16 = 0x700;
 
-/// Where frames were lost.
+/// The places where frames were lost.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Lost {
     /// In the controller: its FIFO was full.
     pub in_controller: bool,
-    /// Behind it: whoever took them from the FIFO had no room.
+    /// In software: the receiver of frames from the FIFO had no room.
     pub in_queue: bool,
 }
 
 impl<I: Controller> Port<I> {
-    /// Takes the controller. It hears and says nothing before [`configure`](Self::configure) and
-    /// [`accept`](Self::accept). Interrupts of receive FIFO 0 and of the mailboxes are on.
+    /// Takes the controller. It receives and sends nothing before [`configure`](Self::configure)
+    /// and [`accept`](Self::accept). Interrupts of receive FIFO 0 and of the mailboxes are on.
     pub fn new(controller: I) -> Self {
         let mut can = Can::builder(controller).leave_disabled();
         can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
@@ -103,29 +105,29 @@ impl<I: Controller> Port<I> {
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
-    /// Joining takes 11 recessive bits on the bus; the controller waits for them by itself and this
-    /// function does not.
+    /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself; this
+    /// function does not wait.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         let config = self.can.modify_config();
         config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
-        // Only now: while a frame is under way that nobody acknowledges, an abort would wait for
-        // it.
+        // The abort comes now, after the controller has left the bus: before, it would wait for a
+        // frame that no other node acknowledges.
         self.waiting = None;
         self.write(TSR, ABRQ);
         while self.read(TSR) & ABRQ != 0 {}
         self.join();
     }
 
-    /// Comes back from bus-off: by itself, once the bus was idle for 128 × 11 bits.
+    /// Starts the recovery from bus-off: it ends when the bus was idle for 128 × 11 bits.
     pub fn recover_from_bus_off(&mut self) {
         self.can.modify_config().leave_disabled();
         self.join();
     }
 
     fn join(&mut self) {
-        // WouldBlock says that the bus was not idle yet; it is the controller's to wait.
+        // WouldBlock means that the bus was not idle yet; the controller waits, not this code.
         let _: nb::Result<(), _> = self.can.enable_non_blocking();
-        // When to leave bus-off is decided above.
+        // `recover_from_bus_off` decides when to leave bus-off.
         self.write(MCR, self.read(MCR) & !ABOM);
     }
 
@@ -134,8 +136,8 @@ impl<I: Controller> Port<I> {
     #[inline(never)]
     pub fn accept(&mut self, [a, b, c]: [u16; 3]) {
         let change = |offset: usize, clear: u32, set: u32| {
-            // SAFETY: the offset is one of a register above, in the registers of the master; of
-            // its bits those change that belong to this controller, which this port owns.
+            // SAFETY: the offset is one of a register above, in the registers of the master. Only
+            // the bits of this controller change, which this port owns.
             unsafe {
                 let register = I::MASTER.cast::<u32>().byte_add(offset);
                 let before = register.read_volatile();
@@ -147,8 +149,8 @@ impl<I: Controller> Port<I> {
         let from_border = u32::MAX << border;
         let (bank, share) = if I::IS_SLAVE { (border, from_border) } else { (0, !from_border) };
         change(FA1R, share, 0);
-        // A list of four identifiers of 16 bits each; one may stand there twice. STID is at 15:5,
-        // and RTR and IDE are clear.
+        // A list of four identifiers of 16 bits each; one of them may appear twice. STID is at
+        // 15:5, and RTR and IDE are clear.
         change(FM1R, 0, 1 << bank);
         change(FS1R, 1 << bank, 0);
         change(FFA1R, 1 << bank, 0);
@@ -166,19 +168,19 @@ impl<I: Controller> Port<I> {
             match self.can.rx0().receive() {
                 Ok(frame) => return received(&frame),
                 Err(nb::Error::WouldBlock) => return None,
-                // The frames that are there are still good.
+                // The frames in the FIFO are still good.
                 Err(nb::Error::Other(OverrunError { .. })) => self.lost.in_controller = true,
             }
         }
     }
 
-    /// A frame that was taken from the FIFO found no room with its taker.
+    /// Records that the receiver of frames had no room for one.
     pub fn record_overrun(&mut self) {
         self.lost.in_queue = true;
     }
 
-    /// Acknowledges the mailbox interrupt and moves a frame that waits into a mailbox. Whether
-    /// there is room for one now.
+    /// Acknowledges the mailbox interrupt and moves a waiting frame into a mailbox. Returns whether
+    /// there is room for another frame now.
     pub fn has_room(&mut self) -> bool {
         self.can.clear_tx_interrupt();
         self.put_waiting();
@@ -186,8 +188,8 @@ impl<I: Controller> Port<I> {
         self.waiting.is_none() && !self.boot_up
     }
 
-    /// Sends a data frame with an identifier of 11 bits. To be called only when there is room; a frame that still waits would be
-    /// lost.
+    /// Sends a data frame with an identifier of 11 bits. Call it only when there is room; otherwise
+    /// a waiting frame would be lost.
     ///
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first
     /// is on its way.
@@ -201,23 +203,23 @@ impl<I: Controller> Port<I> {
         self.put_waiting();
     }
 
-    /// Moves the frame that waits, if any, into a mailbox if there is one for it.
+    /// Moves the waiting frame, if any, into a mailbox if one is free.
     fn put_waiting(&mut self) {
         if let Some(Ok(status)) = self.waiting.as_ref().map(|frame| self.can.transmit(frame)) {
-            // A frame of lower priority may have had to leave its mailbox: it goes next.
+            // A frame of lower priority may have been removed from its mailbox: it is sent next.
             self.waiting = status.dequeued_frame().cloned();
         }
     }
 
-    /// Whether everything given to it is on the bus and acknowledged.
+    /// Whether all frames are on the bus and acknowledged.
     pub fn is_idle(&mut self) -> bool {
-        // Who waits for this may do nothing else with the controller: its interrupt would come
-        // again and again.
+        // A caller that only polls this must acknowledge the interrupt, too: otherwise it would
+        // come again and again.
         self.can.clear_tx_interrupt();
         self.waiting.is_none() && self.can.is_transmitter_idle()
     }
 
-    /// What the controller tells of its errors.
+    /// Reads the controller's error state.
     pub fn errors(&mut self) -> Errors {
         let status = self.read(ESR);
         self.write(ESR, LEC);
@@ -230,7 +232,7 @@ impl<I: Controller> Port<I> {
         Errors { off: status & BOFF != 0, passive: status & EPVF != 0, joined, last }
     }
 
-    /// Where frames were lost since the question before.
+    /// The places where frames were lost since the previous call.
     pub fn take_overruns(&mut self) -> Lost {
         if self.read(RF0R) & FOVR0 != 0 {
             self.write(RF0R, FOVR0);
@@ -240,19 +242,19 @@ impl<I: Controller> Port<I> {
     }
 
     fn read(&self, offset: usize) -> u32 {
-        // SAFETY: `REGISTERS` is the base of the controller that this port owns, the offset one of
-        // the registers above; reading them has no effect.
+        // SAFETY: `REGISTERS` is the base of the controller that this port owns, and the offset is
+        // one of the registers above; reading them has no effect.
         unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
     }
 
     fn write(&mut self, offset: usize, value: u32) {
-        // SAFETY: as above; the values written are those that section 32.9.2 allows at any time.
+        // SAFETY: as above; section 32.9.2 allows these values at any time.
         unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).write_volatile(value) }
     }
 }
 
-/// A frame from the FIFO in another crate's type. The filters let in data frames with identifiers of
-/// 11 bits alone.
+/// A frame from the FIFO in another crate's type. The filters pass only data frames with
+/// identifiers of 11 bits.
 fn received<F: Frame>(frame: &bxcan::Frame) -> Option<F> {
     let bxcan::Id::Standard(id) = frame.id() else { return None };
     F::new(embedded_can::StandardId::new(id.as_raw())?, frame.data()?)

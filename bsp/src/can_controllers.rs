@@ -1,5 +1,5 @@
-//! The two bxCAN controllers of the chip. CAN1 is the master: it has the filters of both, and manages
-//! the memory that both keep frames in, so it needs its clock where only CAN2 is used (RM0090
+//! The two bxCAN controllers of the chip. CAN1 is the master: it has the filters of both, and
+//! manages the frame memory of both. So it needs its clock even if only CAN2 is used (RM0090
 //! sections 32.3.3 and 32.7.4).
 
 use bxcan::RegisterBlock;
@@ -12,27 +12,28 @@ use crate::can::Controller;
 
 const CAN1: *mut RegisterBlock = pac::CAN1::PTR as *mut RegisterBlock;
 
-// SAFETY: it is the master.
+// SAFETY: CAN1 is the master.
 unsafe impl Controller for Can<pac::CAN1> {
     const MASTER: *mut RegisterBlock = CAN1;
     const IS_SLAVE: bool = false;
 }
 
-// SAFETY: its master is CAN1, and has a clock: `take_can2` sees to that.
+// SAFETY: its master is CAN1, and `take_can2` enables the clock of CAN1.
 unsafe impl Controller for Can<pac::CAN2> {
     const MASTER: *mut RegisterBlock = CAN1;
     const IS_SLAVE: bool = true;
 }
 
-/// CAN2, in exchange for its master: CAN1 gets a clock and is reset, and does nothing but serve.
+/// Takes CAN2 in exchange for its master: CAN1 gets its clock and is reset, and only serves CAN2.
 ///
-/// The interrupts of CAN2 are on from here, each with the priority of CAN1's, whose handler it calls
-/// (`can_controller!`). To be called where those have their priorities already and none can come:
-/// in the `init` of a program.
+/// The interrupts of CAN2 are on from here. Each gets the priority of CAN1's, and its handler calls
+/// the handler of CAN1's (`can_controller!`). Call this where CAN1's interrupts already have their
+/// priorities and no interrupt can come: in the `init` of a program.
 pub fn take_can2(_can1: pac::CAN1, rcc: &mut Rcc) -> pac::CAN2 {
     pac::CAN1::enable(rcc);
     pac::CAN1::reset(rcc);
-    // SAFETY: nobody else sets the priorities of these; nothing waits for them to be masked.
+    // SAFETY: no other code sets the priorities of these interrupts, and no code relies on their
+    // being masked.
     unsafe {
         let mut nvic = cortex_m::Peripherals::steal().NVIC;
         for (own, task) in
@@ -42,6 +43,6 @@ pub fn take_can2(_can1: pac::CAN1, rcc: &mut Rcc) -> pac::CAN2 {
             NVIC::unmask(own);
         }
     }
-    // SAFETY: whoever has the only CAN1 asks once.
+    // SAFETY: the caller gives up the only CAN1, so it calls this once.
     unsafe { pac::CAN2::steal() }
 }

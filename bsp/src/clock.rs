@@ -1,23 +1,23 @@
-//! The clock tree at the level of its registers (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and
-//! 6 say the same), for code that has to be small, and to be able to leave it as a reset does. An
-//! application takes the HAL's way, [`crate::clocks`].
+//! The clock tree at register level (RM0090 sections 3.5 and 7; RM0390 sections 3.4 and 6 say the
+//! same). It is for code that must be small and must be able to restore the reset state. An
+//! application uses the HAL's way, [`crate::clocks`].
 
 use shared_abi::geometry::Limits;
 
-/// How a board makes its clocks out of its crystal.
+/// How a board makes its clocks from its crystal.
 #[derive(Clone, Copy, Debug)]
 pub struct ClockTree {
     /// The crystal, in Hz.
     pub hse: u32,
-    /// Whether there is a clock on OSC_IN in place of a crystal.
+    /// Whether OSC_IN has a clock instead of a crystal.
     pub hse_bypass: bool,
-    /// Input of the PLL in Hz: 1 to 2 MHz, and a divisor of the crystal and of the 16 MHz of HSI.
+    /// Input of the PLL in Hz: 1 to 2 MHz; it must divide the crystal and the 16 MHz of HSI.
     pub pll_input: u32,
     /// The PLL's multiplier, 50 to 432.
     pub pll_n: u32,
-    /// The divider behind it: 2, 4, 6 or 8.
+    /// The PLL's output divider: 2, 4, 6 or 8.
     pub pll_p: u32,
-    /// Divider of APB1, to which the CAN controller belongs: 1, 2, 4, 8 or 16.
+    /// Divider of APB1, which clocks the CAN controller: 1, 2, 4, 8 or 16.
     pub apb1: u32,
     /// Divider of APB2.
     pub apb2: u32,
@@ -25,16 +25,16 @@ pub struct ClockTree {
     pub wait_states: u32,
 }
 
-/// What the PLL runs from.
+/// The input of the PLL.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The internal oscillator: there at once, to 1 %.
+    /// The internal oscillator: it needs no start-up time, and is exact to 1 %.
     Internal,
-    /// The crystal: exact, after some milliseconds.
+    /// The crystal: it is exact, and needs some milliseconds to start.
     Crystal,
 }
 
-/// What the core runs from after a reset, in Hz.
+/// The core's clock after a reset, in Hz.
 pub const HSI: u32 = 16_000_000;
 
 impl ClockTree {
@@ -50,10 +50,10 @@ impl ClockTree {
         self.sysclk() / self.apb1
     }
 
-    /// The tree, if the board's chip can run with it.
+    /// Returns the tree if the board's chip can run with it.
     ///
     /// # Panics
-    /// At compile time, with the rule that is broken.
+    /// At compile time, with the message of the broken rule.
     #[must_use]
     pub const fn checked(self) -> Self {
         match self.check(&crate::CHIP.line.limits()) {
@@ -65,7 +65,7 @@ impl ClockTree {
     /// Whether a chip with these limits can run with the tree.
     ///
     /// # Errors
-    /// The rule that is broken, in words (RM0090 sections 7.3.2 and 7.3.3;
+    /// The broken rule, in words (RM0090 sections 7.3.2 and 7.3.3;
     /// [`Line::limits`](shared_abi::geometry::Line::limits)).
     pub const fn check(&self, limits: &Limits) -> Result<(), &'static str> {
         if self.pll_input == 0
@@ -123,7 +123,7 @@ impl ClockTree {
     }
 }
 
-/// Whether a bus can be divided by this.
+/// Whether a bus can have this divider.
 const fn is_divider(value: u32) -> bool {
     value >= 1 && value <= 16 && value.is_power_of_two()
 }
@@ -131,7 +131,7 @@ const fn is_divider(value: u32) -> bool {
 #[cfg(target_arch = "arm")]
 pub(crate) use registers::raise_voltage;
 
-/// The same on the chip.
+/// The clock tree in the registers of the chip.
 #[cfg(target_arch = "arm")]
 mod registers {
     use shared_abi::reset;
@@ -145,24 +145,25 @@ mod registers {
     const HSEBYP: u32 = 1 << 18;
     const PLLON: u32 = 1 << 24;
     const PLLRDY: u32 = 1 << 25;
-    /// RCC_CFGR: what the system clock runs from, as told back.
+    /// RCC_CFGR: the system clock in use, as the chip reports it.
     const SWS_PLL: u32 = 0b10 << 2;
     const SWS: u32 = 0b11 << 2;
-    /// How often a crystal is looked at before it is given up: at 16 MHz and 8 cycles a look 50 ms,
-    /// ten times what one takes.
+    /// Number of checks of a crystal before it is given up: at 16 MHz and 8 cycles a check this is
+    /// 50 ms, ten times the start-up time of a crystal.
     const PATIENCE: u32 = 100_000;
 
     impl ClockTree {
-        /// Runs the core from the PLL. A crystal that does not start is done without, as long as
-        /// the board has power: a device that can be reached badly is better than none.
+        /// Runs the core from the PLL. If the crystal does not start, the PLL uses the internal
+        /// oscillator until the next reset: a device that is hard to reach is better than an
+        /// unreachable one.
         pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
-            // The PLL cannot be changed over while it runs (section 7.3.2).
+            // The PLL cannot be changed while it runs (section 7.3.2).
             if rcc.cr().read().bits() & PLLON != 0 {
                 self.slow_down(rcc);
             }
             let mut source = Source::Internal;
             if wanted == Source::Crystal {
-                // The bypass can be chosen only while the oscillator is off (section 7.3.1).
+                // The bypass can be selected only while the oscillator is off (section 7.3.1).
                 if self.hse_bypass {
                     set(rcc, HSEBYP);
                 }
@@ -176,7 +177,7 @@ mod registers {
                 Source::Crystal => (self.hse, 1 << 22),
             };
             let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
-            // SAFETY: a valid word of PLLCFGR, as `checked` has seen to; the reserved bits and Q
+            // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
             // keep their reset values.
             rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
             raise_voltage(rcc);
@@ -184,7 +185,7 @@ mod registers {
             latency(self.wait_states);
             while rcc.cr().read().bits() & PLLRDY == 0 {}
             await_voltage();
-            // SAFETY: dividers of the buses and the PLL as system clock.
+            // SAFETY: valid dividers of the buses, and the PLL as system clock.
             rcc.cfgr().write(|w| unsafe {
                 w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10)
             });
@@ -192,12 +193,12 @@ mod registers {
             source
         }
 
-        /// Back to the clocks as after a reset.
+        /// Restores the clocks of the reset state.
         pub fn slow_down(&self, rcc: &pac::RCC) {
             // SAFETY: the reset value.
             rcc.cfgr().write(|w| unsafe { w.bits(0) });
             while rcc.cfgr().read().bits() & SWS != 0 {}
-            // SAFETY: the reset values; nothing runs from PLL or crystal any more.
+            // SAFETY: the reset values; nothing uses the PLL or the crystal any more.
             rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
             while rcc.cr().read().bits() & PLLRDY != 0 {}
             // SAFETY: the reset value.
@@ -207,22 +208,22 @@ mod registers {
         }
     }
 
-    /// Whether the board is faster than the regulator allows as a reset leaves it.
+    /// Whether the core is faster than the regulator's scale after a reset allows.
     const NEEDS_SCALE_1: bool = SYSCLK > CHIP.line.limits().sysclk_after_reset;
-    /// PWR_CR.VOS of the STM32F412, F413 and F423: scale 1, and scale 2 as after a reset. It takes
-    /// effect with the PLL, which has to be off when it is written (RM0402 and RM0430, PWR_CR).
+    /// PWR_CR.VOS of the STM32F412, F413 and F423: scale 1, and scale 2 of the reset state. It
+    /// takes effect with the PLL, which must be off when it is written (RM0402 and RM0430, PWR_CR).
     const VOS: u32 = 0b11 << 14;
     const VOS_SCALE_2: u32 = 0b10 << 14;
     const PWREN: u32 = 1 << 28;
 
-    /// Raises the regulator to scale 1, if the board needs that. While the PLL is off.
+    /// Raises the regulator to scale 1, if the board needs that. The PLL must be off.
     pub(crate) fn raise_voltage(rcc: &pac::RCC) {
         if NEEDS_SCALE_1 {
             voltage(rcc, VOS);
         }
     }
 
-    /// Waits until the regulator has reached its scale, which it does when the PLL runs.
+    /// Waits until the regulator has reached its scale; that happens when the PLL runs.
     fn await_voltage() {
         /// PWR_CSR.
         const VOSRDY: u32 = 1 << 14;
@@ -230,7 +231,7 @@ mod registers {
         while NEEDS_SCALE_1 && unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY == 0 {}
     }
 
-    /// The regulator as after a reset. While the PLL is off.
+    /// Restores the regulator's reset state. The PLL must be off.
     fn lower_voltage(rcc: &pac::RCC) {
         if NEEDS_SCALE_1 {
             voltage(rcc, VOS_SCALE_2);
@@ -240,30 +241,30 @@ mod registers {
     }
 
     fn voltage(rcc: &pac::RCC, scale: u32) {
-        // SAFETY: the clock of the power controller in addition to those that are on.
+        // SAFETY: it enables the clock of the power controller and leaves the others on.
         rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PWREN) });
-        // SAFETY: nothing else uses it; of its register, the scale alone is written.
+        // SAFETY: nothing else uses it; only the scale in its register is written.
         let pwr = unsafe { pac::PWR::steal() };
         pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !VOS | scale) });
     }
 
     fn set(rcc: &pac::RCC, bit: u32) {
-        // SAFETY: a switch of CR in addition to those that are on.
+        // SAFETY: it sets a bit of CR and leaves the others set.
         rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
     }
 
-    /// Wait states of the flash; the rest of its access control stays. The new value holds once it
-    /// reads back (section 3.5.1).
+    /// Sets the wait states of the flash; the rest of its access control stays. The new value is
+    /// valid when it reads back (section 3.5.1).
     fn latency(wait_states: u32) {
-        // SAFETY: the access control register is this module's as far as the wait states go; the
-        // flash driver does not touch them, and no other priority runs while clocks change.
+        // SAFETY: this module owns the wait states in the access control register; the flash driver
+        // does not change them, and no other priority runs while clocks change.
         let acr = unsafe { &*pac::FLASH::ptr() }.acr();
         // SAFETY: 0 to 15.
         acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
         while acr.read().bits() & 0xF != wait_states {}
     }
 
-    /// The bits of PPRE1 and PPRE2.
+    /// The code of a divider in PPRE1 and PPRE2.
     const fn prescaler(divider: u32) -> u32 {
         match divider {
             2 => 0b100,
@@ -295,8 +296,8 @@ mod tests {
     /// 100 MHz, APB1 at 50 and APB2 at 100 MHz.
     const SLOW: ClockTree = ClockTree { pll_n: 100, apb1: 2, apb2: 1, wait_states: 3, ..FAST };
 
-    /// The general operating conditions of the datasheets, in MHz: core, APB1, APB2 (over-drive off,
-    /// regulator at scale 1), and wait states at the fastest clock (2.7 to 3.6 V).
+    /// The general operating conditions of the datasheets, in MHz: core, APB1, APB2 (over-drive
+    /// off, regulator at scale 1); and the wait states at the fastest clock (2.7 to 3.6 V).
     #[test]
     fn what_is_too_fast_for_a_line_is_refused() {
         for (line, core, apb1, apb2, wait_states) in [
@@ -332,7 +333,7 @@ mod tests {
             let fewer = says(ClockTree { wait_states: wait_states - 1, ..fastest });
             assert!(fewer.contains("needs a wait state for every"), "{fewer}");
         }
-        // RM0430: two wait states to 75 MHz on the F413; RM0402: to 90 on the F412.
+        // RM0430: two wait states up to 75 MHz on the F413; RM0402: up to 90 MHz on the F412.
         let tree = ClockTree { pll_n: 80, wait_states: 2, ..SLOW };
         assert_eq!(tree.check(&Line::F412.limits()), Ok(()));
         assert!(tree.check(&Line::F413.limits()).unwrap_err().contains("every 25 MHz"));

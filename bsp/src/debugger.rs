@@ -1,22 +1,22 @@
-//! The chip's memory for the debugger interface (feature `debugger`): any address may be asked for,
-//! none faults.
+//! The chip's memory for the debugger interface (feature `debugger`): a request may name any
+//! address, and none causes a fault.
 
 use shared_abi::memory_map::{may_read, may_write};
 
 use crate::{pac, LAYOUT};
 
-/// Why memory is not touched.
+/// Why an access is refused.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Refused {
-    /// Something else lies there, or nothing (`shared_abi::memory_map`).
+    /// The address has no memory that may be accessed (`shared_abi::memory_map`).
     Address,
-    /// The flash is busy: reading it now would stop the CPU until that is over. Or the CCM has no
-    /// clock.
+    /// The flash is busy: reading it now would stop the CPU until the flash is idle. Or the CCM has
+    /// no clock.
     Busy,
 }
 
-/// Whether the chip's read-out protection is on, at whatever level (RM0090, embedded flash: read
-/// protection): `RDP` in `FLASH_OPTCR` is AAh where it is not.
+/// Whether the chip's read-out protection is on, at level 1 or 2 (RM0090, embedded flash: read
+/// protection): `RDP` in `FLASH_OPTCR` is AAh if it is off.
 #[must_use]
 pub fn is_locked() -> bool {
     const OPEN: u8 = 0xAA;
@@ -24,10 +24,10 @@ pub fn is_locked() -> bool {
     unsafe { pac::FLASH::steal() }.optcr().read().rdp().bits() != OPEN
 }
 
-/// Reads memory or registers; words by words where the address allows.
+/// Reads memory or registers, by words if the address allows it.
 ///
 /// # Errors
-/// See [`Refused`]; nothing was touched then.
+/// See [`Refused`]; then nothing was read.
 pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
     if !may_read(LAYOUT.chip, address, bytes.len() as u32) {
         return Err(Refused::Address);
@@ -41,7 +41,7 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
         let width = width(at, rest.len());
         let (piece, behind) = rest.split_at_mut(width);
         // SAFETY: the whole range can be read (`may_read`), and the address is aligned to the
-        // width. What such a read does to a peripheral is what whoever asked for it wants.
+        // width. The effect of such a read on a peripheral is intended by the requester.
         unsafe {
             match width {
                 4 => piece.copy_from_slice(&(at as *const u32).read_volatile().to_le_bytes()),
@@ -55,10 +55,10 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
     Ok(())
 }
 
-/// Writes RAM or registers, as [`read`] reads.
+/// Writes RAM or registers, with the same access widths as [`read`].
 ///
 /// # Errors
-/// See [`Refused`]; nothing was touched then.
+/// See [`Refused`]; then nothing was written.
 pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
     if !may_write(LAYOUT.chip, address, bytes.len() as u32) {
         return Err(Refused::Address);
@@ -72,8 +72,8 @@ pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
         let width = width(at, rest.len());
         let (piece, behind) = rest.split_at(width);
         // SAFETY: the whole range can be written (`may_write`), and the address is aligned to the
-        // width. **What that does to this program is beyond all promises**: a debugger may change
-        // any variable, stacks included. This is why the feature is never on in a product.
+        // width. **The effect on this program is not limited**: a debugger may change any variable,
+        // stacks included. This is why a product never has the feature.
         unsafe {
             match *piece {
                 [a, b, c, d] => (at as *mut u32).write_volatile(u32::from_le_bytes([a, b, c, d])),
@@ -88,7 +88,7 @@ pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
     Ok(())
 }
 
-/// Whether the memory at this address does not answer at present.
+/// Whether the memory at this address cannot be read at present.
 fn is_busy(address: u32) -> bool {
     /// `RCC_AHB1ENR.CCMDATARAMEN`, on after a reset (RM0090, RCC); a chip without CCM does not have
     /// it.
@@ -102,7 +102,7 @@ fn is_busy(address: u32) -> bool {
     }
 }
 
-/// The widest access that fits.
+/// The widest aligned access that fits, in bytes.
 const fn width(address: u32, len: usize) -> usize {
     if address.is_multiple_of(4) && len >= 4 {
         4

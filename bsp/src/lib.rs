@@ -1,10 +1,10 @@
 //! Board support: everything that differs between two boards of one firmware.
 //!
-//! One file per board in `boards/`, chosen by the variable `COBOOT_BOARD` at build time, beside its
-//! memory map in `shared-abi/src/layout/boards/`. To port coboot, have both laid down with
-//! `cargo xtask new-board`. The rest of the crate is what all boards share.
+//! Each board has one file in `boards/`; the variable `COBOOT_BOARD` selects it at build time. Its
+//! memory map is in `shared-abi/src/layout/boards/`. To port coboot, create both files with `cargo
+//! xtask new-board`. All boards share the rest of the crate.
 //!
-//! On the host there are the values of a board, without the drivers.
+//! On the host the crate has the values of a board, without the drivers.
 #![cfg_attr(not(test), no_std)]
 
 pub mod can;
@@ -28,24 +28,24 @@ pub mod virtual_can;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
-/// A GPIO port or a UART, for the `init` of a board. The board file alone knows which that is
-/// about, so no caller hands them over; that it is asked for once is shown by the CAN controller,
-/// which exists once.
+/// Takes a GPIO port or a UART, for the `init` of a board. Only the board file knows which one it
+/// needs, so no caller passes it. The CAN controller, which exists once, proves that `init` runs
+/// once.
 #[cfg(target_arch = "arm")]
 macro_rules! take_port {
     ($port:ident, $can:ident) => {{
         let _: &pac::CAN1 = &$can;
-        // SAFETY: the pins of a board and its UART are set up by its `init` alone, and that takes
-        // the only CAN controller.
+        // SAFETY: only `init` sets up the pins of a board and its UART, and it takes the only CAN
+        // controller.
         unsafe { pac::$port::steal() }
     }};
 }
 
-/// The CAN controller that a board talks through, CAN1 or CAN2.
+/// Selects the board's CAN controller for coboot, CAN1 or CAN2.
 ///
-/// The tasks of a program are bound to CAN1's interrupts, whichever it is: those of CAN2 have
-/// handlers that are the tasks' entries, too. `init` of such a board makes them the same priority
-/// ([`can_controllers::take_can2`]), so that neither interrupts the other.
+/// The tasks of a program are bound to CAN1's interrupts for either controller: with CAN2, the
+/// handlers of CAN2's interrupts call the tasks' entries. `init` of such a board gives both the
+/// same priority ([`can_controllers::take_can2`]), so that neither interrupts the other.
 macro_rules! can_controller {
     (CAN1) => {
         can_controller!(1, CAN1);
@@ -71,14 +71,14 @@ macro_rules! can_controller {
             extern "C" {
                 fn $task();
             }
-            // SAFETY: the handler of the program, called as the core would call it: at the
-            // priority of its own interrupt.
+            // SAFETY: it calls the handler of the program as the core would: at the priority of the
+            // handler's own interrupt.
             unsafe { $task() }
         }
     };
 }
 
-/// The USART that a board talks through; its interrupt has the same name.
+/// Selects the board's USART; its interrupt has the same name.
 #[cfg(target_arch = "arm")]
 macro_rules! uart {
     ($(#[$doc:meta])* $usart:ident) => {
@@ -105,18 +105,18 @@ const CHIP: &Geometry = BOARD.chip;
 
 /// The entry strap: a pin that asks for the bootloader after a reset.
 ///
-/// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks only if it is pressed each
-/// time: a spike must not keep a device from its program, while whoever wants the bootloader holds
-/// the strap.
+/// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks for the bootloader only
+/// if it is pressed each time: a spike must not keep a device from its program, and a user who
+/// wants the bootloader holds the strap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Strap {
     /// Its port, `'A'` and on.
     pub port: char,
-    /// Its number there, 0 to 15.
+    /// The pin's number in the port, 0 to 15.
     pub pin: u8,
     /// The level that asks for the bootloader: high, or low.
     pub pressed: bool,
-    /// The resistor of the chip (about 40 kΩ) that holds it at the other level. It is on while the
+    /// The chip's resistor (about 40 kΩ) that holds the pin at the other level. It is on while the
     /// strap is read.
     pub pull: Pull,
 }
@@ -124,7 +124,7 @@ pub struct Strap {
 /// A resistor in the chip at a pin (`GPIOx_PUPDR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pull {
-    /// None: there is one on the board.
+    /// None: the board has one.
     None,
     /// To the supply.
     Up,
@@ -133,10 +133,10 @@ pub enum Pull {
 }
 
 impl Strap {
-    /// How often it is read.
+    /// How often the strap is read.
     pub const SAMPLES: u32 = 4;
 
-    /// Whether a chip has such a pin, and the resistor does not hold it pressed.
+    /// Whether the chip has this pin, and the resistor does not hold it at the pressed level.
     const fn is_possible(&self, ports: u8) -> bool {
         let port = (self.port as u32).wrapping_sub('A' as u32);
         let holds = match self.pull {
@@ -150,18 +150,18 @@ impl Strap {
 
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
-/// Clock of the CAN controller, in Hz: that of APB1.
+/// Clock of the CAN controller in Hz: the clock of APB1.
 pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
 
-/// Who owns which address on this board; on the chip without the names, which nothing there asks
-/// for.
+/// The memory layout of this board: the owner of each address. On the chip it has no names, because
+/// nothing reads them there.
 #[cfg(target_arch = "arm")]
 pub const LAYOUT: &Layout = {
     const CHIP: Geometry = Geometry { chip: "", ..*BOARD.chip };
     const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*BOARD };
     &NAMELESS
 };
-/// Who owns which address on this board.
+/// The memory layout of this board: the owner of each address.
 #[cfg(not(target_arch = "arm"))]
 pub const LAYOUT: &Layout = BOARD;
 
@@ -179,7 +179,7 @@ const _: () = assert!(
     "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`"
 );
 
-/// The chip that the HAL and its PAC are for, held against that of the board.
+/// Compares the chip of the HAL and its PAC with the chip of the board.
 #[cfg(target_arch = "arm")]
 mod chip_check {
     use super::{pac, CHIP};
@@ -202,7 +202,7 @@ mod chip_check {
         Err(_) => unreachable!(),
     };
 
-    /// Puts a number of three digits into the place of each `###`.
+    /// Replaces each `###` by a number of three digits.
     const fn with_numbers<const N: usize>(mut text: [u8; N], numbers: [u16; 2]) -> [u8; N] {
         let (mut at, mut next) = (0, 0);
         while at < N {
@@ -221,10 +221,10 @@ mod chip_check {
 
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, entry_strap, inputs, Board};
-/// What frames go through: the CAN controller, or the UART in its place.
+/// The port for frames: the CAN controller, or the UART instead of it.
 #[cfg(all(target_arch = "arm", not(feature = "virtual-can")))]
 pub type CanPort = can::Port<CanController>;
-/// What frames go through: the CAN controller, or the UART in its place.
+/// The port for frames: the CAN controller, or the UART instead of it.
 #[cfg(all(target_arch = "arm", feature = "virtual-can"))]
 pub type CanPort = virtual_can::Port;
 #[cfg(target_arch = "arm")]
@@ -232,10 +232,10 @@ pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal::pac;
 
-/// What the device says of itself in 1008h–100Ah and 1018h, for bootloader and application alike.
+/// The device's identity in 1008h–100Ah and 1018h, for bootloader and application.
 #[derive(Clone, Copy, Debug)]
 pub struct Identity {
-    /// 1018h/1, assigned by CiA; 0 where there is none.
+    /// 1018h/1, assigned by CiA; 0 for none.
     pub vendor_id: u32,
     /// 1018h/2.
     pub product_code: u32,
@@ -255,7 +255,8 @@ fn unique_words() -> [u32; 3] {
     unsafe { UNIQUE_ID.read_volatile() }
 }
 
-/// The chip's 96-bit unique identifier (RM0090 section 39.1), as its bytes lie in memory.
+/// The chip's 96-bit unique identifier (RM0090 section 39.1), with its bytes in the order of the
+/// memory.
 #[must_use]
 pub fn unique_id() -> [u8; 12] {
     let mut bytes = [0; 12];

@@ -1,16 +1,16 @@
-//! Between a CANopen slave and the board's port: what the slave says is done, and what it wants to
-//! know of its line is read. Bootloader and application have this in common.
+//! Connects a CANopen slave with the board's port: it carries out the slave's outputs, and reads
+//! the state of the line for it. Bootloader and application share this code.
 
 use canopen::BitRate;
 
 use crate::can::BitTiming;
 use crate::CAN_CLOCK;
 
-/// How the board's CAN controller makes each bit rate.
+/// The bit timing of the board's CAN controller for each bit rate; `None` if there is none.
 pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
 
-/// Whether the board's CAN controller can run at this bit rate; at one that it has to find out, it
-/// can.
+/// Whether the board's CAN controller can run at this bit rate; true for a bit rate that must be
+/// detected.
 #[must_use]
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
@@ -33,8 +33,9 @@ mod port {
     use crate::can::{Errors, Mode};
     use crate::CanPort;
 
-    /// Empties the controller's FIFO, which is three frames deep. `take` gives whether there was room
-    /// for a frame: a frame without is lost. The client's time-out repeats it, and an emergency tells.
+    /// Empties the controller's FIFO, which holds three frames. `take` returns whether there was
+    /// room for a frame; without room the frame is lost. The client repeats it after its time-out,
+    /// and an emergency reports the loss.
     #[inline(always)]
     pub fn receive(can: &mut CanPort, mut take: impl FnMut(Frame) -> bool) {
         while let Some(frame) = can.receive() {
@@ -44,7 +45,7 @@ mod port {
         }
     }
 
-    /// Does what the slave says. To be called only when the port has room for a frame.
+    /// Carries out an output of the slave. Call it only when the port has room for a frame.
     #[inline(always)]
     pub fn carry_out(can: &mut CanPort, output: Output) {
         match output {
@@ -57,13 +58,13 @@ mod port {
     }
 
     fn configure(can: &mut CanPort, rate: BitRate, mode: Mode) {
-        // Another rate is asked for by nobody: `supports` says so.
+        // No other bit rate is requested: `supports` refuses it.
         if let Some(Some(timing)) = TIMINGS.get(rate as usize) {
             can.configure(*timing, mode);
         }
     }
 
-    /// What the slave wants to know of its line.
+    /// The state of the line for the slave.
     #[inline(always)]
     pub fn status(can: &mut CanPort) -> Status {
         let errors = can.errors();

@@ -1,20 +1,20 @@
 //! Stops the program at a breakpoint while the bus goes on (feature `monitor`): the DebugMonitor
 //! exception of the core (ARM DDI 0403E, section C1).
 //!
-//! The exception has a priority between that of the code to be debugged and that of the tasks that
-//! serve the bus. While its handler waits, those tasks pre-empt it as ever: SDO, heartbeats and the
-//! debugger interface itself stay alive, and so does every task of the application above it. The
-//! other side of it: **code of such a priority, code within a critical section and code that holds
-//! a lock of such a task cannot be stopped**. A breakpoint hit there turns all of them off, tells
-//! so, and the code runs on.
+//! The priority of the exception lies between the priority of the code to be debugged and that of
+//! the tasks that serve the bus. While its handler waits, those tasks interrupt it as usual: SDO,
+//! heartbeats and the debugger interface itself continue, and so does every task of the application
+//! above it. In turn, **code of such a priority, code within a critical section and code that holds
+//! a lock of such a task cannot be stopped**. A breakpoint in such code turns all breakpoints off
+//! and is reported, and the code continues.
 //!
-//! The host works it by the core's own registers, through 1025h:
+//! The host controls it through the core's own registers, through 1025h:
 //!
 //! | register | | |
 //! |---|---|---|
 //! | `FP_CTRL` E0002000h | 3 | breakpoints are on |
 //! | `FP_COMP0`–`5` E0002008h… | address, bits 31–30: 1 lower or 2 upper halfword, bit 0 on | a breakpoint |
-//! | `DEMCR` E000EDFCh | 01010000h | go on |
+//! | `DEMCR` E000EDFCh | 01010000h | continue |
 //! | | 01050000h | one instruction, then stop again |
 //! | | 01030000h | stop now |
 //! | | bit 19 (`MON_REQ`) is 1 | the program is stopped |
@@ -34,7 +34,7 @@ const DFSR: u32 = 0xE000_ED30;
 const SHPR3: u32 = 0xE000_ED20;
 const DCRDR: u32 = 0xE000_EDF8;
 const DEMCR: u32 = 0xE000_EDFC;
-/// Interrupts are set pending here.
+/// Writing a bit here makes an interrupt pending.
 const ISPR: u32 = 0xE000_E200;
 
 /// `FP_CTRL`: a write without the key is ignored.
@@ -42,34 +42,34 @@ const KEY: u32 = 1 << 1;
 const ENABLE: u32 = 1 << 0;
 const HFSR_DEBUGEVT: u32 = 1 << 31;
 const HFSR_FORCED: u32 = 1 << 30;
-/// `DFSR`: a breakpoint; written with 1, it is cleared.
+/// `DFSR`: the cause was a breakpoint; writing 1 clears it.
 const BKPT: u32 = 1 << 1;
 const DFSR_ALL: u32 = 0x1F;
 const MON_EN: u32 = 1 << 16;
 const MON_STEP: u32 = 1 << 18;
-/// The core makes no use of it; here it says that the program is stopped.
+/// The core does not use this bit; here it means that the program is stopped.
 const MON_REQ: u32 = 1 << 19;
 const TRCENA: u32 = 1 << 24;
 
-/// Types of a stop, as the emergency carries them (`canopen::debugger::Stop`).
+/// Types of a stop, as the emergency reports them (`canopen::debugger::Stop`).
 pub const BREAKPOINT: u8 = 1;
-/// See [`BREAKPOINT`]: a step is done, or somebody asked for the stop.
+/// See [`BREAKPOINT`]: a step is complete, or the host requested the stop.
 pub const STEP: u8 = 0x80;
-/// See [`BREAKPOINT`]: in code that cannot be stopped.
+/// See [`BREAKPOINT`]: the breakpoint is in code that cannot be stopped.
 pub const OUT_OF_REACH: u8 = 0x81;
 
-/// What the core saves on the stack when it takes an exception.
+/// The registers that the core saves on the stack when it takes an exception.
 #[repr(C)]
 pub struct Frame {
     /// R0 to R3, R12, LR.
     pub registers: [u32; 6],
     /// The next instruction.
     pub pc: u32,
-    /// The flags; the number of the exception that the program is in.
+    /// The flags, and the number of the exception that the program runs in.
     pub xpsr: u32,
 }
 
-/// What the handler adds to it: this is what `DCRDR` points to.
+/// The handler's addition to the frame: `DCRDR` points to this.
 #[repr(C)]
 pub struct Saved {
     /// Address of the [`Frame`]; the program's SP points behind it.
@@ -80,27 +80,27 @@ pub struct Saved {
     pub exc_return: u32,
 }
 
-/// A stop that nobody has told yet: type (0 for none) and address.
+/// A stop that is not yet reported: type (0 for none) and address.
 static TYPE: AtomicU32 = AtomicU32::new(0);
 static ADDRESS: AtomicU32 = AtomicU32::new(0);
-/// The interrupt of the task that tells it.
+/// The interrupt of the task that reports it.
 static TELLER: AtomicU32 = AtomicU32::new(0);
 
 fn load(register: u32) -> u32 {
-    // SAFETY: one of the registers above, or of code; reading any of them changes nothing.
+    // SAFETY: the address is one of the registers above, or of code; reading it changes nothing.
     unsafe { (register as *const u32).read_volatile() }
 }
 
 fn store(register: u32, value: u32) {
-    // SAFETY: one of the registers above. What they do to the flow of the program is what this
-    // module is for.
+    // SAFETY: the address is one of the registers above. Their effect on the flow of the program is
+    // the purpose of this module.
     unsafe { (register as *mut u32).write_volatile(value) }
 }
 
-/// Changes `DEMCR`, which the task that serves 1025h writes, too.
+/// Changes `DEMCR`, which the task for 1025h writes, too.
 fn change_demcr(clear: u32, set: u32) {
     let primask: u32;
-    // SAFETY: interrupts are off for two accesses, and then as they were.
+    // SAFETY: interrupts are off for two accesses, and then restored.
     unsafe {
         asm!("mrs {}, PRIMASK", "cpsid i", out(reg) primask);
         store(DEMCR, load(DEMCR) & !clear | set);
@@ -108,22 +108,24 @@ fn change_demcr(clear: u32, set: u32) {
     }
 }
 
-/// Before anything else of the program, memory included: turns breakpoints off. They outlive a
-/// reset and the exception does not, so that one that is hit before [`arm`] would be a fault.
+/// Turns breakpoints off, before any other code of the program and before its memory is
+/// initialised. Breakpoints outlast a reset, but the exception does not, so a breakpoint that is
+/// hit before [`arm`] would be a fault.
 ///
 /// # Safety
-/// It is for the start-up of `cortex-m-rt` to call.
+/// Only the start-up of `cortex-m-rt` may call it.
 #[unsafe(no_mangle)]
 #[unsafe(naked)]
 pub unsafe extern "C" fn __pre_init() {
-    // FP_CTRL: the key, and not enabled.
+    // FP_CTRL: the key, with the enable bit clear.
     naked_asm!("movw r0, #0x2000", "movt r0, #0xE000", "movs r1, #2", "str r1, [r0]", "dsb", "isb", "bx lr")
 }
 
-/// Makes breakpoints stop the program, of which there are none yet, unless the chip's read-out
-/// protection is on. `priority` is the exception's, as the core has it (the upper four bits): more
-/// urgent (less) than that of the code to be stopped, less urgent than that of the tasks that serve
-/// the bus. A stop pends the interrupt of this number, to be told by [`take_stop`].
+/// Enables breakpoints, of which there are none yet, unless the chip's read-out protection is on.
+/// `priority` is the exception's in the core's encoding (the upper four bits): more urgent (a lower
+/// value) than that of the code to be stopped, and less urgent than that of the tasks that serve
+/// the bus. A stop makes the interrupt with the number `interrupt` pending; its task reports the
+/// stop by [`take_stop`].
 pub fn arm(priority: u8, interrupt: u16) {
     if debugger::is_locked() {
         return;
@@ -138,7 +140,7 @@ pub fn arm(priority: u8, interrupt: u16) {
     store(DEMCR, TRCENA | MON_EN);
 }
 
-/// A stop that is to be told, once: its type and its address.
+/// The type and the address of a stop that is not yet reported; each stop is returned once.
 pub fn take_stop() -> Option<(u8, u32)> {
     let kind = TYPE.load(Ordering::Acquire);
     if kind == 0 {
@@ -148,7 +150,7 @@ pub fn take_stop() -> Option<(u8, u32)> {
     Some((kind as u8, ADDRESS.load(Ordering::Relaxed)))
 }
 
-/// A program that is stopped goes on, and nothing stops it any more.
+/// Continues a stopped program, and disables breakpoints.
 pub fn release_program() {
     store(FP_CTRL, KEY);
     change_demcr(MON_EN | MON_STEP | MON_REQ, 0);
@@ -165,10 +167,10 @@ fn pend_teller() {
     store(ISPR + 4 * (interrupt / 32), 1 << (interrupt % 32));
 }
 
-/// The exception's entry: completes what the core has saved to [`Saved`], and restores from there.
+/// The exception's entry: it completes the core's frame to [`Saved`], and restores from there.
 ///
 /// # Safety
-/// It is the core's to call.
+/// Only the core may call it.
 #[allow(non_snake_case)]
 #[unsafe(no_mangle)]
 #[unsafe(naked)]
@@ -178,7 +180,7 @@ pub unsafe extern "C" fn DebugMonitor() {
         "ite eq",
         "mrseq r0, MSP",
         "mrsne r0, PSP",
-        // Ten words: the stack stays aligned to 8 bytes.
+        // It pushes ten words: the stack stays aligned to 8 bytes.
         "push {{r0, r4-r11, lr}}",
         "mov r0, sp",
         "bl {handler}",
@@ -187,11 +189,11 @@ pub unsafe extern "C" fn DebugMonitor() {
     )
 }
 
-/// A fault's entry. One by a breakpoint in code that cannot be stopped is none; any other restarts
-/// the device.
+/// The entry of a fault. A fault that was caused by a breakpoint in code that cannot be stopped is
+/// ignored; any other fault restarts the device.
 ///
 /// # Safety
-/// It is the core's to call.
+/// Only the core may call it.
 #[allow(non_snake_case)]
 #[unsafe(no_mangle)]
 #[unsafe(naked)]
@@ -221,16 +223,15 @@ unsafe extern "C" fn on_fault(frame: *const Frame) {
     store(FP_CTRL, KEY);
     store(HFSR, HFSR_DEBUGEVT | HFSR_FORCED);
     store(DFSR, DFSR_ALL);
-    // SAFETY: a debug event did not come from a broken stack; what the entry passes is the frame on
-    // it.
+    // SAFETY: a debug event does not come from a broken stack; the entry passes the frame on it.
     notify(OUT_OF_REACH, unsafe { (*frame).pc });
     synchronize();
 }
 
 unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
-    // SAFETY: the entry has just built it on the stack, and the core the frame; both stay there
-    // until this returns. What the host changes in them through 1025h it changes while this waits:
-    // they are read and written by volatile accesses.
+    // SAFETY: the entry has just built it on the stack, and the core has built the frame; both stay
+    // there until this function returns. The host may change both through 1025h while this function
+    // waits, so they are read and written by volatile accesses.
     let pc = unsafe { &raw mut (*(&raw const (*saved).frame).read_volatile()).pc };
     let cause = load(DFSR);
     store(DFSR, DFSR_ALL);
@@ -247,17 +248,17 @@ unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
     store(DCRDR, saved as u32);
     notify(if cause & BKPT != 0 { BREAKPOINT } else { STEP }, stopped_at);
     while load(DEMCR) & MON_REQ != 0 {
-        // The tasks that serve the bus want to look at their deadlines; who does that otherwise may
-        // be what is stopped.
+        // The tasks that serve the bus must check their deadlines. The code that wakes them
+        // otherwise may be the stopped code.
         pend_teller();
-        // SAFETY: it waits for an interrupt; the one that was pended has come before.
+        // SAFETY: it waits for an interrupt; the pended interrupt has run before.
         unsafe { asm!("dsb", "isb", "wfi") };
     }
     // SAFETY: see above.
     let next = unsafe { pc.read_volatile() };
     let instruction = Instruction::at(next);
     if next == stopped_at && instruction == Instruction::Breakpoint {
-        // One in the code itself: the next instruction is behind it.
+        // The breakpoint is an instruction of the code itself: the program continues behind it.
         // SAFETY: see above.
         unsafe { pc.write_volatile(next + 2) };
     } else {
@@ -270,19 +271,19 @@ unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
     synchronize();
 }
 
-/// One instruction is carried out alone.
+/// The execution of one single instruction.
 #[derive(Clone, Copy)]
 struct Step {
-    /// By the host, which wants to hear of its end.
+    /// The host requested the step, and gets a report at its end.
     asked: bool,
-    /// There is a breakpoint at it: all are off meanwhile.
+    /// There is a breakpoint at the instruction: meanwhile all breakpoints are off.
     over: bool,
-    /// The mask that was in force, if it was changed.
+    /// The previous mask (BASEPRI), if the step changed it.
     mask: Option<u8>,
 }
 
-/// The step that is under way, bit by bit: [`STEPS`], asked, over, changed the mask; the mask from
-/// bit 8 on.
+/// The state of the step: the bits [`STEPS`], asked, over, changed the mask; the mask from bit 8
+/// on.
 static STEP_STATE: AtomicU32 = AtomicU32::new(0);
 const STEPS: u32 = 1 << 0;
 const ASKED: u32 = 1 << 1;
@@ -298,8 +299,8 @@ impl Step {
     }
 
     fn begin(mut self, instruction: Instruction) {
-        // Nothing else that can be stopped may come between: that would be stopped in its place.
-        // What changes the mask itself goes without.
+        // No other code that can be stopped may run in between: that code would be stopped instead.
+        // An instruction that changes the mask itself runs without the mask.
         let in_force = basepri();
         let least = (load(SHPR3) as u8).saturating_add(PRIORITY_STEP);
         if instruction != Instruction::SetsMask && (in_force == 0 || in_force > least) {
@@ -326,10 +327,10 @@ impl Step {
     }
 }
 
-/// From one priority to the next: the chip has the upper four bits.
+/// Difference between two priorities: the chip has the upper four bits.
 const PRIORITY_STEP: u8 = 0x10;
 
-/// What is to be known of the instruction at a stop.
+/// The kind of the instruction at a stop.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Instruction {
     Breakpoint,
@@ -365,19 +366,19 @@ fn has_breakpoint(pc: u32) -> bool {
 
 fn basepri() -> u8 {
     let value: u32;
-    // SAFETY: it is read.
+    // SAFETY: it only reads the register.
     unsafe { asm!("mrs {}, BASEPRI", out(reg) value) };
     value as u8
 }
 
 fn set_basepri(value: u8) {
-    // SAFETY: the handler's own priority is above every mask that is set here: what it masks waits
-    // anyway.
+    // SAFETY: the handler's own priority is above every mask that is set here: the masked code must
+    // wait for the handler anyway.
     unsafe { asm!("msr BASEPRI, {}", in(reg) u32::from(value)) };
 }
 
-/// What was written takes effect before the next instruction of the program.
+/// Makes register writes take effect before the next instruction of the program.
 fn synchronize() {
-    // SAFETY: barriers.
+    // SAFETY: these are barriers.
     unsafe { asm!("dsb", "isb") };
 }

@@ -1,14 +1,14 @@
-//! A ring of bytes between an interrupt and the rest of the program: one side puts, the other
-//! takes, and neither waits.
+//! A ring of bytes between an interrupt and the rest of the program: one side puts bytes, the other
+//! takes them, and neither waits.
 
 use core::sync::atomic::{AtomicBool, AtomicU8, AtomicUsize, Ordering};
 
-/// Room for `N` - 1 bytes: a full ring would look like an empty one.
+/// A ring for `N` - 1 bytes: a full ring would look like an empty one.
 pub struct Ring<const N: usize> {
     bytes: [AtomicU8; N],
-    /// Where the next byte goes; of the side that puts.
+    /// Index of the next byte to put; only the putting side changes it.
     put: AtomicUsize,
-    /// Where the next one is; of the side that takes.
+    /// Index of the next byte to take; only the taking side changes it.
     taken: AtomicUsize,
 }
 
@@ -19,22 +19,22 @@ impl<const N: usize> Ring<N> {
         Self { bytes: [const { AtomicU8::new(0) }; N], put: AtomicUsize::new(0), taken: AtomicUsize::new(0) }
     }
 
-    /// Whether there is nothing to take.
+    /// Whether the ring has no bytes.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// How many bytes there are to take.
+    /// Number of bytes in the ring.
     pub fn len(&self) -> usize {
         (self.put.load(Ordering::Acquire) + N - self.taken.load(Ordering::Acquire)) % N
     }
 
-    /// How many bytes there is room for.
+    /// Number of bytes that fit into the ring.
     pub fn room(&self) -> usize {
         N - 1 - self.len()
     }
 
-    /// Puts a byte; whether there was room for it.
+    /// Puts a byte; returns whether there was room for it.
     pub fn put(&self, byte: u8) -> bool {
         let at = self.put.load(Ordering::Relaxed) % N;
         let fits = self.room() > 0;
@@ -60,25 +60,25 @@ impl<const N: usize> Default for Ring<N> {
     }
 }
 
-/// A byte in the place of those that are missing.
+/// The mark that stands for lost bytes.
 pub const LOST: u8 = 0;
 
-/// What comes from a line that loses bytes now and then, with a mark wherever some are missing.
+/// The bytes of a line that may lose some, with a mark at each place where bytes are lost.
 pub struct Inbox<const N: usize> {
     ring: Ring<N>,
-    /// Bytes are missing behind the last one of the ring, and the mark is not there yet.
+    /// Bytes are lost behind the last one of the ring, and the mark is not there yet.
     gap: AtomicBool,
     lost: AtomicBool,
 }
 
 impl<const N: usize> Inbox<N> {
-    /// An empty one.
+    /// An empty inbox.
     #[must_use]
     pub const fn new() -> Self {
         Self { ring: Ring::new(), gap: AtomicBool::new(false), lost: AtomicBool::new(false) }
     }
 
-    /// A byte has come, or one that cannot be read; behind it, others may be missing.
+    /// Puts a received byte, or the mark for an unreadable one; after it, other bytes may be lost.
     pub fn come(&self, byte: Option<u8>, others_missing: bool) {
         if self.gap.load(Ordering::Relaxed) && self.ring.room() >= 2 {
             self.ring.put(LOST);
@@ -97,12 +97,12 @@ impl<const N: usize> Inbox<N> {
         self.ring.take()
     }
 
-    /// Whether it is time to take: half of the room is used.
+    /// Whether the reader should take bytes now: more than half of the room is used.
     pub fn is_pressing(&self) -> bool {
         self.ring.len() > self.ring.room()
     }
 
-    /// Whether something was lost since the question before.
+    /// Whether bytes were lost since the previous call.
     pub fn take_overruns(&self) -> bool {
         self.lost.swap(false, Ordering::Relaxed)
     }

@@ -1,18 +1,18 @@
-//! The adapter's end of a line that speaks SLCAN: CAN frames as text, after the manuals of
-//! Lawicel's CAN232 and CANUSB. Bytes go in; answers and frames come out.
+//! The adapter's end of an SLCAN line: CAN frames as text, after the manuals of Lawicel's CAN232
+//! and CANUSB. It takes bytes, and returns answers and frames.
 //!
-//! What it stands for is a bus of two, this device and the host, that has no bit rate: every one is
-//! accepted. There are no time stamps, no filters that the host could set and no polling: commands
-//! for these are refused.
+//! It simulates a bus with two nodes, this device and the host, without a bit rate: every bit rate
+//! is accepted. There are no time stamps, no filters that the host could set and no polling:
+//! commands for these are refused.
 
 use embedded_can::{ExtendedId, Frame, Id, StandardId};
 
 use crate::ring::LOST;
 
-/// The longest line of the protocol without its end: a data frame of eight bytes with an identifier
-/// of 29 bits.
+/// Length of the protocol's longest line without its end: a data frame of eight bytes with an
+/// identifier of 29 bits.
 const LONGEST: usize = 1 + 8 + 1 + 16;
-/// The longest text of a frame, with its end.
+/// Length of the longest text of a frame, with its end.
 pub const FRAME_TEXT: usize = LONGEST + 1;
 /// The end of a line.
 pub const END: u8 = b'\r';
@@ -20,7 +20,7 @@ pub const END: u8 = b'\r';
 const REFUSED: Answer = Answer::of(&[0x07]);
 const DONE: Answer = Answer::of(&[END]);
 
-/// What the host hears to a line.
+/// The answer to a line of the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Answer {
     bytes: [u8; 6],
@@ -38,24 +38,24 @@ impl Answer {
         Self { bytes, len }
     }
 
-    /// Its text.
+    /// The text of the answer.
     #[must_use]
     pub fn text(&self) -> &[u8] {
         self.bytes.get(..self.len).unwrap_or_default()
     }
 }
 
-/// Whether frames pass.
+/// The state of the channel: whether frames pass.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Channel {
-    /// After a reset of this device, of which the host need not know: frames pass, and it may be
-    /// opened as if they did not.
+    /// After a reset of this device, which the host may not know of: frames pass, and the host may
+    /// open the channel as if it were closed.
     Fresh,
-    /// Both ways.
+    /// Frames pass in both directions.
     Open,
-    /// To the host alone.
+    /// Frames pass only to the host.
     Listening,
-    /// Neither way.
+    /// No frames pass.
     Closed,
 }
 
@@ -64,7 +64,7 @@ enum Channel {
 pub struct Slcan {
     channel: Channel,
     line: [u8; LONGEST],
-    /// Bytes of the line; more than there is room for make no line.
+    /// Number of bytes of the line; a line with more bytes than fit is refused.
     len: usize,
     overrun: bool,
     serial: u16,
@@ -77,30 +77,30 @@ impl Slcan {
         Self { channel: Channel::Fresh, line: [0; LONGEST], len: 0, overrun: false, serial }
     }
 
-    /// Whether frames to the host pass; otherwise they are lost, as on a bus that nobody else is
-    /// on.
+    /// Whether frames to the host pass; otherwise they are lost, as on a bus without another node.
     #[must_use]
     pub fn is_heard(&self) -> bool {
         self.channel != Channel::Closed
     }
 
-    /// A byte from the host. The end of a line gives the answer to it, and the frame that it was.
+    /// Takes a byte from the host. At the end of a line it returns the answer and the frame of the
+    /// line, if it was one.
     pub fn receive<F: Frame>(&mut self, byte: u8) -> Option<(Answer, Option<F>)> {
         match byte {
             END => {
                 let len = core::mem::take(&mut self.len);
                 let line = self.line;
-                // Too long, or lost in part.
+                // The line is too long, or part of it is lost.
                 Some(line.get(..len).map_or((REFUSED, None), |line| self.carry_out(line)))
             }
-            // Some end their lines as text files do.
+            // Some hosts end their lines with CR LF.
             b'\n' if self.len == 0 => None,
             _ => {
                 self.overrun |= byte == LOST;
                 if let Some(place) = self.line.get_mut(self.len) {
                     *place = byte;
                 }
-                // One more than fits is enough to know.
+                // The count stops at one more than fits.
                 self.len = (self.len + 1).min(LONGEST + 1);
                 None
             }
@@ -119,19 +119,20 @@ impl Slcan {
         (self.command(line).unwrap_or(REFUSED), None)
     }
 
-    /// Carries a command out that is not about a frame; `None` where it is refused.
+    /// Carries out a command that is not a frame; `None` if it is refused.
     fn command(&mut self, line: &[u8]) -> Option<Answer> {
         let may_open = matches!(self.channel, Channel::Fresh | Channel::Closed);
         match line {
-            // Whatever was under way is over.
+            // An empty line ends an incomplete command.
             [] => Some(DONE),
-            // Bit rate by number, or by two registers of a controller that is not here.
+            // The bit rate by its number, or by two registers of a controller that does not exist
+            // here.
             [b'S', b'0'..=b'8'] => may_open.then_some(DONE),
             [b's', digits @ ..] if digits.len() == 4 && number(digits).is_some() => may_open.then_some(DONE),
             [b'O'] if may_open => self.set(Channel::Open),
             [b'L'] if may_open => self.set(Channel::Listening),
             [b'C'] if self.channel != Channel::Closed => self.set(Channel::Closed),
-            // Time stamps stay off; frames go out as they come.
+            // Time stamps stay off; frames are sent without polling.
             [b'Z', b'0'] | [b'X', b'1'] => may_open.then_some(DONE),
             [b'F'] if self.channel != Channel::Closed => {
                 // Bit 3: data overrun.
@@ -177,7 +178,7 @@ pub fn text_of<F: Frame>(frame: &F, mut put: impl FnMut(u8)) {
     put(END);
 }
 
-/// The frame of a line, if it is one.
+/// The frame of a line; `None` if the line is not a frame.
 fn parse<F: Frame>(line: &[u8]) -> Option<F> {
     let (kind, rest) = line.split_first()?;
     let (id, rest): (Id, _) = match kind {

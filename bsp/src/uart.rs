@@ -1,9 +1,9 @@
-//! What every board does with its UART, if its firmware uses it (feature `uart`): eight bits, no
-//! parity, one stop bit (RM0090 section 30).
+//! The UART driver for all boards, if the firmware uses it (feature `uart`): eight bits, no parity,
+//! one stop bit (RM0090 section 30).
 
-/// What goes into `USART_BRR` to make `bit_rate` (bit/s) out of `clock` (Hz), 16 samples a bit
-/// (section 30.3.4); `None` where that is more than 2 % off, half of what the two ends may differ
-/// by.
+/// The value of `USART_BRR` for `bit_rate` (bit/s) from `clock` (Hz) with 16 samples a bit (section
+/// 30.3.4). `None` if the error is more than 2 %: that is half of the difference that the two ends
+/// may have.
 #[must_use]
 pub const fn divider(clock: u32, bit_rate: u32) -> Option<u16> {
     if bit_rate == 0 {
@@ -38,7 +38,7 @@ mod drivers {
     pub trait Controller: Instance<RB = usart1::RegisterBlock> {
         /// Its interrupt.
         const INTERRUPT: pac::Interrupt;
-        /// Whether APB2 clocks it, and not APB1 (RM0090 section 2.3, table 1).
+        /// Whether its clock is APB2 instead of APB1 (RM0090 section 2.3, table 1).
         const APB2: bool;
     }
 
@@ -65,7 +65,7 @@ mod drivers {
         tree.sysclk() / if U::APB2 { tree.apb2 } else { tree.apb1 }
     }
 
-    /// What goes into the divider of the board's UART.
+    /// The divider of the board's UART.
     const DIVIDER: u16 = match super::divider(clock::<crate::UartController>(&CLOCK_TREE), UART_BIT_RATE) {
         Some(divider) => divider,
         None => panic!("board: the clock of the UART cannot make UART_BIT_RATE"),
@@ -77,28 +77,28 @@ mod drivers {
     }
 
     impl<U: Controller> Port<U> {
-        /// Sets it up for `UART_BIT_RATE` and switches it on. Interrupts are off.
+        /// Sets the UART up for `UART_BIT_RATE` and switches it on. Its interrupts are off.
         pub fn new(
             usart: U,
             (tx, rx): (impl Into<U::Tx<PushPull>>, impl Into<U::Rx<PushPull>>),
             rcc: &mut Rcc,
         ) -> Self {
             U::enable(rcc);
-            // The pins keep what they were made; they need not be kept.
+            // The pins keep their function, so the values are not needed any more.
             let _: (U::Tx<PushPull>, U::Rx<PushPull>) = (tx.into(), rx.into());
-            // SAFETY: any divider may be written; 16 at least, it makes a bit rate.
+            // SAFETY: any divider may be written; it is at least 16, which makes a bit rate.
             usart.brr().write(|w| unsafe { w.bits(DIVIDER) });
             usart.cr1().write(|w| w.ue().enabled().te().enabled().re().enabled());
             Self { usart }
         }
 
-        /// The port again, where `new` has set it up.
+        /// The port again, after `new` has set it up.
         ///
         /// # Safety
-        /// Nobody else uses it until this is dropped.
+        /// Nothing else uses it until this value is dropped.
         #[must_use]
         pub unsafe fn steal() -> Self {
-            // SAFETY: the caller vouches for it.
+            // SAFETY: the caller guarantees it.
             Self { usart: unsafe { U::steal() } }
         }
 
@@ -108,69 +108,70 @@ mod drivers {
             self.usart.sr().read().txe().bit_is_set()
         }
 
-        /// Whether all that was sent is on the line.
+        /// Whether all bytes have been sent on the line.
         #[must_use]
         pub fn is_silent(&self) -> bool {
             self.usart.sr().read().tc().bit_is_set()
         }
 
-        /// Sends a byte. To be called only when there is room; the byte before would be lost.
+        /// Sends a byte. Call it only when there is room; otherwise the previous byte would be
+        /// lost.
         pub fn send(&mut self, byte: u8) {
             self.usart.dr().write(|w| w.dr().set(byte.into()));
         }
 
-        /// What has come: nothing, a byte, or one that cannot be read.
+        /// Takes what was received: nothing, a byte, or an unreadable byte.
         pub fn receive(&mut self) -> Option<Received> {
             let status = self.usart.sr().read();
             if status.rxne().bit_is_clear() && status.ore().bit_is_clear() {
                 return None;
             }
-            // Behind the status, this clears the flags of errors, too (section 30.6.1).
+            // After a read of the status, this also clears the error flags (section 30.6.1).
             let byte = self.usart.dr().read().dr().bits() as u8;
             let readable =
                 status.rxne().bit_is_set() && status.fe().bit_is_clear() && status.nf().bit_is_clear();
             Some(Received { byte: readable.then_some(byte), overrun: status.ore().bit_is_set() })
         }
 
-        /// Has the interrupt come when there is room.
+        /// Enables the interrupt for a free transmit register.
         pub fn call_for_more(&mut self) {
-            // It switches that off by itself, and may come in between.
+            // The interrupt disables itself, and may come in between.
             interrupt::free(|_| self.usart.cr1().modify(|_, w| w.txeie().enabled()));
         }
 
-        /// Has it come no more for that. From the interrupt itself.
+        /// Disables that interrupt. To be called from the interrupt itself.
         pub fn stop_calling(&mut self) {
             self.usart.cr1().modify(|_, w| w.txeie().disabled());
         }
 
-        /// Has the interrupt come when a byte has come.
+        /// Enables the interrupt for a received byte.
         pub fn call_for_bytes(&mut self) {
             interrupt::free(|_| self.usart.cr1().modify(|_, w| w.rxneie().enabled()));
         }
     }
 
-    /// Something that has come.
+    /// A received byte.
     #[derive(Clone, Copy, Debug, PartialEq, Eq)]
     pub struct Received {
-        /// The byte; `None` for one that cannot be read.
+        /// The byte; `None` if it is unreadable.
         pub byte: Option<u8>,
-        /// Behind it, others were lost.
+        /// Other bytes were lost after this one.
         pub overrun: bool,
     }
 
     type Handler = Option<fn()>;
-    /// Who does what there is to do.
+    /// The function that serves the interrupt.
     static HANDLER: Mutex<Cell<Handler>> = Mutex::new(Cell::new(None));
 
-    /// Lets the interrupt of the board's UART come, before all others, and has a function do what
-    /// there is to do.
+    /// Enables the interrupt of the board's UART, with the highest priority, and sets the function
+    /// that serves it.
     pub fn on_interrupt(handler: fn()) {
         interrupt::free(|cs| HANDLER.borrow(cs).set(Some(handler)));
-        // SAFETY: nothing is masked in order to be alone with what the handler works with.
+        // SAFETY: no code masks this interrupt to protect data that the handler uses.
         unsafe { NVIC::unmask(<crate::UartController as Controller>::INTERRUPT) };
     }
 
-    /// What the UART's vector points to.
+    /// The handler in the UART's vector.
     pub fn interrupted() {
         if let Some(handler) = interrupt::free(|cs| HANDLER.borrow(cs).get()) {
             handler();

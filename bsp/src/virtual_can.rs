@@ -1,5 +1,5 @@
-//! CAN over the board's UART, in the place of bxCAN (feature `virtual-can`): the device and, on the
-//! same two wires, an SLCAN adapter of its own. What a program does with it is what it does with
+//! CAN over the board's UART, instead of bxCAN (feature `virtual-can`): the device contains its own
+//! SLCAN adapter, on the two wires of the UART. A program uses it like
 //! [`can::Port`](crate::can::Port).
 
 use cortex_m::peripheral::NVIC;
@@ -12,11 +12,11 @@ use crate::slcan::{self, Slcan, END, FRAME_TEXT};
 use crate::uart::{self, Received};
 use crate::UartController;
 
-/// Bytes from the host that wait: nine frames, so that a task may take a while.
+/// Bytes from the host that wait: room for nine frames, so that a task may take some time.
 static RECEIVED: Inbox<256> = Inbox::new();
 /// Bytes to the host.
 static TO_SEND: Ring<512> = Ring::new();
-/// What answers leave free for frames: a host that asks and asks cannot silence the device.
+/// The room that answers leave for frames: a host with endless commands cannot silence the device.
 const FOR_FRAMES: usize = 4 * FRAME_TEXT;
 
 /// The UART, and the adapter on it.
@@ -25,12 +25,12 @@ pub struct Port {
     slcan: Slcan,
     accepted: Option<[u16; 3]>,
     lost: Lost,
-    /// A good frame came since the question before.
+    /// Whether a good frame came since the previous call.
     heard: bool,
 }
 
 impl Port {
-    /// Takes the UART. No frame is taken from it before [`accept`](Self::accept).
+    /// Takes the UART. No frame is received before [`accept`](Self::accept).
     pub fn new(uart: uart::Port<UartController>) -> Self {
         let mut port = Self {
             uart,
@@ -44,23 +44,24 @@ impl Port {
         port
     }
 
-    /// A serial line has no bit timing, and nobody on it that a silent one would not disturb.
+    /// Does nothing: a serial line has no bit timing, and no other node that a silent one could
+    /// disturb.
     pub fn configure(&mut self, _timing: BitTiming, _mode: Mode) {}
 
     /// A serial line has no bus-off.
     pub fn recover_from_bus_off(&mut self) {}
 
-    /// Sets the identifiers (data frames, 11 bits) that are taken.
+    /// Sets the identifiers (data frames, 11 bits) that are received.
     pub fn accept(&mut self, identifiers: [u16; 3]) {
         self.accepted = Some(identifiers);
     }
 
-    /// The next frame that is for this device, `None` when there is none.
+    /// The next frame for this device, `None` if there is none.
     pub fn receive<F: Frame>(&mut self) -> Option<F> {
         while let Some(byte) = RECEIVED.take() {
             let Some((answer, frame)) = self.slcan.receive::<F>(byte) else { continue };
             let text = answer.text();
-            // A host that does not read has no use for more.
+            // A host that does not read gets no further answers.
             if TO_SEND.room() >= FOR_FRAMES + text.len() {
                 self.send_text(text.iter().copied());
             }
@@ -78,7 +79,7 @@ impl Port {
         None
     }
 
-    /// A frame that was taken found no room with its taker.
+    /// Records that the receiver of frames had no room for one.
     pub fn record_overrun(&mut self) {
         self.lost.in_queue = true;
     }
@@ -88,8 +89,8 @@ impl Port {
         TO_SEND.room() >= FRAME_TEXT
     }
 
-    /// Sends a frame. To be called only when there is room; parts of it would be lost. While the
-    /// host has closed the channel there is nobody to send it to.
+    /// Sends a frame. Call it only when there is room; otherwise parts of it would be lost. While
+    /// the host has closed the channel, the frame is dropped.
     pub fn send<F: Frame>(&mut self, frame: &F) {
         if self.slcan.is_heard() {
             slcan::text_of(frame, |byte| {
@@ -106,28 +107,29 @@ impl Port {
         self.uart.call_for_more();
     }
 
-    /// Whether everything given to it is on the line.
+    /// Whether all frames are on the line.
     pub fn is_idle(&mut self) -> bool {
         TO_SEND.is_empty() && self.uart.is_silent()
     }
 
-    /// In place of the errors of a controller.
+    /// The error state of the line: it has no errors of its own.
     pub fn errors(&mut self) -> Errors {
         let last = core::mem::take(&mut self.heard).then_some(Ok(()));
         Errors { off: false, passive: false, joined: true, last }
     }
 
-    /// Where something was lost since the question before.
+    /// The places where frames or bytes were lost since the previous call.
     pub fn take_overruns(&mut self) -> Lost {
         Lost { in_controller: RECEIVED.take_overruns(), ..core::mem::take(&mut self.lost) }
     }
 }
 
-/// The UART's interrupt: takes the byte that has come, sends the next one. It comes before all
-/// tasks, and tells them by the interrupts of the controller in whose place it is.
+/// The UART's interrupt: it takes the received byte and sends the next one. It has a higher
+/// priority than all tasks, and notifies them through the interrupts of the controller that it
+/// replaces.
 fn serve() {
-    // SAFETY: of the registers that it touches, the port changes the control register alone, and
-    // does so while this cannot come.
+    // SAFETY: of the registers that this function uses, the port changes only the control register,
+    // and it does so while this interrupt is masked.
     let mut uart = unsafe { uart::Port::<UartController>::steal() };
     if let Some(Received { byte, overrun }) = uart.receive() {
         RECEIVED.come(byte, overrun);
@@ -140,7 +142,7 @@ fn serve() {
             Some(byte) => uart.send(byte),
             None => {
                 uart.stop_calling();
-                // There is room again, and perhaps somebody who waits for silence.
+                // There is room again, and a task may wait for the end of all sending.
                 NVIC::pend(Interrupt::CAN1_TX);
             }
         }

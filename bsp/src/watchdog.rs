@@ -2,8 +2,8 @@
 
 use stm32f4xx_hal::pac;
 
-/// Starts it: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to 8000, as the
-/// LSI counts them (± 50 %).
+/// Starts the watchdog: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to
+/// 8000. The LSI counts them (± 50 %).
 pub fn start(registers: &pac::IWDG, ms: u16) {
     // SAFETY: the keys of section 21.4.1.
     let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });
@@ -15,7 +15,7 @@ pub fn start(registers: &pac::IWDG, ms: u16) {
     registers.rlr().write(|w| unsafe { w.bits(ms / 2) });
 }
 
-/// Puts the end off.
+/// Restarts the watchdog's time.
 pub fn feed(registers: &pac::IWDG) {
     // SAFETY: the key that reloads the counter (section 21.4.1).
     registers.kr().write(|w| unsafe { w.bits(0xAAAA) });

@@ -1,10 +1,10 @@
-//! The silicon: what a chip has, as its reference manual states it (section 3 "Embedded flash
+//! The properties of the chips, as their reference manuals state them (section 3 "Embedded flash
 //! memory" and section 2 "Memory map" of RM0090 rev 19 for STM32F405 to F439, RM0402 for F412,
-//! RM0430 for F413 and F423, RM0390 for F446, RM0386 for F469 and F479). Nothing here is a choice of
-//! ours; the choices are in [`crate::layout`].
+//! RM0430 for F413 and F423, RM0390 for F446, RM0386 for F469 and F479). Nothing here is a choice
+//! of this project; the choices are in [`crate::layout`].
 //!
-//! A chip is what its line has ([`Line`]), and a size of flash. Its name tells both, and which pins
-//! are led out.
+//! A chip is defined by its line ([`Line`]) and the size of its flash. Its name gives both, and the
+//! package.
 
 mod chips;
 mod line;
@@ -29,20 +29,20 @@ impl Region {
         Self { base, size }
     }
 
-    /// The address behind the last byte. No region of a chip reaches the end of the address space.
+    /// The address after the last byte. No region of a chip reaches the end of the address space.
     #[must_use]
     pub const fn end(&self) -> u32 {
         self.base + self.size
     }
 
-    /// Whether it has a byte, and its end is an address.
+    /// Whether the region is not empty, and its end is a 32-bit address.
     #[must_use]
     pub const fn is_possible(&self) -> bool {
         self.size > 0 && self.base.checked_add(self.size).is_some()
     }
 
-    /// Whether the `len` bytes from `address` all lie inside; no address and no length overflows
-    /// it.
+    /// Whether the `len` bytes from `address` all lie inside. No address and no length causes an
+    /// overflow.
     #[must_use]
     pub const fn contains(&self, address: u32, len: u32) -> bool {
         address >= self.base
@@ -58,88 +58,90 @@ impl Region {
     }
 }
 
-/// One erasable unit of the flash.
+/// A sector: one erasable unit of the flash.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sector {
-    /// Its place among the chip's sectors, from 0 on: its number in the manual's table. (With 1 MiB in
-    /// two banks, that leaves 8 to 11 out: 8 here is 12 there.) [`Geometry::sector_code`] makes of it
-    /// what goes into `FLASH_CR.SNB`.
+    /// The sector's index among the chip's sectors, from 0 on. It is the number in the manual's
+    /// table, except on a chip with 1 MiB in two banks: the manual leaves out 8 to 11 there, so
+    /// index 8 is sector 12 of the manual. [`Geometry::sector_code`] converts the index to the
+    /// value for `FLASH_CR.SNB`.
     pub number: u8,
-    /// The bytes it covers.
+    /// The bytes of the sector.
     pub region: Region,
 }
 
-/// A run of equally large sectors.
+/// Consecutive sectors of equal size.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SectorRun {
-    /// How many sectors follow one another.
+    /// The number of sectors.
     pub count: u8,
-    /// Bytes of each.
+    /// The size of each sector in bytes.
     pub size: u32,
 }
 
-/// What one chip has.
+/// The properties of one chip.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Geometry {
     /// Order code without package and temperature range, in lower case.
     pub chip: &'static str,
-    /// The line that it is of.
+    /// The line of the chip.
     pub line: Line,
     /// The main flash.
     pub flash: Region,
-    /// Its sectors, in address order.
+    /// Its sectors, in the order of their addresses.
     pub sectors: &'static [SectorRun],
-    /// Number of the first sector of the second bank, on a chip that has two: 12, or 8 with 1 MiB
+    /// Index of the first sector of the second bank, on a chip with two banks: 12, or 8 with 1 MiB
     /// in two banks.
     pub second_bank: Option<u8>,
-    /// The RAM that both the CPU and the bus masters reach, as one contiguous range.
+    /// The RAM for both the CPU and the bus masters, as one contiguous range.
     pub sram: Region,
-    /// Core-coupled RAM: data only, no code and no DMA. Size 0 where the chip has none.
+    /// Core-coupled RAM: only data, no code and no DMA. Size 0 if the chip has none.
     pub ccm: Region,
-    /// Number of interrupt lines behind the 16 exceptions of the core.
+    /// Number of interrupt lines after the 16 exceptions of the core.
     pub interrupts: u16,
     /// Number of GPIO ports, from A on (the memory map's table of register boundaries). Packages
-    /// have fewer.
+    /// have fewer ports.
     pub ports: u8,
 }
 
 const KIB: u32 = 1024;
 
-/// Vectors of the core, in front of those of the interrupts: the initial stack pointer, Reset and
-/// the other exceptions (ARMv7-M B1.5.3).
+/// Number of the core's vectors, which precede those of the interrupts: the initial stack pointer,
+/// Reset and the other exceptions (ARMv7-M B1.5.3).
 pub const CORE_VECTORS: u32 = 16;
-/// Bytes of them.
+/// Size of these vectors in bytes.
 pub const CORE_VECTORS_SIZE: u32 = CORE_VECTORS * 4;
 
-/// Where flash, SRAM and CCM begin on every chip.
+/// Start of flash, SRAM and CCM on every chip.
 const FLASH: u32 = 0x0800_0000;
 const SRAM: u32 = 0x2000_0000;
 const CCM: u32 = 0x1000_0000;
 
-/// The sectors of a bank, or of a flash of one bank: four of 16 KiB, one of 64 and the rest of 128
-/// (RM0090 tables 5 and 6, RM0402, RM0430, RM0390 and RM0386: flash module organization).
+/// The sectors of a bank, or of a flash with one bank: four of 16 KiB, one of 64 KiB and the rest
+/// of 128 KiB (RM0090 tables 5 and 6, RM0402, RM0430, RM0390 and RM0386: flash module
+/// organization).
 const SMALL: [SectorRun; 2] =
     [SectorRun { count: 4, size: 16 * KIB }, SectorRun { count: 1, size: 64 * KIB }];
 
-/// One bank with so many sectors of 128 KiB.
+/// One bank with `large` sectors of 128 KiB.
 const fn bank(large: u8) -> [SectorRun; 3] {
     [SMALL[0], SMALL[1], SectorRun { count: large, size: 128 * KIB }]
 }
 
-/// Two of them behind one another.
+/// Two such banks, one after the other.
 const fn two_banks(large: u8) -> [SectorRun; 6] {
     let [a, b, c] = bank(large);
     [a, b, c, a, b, c]
 }
 
-/// The chip of this name, as people write it ([`Geometry::is_named`]).
+/// The chip with this name, in the usual spellings ([`Geometry::is_named`]).
 #[must_use]
 pub fn by_name(name: &str) -> Option<&'static Geometry> {
     CHIPS.iter().copied().find(|chip| chip.is_named(name))
 }
 
-/// Bytes as the text that they are.
+/// The text in these bytes.
 const fn text(bytes: &[u8]) -> &str {
     match core::str::from_utf8(bytes) {
         Ok(text) => text,
@@ -148,7 +150,7 @@ const fn text(bytes: &[u8]) -> &str {
 }
 
 impl Geometry {
-    /// The chip of a line by its name in lower case, whose last letter tells the flash.
+    /// A chip of a line, from its name in lower case; the last letter gives the size of the flash.
     const fn new(line: Line, chip: &'static str) -> Self {
         let (kib, sectors, second_bank): (u32, &[SectorRun], _) = match chip.as_bytes()[10] {
             b'c' => (256, &const { bank(1) }, None),
@@ -172,7 +174,7 @@ impl Geometry {
         .checked()
     }
 
-    /// The same chip with its 1 MiB in two banks, as the option bit DB1M makes it: sectors 0 to 7
+    /// The same chip with its 1 MiB in two banks, as the option bit DB1M sets it: sectors 0 to 7
     /// and 12 to 19 of the manual (RM0090 table 9, RM0386). The option is set in production.
     ///
     /// # Panics
@@ -187,8 +189,8 @@ impl Geometry {
         Self { sectors: &const { two_banks(3) }, second_bank: Some(8), ..self }.checked()
     }
 
-    /// Whether this is its name: the order code as people write it, in any case, with or without
-    /// package, temperature range and what follows them (`STM32F407VGT6TR`).
+    /// Whether this is the chip's name: the order code in any case, with or without package,
+    /// temperature range and the characters after them (`STM32F407VGT6TR`).
     #[must_use]
     pub fn is_named(&self, name: &str) -> bool {
         let Some((code, rest)) = name.split_at_checked(self.chip.len()) else { return false };
@@ -205,8 +207,8 @@ impl Geometry {
         code.eq_ignore_ascii_case(self.chip) && is_rest
     }
 
-    /// Gives the geometry back if it can be that of a chip; fails the build with the broken rule's
-    /// words if not.
+    /// Returns the geometry if it is possible; otherwise it fails the build with the message of the
+    /// broken rule.
     #[must_use]
     pub const fn checked(self) -> Self {
         match self.check() {
@@ -215,11 +217,10 @@ impl Geometry {
         }
     }
 
-    /// Whether it can be that of a chip; otherwise the first rule that it breaks, in words. No number
-    /// makes it panic.
+    /// Checks whether the geometry is possible. No number causes a panic.
     ///
     /// # Errors
-    /// The broken rule.
+    /// The first broken rule, in words.
     pub const fn check(&self) -> Result<(), &'static str> {
         if !self.flash.is_possible() || !self.sram.is_possible() {
             return Err("flash or SRAM of the chip is empty, or reaches over the end of the address space");
@@ -254,7 +255,7 @@ impl Geometry {
         Ok(())
     }
 
-    /// What `FLASH_CR.SNB` takes for a sector: its number, but bit 4 chooses the second bank, whose
+    /// The value of `FLASH_CR.SNB` for a sector: its number; bit 4 selects the second bank, whose
     /// sectors count from 0 again (RM0090 section 3.9.8: sector 12 is 10000b).
     #[must_use]
     pub const fn sector_code(&self, number: u8) -> u8 {
@@ -264,7 +265,7 @@ impl Geometry {
         }
     }
 
-    /// The sectors in address order.
+    /// The sectors in the order of their addresses.
     pub fn sectors(&self) -> impl Iterator<Item = Sector> + '_ {
         let mut next = 0;
         core::iter::from_fn(move || {
@@ -274,7 +275,7 @@ impl Geometry {
         })
     }
 
-    /// The sector of this number, if the chip has it.
+    /// The sector with this number, if the chip has it.
     #[must_use]
     pub const fn sector(&self, number: u8) -> Option<Sector> {
         let mut base = self.flash.base;
@@ -293,7 +294,7 @@ impl Geometry {
         None
     }
 
-    /// The sector that holds `address`, if it is in flash.
+    /// The sector that contains `address`, if the address is in flash.
     #[must_use]
     pub const fn sector_at(&self, address: u32) -> Option<Sector> {
         let (mut number, mut base) = (0, self.flash.base);
@@ -315,8 +316,8 @@ impl Geometry {
         None
     }
 
-    /// Whether a region starts and ends where sectors do, so that it can be erased without touching
-    /// a neighbour.
+    /// Whether a region starts and ends at borders of sectors, so that it can be erased without an
+    /// effect on its neighbours.
     #[must_use]
     pub const fn is_whole_sectors(&self, region: &Region) -> bool {
         let starts = match self.sector_at(region.base) {
@@ -330,14 +331,14 @@ impl Geometry {
         region.size > 0 && starts && ends
     }
 
-    /// Bytes that a vector table of this chip occupies.
+    /// Size of this chip's vector table in bytes.
     #[must_use]
     pub const fn vector_table_size(&self) -> u32 {
         CORE_VECTORS_SIZE + self.interrupts as u32 * 4
     }
 
-    /// What `VTOR` demands of a vector table's address: the table's size rounded up to a power of
-    /// two (PM0214 section 4.4.4).
+    /// The alignment that `VTOR` requires of a vector table: the table's size rounded up to a power
+    /// of two (PM0214 section 4.4.4).
     #[must_use]
     pub const fn vector_table_alignment(&self) -> u32 {
         self.vector_table_size().next_power_of_two()
@@ -373,7 +374,7 @@ mod tests {
         assert_eq!(STM32F407VG.sector_at(0x07FF_FFFF), None);
     }
 
-    /// RM0090 table 6 and section 3.9.8 (SNB), at the borders.
+    /// RM0090 table 6 and section 3.9.8 (SNB), first and last sectors.
     #[test]
     fn sectors_of_the_f429_are_those_of_the_manual() {
         let table = [
@@ -396,7 +397,7 @@ mod tests {
         assert_eq!(STM32F429ZI.sector_at(0x0820_0000), None);
     }
 
-    /// RM0390, the sectors.
+    /// The sectors of RM0390.
     #[test]
     fn sectors_of_the_f446_are_those_of_the_manual() {
         let bases = [
@@ -415,7 +416,7 @@ mod tests {
         assert_eq!(STM32F446RE.sector_code(7), 7);
     }
 
-    /// RM0090 table 9 (DB1M = 1) and section 3.9.8, at the borders.
+    /// RM0090 table 9 (DB1M = 1) and section 3.9.8, first and last sectors.
     #[test]
     fn a_mebibyte_in_two_banks_is_that_of_the_manual() {
         let chip = STM32F429ZG.in_two_banks();
@@ -435,8 +436,8 @@ mod tests {
         assert_eq!((STM32F429ZG.sectors().count(), STM32F429ZG.second_bank), (12, None));
     }
 
-    /// Flash, SRAM, CCM in KiB and device identifier as ST's CMSIS packs have them (Keil.STM32F4xx_DFP
-    /// 2.17.1), a line of chips in each row.
+    /// Flash, SRAM, CCM in KiB and the device identifier from ST's CMSIS packs (Keil.STM32F4xx_DFP
+    /// 2.17.1), with the chips of one line in each row.
     #[test]
     fn memories_are_those_of_the_packs() {
         for (line, letters, sram, ccm) in [
@@ -468,7 +469,7 @@ mod tests {
                 assert!(of_line().any(|chip| chip.chip.ends_with(letter)), "{line} with {letter}");
             }
         }
-        // The packs list as many.
+        // The packs list the same number of chips.
         assert_eq!(CHIPS.len(), 125);
     }
 

@@ -1,5 +1,5 @@
-//! Which addresses of a chip may be touched blindly, as a debugger does: those behind which
-//! something answers. An access to any other is a bus fault.
+//! The addresses of a chip that a debugger may access without knowledge of the chip: there is
+//! memory or a register behind each of them. An access to any other address is a bus fault.
 //!
 //! | what | read | written |
 //! |---|---|---|
@@ -8,10 +8,10 @@
 //! | registers of the peripherals, by words | yes | yes, but for those of the flash |
 //! | registers of the core, by words: DWT, FPB, system control space, DBGMCU | yes | yes |
 //!
-//! The registers of the flash are left out because a write to them could erase the bootloader. Left
-//! out altogether are USB, Ethernet, the camera, cryptography, random numbers, DMA2D and external
-//! memory: some of them stall the bus while they have no clock. The bit-band aliases and the alias
-//! of the flash at 0 are left out because they lead around this table.
+//! Registers of the flash cannot be written, because a write could erase the bootloader. The table
+//! leaves out USB, Ethernet, the camera, cryptography, random numbers, DMA2D and external memory:
+//! some of them stall the bus while they have no clock. It also leaves out the bit-band aliases and
+//! the alias of the flash at 0, because they would bypass this table.
 
 use crate::geometry::{Geometry, Line, Region};
 
@@ -23,7 +23,8 @@ const OPTION_BYTES: Region = Region::new(0x1FFF_C000, 0x10);
 /// The flash interface.
 const FLASH_REGISTERS: Region = Region::new(0x4002_3C00, 0x400);
 
-/// The core's (PM0214 section 4, DDI 0403E section C1; DBGMCU: RM0090, debug support).
+/// The registers of the core (PM0214 section 4, DDI 0403E section C1; DBGMCU: RM0090, debug
+/// support).
 const CORE: [Region; 4] = [
     // DWT, FPB.
     Region::new(0xE000_1000, 0x1000),
@@ -117,7 +118,7 @@ const F413: &[Region] = &[
     Region::new(0x4002_6000, 0x0800), // DMA1, DMA2
 ];
 
-/// The peripherals of a chip. Those of the F469 and F479 that are more than the F429's, DSI and
+/// The peripherals of a chip. The additional ones of the F469 and F479 over the F429's, DSI and
 /// QUADSPI, are left out.
 const fn peripherals(line: Line) -> &'static [Region] {
     match line {
@@ -129,7 +130,7 @@ const fn peripherals(line: Line) -> &'static [Region] {
     }
 }
 
-/// Whether these bytes are registers, all of one peripheral or of neighbours, and whole ones.
+/// Whether these bytes are whole registers, all of one peripheral or of adjacent ones.
 fn are_registers(chip: &Geometry, address: u32, len: u32) -> bool {
     let all = peripherals(chip.line).iter().chain(&CORE);
     address.is_multiple_of(4) && len.is_multiple_of(4) && within(all, address, len)
@@ -139,16 +140,16 @@ fn within<'a>(regions: impl IntoIterator<Item = &'a Region>, address: u32, len: 
     len > 0 && regions.into_iter().any(|region| region.contains(address, len))
 }
 
-/// Whether these bytes may be read. Any address and any length may be asked for; no bytes may not
-/// be.
+/// Whether these bytes may be read. Every address and length is allowed as an argument; a length of
+/// 0 may not be read.
 #[must_use]
 pub fn may_read(chip: &Geometry, address: u32, len: u32) -> bool {
     within([&chip.flash, &chip.sram, &chip.ccm, &SYSTEM, &OPTION_BYTES], address, len)
         || are_registers(chip, address, len)
 }
 
-/// Whether these bytes may be written. Any address and any length may be asked for; no bytes may
-/// not be.
+/// Whether these bytes may be written. Every address and length is allowed as an argument; a length
+/// of 0 may not be written.
 #[must_use]
 pub fn may_write(chip: &Geometry, address: u32, len: u32) -> bool {
     let is_flash = || FLASH_REGISTERS.overlaps(&Region::new(address, len));
@@ -160,7 +161,7 @@ mod tests {
     use super::*;
     use crate::geometry::{CHIPS, STM32F407VG, STM32F412RG, STM32F413RH, STM32F429ZI, STM32F446RE};
 
-    /// First and last word of what there is, and the words beside it (RM0090 tables 1 and 5).
+    /// The first and the last word of each region, and the words beside it (RM0090 tables 1 and 5).
     #[test]
     fn what_answers_may_be_touched_and_what_does_not_may_not() {
         let chip = &STM32F407VG;
@@ -247,7 +248,7 @@ mod tests {
             }
             let ram = chip.sram.end();
             assert!(may_write(chip, ram - 8, 8) && !may_write(chip, ram - 8, 9));
-            // Into the flash's registers, or out of them.
+            // A range that enters the flash's registers, and one that leaves them.
             assert!(may_read(chip, 0x4002_3BFC, 8) && !may_write(chip, 0x4002_3BFC, 8));
             assert!(!may_write(chip, 0x4002_3FFC, 8));
             for (address, len) in [(0x2000_0000, 0), (u32::MAX, 1), (u32::MAX - 3, u32::MAX), (4, u32::MAX)] {

@@ -22,7 +22,7 @@ BUSY = 1
 
 
 class Failed(Exception):
-    """What went wrong with a device."""
+    """The error of a device."""
 
 
 async def number(node, index, subindex=1):
@@ -30,7 +30,7 @@ async def number(node, index, subindex=1):
 
 
 async def until(condition, what):
-    """Asks until it is so, for 60 s; a device that restarts does not answer."""
+    """Waits until the condition is true, at most 60 s; a device does not answer while it restarts."""
     for _ in range(600):
         try:
             if await condition():

@@ -11,13 +11,13 @@ import sys
 import client
 from canopen_client import Failed, step
 
-# Mandatory ones, the texts of the device, and the program objects of CiA 302-3.
+# Mandatory objects, the texts of the device, and the program objects of CiA 302-3.
 OBJECTS = [(0x1000, 0), (0x1008, 0), (0x1009, 0), (0x100A, 0), (0x1018, 0), (0x1018, 1), (0x1018, 4)]
 OBJECTS += [(0x1F51, 1), (0x1F56, 1), (0x1F57, 1)]
 
 
 def read(node, index, subindex, block):
-    # No buffer in between: what the device sends is what is compared.
+    # Without a buffer, so that the device's bytes are compared unchanged.
     with node.sdo.open(index, subindex, "rb", buffering=0, block_transfer=block) as stream:
         data = b""
         while True:

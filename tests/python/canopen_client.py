@@ -25,7 +25,7 @@ from canopen.sdo.exceptions import SdoError
 DEVICE_TYPE_BOOTLOADER = 0x1000_0000
 # Commands of 1F51h (manual, table 2).
 START, CLEAR, START_BOOTLOADER, SET_SIGNATURE = 0x01, 0x03, 0x80, 0x83
-# Values of 1F57h (manual, table 3); bit 0 is BUSY, bits 16 to 31 are the maker's.
+# Values of 1F57h (manual, table 3); bit 0 is BUSY, bits 16 to 31 are manufacturer-specific.
 STATUS = {
     0x00: "OK",
     0x02: "NOVALPROG",
@@ -47,7 +47,7 @@ LAST_BLOCK = 0xFFFF_FFFF
 
 
 class Failed(Exception):
-    """A step did not give what it should."""
+    """A step failed."""
 
 
 def step(text):
@@ -79,7 +79,7 @@ def read_blocks(path):
 
 
 def program_of(blocks):
-    """Size and CRC of the program: as the last block says, and as the data say; both must agree."""
+    """Size and CRC of the program, from the last block and from the data; both must agree."""
     size, crc = struct.unpack("<2L", blocks[-1][2])
     base = blocks[1][1]
     image = bytearray(b"\xff" * size)
@@ -101,7 +101,7 @@ def variable(parent, name, index, subindex=0, data_type=types.UNSIGNED32):
 
 
 def object_dictionary():
-    """What a CiA 302-3 master knows of any device: 1000h, 1018h, 1F50h, 1F51h, 1F56h, 1F57h."""
+    """The objects of any device for a CiA 302-3 master: 1000h, 1018h, 1F50h, 1F51h, 1F56h, 1F57h."""
     dictionary = ObjectDictionary()
     dictionary.add_object(variable(None, "Device type", 0x1000))
     identity = ODRecord("Identity object", 0x1018)
@@ -123,7 +123,7 @@ def object_dictionary():
 
 
 class Device:
-    """The device under test, as python-canopen shows it."""
+    """The device under test, through python-canopen."""
 
     def __init__(self, node, patience):
         self.sdo = node.sdo
@@ -133,7 +133,7 @@ class Device:
         return self.sdo[0x1000].raw
 
     def wait_until_idle(self, doing):
-        """Reads 1F57h until it is not busy. OK is the only good end."""
+        """Reads 1F57h until it is not busy. Only OK is a success."""
         give_up = time.monotonic() + self.patience
         while True:
             status = self.sdo[0x1F57][1].raw
@@ -151,7 +151,7 @@ class Device:
         self.wait_until_idle(doing)
 
     def wait_for(self, wanted, doing):
-        """Reads 1000h until `wanted` holds of it; the device may be away for a while."""
+        """Reads 1000h until `wanted` is true for it; the device may be unreachable meanwhile."""
         give_up = time.monotonic() + self.patience
         while True:
             try:
@@ -221,8 +221,8 @@ def main():
     options = parser.parse_args()
     host, colon, port = options.endpoint.rpartition(":")
     if host == "slcan":
-        # Whatever the bit rate of the bus behind it; the default pause behind the opening is for
-        # boards that it resets.
+        # The bit rate of the bus behind it does not matter. The default pause after opening is for
+        # boards that reset when they are opened.
         bus = {"interface": "slcan", "channel": port, "bitrate": 125_000, "sleep_after_open": 0.1}
     elif colon and port.isdecimal():
         # tcp_tune sets TCP_NODELAY; without it every answer waits for the kernel's delayed ACK.

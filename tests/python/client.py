@@ -14,14 +14,14 @@ from canopen_client import Failed
 
 
 def arguments(doc):
-    """A parser that describes the program by the first sentences of its documentation, for a device on this bus."""
+    """A parser for a device on this bus; its description is the first paragraph of `doc`."""
     parser = argparse.ArgumentParser(description=doc.split("\n\n")[0])
     parser.add_argument("address", help="HOST:PORT of the socketcand server")
     return parser
 
 
 def image_arguments(doc, image):
-    """The same for a file that is written to 1F50h."""
+    """The same, with a file that is written to 1F50h."""
     parser = arguments(doc)
     parser.add_argument("image", help=image)
     parser.add_argument("--block", action="store_true", help="by SDO block transfer")
@@ -34,10 +34,10 @@ def read(path):
 
 
 def run(address, act, number=1, dictionary=None, timeout=2.0):
-    """Calls `act` with a node on the bus; gives what the program ends with: 0, or 1 with what went wrong.
+    """Calls `act` with a node on the bus; returns the exit code: 0, or 1 after an error.
 
-    The SDO time-out is on the clock of a machine that may have other work: tests in virtual time show that no
-    answer takes 5 ms. Without one it is as the library has it.
+    The SDO time-out uses the clock of a machine that may have other work: tests in virtual time
+    show that no answer takes 5 ms. Without a time-out the library's default applies.
     """
     host, port = address.rsplit(":", 1)
     network = canopen.Network()

@@ -34,11 +34,11 @@ IDENTITY = 0x1018
 
 
 class Differs(Exception):
-    """The device is not as the file says."""
+    """The device differs from the file."""
 
 
 def values(dictionary):
-    """Every value of the file; those that can only be written last, since writing them changes what others read."""
+    """Every value of the file; write-only ones last, since writing them changes other values."""
     found = []
     for entry in dictionary.values():
         found.extend([entry] if isinstance(entry, ODVariable) else entry.values())
@@ -51,7 +51,7 @@ def read(sdo, value):
 
 
 def abort_of(doing):
-    """The code of the abort that something gives, None for none."""
+    """The abort code that `doing` causes, None for none."""
     try:
         doing()
     except SdoAbortedError as error:
@@ -78,11 +78,10 @@ def check_type(value, data):
 
 
 def check(sdo, value):
-    """Compares one value, and tells in a few words how it is."""
+    """Compares one value, and returns the result in a few words."""
     if value.access_type == "wo":
         expect_abort(lambda: read(sdo, value), READ_OF_WRITE_ONLY, "reading")
-        # A domain takes data of its own form alone; what matters here is that writing as such is
-        # allowed.
+        # A domain accepts only data in its own format; here it matters only that it can be written.
         code = abort_of(lambda: sdo.download(value.index, value.subindex, b"\0"))
         if code in (WRITE_OF_READ_ONLY, NO_OBJECT, NO_SUB_INDEX):
             raise Differs(f"writing gives {shown(code)}")
@@ -99,7 +98,7 @@ def check(sdo, value):
     if value.default is not None and is_value != value.default:
         raise Differs(f"{is_value!r} is read, its default is {value.default!r}")
     if value.access_type == "rw":
-        # What it is already changes nothing, and must be taken.
+        # Writing the present value changes nothing, and must be accepted.
         sdo.download(value.index, value.subindex, data)
     elif value.access_type in ("ro", "const"):
         expect_abort(lambda: sdo.download(value.index, value.subindex, data), WRITE_OF_READ_ONLY, "writing")
@@ -109,7 +108,7 @@ def check(sdo, value):
 
 
 def check_identity(sdo, information):
-    """The identity stands in the file a second time."""
+    """The file has the identity a second time."""
     for subindex, said in enumerate(
         (information.vendor_number, information.product_number, information.revision_number), 1
     ):

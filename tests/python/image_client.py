@@ -31,7 +31,7 @@ def update(device, image, block):
         step("stopped")
     device.command(CLEAR, "clear")
     step("cleared")
-    # As any master, it sends what there is as fast as it is acknowledged.
+    # Like any master, it sends the data as fast as they are acknowledged.
     options = {"block_transfer": True} if block else {}
     with device.sdo[0x1F50][1].open("wb", size=len(image), buffering=1024, **options) as stream:
         stream.write(image)

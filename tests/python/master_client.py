@@ -38,15 +38,15 @@ from canopen_client import (
 # Index in the table of bit rates (CiA 305, table 1).
 RATE_250K = 3
 UNCONFIGURED = 255
-# What a heartbeat says (CiA 301, table 37).
+# The states in a heartbeat (CiA 301, table 37).
 BOOT_UP, OPERATIONAL, PRE_OPERATIONAL = 0x00, 0x05, 0x7F
 # Abort codes (CiA 301, table 22).
 WRITE_ONLY, READ_ONLY, NO_OBJECT, NOT_STORED = 0x0601_0001, 0x0601_0002, 0x0602_0000, 0x0800_0020
-# Emergencies (CiA 301, table 26): wrong data set, device specific; and bit 0 and 7 of the error
+# Emergencies (CiA 301, table 26): wrong data set, device specific; and bits 0 and 7 of the error
 # register.
 DATA_SET, DEVICE_SPECIFIC, ERROR_RESET = 0x6300, 0xFF00, 0x0000
 GENERIC, MANUFACTURER = 0x01, 0x80
-# The emergency after boot-up: a bootloader, and why it stayed one (docs/protocol.md: 6 is "no
+# The emergency after boot-up: a bootloader, and the reason why it stays (docs/protocol.md: 6 is "no
 # program").
 NO_PROGRAM_TO_START = b"BOOT\x06"
 CRC_STATUS = 0x06
@@ -58,7 +58,7 @@ def expect(what, found, wanted):
 
 
 def refused_by_lss(doing):
-    """The text of the refusal, None if there was none."""
+    """The text of the refusal, None if there is none."""
     try:
         doing()
     except lss.LssError as error:
@@ -67,7 +67,7 @@ def refused_by_lss(doing):
 
 
 def abort_of(doing):
-    """The code of the abort that something gives, None for none."""
+    """The abort code that `doing` causes, None for none."""
     try:
         doing()
     except SdoAbortedError as error:
@@ -79,7 +79,7 @@ def abort_of(doing):
 
 
 def inquire(master):
-    """The LSS address of the one slave in configuration state."""
+    """The LSS address of the only slave in configuration state."""
     return [
         master.inquire_lss_address(part)
         for part in (
@@ -92,10 +92,11 @@ def inquire(master):
 
 
 def scan(master, attempts=4):
-    """Finds one device without a node-ID, which is in configuration state then.
+    """Finds one device without a node-ID, which then is in configuration state.
 
-    A scan takes silence for an answer: an answer that is late on a busy machine spoils it. What it found is therefore
-    asked for, and a scan that went wrong is repeated with more patience.
+    A scan takes silence for an answer: a late answer on a busy machine spoils it. So the address
+    that it found is
+    checked, and a failed scan is repeated with more patience.
     """
     for attempt in range(attempts):
         master.RESPONSE_TIMEOUT = 0.1 * 2**attempt
@@ -121,8 +122,8 @@ def commission(network, node_ids, refused_bit_rate):
     for node_id in node_ids:
         network.subscribe(0x700 + node_id, on_heartbeat)
 
-    # Is anybody there? Three answer the same at once. (python-canopen leaves the answer in its
-    # queue.)
+    # Is there a device? Three give the same answer at once. (python-canopen leaves the answer in
+    # its queue.)
     master.send_identify_non_configured_remote_slave()
     expect("identify non-configured", master.responses.get(timeout=2)[0], lss.CS_IDENTIFY_NON_CONFIGURED_SLAVE)
 
@@ -138,13 +139,13 @@ def commission(network, node_ids, refused_bit_rate):
         master.store_configuration()
         identities.append(identity)
         step("found %08X %08X %08X %08X: node-ID %d" % (*identity, node_id))
-        # Back to waiting: now the device has its node-ID, and boots.
+        # Back to waiting state: now the device has its node-ID, and boots.
         master.send_switch_state_global(master.WAITING_STATE)
         expect("boot-up", boot_ups.get(timeout=5), node_id)
 
     master.RESPONSE_TIMEOUT = 1
     expect("fastscan when all are configured", master.fast_scan(), (False, None))
-    # Each answers to its name, and to no other's.
+    # Each device answers to its own LSS address, and to no other.
     master.RESPONSE_TIMEOUT = 2
     if not master.send_switch_state_selective(*identities[1]):
         raise Failed("switch state selective")
@@ -159,7 +160,7 @@ def commission(network, node_ids, refused_bit_rate):
 
 
 class Consumer:
-    """What a node says by itself, in the order in which it says it."""
+    """The messages that a node sends by itself, in their order."""
 
     def __init__(self, node):
         self.states = queue.Queue()
@@ -179,7 +180,7 @@ class Consumer:
         raise Failed(f"{who}: not in state {wanted:02X}h")
 
     def expect_state(self, who, wanted):
-        """The next two heartbeats; one may have been on its way when the master said something."""
+        """The next two heartbeats; one may have been sent before the master's message."""
         while not self.states.empty():
             self.states.get()
         for _ in range(2):
@@ -213,7 +214,7 @@ def download_by_blocks(sdo, index, subindex, value):
 
 
 def talk(node, device_name):
-    """SDO upload in three ways, and what is refused."""
+    """SDO upload in three ways, and requests that are refused."""
     sdo = node.sdo
     expect("1000h", sdo.upload(0x1000, 0), DEVICE_TYPE_BOOTLOADER.to_bytes(4, "little"))
     expect("1008h, segmented", sdo.upload(0x1008, 0), device_name)
@@ -256,7 +257,7 @@ def use(network, path, node_ids, device_name, timeout):
     expect(f"{last}: has said nothing", consumers[last].emergencies.qsize(), 0)
     device.command(CLEAR, "clear")
 
-    # Block 0 by segments, the others as blocks, one of them damaged at first.
+    # Block 0 by segments, the others as blocks; one of them is damaged at first.
     (*_, control), (*_, damaged) = blocks[0], blocks[1]
     sdo.download(0x1F50, 1, control)
     device.wait_until_idle("block 0")
@@ -268,8 +269,8 @@ def use(network, path, node_ids, device_name, timeout):
     for number, *_, block in blocks[1:]:
         download_by_blocks(sdo, 0x1F50, 1, block)
         if number == 1:
-            # The device erases behind the first good block: neither it nor anybody else is silent
-            # meanwhile.
+            # The device erases after the first good block: meanwhile it and all other devices
+            # answer.
             talk(nodes[first], device_name)
             for node_id, node in nodes.items():
                 expect(f"{node_id}: heartbeat", node.nmt.wait_for_heartbeat(timeout=5), "PRE-OPERATIONAL")

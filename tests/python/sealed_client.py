@@ -10,7 +10,7 @@ from canopen.sdo.exceptions import SdoError
 import client
 from canopen_client import CLEAR, START, Device, object_dictionary, step
 
-# What 1F51h reads while the program runs (CiA 302-3).
+# The value of 1F51h while the program runs (CiA 302-3).
 STARTED = 1
 
 

@@ -22,7 +22,8 @@ from pathlib import Path
 
 from playwright.sync_api import expect, sync_playwright
 
-# How long something may take before it counts as hanging, in milliseconds. Nothing is measured with it.
+# The time after which a step counts as hanging, in milliseconds. It is not used to measure
+# anything.
 PATIENCE = 120_000
 expect.set_options(timeout=PATIENCE)
 
@@ -36,7 +37,7 @@ def scenario(function):
 
 
 class Bench:
-    """Programs, files and browser of one scenario."""
+    """Programs, files and the browser of one scenario."""
 
     def __init__(self, arguments, browser, stack):
         self.arguments, self.browser, self.stack = arguments, browser, stack
@@ -49,8 +50,8 @@ class Bench:
             return probe.getsockname()[1]
 
     def spawn(self, *command, until):
-        """Starts a program, and waits for a line with `until`; gives program and line."""
-        # Its errors go where those of this script go.
+        """Starts a program, and waits for a line with `until`; returns the program and the line."""
+        # Its error messages go to this script's standard error.
         program = subprocess.Popen([str(word) for word in command], stdout=subprocess.PIPE, text=True)
         self.stack.callback(end, program)
         for line in program.stdout:
@@ -64,7 +65,7 @@ class Bench:
         return node
 
     def ui(self, bus=None):
-        """Starts the server; gives program and URL."""
+        """Starts the server; returns the program and the URL."""
         bus = ["--bus", bus] if bus else []
         program, line = self.spawn(self.arguments.coflash, *bus, "ui", "--no-open", until="http://127.0.0.1:")
         return program, re.search(r"http://127\.0\.0\.1:\d+/[0-9a-f]{32}/", line)[0]
@@ -73,8 +74,9 @@ class Bench:
         context = self.browser.new_context(viewport={"width": width, "height": height}, **options)
         context.set_default_timeout(PATIENCE)
         page = context.new_page()
-        # A script that fails, or that the page's own policy blocks, says so there. What the server refuses is
-        # told as well, and is no complaint; nor is a connection that is lost on purpose.
+        # A script that fails, or that the page's own policy blocks, is reported there. Requests
+        # that the server refuses are reported there, too, but are no errors of the page; nor is a
+        # connection that is lost on purpose.
         page.on("console", lambda message: self.complaint(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: self.complaint(str(error)))
         page.goto(url)
@@ -86,7 +88,7 @@ class Bench:
             self.complaints.append(words)
 
     def image(self, name, size=8 * 1024, seed=1, vendor=VENDOR, product=PRODUCT):
-        """A block file with a program of so many bytes, made by the host tool from a raw image."""
+        """A block file with a program of `size` bytes, made by the host tool from a raw image."""
         words = [0x2001_0000, 0x0801_0201] + [0] * 2
         body = bytes((seed * 7 + at * 31 + (at >> 8)) & 0xFF for at in range(size - 16))
         raw, blocks = self.folder / f"{name}.bin", self.folder / f"{name}.blk"
@@ -96,7 +98,7 @@ class Bench:
         return blocks
 
     def picture(self, page, name, height=None):
-        """Keeps a screenshot, of so many pixels from the top or of the whole page."""
+        """Saves a screenshot: a number of pixels from the top, or the whole page."""
         if self.arguments.pictures:
             Path(self.arguments.pictures).mkdir(parents=True, exist_ok=True)
             page.evaluate("scrollTo(0, 0)")
@@ -116,8 +118,8 @@ TWO = ["--node", "5", "--count", "2", "--serial", "0x100", "--stand-in", *IDENTI
 
 
 def drop(page, *paths):
-    """Drags files or folders from the desktop onto the page, by the browser's own input."""
-    # Input goes to what can be seen.
+    """Drags files or folders from the desktop onto the page, with the browser's own input."""
+    # Only a visible element gets input.
     page.locator("#drop").scroll_into_view_if_needed()
     box = page.locator("#drop").bounding_box()
     at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
@@ -134,7 +136,8 @@ def connected(page):
 
 def scan(page, count):
     page.get_by_role("button", name="Search the bus").click()
-    # The table may have had as many rows before: that the search is over is told by its result.
+    # The table may have had the same number of rows before: the result shows that the search is
+    # over.
     expect(page.locator("#notice")).to_contain_text(re.compile(rf"{count} devices? found"))
     expect(page.locator("#rows tr")).to_have_count(count)
     idle(page)
@@ -149,7 +152,7 @@ def update_line(page, node):
 
 
 def sending(page, node=5):
-    """Waits until the program is being sent: part of it is there, and not all."""
+    """Waits until the program is being sent: a part of it is transferred, but not all."""
     page.wait_for_function(
         "node => { const bar = document.querySelector(`.update[data-node=\"${node}\"] progress`);"
         " return bar && bar.value > 0.02 && bar.value < 0.95 }", arg=node)
@@ -157,7 +160,7 @@ def sending(page, node=5):
 
 @scenario
 def two_nodes(bench):
-    """Two nodes get a program by a file that is dropped; the report has their serial numbers."""
+    """Two nodes get a program from a dropped file; the report has their serial numbers."""
     port = bench.free_port()
     bench.nodes(port, *TWO)
     program, url = bench.ui()
@@ -166,7 +169,7 @@ def two_nodes(bench):
     page.get_by_label("Address of the bus").fill(f"socketcand://127.0.0.1:{port}/can0")
     page.keyboard.press("Enter")
     connected(page)
-    # Who reads the address bar or the history gets no more than the page's own address.
+    # The address bar and the history contain only the page's own address.
     assert page.url == url, page.url
     scan(page, 2)
     expect(page.locator("#rows")).to_contain_text("bootloader")
@@ -188,7 +191,7 @@ def two_nodes(bench):
     report = page.locator("#report-rows")
     for serial in ["00000100h", "00000101h"]:
         expect(report).to_contain_text(serial)
-    # The CRC of the report is the file's, which the host tool tells as well.
+    # The CRC of the report is the file's, which the host tool prints as well.
     info = subprocess.run([bench.arguments.coflash, "--json", "inspect", bench.folder / "app.blk"], check=True,
                           capture_output=True, text=True).stdout
     crc = f'{int(re.search(r"crc.:([0-9]+),.size.:[0-9]+,.start", info)[1]):08X}h'
@@ -198,7 +201,7 @@ def two_nodes(bench):
     expect(page.locator("#devices")).to_be_hidden()
     bench.picture(page, "print")
     page.emulate_media(media="screen")
-    # What went over the bus stands there in words, and the filter takes its part.
+    # The page shows the frames on the bus in words, and the filter selects some of them.
     page.get_by_label("Show frames with").fill("node 6 heartbeat")
     expect(page.locator("#frame-rows tr").first).to_contain_text("node 6: heartbeat")
     expect(page.locator("#frame-rows")).not_to_contain_text("node 5")
@@ -213,7 +216,7 @@ def two_nodes(bench):
     shown = subprocess.run([bench.arguments.coflash, "monitor", "--replay", replay, "--count", "5"], check=True,
                            capture_output=True, text=True).stdout
     assert len(shown.splitlines()) == 5, shown
-    # Ctrl-C ends it cleanly.
+    # Ctrl-C ends the server without an error.
     program.send_signal(signal.SIGINT)
     assert program.wait(timeout=60) == 0
     expect(page.locator("#lost")).to_be_visible()
@@ -221,7 +224,7 @@ def two_nodes(bench):
 
 @scenario
 def unplugged(bench):
-    """The server of the adapter goes away in the middle of an update, and comes back."""
+    """The server of the adapter ends in the middle of an update, and comes back."""
     port = bench.free_port()
     node = bench.nodes(port, *TWO)
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
@@ -239,7 +242,7 @@ def unplugged(bench):
     expect(page.locator("#adapter-words")).to_contain_text("The adapter is lost")
     expect(page.locator("#report-rows")).to_contain_text("failed")
     bench.picture(page, "unplugged", 1010)
-    # Nothing can be asked of it meanwhile.
+    # Without the adapter the page allows no requests to it.
     expect(page.get_by_role("button", name="Search the bus")).to_be_disabled()
     bench.nodes(port, *TWO)
     connected(page)
@@ -251,7 +254,7 @@ def unplugged(bench):
 
 @scenario
 def refused(bench):
-    """An image for another product is refused by its label, and one that is no firmware by what it is."""
+    """An image for another product is refused by its label, other files by their contents."""
     port = bench.free_port()
     bench.nodes(port, *TWO)
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
@@ -279,7 +282,7 @@ def refused(bench):
         (bench.folder / name).write_bytes(content)
     huge = bench.folder / "huge.bin"
     with open(huge, "wb") as file:
-        # It takes no room on the disk.
+        # The sparse file takes no room on the disk.
         file.truncate(200 * 1024 * 1024)
     wrong = [(bench.folder / name, words) for name, (_, words) in files.items()]
     wrong += [(folder, "hat is a folder"), (huge, "more than any program")]
@@ -288,16 +291,16 @@ def refused(bench):
         expect(page.locator("#notice")).to_contain_text(words)
     drop(page, bench.folder / "other.blk", bench.folder / "empty.hex")
     expect(page.locator("#notice")).to_contain_text("ne file at a time")
-    # A browser that is dropped a file on opens it, unless the page takes it.
+    # A browser opens a dropped file, unless the page handles it.
     assert page.url == url
-    # After all that the right one is taken.
+    # After all these files the right one is accepted.
     drop(page, bench.image("app"))
     expect(page.locator(".verdict.yes")).to_have_count(2)
 
 
 @scenario
 def reload_in_mid_update(bench):
-    """The page is loaded anew while it updates, a second tab sees the same, and a closed tab stops nothing."""
+    """A reload of the page, a second tab and a closed tab do not disturb a running update."""
     port = bench.free_port()
     bench.nodes(port, *TWO)
     program, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
@@ -315,7 +318,7 @@ def reload_in_mid_update(bench):
     second = bench.page(url)
     expect(update_line(second, 5)).to_have_attribute("data-phase", "running")
     expect(second.get_by_role("button", name="Update", exact=True)).to_be_disabled()
-    # The page lets nobody press it; the server says no all the same.
+    # The page disables the button; the server refuses the request as well.
     answer = second.evaluate(
         "async () => { const response = await fetch('update', { method: 'POST', headers: { 'content-type':"
         " 'application/json' }, body: JSON.stringify({ nodes: [6], trial: false, start: true }) });"
@@ -325,7 +328,7 @@ def reload_in_mid_update(bench):
     expect(update_line(second, 5)).to_have_attribute("data-phase", "done")
     idle(second)
     expect(second.locator("#report-rows")).to_contain_text("00000100h")
-    # A server that says nothing any more is taken for lost, and found again when it is back.
+    # A server that does not answer any more counts as lost, and is found again when it is back.
     expect(second.locator("#lost")).to_be_hidden()
     program.send_signal(signal.SIGSTOP)
     expect(second.locator("#lost")).to_contain_text("connection to coflash is lost")
@@ -336,7 +339,7 @@ def reload_in_mid_update(bench):
 
 @scenario
 def single_steps(bench):
-    """Call back, release, erase with a question first, by keys alone; LSS gives node-ID and bit rate."""
+    """Call back, release, erase after a question, only by keys; LSS sets node-ID and bit rate."""
     port = bench.free_port()
     bench.nodes(port, "--unconfigured", "--serial", "0x200", "--stand-in", *IDENTITY)
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
@@ -363,7 +366,7 @@ def single_steps(bench):
     more = page.get_by_role("button", name="More about node 9")
 
     def press(name):
-        """Reaches a button of the device's dialog by the tabulator, and presses it."""
+        """Moves to a button of the device's dialog with the tab key, and presses it."""
         more.focus()
         page.keyboard.press("Enter")
         expect(page.locator("#device")).to_be_visible()
@@ -383,7 +386,7 @@ def single_steps(bench):
     assert "signed" not in page.locator("body").inner_text().lower()
     idle(page)
     press("Erase the program …")
-    # The question comes up with the answer that does no harm.
+    # The question has the harmless answer selected.
     expect(page.locator("#confirm")).to_be_visible()
     assert page.evaluate("document.activeElement.textContent") == "Keep it"
     page.keyboard.press("Escape")
@@ -395,7 +398,7 @@ def single_steps(bench):
     expect(page.locator("#notice")).to_contain_text("is erased")
     expect(row.locator("code")).to_have_text("–")
     idle(page)
-    # This device lets nobody read its program.
+    # This device does not allow its program to be read.
     press("Read the program back")
     expect(page.locator("#notice")).to_have_attribute("role", "alert")
     idle(page)
@@ -403,7 +406,7 @@ def single_steps(bench):
 
 @scenario
 def looks(bench):
-    """Nothing is cut off at 1280 and at 390 pixels, light and dark; every field has a name; no key traps."""
+    """No part is cut off at 1280 and 390 pixels, light and dark; fields have names; no key trap."""
     port = bench.free_port()
     bench.nodes(port, *TWO)
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
@@ -437,7 +440,7 @@ def looks(bench):
                 " && !(e.labels?.length || e.ariaLabel || e.textContent.trim())).map(e => e.outerHTML.slice(0, 80))")
             assert nameless == [], nameless
             page.context.close()
-    # The tabulator goes through all of it, forwards in the order of the page, and out of it.
+    # The tab key moves through all elements, in the order of the page, and then out of it.
     page = bench.page(url)
     expect(page.locator("#rows tr")).to_have_count(2)
     seen = []
@@ -454,12 +457,12 @@ def looks(bench):
              "filter", "trace", "frames", "fastscan", "lss-0", "lss-node", "assign", "run", "print"]
     places = [seen.index(name) for name in order]
     assert places == sorted(places), list(zip(order, places))
-    # And what the state is told to a screen reader by.
+    # The elements that tell the state to a screen reader.
     for name in ["task", "notice", "adapter-state"]:
         assert page.locator(f"#{name}").get_attribute("role") in ("status", "alert"), name
 
 
-# WCAG 2.1, 1.4.3: text has a contrast of 4.5 against what is behind it.
+# WCAG 2.1, 1.4.3: text has a contrast of 4.5 against its background.
 CONTRAST = """() => {
   const parts = (colour) => colour.match(/[\\d.]+/g).map(Number);
   const light = ([r, g, b]) => [r, g, b].map((c) => c / 255)
@@ -492,12 +495,12 @@ def emulated(bench):
     page.get_by_label("Choose all devices").check()
     page.locator("#update").click()
     line = page.locator(".update")
-    # Which of them, the next line tells, with what the page says.
+    # The next line tells which one, with the page's message.
     expect(line).to_have_attribute("data-phase", re.compile("done|failed"))
     expect(line).to_have_attribute("data-phase", "done")
     idle(page)
     expect(page.locator("#rows")).to_contain_text("application")
-    # What the running application tells of itself.
+    # The application's own data.
     expect(page.locator("#rows")).to_contain_text("1.0.0")
     expect(page.locator("#report-rows")).to_contain_text("the program runs")
 
@@ -515,7 +518,7 @@ def main():
     chromium = os.environ.get("COBOOT_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
     if not chromium:
         sys.exit("there is no chromium: `cargo xtask setup` installs it")
-    # The sandbox of Chromium cannot be had as root.
+    # As root Chromium has no sandbox.
     options = ["--no-sandbox"] if os.geteuid() == 0 else []
     with sync_playwright() as playwright, contextlib.ExitStack() as stack:
         browser = playwright.chromium.launch(executable_path=chromium, args=options)

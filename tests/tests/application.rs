@@ -1,6 +1,6 @@
-//! The application that docs/application.md goes through (`examples/no-stack`): built as a package of
-//! its own, as a stranger's is, and run under the real bootloader; and what happens where an
-//! application gets it wrong.
+//! The application of docs/application.md (`examples/no-stack`): it is built as a separate package,
+//! like an application of another author, and runs under the real bootloader. Other tests show the
+//! effects of mistakes in an application.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -19,17 +19,18 @@ use coflash::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::toml::Toml;
 
-/// Where the example is, and where the job that builds the examples has built it.
+/// The folder of the example; the job for the examples has built it there.
 fn example() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/no-stack")
 }
 
-/// The ELF of the example. `None` where the tests are about another board.
+/// The ELF file of the example. `None` if the tests run for another board.
 fn built() -> Option<Vec<u8>> {
     build(&example())
 }
 
-/// The ELF of a copy of the example in which `old` is `new`: what its author could do.
+/// The ELF file of a copy of the example in which `old` is replaced by `new`: a change by its
+/// author.
 fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
     let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);
     fs::create_dir_all(copy.join("src")).expect("the folder can be made");
@@ -49,7 +50,7 @@ fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
 }
 
 fn build(folder: &Path) -> Option<Vec<u8>> {
-    /// One build at a time: they share a folder, that of `cargo xtask examples`.
+    /// One build at a time: they share the folder of `cargo xtask examples`.
     static BUILD: Mutex<()> = Mutex::new(());
     if firmware::board().board != LAYOUT.board {
         println!("not run: the example is for {}", LAYOUT.board);
@@ -91,7 +92,7 @@ fn power_cycle(bench: &mut Bench) {
     bench.run_ms(500);
 }
 
-/// Step 1: the memory map that is checked in is the one that is printed.
+/// Step 1: the memory map in the repository equals the printed one.
 #[test]
 fn its_memory_map_is_the_boards() {
     let printed = Toml(&LAYOUT).to_string();
@@ -102,7 +103,7 @@ fn its_memory_map_is_the_boards() {
     );
 }
 
-/// Steps 2 to 6, and "All of it": the second update begins in the running program.
+/// Steps 2 to 6, and "All of it": the second update starts in the running program.
 #[test]
 fn it_is_updated_twice_and_answers_what_a_host_asks() {
     let Some(elf) = built() else { return };
@@ -116,20 +117,20 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
         assert_eq!(number(&mut bench, 0x1F57, 1), 0);
         assert_eq!(number(&mut bench, 0x1018, 2), bsp::IDENTITY.product_code);
     }
-    // Step 5: three resets by the NMT master are no crashes.
+    // Step 5: resets by the NMT master are no crashes: five of them exceed the limit of three.
     for _ in 0..5 {
         bench.post(0, &[0x81, NODE]);
         bench.await_program(1000);
         bench.run_ms(20);
     }
     assert!(!bench.is_bootloader(NODE));
-    // Step 3: STOP is answered by the bootloader, in the program's place.
+    // Step 3: the bootloader answers STOP for the program.
     bench.session().command(1, ProgramControl::Stop).unwrap();
     assert!(bench.is_bootloader(NODE));
     bench.assert_nothing_unmodelled();
 }
 
-/// Step 7: without a confirmation the bootloader is there behind a power-off, with one the program.
+/// Step 7: after a power-off the bootloader runs without a confirmation, and the program with one.
 #[test]
 fn a_trial_confirms_itself_when_its_master_has_started_it() {
     let Some(elf) = built() else { return };
@@ -149,13 +150,13 @@ fn a_trial_confirms_itself_when_its_master_has_started_it() {
 }
 
 const LABEL: &str = "coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);";
-/// What the program does first.
+/// The first statement of the program.
 const FIRST: &str = "    let mut rcc = ";
-/// VTOR at the vectors of the bootloader, as start-up code leaves it that was made for a program at
-/// the start of the flash.
+/// It sets VTOR to the vectors of the bootloader, like the start-up code for a program at the start
+/// of the flash.
 const WRONG_VTOR: &str = "    unsafe { (*SCB::PTR).vtor.write(0x0800_0000) };\n    let mut rcc = ";
 
-/// It is taken, and tells nobody whom it is for.
+/// The device accepts the program, because it does not name its target.
 #[test]
 fn a_program_without_a_label_is_taken_by_every_device() {
     let Some(elf) = built() else { return };
@@ -172,8 +173,8 @@ fn a_program_without_a_label_is_taken_by_every_device() {
     assert!(!bench.is_bootloader(NODE));
 }
 
-/// Its first interrupt is the bootloader's. It never answers, is not released, and goes when a good
-/// one comes.
+/// Its first interrupt enters the bootloader's vectors. It never answers, is not released, and a
+/// good program replaces it.
 #[test]
 fn a_program_with_vtor_at_the_bootloader_is_told_to_be_silent_and_is_replaced() {
     let (Some(good), Some(wrong)) = (built(), altered("wrong-vtor", FIRST, WRONG_VTOR)) else { return };

@@ -1,6 +1,5 @@
-//! The programs of `examples/`, as their own tools built them (`cargo xtask examples`): they come up
-//! under the bootloader, go back into it and are updated. And what is said to those who build one of
-//! them with a mistake.
+//! The programs of `examples/`, built by their own tools (`cargo xtask examples`): they start under
+//! the bootloader, return to it and are updated. And the messages for authors who make a mistake.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -18,7 +17,7 @@ use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two, Image};
 
 const CRC: Address = Address::new(0x1F56, 1);
 
-/// Each as version 1, and as version 2, which another compiler may have made.
+/// Each program as version 1, and as version 2, which another compiler may have built.
 const EXAMPLES: [[&str; 2]; 5] = [
     ["example-c-cmake.elf", "example-c-cmake-v2.elf"],
     ["example-cpp.elf", "example-cpp-v2.elf"],
@@ -27,17 +26,17 @@ const EXAMPLES: [[&str; 2]; 5] = [
     ["example-rtic.elf", "example-rtic-v2.elf"],
 ];
 
-/// Registers of which the emulator reports something when embassy-stm32 starts: `RCC_DCKCFGR`, which
-/// the STM32F407 does not have (RM0090 section 7.3), and `CAN_MCR`, whose TTCM is for time stamps that
-/// nobody reads.
+/// Registers for which the emulator reports an access when embassy-stm32 starts: `RCC_DCKCFGR`,
+/// which the STM32F407 does not have (RM0090 section 7.3), and `CAN_MCR`, whose bit TTCM is for
+/// time stamps that are not used.
 const OF_EMBASSY: [u32; 2] = [0x4002_388C, 0x4000_6400];
 
-/// Whether the tests are about the board that the examples are for.
+/// Whether the tests run for the board of the examples.
 fn is_board_of_examples() -> bool {
     firmware::board() == &stm32f407g_disc1::LAYOUT
 }
 
-/// A board with nothing but the bootloader.
+/// A board with only the bootloader.
 fn empty_board() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
@@ -55,15 +54,15 @@ fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// The label of an image: at its place, and whole.
+/// The label of an image, which must be complete and at its place.
 fn label_of(image: &str) -> Label {
     let bytes = firmware::raw_from(stm32f407g_disc1::LAYOUT.programs[0].base, image);
     let place = label::OFFSET as usize;
     Label::parse(bytes[place..place + label::SIZE].try_into().unwrap()).expect("a label")
 }
 
-/// The main job with each: installed, verified, started, called back, updated, and there again after
-/// a power-off.
+/// The main job with each program: it is installed, verified, started, called back, updated, and
+/// runs again after a power-off.
 #[test]
 fn each_is_installed_and_updates_itself_over_socketcand() {
     if !is_board_of_examples() {
@@ -78,7 +77,7 @@ fn each_is_installed_and_updates_itself_over_socketcand() {
             let board = ["--verify", "--board", stm32f407g_disc1::LAYOUT.board];
             let mut command = coflash();
             command.args(["--bus", &url, "flash"]).arg(firmware::dir().join(name)).args(board);
-            // The second time the program that runs is told to go back.
+            // The second time the running program gets the command to return to the bootloader.
             let output = endpoint.run(&mut command);
             assert!(output.status.success(), "{name}: {}", text(&output));
             let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
@@ -107,7 +106,7 @@ fn each_is_installed_and_updates_itself_over_socketcand() {
     }
 }
 
-/// The answer to 80h is whole on the bus, and 10 ms more have passed, when they leave.
+/// When they reset, the answer to 80h is complete on the bus, and 10 ms more have passed.
 #[test]
 fn each_can_be_called_back_at_every_bit_rate() {
     if is_board_of_examples() {
@@ -115,7 +114,7 @@ fn each_can_be_called_back_at_every_bit_rate() {
     }
 }
 
-/// A copy of the example in C, to be built with a mistake in it.
+/// A copy of the example in C, to build it with a mistake.
 struct Project(PathBuf);
 
 impl Project {
@@ -129,7 +128,7 @@ impl Project {
         Self(root)
     }
 
-    /// Puts `new` in the place of `old`, which is there once.
+    /// Replaces `old`, which must be there once, by `new`.
     fn edit(self, file: &str, old: &str, new: &str) -> Self {
         let path = self.0.join(file);
         let before = fs::read_to_string(&path).expect(file);
@@ -138,10 +137,10 @@ impl Project {
         self
     }
 
-    /// Builds it with options of CMake.
+    /// Builds the project with options of CMake.
     ///
     /// # Errors
-    /// What the tools say when they refuse it.
+    /// The tools' messages if they refuse it.
     fn build(&self, options: &[&str]) -> Result<PathBuf, String> {
         let (source, build) = (self.0.join("examples/c-cmake"), self.0.join("build"));
         let toolchain = self.0.join("app-c/cmake/arm-none-eabi-gcc.cmake");
@@ -171,17 +170,17 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// What `coflash` says of a file without a bus; whether it takes it.
+/// The output of `coflash` about a file, without a bus, and whether it accepts the file.
 fn judged(words: &[&str], file: &Path) -> (bool, String) {
     let board = ["--board", stm32f407g_disc1::LAYOUT.board];
     let output = coflash().args(words).arg(file).args(board).output().expect("coflash starts");
     (output.status.success(), text(&output))
 }
 
-/// `flash` without a bus: what it refuses before it looks for one.
+/// `flash` without a bus: it refuses these files before it looks for a bus.
 const FLASH: [&str; 3] = ["--bus", "socketcand://127.0.0.1:1/can0", "flash"];
 
-/// The label stands behind the vectors of the chip. More of them would run into it, fewer would leave
+/// The label is after the vectors of the chip. More vectors would overlap it, fewer would leave
 /// interrupts without a handler.
 #[test]
 fn another_number_of_vectors_than_the_chips_does_not_link() {
@@ -196,7 +195,7 @@ fn another_number_of_vectors_than_the_chips_does_not_link() {
     project.build(&["-DINTERRUPT_LINES=82"]).unwrap_or_else(|refused| panic!("{refused}"));
 }
 
-/// A label is optional: the device takes the program, and nobody can tell whom it is for.
+/// A label is optional: the device accepts the program, but coflash cannot tell its target.
 #[test]
 fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     let project =
@@ -210,7 +209,7 @@ fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap();
     assert!(!bench.is_bootloader(NODE));
 
-    // Two of them are one too many.
+    // A second label is an error.
     let again = "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n";
     let project = Project::new("label").edit(
         "app-c/board.c",
@@ -221,8 +220,8 @@ fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     assert!(refused.contains("multiple definition of `coboot_label_of_image'"), "{refused}");
 }
 
-/// Linked for the beginning of the flash, as every project begins, or for the place of another
-/// program.
+/// The program is linked for the start of the flash, as in every new project, or for the place of
+/// another program.
 #[test]
 fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     let layout = "examples/c-cmake/layout.x";
@@ -232,7 +231,7 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     let refused = at_the_beginning("address").build(&[]).expect_err("it links");
     assert!(refused.contains("ERROR(coboot): the program lies over the bootloader's callgate"), "{refused}");
 
-    // With a linker script that knows nothing of coboot.
+    // With a linker script without the parts for coboot.
     let project = at_the_beginning("address").edit("app-c/app.x", "  INCLUDE coboot.x\n", "");
     let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
     for words in [&["convert"][..], &FLASH] {
@@ -254,7 +253,7 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     assert!(told.contains("does not begin with an initial stack pointer and a reset vector"), "{told}");
 }
 
-/// `VTOR` is left at the bootloader's vectors, as the start-up of a project for the whole flash does:
+/// `VTOR` is left at the bootloader's vectors, as by the start-up of a project for the whole flash:
 /// the first interrupt ends the program.
 #[test]
 fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
@@ -269,14 +268,14 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
     let told = refused.to_string();
     assert!(told.contains("the trial failed") && told.contains("it does not start"), "{told}");
-    // Started by START, and ended by itself; then the bootloader stays.
+    // START starts it, and it ends by itself; then the bootloader stays.
     let resets = bench.events().len();
     assert_eq!(resets, 2);
     bench.run_ms(3000);
     assert_eq!(bench.events(), []);
     assert!(bench.is_bootloader(NODE));
 
-    // Without a trial it is started, and started again, until it has crashed too often.
+    // Without a trial it is started again until it has crashed too often.
     let options = FlashOptions::default().trial_run(false);
     let refused = flash(&mut bench.session(), &blocks, &options, &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::StartFailed { .. }), "{refused}");
@@ -291,8 +290,8 @@ fn block<'p>(page: &'p str, language: &str) -> &'p str {
     behind.split_once("```").expect("its end").0
 }
 
-/// The page for projects of CubeIDE: the sample links with the script that the page shows, and its code
-/// compiles beside as much of the HAL as it uses.
+/// The page for projects of CubeIDE: the sample links with the script on the page, and its code
+/// compiles with the parts of the HAL that it uses.
 #[test]
 fn the_blocks_of_the_page_for_cube_link_and_compile() {
     let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");

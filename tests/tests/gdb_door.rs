@@ -1,5 +1,5 @@
-//! gdb at the emulated board: it stops in the application's 1F51h callback and in the bootloader that
-//! follows, while a host calls the bootloader.
+//! gdb with the emulated board: it stops in the application's 1F51h callback and in the bootloader
+//! after it, while a host calls the bootloader.
 #![cfg(unix)]
 
 use std::env;
@@ -16,10 +16,10 @@ use emulator::gdb::Door;
 use emulator::pacing::{Pacer, Speed};
 use emulator::socketcand::Server;
 
-/// How long it may take before it counts as hanging, on the wall clock.
+/// The time after which the test counts as hanging, on the wall clock.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// The board with its doors open.
+/// The board with its servers for gdb and for the host.
 struct Desk {
     bench: Bench,
     door: Door,
@@ -37,7 +37,7 @@ impl Desk {
         Self { bench, door, server, pacer, since }
     }
 
-    /// Lets the board live until this is so.
+    /// Runs the board until `reached` is true.
     fn live_until(&mut self, what: &str, mut reached: impl FnMut(&mut Self) -> bool) {
         while !reached(self) {
             assert!(self.since.elapsed() < PATIENCE, "{what}: it hangs");
@@ -93,7 +93,7 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
         "continue",
         "backtrace 1",
         "delete",
-        // Its code is not there yet: this is RAM of the application now.
+        // The bootloader's code is not in RAM yet: this is RAM of the application now.
         &format!("symbol-file {}", bootloader.display()),
         "hbreak main",
         "continue",
@@ -123,6 +123,6 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
         rest = &rest[at + words.len()..];
     }
     assert!(rest.contains("detached"), "{said}");
-    // The host's own time goes on while the board is halted, so it may have given up.
+    // The host's own time goes on while the board is halted, so the host may have given up.
     assert!(desk.bench.is_bootloader(NODE), "{told}\n{said}");
 }

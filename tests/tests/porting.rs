@@ -1,7 +1,7 @@
-//! The way to a new board (docs/porting.md): followed to the letter, and left in every way that the
-//! build has to notice.
+//! The guide to a new board (docs/porting.md): one test follows it exactly, another one makes each
+//! mistake that the build must notice.
 //!
-//! Both tests work on a copy of the repository, one after the other.
+//! The tests work on a copy of the repository, one after the other.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -15,16 +15,16 @@ const TARGET: &str = "thumbv7em-none-eabihf";
 /// A copy of the repository.
 struct Copy {
     root: PathBuf,
-    /// Cargo's folder for it: cargo tells packages apart by where they are in their workspace, so a
-    /// folder shared with another copy would be built anew each time.
+    /// Cargo's folder for the copy. Cargo identifies packages by their place in the workspace, so a
+    /// folder that is shared with another copy would be rebuilt each time.
     target: PathBuf,
     /// One test at a time.
     _alone: MutexGuard<'static, ()>,
 }
 
 impl Copy {
-    /// What is there from an earlier run is brought up to date: files that did not change keep
-    /// their time, so that cargo builds anew only what it has to.
+    /// The copy of an earlier run is updated: unchanged files keep their time, so that cargo
+    /// rebuilds only what it must.
     fn new() -> Self {
         static ALONE: Mutex<()> = Mutex::new(());
         let alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
@@ -44,9 +44,9 @@ impl Copy {
         self.cargo_for("stm32f407g-disc1", None, words)
     }
 
-    /// The same for a board, and for a product by name.
+    /// The same for a board, and for a named product.
     fn cargo_for(&self, board: &str, product: Option<&str>, words: &[&str]) -> Output {
-        // Firmware goes where `cargo xtask build` has it built.
+        // Firmware goes into the same folder as with `cargo xtask build`.
         let firmware = words.contains(&TARGET);
         let chip = layout::by_name(board).map_or("stm32f405", |layout| layout.chip.line.name());
         let target = if firmware { self.target.join("fw").join(chip) } else { self.target.clone() };
@@ -58,7 +58,7 @@ impl Copy {
         cargo.output().expect("cargo can be started")
     }
 
-    /// Puts `new` in the place of `old`, which is there once; gives the file as it was.
+    /// Replaces `old`, which must be there once, by `new`; returns the previous file.
     fn edit(&self, file: &str, old: &str, new: &str) -> String {
         let path = self.root.join(file);
         let before = fs::read_to_string(&path).expect(file);
@@ -72,8 +72,8 @@ fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
-/// Gives the copy what was built of other people's crates: files that cargo replaces as a whole are
-/// the same files, those that it writes into are copied. Where that fails, the copy builds them.
+/// Gives the copy the built crates of other authors: files that cargo replaces as a whole are hard
+/// links, files that it changes are copied. If that fails, the copy builds them.
 fn share(profile: &str, to: &Path) {
     let from = Path::new(env!("CARGO_TARGET_TMPDIR")).join("..").join(profile);
     fs::create_dir_all(to).expect("the folder can be made");
@@ -82,7 +82,7 @@ fn share(profile: &str, to: &Path) {
     }
 }
 
-/// Makes `to` what `from` is, but for version control and what was built.
+/// Makes `to` equal to `from`, except for version control and build results.
 fn synchronise(from: &Path, to: &Path) {
     fs::create_dir_all(to).expect("the copy can be made");
     let names = |folder: &Path| -> Vec<_> {
@@ -110,7 +110,7 @@ fn synchronise(from: &Path, to: &Path) {
     }
 }
 
-/// From `new-board` to an update on the emulated board: the example of the guide, an STM32F405RG with
+/// From `new-board` to an update on the emulated board: the guide's example, an STM32F405RG with
 /// CAN1 on PB8 and PB9, a crystal of 8 MHz, its LED on PC13 and no strap.
 #[test]
 fn a_board_is_made_as_the_guide_says() {
@@ -125,7 +125,7 @@ fn a_board_is_made_as_the_guide_says() {
     assert_eq!(added, new);
     assert_formatted(&copy, &new[1..]);
 
-    // The memory map, clocks, pins and LED are those of the example as they are laid down.
+    // The created files already have the memory map, clocks, pins and LED of the example.
     let board = new[1];
     for (step, old, new) in [
         (5, "product_code: 0,", "product_code: 0x1234_5678,"),
@@ -137,7 +137,7 @@ fn a_board_is_made_as_the_guide_says() {
     copy.edit(new[0], "PRODUCT_CODE UINT32_C(0)", "PRODUCT_CODE UINT32_C(0x12345678)");
 
     let app_c = copy.target.join("firmware/my-board/app-c.elf");
-    // Of an earlier run.
+    // The result of an earlier run.
     let _ = fs::remove_file(&app_c);
     copy.xtask(&["build", "--all", "--board", "my-board"]);
     assert!(app_c.exists(), "no application in C");
@@ -147,14 +147,14 @@ fn a_board_is_made_as_the_guide_says() {
     assert!(told.contains("a node of my own"), "the device does not say its name:\n{told}");
 }
 
-/// A board for each chip that `COBOOT_CHIPS` names, from `new-board` to the update on the emulated
-/// board. Minutes for each: `cargo xtask chips` chooses them.
+/// A board for each chip in `COBOOT_CHIPS`, from `new-board` to the update on the emulated board.
+/// Each one takes minutes: `cargo xtask chips` selects the chips.
 #[test]
 #[ignore = "cargo xtask chips"]
 fn a_board_is_made_for_every_chip() {
     let chips = std::env::var("COBOOT_CHIPS").expect("COBOOT_CHIPS names chips, with commas between them");
     let copy = Copy::new();
-    // All of them first: tools that know the boards are built once.
+    // All boards are made first: so tools that know the boards are built once.
     for chip in chips.split(',') {
         copy.xtask(&["new-board", chip, "--chip", chip]);
         assert_formatted(&copy, &[&format!("bsp/src/boards/{chip}.rs")]);
@@ -168,7 +168,7 @@ fn a_board_is_made_for_every_chip() {
 }
 
 impl Copy {
-    /// Runs a job of the copy; gives what it printed.
+    /// Runs a job of the copy; returns its output.
     fn xtask(&self, words: &[&str]) -> String {
         let output = self.cargo(&[&["run", "-q", "-p", "xtask", "--"], words].concat());
         assert!(output.status.success(), "cargo xtask {}:\n{}", words.join(" "), text(&output));
@@ -176,7 +176,7 @@ impl Copy {
     }
 }
 
-/// Every file below a folder and what is in it, by name.
+/// Every file below a folder with its contents, sorted by name.
 fn files(root: &Path) -> Vec<(String, Vec<u8>)> {
     let mut found = Vec::new();
     let mut folders = vec![root.to_owned()];
@@ -195,7 +195,7 @@ fn files(root: &Path) -> Vec<(String, Vec<u8>)> {
     found
 }
 
-/// Whether files are formatted as the rest is.
+/// Checks that files have the standard formatting.
 fn assert_formatted(copy: &Copy, files: &[&str]) {
     let mut rustfmt = Command::new("rustfmt");
     rustfmt.current_dir(&copy.root).args(["--check", "--edition", "2021"]).args(files);
@@ -203,36 +203,36 @@ fn assert_formatted(copy: &Copy, files: &[&str]) {
     assert!(output.status.success(), "{}", text(&output));
 }
 
-/// One mistake in an otherwise good port, and what the build says.
+/// One mistake in an otherwise good port, and the message of the build.
 struct Mistake {
     file: &'static str,
     right: &'static str,
     wrong: &'static str,
-    /// What has to be looked at for it to be found.
+    /// The check that finds it.
     by: By,
     says: &'static str,
 }
 
-/// What finds a mistake.
+/// The checks that find mistakes.
 #[derive(Clone, Copy)]
 enum By {
     /// `cargo check` of the memory maps.
     Layout,
     /// `cargo check` of the board file, on the host.
     Board,
-    /// The same of this board.
+    /// The same for this board.
     BoardOf(&'static str),
     /// `cargo check` of the board file for the chip.
     Drivers,
-    /// `cargo check` of the resident part, the smaller one of the two that the choices of a product
-    /// are built into; for the product of this name, if one is named.
+    /// `cargo check` of the resident part, the smaller one of the two programs with the choices of
+    /// a product; for the product with this name, if there is one.
     Product(Option<&'static str>),
 }
 
 const LAYOUT: &str = "shared-abi/src/layout/boards/nucleo_f446re.rs";
 const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
-/// A choice that a product makes in place of the default.
+/// A mistake in the choices of a product.
 const fn product(wrong: &'static str, says: &'static str) -> Mistake {
     let file = "bootloader/src/product.rs";
     Mistake { file, right: "Product { ..Product::DEFAULT }", wrong, by: By::Product(None), says }
@@ -316,7 +316,7 @@ const MISTAKES: &[Mistake] = &[
         by: By::Board,
         says: "board: APB2 is too fast: 84 MHz at most, without over-drive",
     },
-    // The other class: DS11139 and DS11581, general operating conditions.
+    // The slower class of chips: DS11139 and DS11581, general operating conditions.
     Mistake {
         file: "bsp/src/boards/an_f412.rs",
         right: "pll_n: 96",
@@ -376,7 +376,7 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "usart2::Tx: From<stm32f4xx_hal::gpio::Pin<'A', 4>>",
     },
-    // 40 MHz and 16 cycles a bit at least.
+    // 40 MHz and at least 16 cycles a bit.
     Mistake {
         file: BOARD,
         right: "UART_BIT_RATE: u32 = 115_200",
@@ -384,7 +384,7 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "board: the clock of the UART cannot make UART_BIT_RATE",
     },
-    // Choices that contradict each other, or the layout, which has one program.
+    // Choices that contradict each other, or the layout, which has only one program.
     product(
         "Product { autostart: Some(2), ..Product::DEFAULT }",
         "product: autostart names a program that the layout has not",
@@ -452,7 +452,7 @@ const MISTAKES: &[Mistake] = &[
         "Product { profile: Profile { password: b\"\", ..Profile::LIFT }, ..Product::DEFAULT }",
         "product: a profile that locks 1F50h needs a password, and only such a profile has one",
     ),
-    // This product does not find out the bit rate.
+    // The product does not detect the bit rate.
     Mistake {
         file: BOARD,
         right: "BIT_RATE: u32 = 125_000",
@@ -494,7 +494,7 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
             copy.cargo_for(board, name, &[&words[..], &features, &triple].concat())
         }
     };
-    // Without a mistake there is none.
+    // Without a mistake the build succeeds.
     let slower = [By::BoardOf("an-f412"), By::BoardOf("an-f413")];
     let good = [By::Layout, By::Board, By::Drivers, By::Product(None), By::Product(Some("least"))];
     for by in good.into_iter().chain(slower) {
@@ -507,7 +507,7 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
         fs::write(copy.root.join(mistake.file), before).expect("the file can be written");
         let said = text(&output);
         assert!(!output.status.success(), "built with {} in {}", mistake.wrong, mistake.file);
-        // Types are told with or without their paths, and lines may be broken anywhere.
+        // Types appear with or without their paths, and lines may be broken anywhere.
         let flat = |text: &str| {
             text.replace("stm32f4xx_hal::gpio::", "").split_whitespace().collect::<Vec<_>>().join(" ")
         };

@@ -1,4 +1,4 @@
-//! The recorded windows of the README against what `coflash` prints today.
+//! Compares the recorded windows of the README with today's output of `coflash`.
 
 use std::process::Command;
 use std::{env, fs};
@@ -8,8 +8,8 @@ use coboot_tests::endpoint::Endpoint;
 
 const RECORDING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/pictures/two-windows.txt");
 
-/// What stays the same from build to build and from run to run: words with a digit in them (sizes,
-/// CRCs, times) are one and the same word, and progress comes in as many lines as it likes.
+/// The parts of the text that are the same for all builds and runs: all words with a digit (sizes,
+/// CRCs, times) become the same word, and all lines of progress become one.
 fn lasting(text: &str) -> Vec<String> {
     let is_progress = |line: &&str| line.contains(" % ") || line.trim() == "…";
     let word = |word: &str| {

@@ -90,7 +90,7 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     bench.await_boot_up(1000);
     bench.run_ms(20);
 
-    // Erasing one leaves every byte of the other unchanged.
+    // The erase of one program leaves every byte of the other unchanged.
     let place = (LAYOUT.programs[1].base - LAYOUT.chip.flash.base) as usize;
     let before = bench.machine().flash()[place..].to_vec();
     for _ in 0..2 {
@@ -107,8 +107,8 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     assert!(NodeId::new(NODE).is_some());
 }
 
-/// A program that was linked for another place has no business here: its vectors would point into
-/// the other one.
+/// A program that was linked for the other place is refused: its vectors would point into the other
+/// program.
 #[test]
 fn a_block_for_the_other_program_is_refused() {
     if !is_its_chip() {
@@ -119,7 +119,8 @@ fn a_block_for_the_other_program_is_refused() {
     bench.await_boot_up(100);
     let second = blocks(firmware::PROGRAM_2, 2);
     let options = FlashOptions::default().program(1).start(false).repeats(0);
-    // The host is told by the device, and sends nothing; one that does not judge gets the refusal.
+    // The device tells the host its regions, and the host sends nothing. A host without this check
+    // gets the refusal from the device.
     let refused = flash(&mut bench.session(), &second, &options, &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
     let refused = flash(&mut bench.session(), &second, &options.force(true), &mut |_| {}).unwrap_err();
@@ -129,12 +130,12 @@ fn a_block_for_the_other_program_is_refused() {
     assert!(bench.machine().flash()[start..end].iter().all(|byte| *byte == 0xFF));
 }
 
-/// Applications at the first program's place, and their likes at the second's.
+/// Applications at the first program's place, and the same applications at the second's.
 const PAIRS: [(&str, &str); 2] =
     [(firmware::APP_V1, firmware::PROGRAM_2), (firmware::APP_C, firmware::APP_C_PROGRAM_2)];
 
-/// The second program of a device whose first one runs: the call goes through 1F51h/1, as the manual has
-/// it, and the application serves each program's sub-index.
+/// The second program of a device is written while the first one runs: 1F51h/1 calls the
+/// bootloader, as in the manual, and the application serves each program's sub-index.
 #[test]
 fn a_second_program_is_written_to_a_running_device() {
     if !is_its_chip() {
@@ -160,8 +161,9 @@ fn a_second_program_is_written_to_a_running_device() {
         }
         assert_eq!(identification(&mut bench, 1), one.program_crc(), "{first}");
         assert_eq!(identification(&mut bench, 2), 0, "{first}");
-        // Its own start is no news; that of another one, and what is done to another one, is the
-        // bootloader's (08000022h). What does not exist is told as such.
+        // START of the running program changes nothing. START of another program, and all other
+        // commands for it, are left to the bootloader (08000022h). A program that does not exist
+        // has its own code.
         for (sub, value, code) in
             [(2, 1, 0x0800_0022_u32), (2, 2, 0x0800_0022), (2, 0x83, 0x0800_0022), (3, 3, 0x0609_0011)]
         {
@@ -173,12 +175,12 @@ fn a_second_program_is_written_to_a_running_device() {
         let options = FlashOptions::default().program(2).verify(true);
         let report = flash(&mut bench.session(), &two, &options, &mut |_| {}).unwrap();
         assert!(report.running.is_some(), "{second}");
-        // The second runs now; the first is there, stopped.
+        // The second program runs now; the first one is installed and stopped.
         assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 0, 0, 0, 0]);
         assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 1, 0, 0, 0]);
         assert_eq!(identification(&mut bench, 1), one.program_crc(), "{second}");
         assert_eq!(identification(&mut bench, 2), two.program_crc(), "{second}");
-        // And back, from the second one.
+        // The update of the first program starts in the second one.
         let options = FlashOptions::default().verify(true);
         flash(&mut bench.session(), &one, &options, &mut |_| {}).unwrap();
         assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
@@ -186,8 +188,8 @@ fn a_second_program_is_written_to_a_running_device() {
     }
 }
 
-/// STOP and CLEAR of a program that does not run are the bootloader's as well, and answered by it; 80h of
-/// another program's sub-index is a call, also to a program that is fresh.
+/// The bootloader also carries out STOP and CLEAR of a program that does not run, and answers them.
+/// 80h to another program's sub-index calls the bootloader, also if that program is fresh.
 #[test]
 fn commands_for_the_other_program_lead_into_the_bootloader() {
     if !is_its_chip() {

@@ -1,17 +1,17 @@
-//! The parts of the UART's driver that need no chip (`bsp::uart`, `bsp::ring`).
+//! The parts of the UART's driver that work without a chip (`bsp::uart`, `bsp::ring`).
 
 use bsp::ring::{Inbox, Ring, LOST};
 use bsp::uart::divider;
 
-/// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV 22.8125 for 115.2 kbit/s, 273.4375
-/// for 9.6, 2.875 for 921.6 (0.93 % off).
+/// RM0090 section 30.3.4 (42 MHz, 16 samples a bit): USARTDIV is 22.8125 for 115.2 kbit/s, 273.4375
+/// for 9.6 kbit/s, and 2.875 for 921.6 kbit/s (an error of 0.93 %).
 #[test]
 fn dividers_of_the_manual() {
     assert_eq!(divider(42_000_000, 115_200), Some(365));
     assert_eq!(divider(42_000_000, 9_600), Some(4375));
     assert_eq!(divider(42_000_000, 921_600), Some(46));
     assert_eq!(divider(16_000_000, 1_000_000), Some(16));
-    // 15 cycles a bit are too few, 2.8 % are too far off, 70 000 do not fit.
+    // 15 cycles a bit are too few, an error of 2.8 % is too large, 70 000 does not fit.
     for (clock, rate) in [(15_000_000, 1_000_000), (1_750_000, 100_000), (42_000_000, 600), (42_000_000, 0)] {
         assert_eq!(divider(clock, rate), None, "{clock} {rate}");
     }
@@ -34,14 +34,14 @@ fn all<const N: usize>(inbox: &Inbox<N>) -> Vec<u8> {
     std::iter::from_fn(|| inbox.take()).collect()
 }
 
-/// Wherever bytes are missing there is one mark, once there is room for it: what came before and
-/// what comes after never touch.
+/// There is one mark at each place with lost bytes, as soon as there is room for it: bytes before
+/// and after the loss are never adjacent.
 #[test]
 fn a_mark_stands_wherever_bytes_are_missing() {
     let inbox: Inbox<6> = Inbox::new();
     inbox.come(Some(b'a'), false);
     assert!(!inbox.take_overruns() && !inbox.is_pressing());
-    // Nobody could read the next one; and behind the one after it the controller lost some.
+    // The first byte is unreadable; after the second one the controller lost bytes.
     inbox.come(None, false);
     inbox.come(Some(b'b'), true);
     assert!(inbox.take_overruns() && !inbox.take_overruns());
@@ -49,7 +49,7 @@ fn a_mark_stands_wherever_bytes_are_missing() {
     assert!(inbox.is_pressing());
     assert_eq!(all(&inbox), [b'a', LOST, b'b', LOST, b'c']);
 
-    // Five fit. The others are missing until there is room for the mark and what follows it.
+    // Five bytes fit. The others are lost until there is room for the mark and the next byte.
     for byte in b"1234567" {
         inbox.come(Some(*byte), false);
     }

@@ -1,5 +1,5 @@
-//! The page of `coflash ui` in a real Chromium, driven by tests/python/ui_page.py: against nodes
-//! (`coboot-node`), which the script starts itself, and against the emulated board.
+//! Tests of `coflash ui` in a real Chromium, which tests/python/ui_page.py controls: with nodes
+//! (`coboot-node`) that the script starts, and with the emulated board.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -14,14 +14,14 @@ use coboot_tests::firmware;
 /// One browser at a time: several would only slow each other down.
 static BROWSER: Mutex<()> = Mutex::new(());
 
-/// What `cargo xtask test` has built or installed.
+/// A program that `cargo xtask test` has built or installed.
 fn given(name: &str) -> PathBuf {
     let path =
         env::var_os(name).unwrap_or_else(|| panic!("{name} is not set: run the tests by `cargo xtask test`"));
     path.into()
 }
 
-/// The script with what every scenario needs, and a folder for its files.
+/// The script with the arguments of every scenario, and a folder for its files.
 fn script(scenario: &str) -> (Command, PathBuf) {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("ui-{scenario}"));
     let _ = fs::remove_dir_all(&folder);
@@ -34,7 +34,7 @@ fn script(scenario: &str) -> (Command, PathBuf) {
         .arg(given("COBOOT_COFLASH"))
         .arg("--folder")
         .arg(&folder);
-    // Where the pictures of the documentation are wanted, they are taken here.
+    // The pictures of the documentation are taken here, if they are requested.
     if let Some(pictures) = env::var_os("COBOOT_PICTURES") {
         command.arg("--pictures").arg(pictures);
     }
@@ -52,7 +52,7 @@ fn check(scenario: &str, output: &Output, folder: &Path) {
     let _ = fs::remove_dir_all(folder);
 }
 
-/// A scenario with nodes of its own.
+/// Runs a scenario with nodes of its own.
 #[track_caller]
 fn with_nodes(scenario: &str) {
     let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);

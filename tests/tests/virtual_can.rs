@@ -1,5 +1,5 @@
-//! CAN over UART: the bootloader and the application that talk through the board's serial port, to
-//! `coflash` and its adapter.
+//! CAN over UART: the bootloader and the application use the board's serial port, with `coflash`
+//! and its adapter.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -17,7 +17,7 @@ use coflash::bus::Adapter;
 use coflash::device::{Session, Timing};
 use coflash::update::{flash, FlashOptions};
 
-/// A board in its bootloader, with nothing installed.
+/// A board in its bootloader, with no program installed.
 fn empty_board() -> Bench {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_VIRTUAL_CAN);
     bench.power_on();
@@ -25,13 +25,13 @@ fn empty_board() -> Bench {
     bench
 }
 
-/// What the board has said on its line, and when the last of it was.
+/// The text that the board has sent on its line since the previous call.
 fn said(bench: &mut Bench) -> String {
     String::from_utf8(bench.usart().take_sent().iter().map(|character| character.byte).collect())
         .expect("ASCII")
 }
 
-/// Says text to the board and gives what it says within the next `ms`.
+/// Sends text to the board and returns its output of the next `ms`.
 fn ask(bench: &mut Bench, text: &[u8], ms: u64) -> String {
     let now = bench.time();
     assert_eq!(bench.usart().receive(text, now), text.len());
@@ -47,8 +47,9 @@ fn session(adapter: &mut dyn Adapter) -> Session<'_> {
     Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default())
 }
 
-/// Boot-up and emergency (docs/protocol.md) in the text of the CAN232's manual, and an SDO upload
-/// of 1000h (CiA 301 section 7.2.4.3.5), all by hand: 10000000h is the bootloader's device type.
+/// Boot-up and emergency (docs/protocol.md) in the text format of the CAN232's manual, and an SDO
+/// upload of 1000h (CiA 301 section 7.2.4.3.5), all by hand: 10000000h is the bootloader's device
+/// type.
 #[test]
 fn the_text_on_the_line() {
     let mut bench = empty_board();
@@ -56,20 +57,20 @@ fn the_text_on_the_line() {
     assert_eq!(told, "t701100\rt081800FF00424F4F5406\r");
     assert_eq!(ask(&mut bench, b"C\rS4\rO\r", 20), "\r\r\r");
     assert_eq!(ask(&mut bench, b"t60184000100000000000\r", 20), "z\rt58184300100000000010\r");
-    // Somebody else's, network management for nobody here, a remote frame and 29 bits:
+    // A frame for another node, NMT for another node, a remote frame and one with 29 bits: they are
     // acknowledged, as by any node of a bus.
     assert_eq!(
         ask(&mut bench, b"t60284000100000000000\rt00028105\rr6010\rT0000060184000100000000000\r", 30),
         "z\rz\rz\rZ\r"
     );
-    // Closed, it hears nothing and says nothing; heartbeats come every second.
+    // With a closed channel it receives and sends nothing; heartbeats come every second.
     assert_eq!(ask(&mut bench, b"C\rt60184000100000000000\r", 2500), "\r\x07");
     assert_eq!(ask(&mut bench, b"O\r", 2000).matches("t70117F\r").count(), 2);
     bench.assert_nothing_unmodelled();
 }
 
-/// The main job over the line: install, verify, start, call back, update; and nothing on the CAN
-/// bus meanwhile.
+/// The main job over the line: install, verify, start, call back, update. Meanwhile the CAN bus has
+/// no frame.
 #[test]
 fn coflash_updates_the_device_through_its_serial_port() {
     let mut bench = empty_board();
@@ -82,7 +83,7 @@ fn coflash_updates_the_device_through_its_serial_port() {
             .unwrap_or_else(|error| panic!("{round}: {error}"));
         assert!(!session.device_type().unwrap().unwrap().is_bootloader(), "the application runs");
         assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1);
-        // The second time it is the application that is called back.
+        // The second time the application is called back.
     }
     let mut session = session(&mut adapter);
     session.command(1, ProgramControl::StartBootloader).unwrap();
@@ -97,14 +98,13 @@ fn coflash_updates_the_device_through_its_serial_port() {
     bench.assert_nothing_unmodelled();
 }
 
-/// Asks for 1F57h/1 by hand; whether it is answered within 10 ms: 2.3 ms for the question on the
-/// line, 2 for the answer.
+/// Requests 1F57h/1 by hand; returns whether the answer comes within 10 ms: the request takes 2.3
+/// ms on the line, the answer 2 ms.
 fn is_answered(bench: &mut Bench) -> bool {
     ask(bench, b"t601840571F0100000000\r", 10).contains("t581843571F01")
 }
 
-/// What nobody should send: it is refused line by line, the device stays reachable, and its
-/// heartbeats come.
+/// Invalid input: it is refused line by line, the device stays reachable, and its heartbeats come.
 #[test]
 fn noise_on_the_line_costs_nothing_but_itself() {
     let mut bench = empty_board();
@@ -114,7 +114,7 @@ fn noise_on_the_line_costs_nothing_but_itself() {
         state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         (state >> 56) as u8
     })
-    // Not that it closes the channel by chance.
+    // The noise must not close the channel by chance.
     .filter(|byte| *byte != b'C')
     .take(40_000)
     .collect();
@@ -124,14 +124,14 @@ fn noise_on_the_line_costs_nothing_but_itself() {
     assert!((3..=4).contains(&told.matches("t70117F\r").count()), "{told:?}");
     ask(&mut bench, b"\r", 10);
     assert!(is_answered(&mut bench));
-    // A host that wants answers to more than the line can carry: twice as many as it says. The
-    // device's own are among them.
+    // A host requests twice as many answers as the line can carry. The device's own frames are
+    // still sent.
     let flood = b"V\r".repeat(15_000);
     let told = ask(&mut bench, &flood, 2700);
     assert!((2..=3).contains(&told.matches("t70117F\r").count()), "heartbeats in a flood");
     bench.run_ms(100);
     assert!(is_answered(&mut bench));
-    // Half a line, and the host starts anew.
+    // After half a line, the host starts a new one.
     assert_eq!(ask(&mut bench, b"t60184057\r", 10), "\x07");
     assert!(is_answered(&mut bench));
     assert_eq!(ask(&mut bench, &[b'x'; 3000], 300).trim_matches(|c: char| c != '\x07'), "");
@@ -140,9 +140,9 @@ fn noise_on_the_line_costs_nothing_but_itself() {
     bench.assert_nothing_unmodelled();
 }
 
-/// The host's terminal runs at another bit rate: nothing of it is taken for a frame, an emergency
-/// tells that something was lost (8110h, controller overrun), and the right one is understood at
-/// once.
+/// The host's terminal runs at another bit rate: none of its text is taken for a frame, an
+/// emergency reports that something was lost (8110h, controller overrun), and text at the right bit
+/// rate is understood at once.
 #[test]
 fn another_bit_rate_is_noticed() {
     let mut bench = empty_board();
@@ -169,8 +169,7 @@ fn never_silent_during_an_erase() {
     session_.command(1, ProgramControl::Clear).unwrap();
     session_.command(1, ProgramControl::Clear).unwrap();
     drop(adapter);
-    // The adapter has closed the channel as it went.
-    // A heartbeat may fall into these 10 ms.
+    // The adapter closed the channel when it ended. A heartbeat may come in these 10 ms.
     assert_eq!(ask(&mut bench, b"O\r", 10).replace("t70117F\r", ""), "\r\r");
     let answers = (0..100).filter(|_| is_answered(&mut bench)).count();
     assert_eq!(answers, 100);
@@ -181,7 +180,7 @@ fn never_silent_during_an_erase() {
     assert_eq!(bench.machine().counters().flash_stalls, 0);
 }
 
-/// The command line, in real time, by a terminal that it takes for a serial port.
+/// The command line in real time, with a terminal as its serial port.
 #[cfg(unix)]
 #[test]
 fn the_coflash_command_finds_the_device_at_its_serial_port() {
@@ -196,8 +195,8 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
     assert!(told.contains("the bootloader") && told.contains(bsp::IDENTITY.device_name), "{told}");
 }
 
-/// python-can's adapter and python-canopen, neither of which knows that there is no box between:
-/// they install and start the application.
+/// python-can's adapter and python-canopen, both without knowledge of the device's own adapter,
+/// install and start the application.
 #[cfg(unix)]
 #[test]
 fn python_canopen_flashes_the_device_through_its_serial_port() {

@@ -1,4 +1,4 @@
-//! What a device does that crashed, or hangs.
+//! The behaviour of a device that has crashed or hangs.
 
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
@@ -8,7 +8,7 @@ use emulator::machine::{ResetCause, Stop};
 use emulator::time::Time;
 use object::{Object, ObjectSymbol};
 
-/// The emergencies since then.
+/// The emergencies since a time.
 fn emergencies(bench: &Bench, since: Time) -> Vec<Vec<u8>> {
     let id = 0x80 + u32::from(NODE);
     bench.frames_since(since).into_iter().filter(|frame| frame.1 == id).map(|frame| frame.2).collect()
@@ -22,7 +22,7 @@ fn address_of(part: &str) -> u32 {
     symbol.unwrap_or_else(|| panic!("no symbol {part}")).address() as u32 & !1
 }
 
-/// Overwrites the beginning of a function, which lies in RAM, with Thumb code.
+/// Overwrites the start of a function in RAM with Thumb code.
 fn patch(bench: &mut Bench, function: &str, code: &[u16]) {
     let bytes: Vec<u8> = code.iter().flat_map(|half| half.to_le_bytes()).collect();
     bench.machine().write_ram(address_of(function), &bytes).expect("it lies in RAM");
@@ -50,7 +50,7 @@ fn a_task_that_hangs_ends_in_a_watchdog_reset_and_the_device_is_back() {
     bench.run_ms(2500);
     let events = bench.events();
     let [(at, Stop::Reset(ResetCause::IndependentWatchdog))] = events[..] else { panic!("{events:?}") };
-    // The LSI's nominal frequency; it is fed every 2 ms until then.
+    // The time is for the LSI's nominal frequency; before, the watchdog is fed every 2 ms.
     let ms = (at - hung).0 / 1_000_000_000;
     assert!((900..=1010).contains(&ms), "reset after {ms} ms");
     assert!(bench.session().device_type().unwrap().unwrap().is_bootloader());
@@ -59,7 +59,7 @@ fn a_task_that_hangs_ends_in_a_watchdog_reset_and_the_device_is_back() {
 #[test]
 fn a_task_that_is_alive_does_not_feed_for_one_that_is_not() {
     let mut bench = running_bootloader();
-    // `idle` hangs; protocol and tick go on, and so does the heartbeat until the reset.
+    // `idle` hangs; protocol and tick continue, and so does the heartbeat until the reset.
     let idle = bench.machine().pc();
     bench.machine().write_ram(idle, &HANG[0].to_le_bytes()).expect("idle sleeps in RAM");
     bench.run_ms(1500);
@@ -72,7 +72,7 @@ fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    // With a program installed: without the fault it would start.
+    // A program is installed: without the fault it would start.
     let file = firmware::blocks(firmware::APP_V1);
     flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
@@ -100,7 +100,7 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
     bench.confirm_program();
     for crash in 1..=3 {
         bench.events();
-        // An application that started the watchdog and hangs: LSI / 4, 8 ms.
+        // An application that started the watchdog and then hangs: LSI / 4, 8 ms.
         let from = bench.time();
         bench.machine().start_watchdog(64);
         bench.run_ms(200);

@@ -1,8 +1,8 @@
-//! zencan-client, a CANopen master that we did not write, unmodified, against emulated devices: as
-//! SDO client, LSS master and NMT master.
+//! zencan-client, an unmodified CANopen master by other authors, with emulated devices: as SDO
+//! client, LSS master and NMT master.
 //!
-//! Its transport is a pair of traits. Here they are two queues to the bench, and its time-outs run
-//! on virtual time, so the tests are as deterministic as the bench.
+//! Its transport is a pair of traits. Here they are two queues to the bench, and its time-outs use
+//! virtual time, so the tests are as deterministic as the bench.
 
 use std::time::Duration;
 
@@ -21,17 +21,17 @@ use zencan_client::common::traits::{AsyncCanReceiver, AsyncCanSender, CanSendErr
 use zencan_client::common::NodeId;
 use zencan_client::{BusManager, RawAbortCode, SdoClient, SdoClientError};
 
-/// How long zencan may take in all, in virtual time: it would scan for ever for a device that does
-/// not mind being found.
+/// The longest time for all of zencan's work, in virtual time: it would scan without end for a
+/// device that stays unconfigured after it was found.
 const PATIENCE: Duration = Duration::from_secs(120);
 
-/// zencan's way to the bus.
+/// zencan's sender to the bus.
 struct Sender(UnboundedSender<CanMessage>);
 
-/// zencan's way from the bus.
+/// zencan's receiver from the bus.
 struct Receiver(UnboundedReceiver<CanMessage>);
 
-/// The bench has gone.
+/// The bench has ended.
 #[derive(Debug)]
 struct Gone(CanMessage);
 
@@ -65,7 +65,7 @@ impl AsyncCanReceiver for Receiver {
     }
 }
 
-/// Runs zencan's side on the bench, to its end.
+/// Runs zencan's part on the bench, to its end.
 fn on<T>(bench: &mut Bench, peer: impl AsyncFnOnce(Sender, Receiver) -> T) -> T {
     let runtime =
         tokio::runtime::Builder::new_current_thread().enable_time().start_paused(true).build().unwrap();
@@ -80,8 +80,8 @@ fn on<T>(bench: &mut Bench, peer: impl AsyncFnOnce(Sender, Receiver) -> T) -> T 
     })
 }
 
-/// Lets the bus live: in turn, zencan does all it can, and the bench runs until zencan has
-/// something to hear, or for a millisecond, which then passes for zencan as well.
+/// Runs the bus: zencan does all that it can, then the bench runs until there is a frame for
+/// zencan, or for a millisecond, which then passes for zencan as well.
 async fn drive(
     bench: &mut Bench,
     mut sent: UnboundedReceiver<CanMessage>,
@@ -96,7 +96,7 @@ async fn drive(
         match bench.receive(Duration::from_millis(1)).unwrap() {
             Some(frame) => {
                 let Id::Standard(id) = frame.id() else { panic!("a 29-bit identifier: {frame:?}") };
-                // Nobody may be listening any more.
+                // zencan's receiver may be closed already.
                 let _ = received.send(CanMessage::new(CanId::Std(id.as_raw()), frame.data()));
                 tokio::task::yield_now().await;
             }
@@ -147,12 +147,12 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
         );
         // Segments.
         assert_eq!(client.read_device_name().await.as_deref(), Ok(bsp::IDENTITY.device_name));
-        // Blocks: of the server's answer C6h (CRC, size announced) zencan 0.0.5 takes two bits for
-        // the subcommand, where CiA 301 has one and the other says that the size follows. So it
-        // gives up, without a word; the server serves the next request all the same. (Block upload
-        // to a client is shown with python-canopen.)
+        // Blocks: in the server's answer C6h (CRC, size announced) zencan 0.0.5 takes two bits for
+        // the subcommand, where CiA 301 has one and the other one says that the size follows. So it
+        // gives up without an abort; the server still serves the next request. (python-canopen
+        // tests block upload to a client.)
         assert_eq!(client.block_upload(0x1008, 0).await, Err(SdoClientError::MalformedResponse));
-        // What is not there, cannot be read, cannot be written, or makes no sense.
+        // Objects that do not exist, cannot be read or cannot be written, and invalid values.
         assert_eq!(client.upload(0x2000, 0).await, refused(0x2000, 0, AbortCode::NoSuchObject));
         assert_eq!(client.upload(0x1018, 9).await, refused(0x1018, 9, AbortCode::NoSuchSubIndex));
         assert_eq!(client.upload(0x1F50, 1).await, refused(0x1F50, 1, AbortCode::WriteOnly));
@@ -224,11 +224,11 @@ fn as_lss_master_it_finds_three_devices_by_fastscan_and_gives_each_a_node_id() {
         sorted.iter().map(|serial| LssIdentity::new(vendor_id, product_code, revision, *serial)).collect();
     assert_eq!(identities, expected);
 
-    // Now, and after the power was off.
+    // The node-IDs hold now, and after a power-off.
     for _ in 0..2 {
         let nodes = on(&mut bench, async |sender, receiver| {
             let mut bus = BusManager::new(sender, receiver);
-            // Two heartbeats each.
+            // In this time each node sends two heartbeats.
             tokio::time::sleep(Duration::from_millis(2500)).await;
             bus.scan_nodes().await.unwrap()
         });

@@ -1,13 +1,13 @@
-//! The words of a command line. A job takes the options it knows; [`Args::none_left`] refuses the
-//! rest.
+//! The arguments of a command line. A job takes the options it knows; [`Args::none_left`] refuses
+//! the rest.
 
 use crate::Outcome;
 
-/// What stands behind `cargo xtask JOB`.
+/// The arguments after `cargo xtask JOB`.
 pub struct Args {
-    /// The words up to `--`.
+    /// The words before `--`.
     own: Vec<String>,
-    /// `--` and all behind it, meant for another program.
+    /// `--` and the words after it, for another program.
     behind: Vec<String>,
 }
 
@@ -32,7 +32,7 @@ impl Args {
             .any(|word| word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('=')))
     }
 
-    /// Takes a flag; whether it was there.
+    /// Takes a flag; returns whether it was there.
     pub fn flag(&mut self, name: &str) -> bool {
         let before = self.own.len();
         self.own.retain(|word| word != name);
@@ -42,7 +42,7 @@ impl Args {
     /// Takes `NAME VALUE` or `NAME=VALUE`.
     ///
     /// # Errors
-    /// When the value is missing, or the option stands there twice.
+    /// When the value is missing, or the option is there twice.
     pub fn value(&mut self, name: &str) -> Outcome<Option<String>> {
         let mut found = None;
         while let Some(at) = self.own.iter().position(|word| {
@@ -61,17 +61,17 @@ impl Args {
         Ok(found)
     }
 
-    /// All words that no one took, for the program that the job starts.
+    /// All words that were not taken, for the program that the job starts.
     pub fn rest(self) -> Vec<String> {
         let mut words = self.own;
         words.extend(self.behind);
         words
     }
 
-    /// For a job that passes nothing on.
+    /// Checks that all words were taken, for a job that passes none on.
     ///
     /// # Errors
-    /// When there is a word that no one took.
+    /// When a word is left.
     pub fn none_left(self) -> Outcome {
         match self.rest().first() {
             None => Ok(()),

@@ -1,11 +1,11 @@
-//! `cargo xtask arrows`: who may depend on whom.
+//! `cargo xtask arrows`: checks which crate depends on which.
 //!
-//! The house stands on a few independent walls. The emulator knows nothing of our drivers, so that
-//! a mistake in one does not cancel out in the other; the application knows nothing of `boot-core`,
-//! so that it can be replaced; the wire code knows nothing of us at all; and nothing that leaves
-//! the desk links the GPL-2.0 library under the emulator. This check reads the manifests as cargo
-//! does, and the sources where a manifest does not tell: the emulator's, and the roots of the
-//! crates without `unsafe`.
+//! The crates are separated by a few rules. The emulator does not use our drivers, so that a
+//! mistake in one does not cancel out in the other. The application does not use `boot-core`, so
+//! that it can be replaced. The wire code uses no other crate of ours. No delivered program links
+//! the emulator's GPL-2.0 library. This check reads the manifests as cargo does. It also reads
+//! sources where the manifest is not enough: the emulator's, and the roots of the crates without
+//! `unsafe`.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -25,21 +25,21 @@ forbid unsafe code; and that the modules of a crate do not use each other in cir
 coflash, its files), those of boot-core and coflash no others than xtask/src/rooms.rs allows.
 ";
 
-/// What one of our crates may depend on, of ours. Dev- and build-dependencies are held to the same
-/// row.
+/// The crates of ours that one of our crates may depend on. Dev- and build-dependencies follow the
+/// same rule.
 struct Rule {
     name: &'static str,
     may_use: &'static [&'static str],
 }
 
-/// The arrows. A new crate needs a row.
+/// The permitted dependencies. A new crate needs a row.
 const RULES: &[Rule] = &[
     Rule { name: "shared-abi", may_use: &[] },
     Rule { name: "canopen", may_use: &[] },
     Rule { name: "seal", may_use: &[] },
     Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi"] },
     Rule { name: "coboot-app", may_use: &["canopen", "shared-abi"] },
-    // On the host alone: build scripts and tools.
+    // Only on the host: build scripts and tools.
     Rule { name: "coboot-linker", may_use: &["shared-abi"] },
     Rule { name: "bsp", may_use: &["canopen", "shared-abi"] },
     Rule { name: "bootloader", may_use: &["boot-core", "bsp", "coboot-linker", "seal", "shared-abi"] },
@@ -66,17 +66,18 @@ const RULES: &[Rule] = &[
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
 
-/// The crates that need no `unsafe` and say so to the compiler.
+/// The crates that need no `unsafe` and forbid it to the compiler.
 const PURE: &[&str] = &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "xtask"];
-/// How they say it.
+/// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 
-/// Who may link the GPL-2.0 library.
+/// The crates that may link the GPL-2.0 library.
 const MAY_LINK_UNICORN: &[&str] = &["emulator", "coboot-tests"];
 
-/// The one module of shared-abi that tells of the silicon and not of our choices.
+/// The only module of shared-abi that describes the chips and not our choices.
 const GEOMETRY: &str = "geometry";
-/// Where the emulator may look a board up by its name: its command line, which has no register.
+/// The only part of the emulator that may look up a board by its name: its command line, which
+/// models no register.
 const COMMAND_LINE: &str = "src/bin";
 
 pub fn run(args: Args) -> Outcome {
@@ -132,15 +133,15 @@ fn read(path: &Path) -> Outcome<String> {
 /// A crate of the workspace.
 #[derive(Debug, PartialEq, Eq)]
 struct Package {
-    /// What the sources call it: the name of its library, with dashes, or of the package if there is
-    /// no library. (The registry knows `canopen` as the package `coboot-canopen`.)
+    /// The crate's name in sources: the name of its library, with dashes, or of the package if
+    /// there is no library. (In the registry `canopen` is the package `coboot-canopen`.)
     name: String,
     folder: PathBuf,
     /// Names of all dependencies by their real names, with their kind (`normal`, `dev`, `build`).
     dependencies: Vec<(String, &'static str)>,
 }
 
-/// Reads what `cargo metadata --no-deps` printed.
+/// Reads the output of `cargo metadata --no-deps`.
 fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
     let mut libraries = BTreeMap::new();
     for package in metadata.get("packages").items() {
@@ -178,7 +179,7 @@ fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
         .ok_or_else(|| "cargo metadata printed something unexpected.".into())
 }
 
-/// The arrows that no rule allows, in words.
+/// The dependencies that no rule permits, as messages.
 fn broken_arrows(packages: &[Package]) -> Vec<String> {
     let rules: BTreeMap<_, _> = RULES.iter().map(|rule| (rule.name, rule.may_use)).collect();
     let mut broken = Vec::new();
@@ -192,7 +193,7 @@ fn broken_arrows(packages: &[Package]) -> Vec<String> {
             let dependency = dependency.as_str();
             let ours =
                 rules.contains_key(dependency) || packages.iter().any(|package| package.name == dependency);
-            // A crate names itself among its dev-dependencies to test with all its features.
+            // A crate is among its own dev-dependencies in order to test with all its features.
             let itself = dependency == name && *kind == "dev";
             if ours && !itself && !may_use.contains(&dependency) {
                 broken.push(format!("{name} -> {dependency} ({kind}): not among its arrows ({may_use:?})"));
@@ -229,11 +230,11 @@ fn sources(folder: &Path) -> Outcome<Vec<PathBuf>> {
     Ok(sources)
 }
 
-/// Uses of shared-abi other than `shared_abi::geometry`, with the number of their line. Of a group
-/// (`use shared_abi::{…}`) each foreign member; an alias of the crate as a whole counts as foreign.
+/// Uses of shared-abi other than `shared_abi::geometry`, with their line numbers. Each foreign
+/// member of a group (`use shared_abi::{…}`) counts; so does an alias of the whole crate.
 fn foreign_modules(source: &str) -> Vec<(usize, String)> {
     let mut found = Vec::new();
-    // Comments are cut away (in place, so that line numbers hold): text may speak of anything.
+    // Comments are removed (in place, to keep the line numbers): they may name any module.
     let code: String = source
         .split_inclusive('\n')
         .map(|line| match line.find("//") {
@@ -268,7 +269,7 @@ fn foreign(path: &str) -> Option<String> {
     (module != GEOMETRY).then(|| module.to_owned())
 }
 
-/// The members of a group whose opening brace was taken away; braces inside belong to a member.
+/// The members of a group, without its opening brace; inner braces belong to a member.
 fn members(group: &str) -> impl Iterator<Item = &str> {
     let mut depth = 1;
     let mut borders = vec![0];
@@ -292,7 +293,7 @@ fn members(group: &str) -> impl Iterator<Item = &str> {
 mod tests {
     use super::*;
 
-    /// A workspace of these arrows: `from -> to`, `from dev to`, `from build to`.
+    /// A workspace with these dependencies: `from -> to`, `from dev to`, `from build to`.
     fn workspace_of(arrows: &[&str]) -> Vec<Package> {
         let mut packages: Vec<Package> = Vec::new();
         for arrow in arrows {
@@ -378,8 +379,8 @@ mod tests {
         assert_eq!(broken_arrows(&house).len(), 2);
     }
 
-    /// The form is that of `cargo metadata --format-version 1 --no-deps`; renamed and of every
-    /// kind.
+    /// The output format of `cargo metadata --format-version 1 --no-deps`, with a renamed
+    /// dependency and all kinds.
     #[test]
     fn metadata_is_read_by_the_real_names() {
         let text = r#"{"packages":[{"name":"coboot-canopen","manifest_path":"/x/canopen/Cargo.toml","targets":[

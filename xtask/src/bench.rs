@@ -1,4 +1,4 @@
-//! `cargo xtask bench`: how fast a program gets into the device, and what that costs the host.
+//! `cargo xtask bench`: measures how fast a program is downloaded, and the load on the host.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
@@ -28,7 +28,7 @@ pub fn run(mut args: Args) -> Outcome {
     let mut bench = process::cargo("run");
     bench.args(build::tests_args(board)).args(["--bin", "bench"]);
     bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
-    // Optimised, as users have it.
+    // Optimised, as a user runs it.
     let cost = || {
         process::run(process::cargo("build").args(["--release", "--package", "coboot-node"]))?;
         let mut cost = process::cargo("run");
@@ -38,7 +38,7 @@ pub fn run(mut args: Args) -> Outcome {
     if json {
         let emulated = process::output(bench.args(["--", "--json"]))?;
         let host = process::output(cost()?.args(["--", "--json"]))?;
-        // The first is an object, to which the second is added.
+        // The first result is an object; the second one is added to it.
         let emulated =
             emulated.trim_end().strip_suffix('}').ok_or("the bench printed something unexpected.")?;
         println!("{emulated},\n\"host\": {}}}", host.trim_end());

@@ -1,7 +1,7 @@
-//! `cargo xtask docs`: the pages as a site.
+//! `cargo xtask docs`: makes a site of the pages.
 //!
-//! mdBook renders a copy of the pages in which every file lies where the repository has it, so that
-//! a link is the same here, in the repository, and on a server that shows Markdown.
+//! mdBook renders a copy of the pages in which every file has its path of the repository. So a link
+//! is the same in the site, in the repository, and on a server that shows Markdown.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -23,10 +23,10 @@ mdBook is installed into target/tools where it is missing, which takes some minu
 
 const MDBOOK: &str = "mdbook";
 const VERSION: &str = "0.5.4";
-/// Of mdBook's features the one that a reader has something of.
+/// The only feature of mdBook that is useful for readers.
 const FEATURES: [&str; 3] = ["--no-default-features", "--features", "search"];
 
-/// The order of the pages; its links lead from `docs/` on.
+/// The order of the pages; its links start at `docs/`.
 const SUMMARY: &str = "docs/SUMMARY.md";
 
 pub fn run(args: Args) -> Outcome {
@@ -64,7 +64,7 @@ fn failed(done: &str, path: &Path, error: &std::io::Error) -> String {
     format!("{} cannot be {done}: {error}.", workspace::shown(path))
 }
 
-/// The pages that the summary does not have, as faults.
+/// The pages that are missing in the summary, as messages.
 fn not_in(summary: &str, pages: &[PathBuf]) -> Vec<String> {
     let targets: BTreeSet<PathBuf> =
         links::of_page(Path::new(SUMMARY), summary).into_iter().map(|link| link.file).collect();
@@ -77,7 +77,7 @@ fn not_in(summary: &str, pages: &[PathBuf]) -> Vec<String> {
         .collect()
 }
 
-/// Copies pages, pictures, what they link to, and mdBook's configuration.
+/// Copies pages, pictures, the files that they link to, and mdBook's configuration.
 fn gather(to: &Path) -> Outcome {
     let mut files: BTreeSet<PathBuf> = links::pages()?.into_iter().collect();
     files.extend(links::all()?.into_iter().map(|link| link.file));
@@ -92,7 +92,7 @@ fn gather(to: &Path) -> Outcome {
         .map_err(|error| failed("written", &summary, &error))
 }
 
-/// The summary with links that lead from the root of the repository on.
+/// The summary with links from the root of the repository.
 fn from_the_root(summary: &str) -> String {
     summary.replace("](", "](docs/").replace("](docs/../", "](")
 }
@@ -103,14 +103,13 @@ fn copy(from: &Path, to: &Path) -> Outcome {
     fs::copy(from, to).map(drop).map_err(|error| failed("copied", from, &error))
 }
 
-/// What mdBook said that is no mere information.
+/// The warnings and errors in mdBook's output.
 fn warnings(said: &str) -> Vec<String> {
     let is_good = |line: &str| line.trim_start().starts_with("INFO") || line.trim().is_empty();
     said.lines().filter(|line| !is_good(line)).map(str::to_owned).collect()
 }
 
-/// References of the site that lead nowhere: to a file that is not there, or to a place that its
-/// page does not have.
+/// The broken references of the site: to a missing file, or to a missing place of a page.
 fn broken(book: &Path) -> Outcome<Vec<String>> {
     let mut pages = BTreeMap::new();
     let mut folders = vec![book.to_owned()];
@@ -149,7 +148,7 @@ fn broken(book: &Path) -> Outcome<Vec<String>> {
     Ok(faults.into_iter().collect())
 }
 
-/// The values of an attribute, as they stand in the text of a page.
+/// The values of an attribute, as the page's text has them.
 fn attributes<'h>(html: &'h str, name: &str) -> impl Iterator<Item = &'h str> {
     let opening = format!(" {name}=\"");
     let behind = html.match_indices(&opening).map(|(at, opening)| at + opening.len()).collect::<Vec<_>>();

@@ -1,4 +1,4 @@
-//! `cargo xtask build`: the images that go onto the chip.
+//! `cargo xtask build`: builds the images for the chip.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -32,17 +32,17 @@ pub struct Variant {
     pub name: &'static str,
     /// The package, which is also the name of its program.
     pub package: &'static str,
-    /// Features besides the one that chooses the board.
+    /// The features in addition to the one for the board.
     pub features: &'static str,
-    /// What the build finds in `COBOOT_PRODUCT`, where that matters.
+    /// The value of `COBOOT_PRODUCT` for the build, if it needs one.
     pub product: Option<&'static str>,
-    /// The number of the program that it is; 0 for a bootloader.
+    /// The number of the program; 0 for a bootloader.
     pub program: u8,
-    /// Boards with fewer programs have no such image.
+    /// The least number of programs of a board with this image.
     pub least_programs: usize,
 }
 
-/// Rows as they stand, and behind them one for each feature with each product, on boards with two
+/// The rows as written, followed by one row for each feature with each product, on boards with two
 /// programs.
 macro_rules! table {
     ($($row:expr,)+; $($feature:literal with $($product:literal),+;)+) => {
@@ -54,53 +54,53 @@ macro_rules! table {
     };
 }
 
-/// All of them, in the order in which they are built.
+/// All images, in the order in which they are built.
 pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader", ""),
     product("bootloader-paulus", "paulus"),
     product("bootloader-esacademy", "esacademy"),
     product("bootloader-lift", "lift"),
     product("bootloader-crc-16", "crc-16"),
-    // Everything that a product may switch off is off.
+    // All options that a product may switch off are off.
     product("bootloader-least", "least"),
-    // The choices that stand for a board's own: switches, identifiers, ranges.
+    // A board's own choices: switches, identifiers, ranges.
     product("bootloader-switches", "switches"),
-    // They tell what they do, each in a way of its own (`cargo xtask emulate --log=WAY`).
+    // They log their work, each one in another way (`cargo xtask emulate --log=WAY`).
     bootloader("bootloader-log-rtt", "log-rtt"),
     bootloader("bootloader-log-defmt", "log-defmt"),
     bootloader("bootloader-log-uart", "log-uart"),
     bootloader("bootloader-virtual-can", "virtual-can"),
-    // It takes programs from the holder of a key alone.
+    // It accepts programs only from the holder of a key.
     bootloader("bootloader-sealed", "sealed"),
-    // With the debugger interface, for the tests alone: never ship it.
+    // With the debugger interface, only for the tests: never ship it.
     bootloader("bootloader-debugger", "debugger"),
     application("app-debugger", "debugger"),
-    // Version 1 is the template as it stands.
+    // Version 1 is the unchanged template.
     application("app-v1", ""),
     application("app-v2", "version-2"),
     application("app-virtual-can", "virtual-can"),
     Variant { program: 2, least_programs: 2, ..application("app-program-2", "version-2,program-2") },
     Variant { least_programs: 2, ..application("app-lift", "lift") },
     Variant { least_programs: 2, ..application("app-lift-v2", "lift,version-2") },
-    // What the sessions of the dialects need over UART (tests/tests/matrix.rs).
+    // The image for the sessions of the dialects over UART (tests/tests/matrix.rs).
     Variant { least_programs: 2, ..application("app-virtual-can-v2", "virtual-can,version-2") },
     Variant { least_programs: 2, ..application("app-virtual-can-lift", "virtual-can,lift") },
     ;
-    // Each log and the serial transport with each dialect, `bootloader-log-rtt-paulus` for one.
+    // Each log and the serial transport with each dialect, for example `bootloader-log-rtt-paulus`.
     "log-rtt" with "paulus", "esacademy", "lift";
     "log-defmt" with "paulus", "esacademy", "lift";
     "log-uart" with "paulus", "esacademy", "lift";
     "virtual-can" with "paulus", "esacademy", "lift";
 ];
 
-/// What the main job needs.
+/// The images for the main job.
 pub const MAIN: [&str; 3] = ["bootloader", "app-v1", "app-v2"];
 
 const fn bootloader(name: &'static str, features: &'static str) -> Variant {
     Variant { name, package: "bootloader", features, product: None, program: 0, least_programs: 1 }
 }
 
-/// The bootloader with the choices of a product of this name (`bootloader/src/test_products.rs`).
+/// The bootloader with the choices of this product (`bootloader/src/test_products.rs`).
 const fn product(name: &'static str, product: &'static str) -> Variant {
     Variant { product: Some(product), ..bootloader(name, "") }
 }
@@ -110,10 +110,10 @@ const fn application(name: &'static str, features: &'static str) -> Variant {
 }
 
 impl Variant {
-    /// The one of this name, if a board has it.
+    /// The image with this name, if the board has it.
     ///
     /// # Errors
-    /// When there is none; the message lists those that there are.
+    /// When there is none; the message lists the existing ones.
     pub fn by_name(board: &Layout, name: &str) -> Outcome<&'static Self> {
         Self::of(board).find(|variant| variant.name == name).ok_or_else(|| {
             let known: Vec<_> = Self::of(board).map(|variant| variant.name).collect();
@@ -121,17 +121,17 @@ impl Variant {
         })
     }
 
-    /// Those that a board has.
+    /// The images of a board.
     pub fn of(board: &Layout) -> impl Iterator<Item = &'static Self> + '_ {
         VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len())
     }
 
-    /// Whether it is a bootloader.
+    /// Whether the image is a bootloader.
     pub const fn is_bootloader(&self) -> bool {
         self.program == 0
     }
 
-    /// The flash that it is for.
+    /// The flash region of the image.
     fn region(&self, board: &Layout) -> Region {
         board.program(self.program).unwrap_or(board.bootloader_image())
     }
@@ -163,10 +163,10 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-/// Builds images of a board by their names, and prints their sizes; gives the folder they are in.
+/// Builds images of a board by their names, and prints their sizes; returns their folder.
 ///
 /// # Errors
-/// When one does not build, or is no image of this board.
+/// When an image does not build, or is not an image of this board.
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
@@ -175,8 +175,7 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     Ok(workspace::firmware_dir(board))
 }
 
-/// Builds all images of a board but those in C, and prints their sizes; gives the folder they are
-/// in.
+/// Builds all images of a board except those in C, and prints their sizes; returns their folder.
 ///
 /// # Errors
 /// As for [`images`].
@@ -184,11 +183,11 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
     images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
 
-/// Builds everything for several boards: [`all`] and [`c_applications`], chips beside one another,
-/// since the last step of each image keeps one core busy.
+/// Builds everything for several boards ([`all`] and [`c_applications`]), several chips at once,
+/// since the last step of each image uses only one core.
 ///
 /// # Errors
-/// As for [`images`]; the first one.
+/// As for [`images`]; the first error.
 pub fn boards(boards: &[&Layout]) -> Outcome {
     let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line.name()).collect();
     chips.sort_unstable();
@@ -205,18 +204,18 @@ pub fn boards(boards: &[&Layout]) -> Outcome {
                 })
             })
             .collect();
-        // A builder that panics has told why.
+        // A builder that panics has printed the reason.
         builders
             .into_iter()
             .try_for_each(|builder| builder.join().unwrap_or_else(|_| Err("a build broke off.".into())))
     })
 }
 
-/// Builds the application in C for each program of a board, and the same with the tests' object 2100h.
-/// A board that app-c/boards does not know has none.
+/// Builds the application in C for each program of a board, and the same with the tests' object
+/// 2100h. A board without a header in app-c/boards has none.
 ///
 /// # Errors
-/// When it does not build, or is no image of this board.
+/// When it does not build, or is not an image of this board.
 pub fn c_applications(board: &Layout) -> Outcome {
     let sources = workspace::root().join("app-c");
     if !sources.join("boards").join(board.board).with_extension("h").exists() {
@@ -233,8 +232,8 @@ pub fn c_applications(board: &Layout) -> Outcome {
     Ok(())
 }
 
-/// Builds the application in C for a place on a board, from its sources and one more; gives the ELF
-/// file.
+/// Builds the application in C for a program of a board, from its sources and an additional one;
+/// returns the ELF file.
 fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> Outcome<PathBuf> {
     let sources = workspace::root().join("app-c");
     let dir = workspace::firmware_dir(board);
@@ -266,13 +265,14 @@ fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> 
 
 /// The name of the application in C; for a build it stands for all applications in C.
 pub const C_APPLICATION: &str = "app-c";
-/// What the application in C is made of.
+/// The sources of the application in C.
 const C_SOURCES: [&str; 8] =
     ["startup.c", "board.c", "can.c", "coboot/reentry.c", "coboot/program.c", "objects.c", "sdo.c", "main.c"];
-/// What adds the tests' objects to it.
+/// The source of the tests' objects.
 const PROBE: &str = "../tests/c/probe.c";
-/// How it is compiled. It keeps the FPU off, so it is compiled for a chip without one; what it
-/// calls in the bootloader takes and gives no floating-point numbers.
+/// The compiler's arguments. The application does not use the FPU, so it is compiled for a chip
+/// without one; the functions of the bootloader that it calls have no floating-point arguments or
+/// results.
 const C_FLAGS: &[&str] = &[
     "--target=thumbv7em-none-eabi",
     "-mcpu=cortex-m4",
@@ -291,7 +291,7 @@ const C_FLAGS: &[&str] = &[
     "-Werror",
 ];
 
-/// The linker that comes with the Rust toolchain: what links the rest of the firmware.
+/// The linker of the Rust toolchain, which also links the rest of the firmware.
 fn rust_lld() -> Outcome<PathBuf> {
     let said = process::output(Command::new("rustc").args(["--version", "--verbose"]))?;
     let host = said.lines().find_map(|line| line.strip_prefix("host: ")).unwrap_or_default();
@@ -300,7 +300,7 @@ fn rust_lld() -> Outcome<PathBuf> {
     Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
 
-/// Builds a bootloader to look at; gives its ELF file.
+/// Builds a bootloader for examination; returns its ELF file.
 ///
 /// # Errors
 /// When it does not build.
@@ -311,7 +311,7 @@ pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outc
     pack::pack(&built(board, "bootloader")?)
 }
 
-/// Where the files of the boards are.
+/// The folders with the files of the boards.
 pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
 
 /// The files in such a folder.
@@ -324,18 +324,18 @@ pub fn board_files(folder: &str) -> Outcome<Vec<PathBuf>> {
     entries.map(|entry| Ok(entry.map_err(unreadable)?.path())).collect()
 }
 
-/// The arguments that tell cargo which board is meant, whatever the variable `COBOOT_BOARD` says.
+/// The arguments that set the board for cargo; they override the variable `COBOOT_BOARD`.
 pub fn board_args(board: &Layout) -> [String; 4] {
     let value = format!("env.COBOOT_BOARD.value=\"{}\"", board.board);
     ["--config", &value, "--config", "env.COBOOT_BOARD.force=true"].map(str::to_owned)
 }
 
-/// The feature that chooses the HAL of a board's chip.
+/// The feature that selects the HAL of a board's chip.
 pub fn chip_feature(board: &Layout) -> String {
     format!("bsp/chip-{}", board.chip.line.name())
 }
 
-/// The arguments that make cargo work on a firmware package for a board; for `cargo clippy`, too.
+/// The arguments for cargo to build a firmware package for a board; also for `cargo clippy`.
 pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
     let features = format!("{},{features}", chip_feature(board));
     let target_dir = target_dir(board).display().to_string();
@@ -354,21 +354,21 @@ pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<Strin
     .collect()
 }
 
-/// The arguments that make cargo build the crate of the emulated tests for a board.
+/// The arguments for cargo to build the crate of the emulated tests for a board.
 pub fn tests_args(board: &Layout) -> Vec<String> {
     board_args(board).into_iter().chain(["--package=coboot-tests".to_owned()]).collect()
 }
 
-/// Where cargo builds the firmware of a board. A folder for each chip: cargo locks its folder, so
-/// that two chips can be built at once, and a host crate besides; they share no HAL anyway.
+/// Cargo's folder for the firmware of a board: one for each chip. Cargo locks its folder, so this
+/// allows builds of two chips and of a host crate at once; two chips share no HAL anyway.
 fn target_dir(board: &Layout) -> PathBuf {
     workspace::target_dir().join("fw").join(board.chip.line.name())
 }
 
 include!("../../linker/packs_well.rs");
 
-/// A call of cargo that builds an image. What it adds to the compiler's arguments holds for the last
-/// crate; code for the chip is made there and nowhere else (`lto`).
+/// The cargo command that builds an image. Its additional compiler arguments apply only to the last
+/// crate; with `lto` all code for the chip is generated there.
 fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
     let is_packed = package == "bootloader";
     let mut cargo = process::cargo(if is_packed { "rustc" } else { "build" });
@@ -379,14 +379,14 @@ fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
     cargo
 }
 
-/// Builds an image; gives its ELF file as the linker made it.
+/// Builds an image; returns the linker's ELF file.
 fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for(variant.package, board, variant.features);
     process::run(with_product(&mut cargo, variant.product))?;
     built(board, variant.package)
 }
 
-/// Chooses a product for what cargo builds.
+/// Selects a product for cargo's build.
 fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Command {
     if let Some(product) = product {
         cargo.env("COBOOT_PRODUCT", product);
@@ -394,14 +394,14 @@ fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Co
     cargo
 }
 
-/// The ELF file that cargo built last of a package.
+/// The ELF file of cargo's last build of a package.
 fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
     let path = target_dir(board).join(TARGET).join(PROFILE).join(package);
     fs::read(&path)
         .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
 }
 
-/// What is done after the link: a bootloader is packed.
+/// The step after the link: a bootloader is packed.
 fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
     if variant.is_bootloader() {
         pack::pack(&built).map_err(|problem| format!("{} cannot be packed: {problem}", variant.name))
@@ -410,13 +410,13 @@ fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
     }
 }
 
-/// Puts an image, by its name there, into the board's folder, and prints its size.
+/// Writes an image into the board's folder, under its name, and prints its size.
 fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
     let dir = workspace::firmware_dir(board);
     fs::create_dir_all(&dir)
         .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
     let to = dir.join(format!("{}.elf", variant.name));
-    // Left alone when nothing changed, so that whoever looks at the time sees no change.
+    // An unchanged file is not written, so that its time does not change.
     if fs::read(&to).ok().as_ref() != Some(&file) {
         fs::write(&to, &file)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
@@ -431,7 +431,8 @@ fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
 pub fn report(image: &Path, region: Region) -> Outcome {
     let flash = Flash::of(&size::read(image)?, region)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
-    // Beside what cargo says: the standard output is the job's, which may be asked for JSON.
+    // It goes to the standard error like cargo's messages: the standard output belongs to the job,
+    // which may print JSON.
     eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(image), flash.used, region.size);
     Ok(())
 }

@@ -1,4 +1,5 @@
-//! `cargo xtask chips`: a board for every chip, from `new-board` to an update in the emulator.
+//! `cargo xtask chips`: makes a board for every chip and runs it, from `new-board` to an update in
+//! the emulator.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -55,7 +56,7 @@ fn kinds() -> Vec<&'static Geometry> {
     kinds
 }
 
-/// Two of them, other ones every day until all had their turn.
+/// Two of them: different ones every day, until all have been used.
 fn of_day<'a>(kinds: &[&'a Geometry], day: u64) -> Vec<&'a Geometry> {
     let first = (2 * day % kinds.len() as u64) as usize;
     vec![kinds[first], kinds[(first + 1) % kinds.len()]]

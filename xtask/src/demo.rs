@@ -1,4 +1,4 @@
-//! `cargo xtask demo`: the main job, end to end.
+//! `cargo xtask demo`: runs the main job, end to end.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};

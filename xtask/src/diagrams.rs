@@ -1,4 +1,4 @@
-//! `cargo xtask diagrams`: the pictures of the documents, from text.
+//! `cargo xtask diagrams`: draws the pictures of the documents from text.
 
 use std::fmt::Write;
 use std::fs;
@@ -20,7 +20,7 @@ diagram (xtask/src/timing.rs), and the memory map of the stm32f407g-disc1 from i
 what it is drawn from.
 ";
 
-/// The names of the sources with this ending, without it.
+/// The names of the sources with this ending, without the ending.
 fn sources(ending: &str) -> Outcome<Vec<String>> {
     let folder = path("");
     let entries = fs::read_dir(&folder)
@@ -48,7 +48,7 @@ fn timing_diagram(name: &str) -> Outcome<String> {
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    // First what needs no tool.
+    // The pictures that need no tool come first.
     write(&path("memory.svg"), &memory_map(&stm32f407g_disc1::LAYOUT))?;
     for name in sources("timing")? {
         write(&path(&format!("{name}.svg")), &timing_diagram(&name)?)?;
@@ -70,15 +70,15 @@ fn write(file: &PathBuf, text: &str) -> Outcome {
     fs::write(file, text).map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(file)))
 }
 
-/// The picture with the mark of what it was drawn from, and without what another version of
-/// Graphviz would change for nothing.
+/// The picture with the mark of its source, and without the parts that change with the version of
+/// Graphviz.
 fn marked(drawn: &str, source: &str) -> Outcome<String> {
     let from = drawn.find("<svg").ok_or("Graphviz drew no SVG.")?;
     Ok(format!("{}\n{}", mark(source), &drawn[from..]))
 }
 
-/// Tells a text from every other version of it (64-bit FNV-1a): pictures of another Graphviz differ
-/// in every line, so the sources are what is compared.
+/// A hash of the text (64-bit FNV-1a). The sources are compared by it, since pictures of another
+/// version of Graphviz differ in every line.
 fn mark(source: &str) -> String {
     let hash = source.bytes().fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3)
@@ -91,8 +91,8 @@ const BAR: u32 = 150;
 const COLUMN: u32 = 440;
 const TOP: u32 = 56;
 
-/// Flash and RAM of a board as an SVG, each in the order of its addresses from bottom to top, as
-/// manuals have it. The heights are not to scale: 16 bytes beside 960 KiB could not be seen.
+/// Flash and RAM of a board as an SVG, each in the order of its addresses from bottom to top, as in
+/// manuals. The heights are not to scale: 16 bytes beside 960 KiB would be invisible.
 fn memory_map(layout: &Layout) -> String {
     let programs = (1..).zip(layout.programs).map(|(number, region)| (format!("program {number}"), *region));
     let mut flash = vec![

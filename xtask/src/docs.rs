@@ -1,4 +1,4 @@
-//! What the documents quote, held against what they quote from.
+//! Compares the quotes in the documents with their sources.
 
 use std::fs;
 
@@ -8,18 +8,18 @@ use crate::build::{C_APPLICATION, VARIANTS};
 use crate::pages::{self, Shown};
 use crate::{workspace, JOBS};
 
-/// A block of code in a document that names the file it was taken from.
+/// A block of code in a document that names its source file.
 struct Quote {
     file: String,
     lines: Vec<String>,
 }
 
-/// The marker in front of a quoted block: `<!-- from FILE -->`, a fence behind it.
+/// The marker before a quoted block: `<!-- from FILE -->`, followed by a fence.
 const MARKER: &str = "<!-- from ";
-/// A line that stands for some that were left out.
+/// A line that stands for omitted lines.
 const GAP: &str = "// …";
 
-/// Lines as they are compared: without their indentation, and without the empty ones.
+/// Lines for the comparison: without indentation and without empty lines.
 fn bare(text: &str) -> Vec<String> {
     text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect()
 }
@@ -35,8 +35,7 @@ fn quotes(document: &str) -> Vec<Quote> {
     document.split(MARKER).skip(1).map(quote).collect()
 }
 
-/// The first part of the quote that does not stand in the source, in one piece and behind the part
-/// before.
+/// The first part of the quote that is not in the source, contiguous and after the previous part.
 fn missing(quote: &[String], source: &str) -> Option<String> {
     let source = bare(source);
     let mut rest = source.as_slice();
@@ -73,7 +72,7 @@ fn a_quote_that_has_changed_is_found() {
     assert_eq!(missing(&quote("three();\n// …\none();"), source).as_deref(), Some("one();"));
 }
 
-/// Commands that are nobody's of this house: of a shell, of the system, of other projects.
+/// Commands that are not part of this repository: of a shell, of the system, of other projects.
 const FOREIGN: [&str; 17] = [
     "cd",
     "export",
@@ -93,12 +92,12 @@ const FOREIGN: [&str; 17] = [
     "unzip",
     "west",
 ];
-/// Cargo's own jobs that pages call; what is behind them names packages of the workspace.
+/// Cargo's own jobs on pages; their arguments name packages of the workspace.
 const CARGO: [&str; 5] = ["build", "check", "install", "run", "test"];
 
-/// Every command of every page: a job of this crate with options that it has, a program of the
-/// workspace (whose own tests read the rest: `coflash` and `coboot-node`), a file that is there, or
-/// one of the few that are foreign.
+/// Checks every command of every page. It must be a job of this crate with options that it has, a
+/// program of the workspace (the tests of `coflash` and `coboot-node` check their arguments), an
+/// existing file, or one of the few foreign commands.
 #[test]
 fn every_command_of_the_pages_is_one() {
     let commands = pages::commands();
@@ -110,7 +109,7 @@ fn every_command_of_the_pages_is_one() {
     assert!(commands.len() > 120 && jobs > 50, "{} commands, {jobs} jobs", commands.len());
 }
 
-/// What is wrong with a command.
+/// The fault of a command, if it has one.
 pub fn check(shown: &Shown) -> Option<String> {
     let words: Vec<&str> = shown.words.iter().map(String::as_str).collect();
     match words.as_slice() {
@@ -127,7 +126,7 @@ pub fn check(shown: &Shown) -> Option<String> {
             (!there).then(|| format!("there is no package {}", package.unwrap_or(&"")))
         }
         [program, rest @ ..] if program.contains('/') || program.starts_with("python") => {
-            // An interpreter, or a script; and what it is given to run.
+            // An interpreter or a script, and its script argument.
             let ours = |word: &&&str| word.ends_with(".py") || word.ends_with("/run");
             let all = [*program].into_iter().chain(rest.iter().copied()).collect::<Vec<_>>();
             let missing = all.iter().filter(ours).find(|file| !workspace::root().join(file).exists());
@@ -138,7 +137,7 @@ pub fn check(shown: &Shown) -> Option<String> {
     }
 }
 
-/// Whether a folder of the workspace holds the package of this name.
+/// Whether a folder of the workspace contains the package of this name.
 fn is_package(name: &str) -> bool {
     let folders = fs::read_dir(workspace::root()).expect("the workspace can be read");
     let named = format!("name = \"{name}\"");
@@ -149,7 +148,7 @@ fn is_package(name: &str) -> bool {
     })
 }
 
-/// What is wrong with what stands behind a job.
+/// The fault of a job's arguments, if there is one.
 fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
     let mut words = words.iter().take_while(|word| **word != "--").copied();
     while let Some(word) = words.next() {
@@ -157,7 +156,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
         let known = help.split([' ', '[', '\n']).any(|known| known == name);
         match name {
             _ if name.starts_with("--") && known => {
-                // An option with a value has it in capitals in the help, or an example.
+                // In the help an option with a value has it in capitals, or has an example.
                 let line = help.lines().find(|line| line.split([' ', '[']).any(|known| known == name))?;
                 let behind = line.split_once(name).map(|(_, behind)| behind.trim_start_matches(' '));
                 let takes = behind.is_some_and(|behind| {
@@ -166,7 +165,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
                 });
                 let value = value.or_else(|| if takes { words.next() } else { None });
                 let board = value.filter(|_| name == "--board").filter(|board| !pages::is_placeholder(board));
-                // A guide makes a board of this name.
+                // A guide creates a board with this name.
                 let unknown = board.filter(|board| {
                     *board != "my-board" && !BOARDS.iter().any(|layout| layout.board == *board)
                 });
@@ -174,7 +173,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
                     return Some(format!("there is no board {unknown}"));
                 }
             }
-            // The rest goes to cargo test.
+            // The other arguments go to cargo test.
             "--test" if job == "test" => {
                 let name = words.next().unwrap_or_default();
                 let is_test =

@@ -1,4 +1,4 @@
-//! `cargo xtask eds`: the EDS files, from the tables that the firmware serves.
+//! `cargo xtask eds`: writes the EDS files, from the object dictionaries of the firmware.
 
 use std::fs;
 
@@ -26,7 +26,7 @@ pub fn run(mut args: Args) -> Outcome {
     let out = args.value("--out")?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    // The crate that makes them is also that of the emulated tests.
+    // The crate that makes them is the crate of the emulated tests.
     setup.prepare(&[Part::Emulator])?;
     let folder = match out {
         Some(folder) => folder.into(),

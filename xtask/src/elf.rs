@@ -1,34 +1,34 @@
-//! As much of an ELF file as the size gate needs: 32 bit, little-endian (System V ABI, chapter 4
-//! and 5).
+//! A reader of ELF files with the parts that the size gate needs: 32 bit, little-endian (System V
+//! ABI, chapters 4 and 5).
 //!
-//! Every offset in the file is taken as hostile: what points outside is an error that says so.
+//! Every offset in the file may be hostile: an offset outside the file is an error with a message.
 
 use crate::Outcome;
 
-/// A piece of the image as the program headers tell it (`PT_LOAD` alone).
+/// A piece of the image from the program headers (only `PT_LOAD`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Segment {
-    /// Where its bytes lie in the file.
+    /// Offset of its bytes in the file.
     pub offset: u32,
-    /// The load address (LMA): where the bytes lie in flash.
+    /// The load address (LMA): the address of the bytes in flash.
     pub load_address: u32,
-    /// How many bytes the file holds of it.
+    /// Number of its bytes in the file.
     pub file_size: u32,
 }
 
 /// A section that is part of the image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Section {
-    /// Its name, `.text` and the like.
+    /// Its name, for example `.text`.
     pub name: String,
     /// The run-time address (VMA).
     pub address: u32,
-    /// Where its bytes lie in the file.
+    /// Offset of its bytes in the file.
     pub offset: u32,
     /// Its length in bytes.
     pub size: u32,
-    /// Whether the image holds its bytes: it is allocated, and neither zeroed nor left alone at
-    /// start-up.
+    /// Whether the image contains its bytes: it is allocated, and is neither zeroed nor left
+    /// unchanged at start-up.
     pub loaded: bool,
 }
 
@@ -37,7 +37,7 @@ pub struct Section {
 pub struct Symbol {
     /// The name as mangled by the compiler.
     pub name: String,
-    /// Its address; bit 0 set in a Thumb function's.
+    /// Its address; bit 0 is set for a Thumb function.
     pub address: u32,
     /// Its length in bytes.
     pub size: u32,
@@ -45,12 +45,12 @@ pub struct Symbol {
     pub section: usize,
 }
 
-/// What an ELF file says of itself.
+/// The contents of an ELF file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Elf {
-    /// What is loaded.
+    /// The loaded segments.
     pub segments: Vec<Segment>,
-    /// All sections, in file order, so that a symbol's section index fits.
+    /// All sections, in the order of the file, so that a symbol's section index is valid.
     pub sections: Vec<Section>,
     /// Functions and statics; empty in a stripped file.
     pub symbols: Vec<Symbol>,
@@ -67,7 +67,8 @@ impl Elf {
     /// Reads an ELF file.
     ///
     /// # Errors
-    /// When it is no 32-bit little-endian ELF file, or a table of it points outside the file.
+    /// When it is not a 32-bit little-endian ELF file, or one of its tables points outside the
+    /// file.
     pub fn parse(file: &[u8]) -> Outcome<Self> {
         let file = File(file);
         if file.bytes(0, 6)? != [0x7F, b'E', b'L', b'F', 1, 1] {
@@ -130,7 +131,7 @@ impl Elf {
         Ok(Self { segments, sections, symbols })
     }
 
-    /// Where a section's bytes lie in flash, if the image holds them.
+    /// The address of a section's bytes in flash, if the image contains them.
     pub fn load_address(&self, section: &Section) -> Option<u32> {
         if !section.loaded || section.size == 0 {
             return None;
@@ -189,8 +190,8 @@ impl<'a> File<'a> {
 pub mod tests {
     use super::*;
 
-    /// A file by hand, as the System V ABI lays it out: a vector table at 0800_0000, and `.data`
-    /// that runs at 2000_0000 and is loaded behind the vectors; one function in `.vectors`.
+    /// A file built by hand after the System V ABI: a vector table at 0800_0000, and `.data` that
+    /// runs at 2000_0000 and is loaded after the vectors; one function in `.vectors`.
     pub fn by_hand() -> Vec<u8> {
         let mut file = vec![
             0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, // e_ident

@@ -1,4 +1,4 @@
-//! `cargo xtask emulate`: a board for other programs to talk to.
+//! `cargo xtask emulate`: runs an emulated board for other programs.
 
 use crate::args::Args;
 use crate::build::VARIANTS;
@@ -53,14 +53,14 @@ pub fn run(mut args: Args) -> Outcome {
     process::run(&mut emulator)
 }
 
-/// What the names of the bootloaders begin with that tell what they do.
+/// The prefix of the names of the bootloaders with a log.
 const LOG: &str = "bootloader-log-";
 
-/// The name of the bootloader that is asked for by `--log`.
+/// The name of the bootloader for the option `--log`.
 fn log(args: &mut Args) -> Outcome<Option<&'static str>> {
     let wanted = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
     let Some(wanted) = wanted else { return Ok(None) };
-    // Those with another dialect are for the tests.
+    // Those with another dialect are only for the tests.
     let standard = || VARIANTS.iter().filter(|variant| variant.product.is_none());
     let ways = || standard().filter_map(|variant| Some((variant.name.strip_prefix(LOG)?, variant.name)));
     let found = ways().find(|(way, _)| *way == wanted);

@@ -1,5 +1,5 @@
-//! `cargo xtask examples`: the programs in `examples/`, each built by its own tools as its page says,
-//! outside the workspace.
+//! `cargo xtask examples`: builds the programs in `examples/`, each with its own tools as its page
+//! says, outside the workspace.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -37,17 +37,17 @@ const BOARD: &Layout = &stm32f407g_disc1::LAYOUT;
 
 /// A program that is built from a folder of `examples/`.
 struct Example {
-    /// Behind `example-` in the name of its image.
+    /// The name of its image without the prefix `example-`.
     name: &'static str,
-    /// Below `examples/`.
+    /// The folder within `examples/`.
     folder: &'static str,
     tools: Tools,
 }
 
-/// What builds an example.
+/// The build tool of an example.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tools {
-    /// CMake with a toolchain file of `app-c/cmake/`; the version goes into the program's label.
+    /// CMake with a toolchain file of `app-c/cmake/`; the version is for the program's label.
     Cmake { toolchain: &'static str, version: u32 },
     /// Cargo: the program of this name, with features of its package.
     Cargo { program: &'static str, features: &'static str },
@@ -101,10 +101,10 @@ pub fn run(mut args: Args) -> Outcome {
     chosen.into_iter().try_for_each(build)
 }
 
-/// Builds all of them, and prints their sizes. What they need is there.
+/// Builds all examples, and prints their sizes. The tools must be installed.
 ///
 /// # Errors
-/// When one does not build, or is no image of its board.
+/// When an example does not build, or is not an image of its board.
 pub fn all() -> Outcome {
     EXAMPLES.iter().try_for_each(build)
 }
@@ -131,9 +131,9 @@ fn build(example: &Example) -> Outcome {
     report(&image, BOARD.programs[0])
 }
 
-/// Builds a folder by CMake; gives the program.
+/// Builds a folder with CMake; returns the program.
 fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<PathBuf> {
-    // Anew: CMake keeps the compiler and the folders of the run before.
+    // The folder is deleted first: CMake keeps the compiler and the folders of the previous run.
     if work.exists() {
         fs::remove_dir_all(work)
             .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(work)))?;
@@ -143,16 +143,16 @@ fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<P
     configure.arg("-S").arg(folder).arg("-B").arg(work);
     configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
     configure.arg(format!("-DVERSION={version}"));
-    // What they print is for whoever looks for a mistake.
+    // Its output helps only to find a mistake.
     process::output(&mut configure)?;
     process::output(Command::new("cmake").arg("--build").arg(work))?;
     Ok(work.join("app.elf"))
 }
 
-/// Builds a package; gives the program. All packages share `work`, and with it what they depend on.
+/// Builds a package; returns the program. All packages share `work`, and so their dependencies.
 fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<PathBuf> {
     let mut cargo = process::cargo_on(folder, "build");
-    // Cargo looks for the folder's own settings from where it is called.
+    // Cargo looks for the folder's own settings from its current folder.
     cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
     cargo.arg("--target-dir").arg(work);
     process::output(&mut cargo)?;
@@ -165,7 +165,7 @@ mod tests {
 
     use super::*;
 
-    /// The numbers that are checked in are those of the board.
+    /// The numbers in the repository's files are those of the board.
     #[test]
     fn the_memory_maps_of_the_examples_are_up_to_date() {
         let map = BOARD.linker_script(Image::Program(1)).to_string();

@@ -1,4 +1,4 @@
-//! `cargo xtask fuzz`: all fuzz targets, one after the other.
+//! `cargo xtask fuzz`: runs all fuzz targets, one after the other.
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -22,9 +22,9 @@ It needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed
 where it is missing.
 ";
 
-/// The version that is installed where there is none.
+/// The version to install if there is none.
 const CARGO_FUZZ: &str = "0.13.2";
-/// How long a target may take for one input, in seconds. They take microseconds.
+/// The longest time for one input of a target, in seconds. They need microseconds.
 const TOO_LONG: u32 = 10;
 
 pub fn run(mut args: Args) -> Outcome {
@@ -91,14 +91,14 @@ pub fn run(mut args: Args) -> Outcome {
 
 fn seconds(value: Option<String>) -> Outcome<u32> {
     let Some(value) = value else { return Ok(30) };
-    // 0 would mean "for ever" to the fuzzer.
+    // The fuzzer would run without end with 0.
     match value.parse() {
         Ok(seconds @ 1..) => Ok(seconds),
         _ => Err(format!("--seconds takes a number from 1 on, not \"{value}\".")),
     }
 }
 
-/// The targets, by the names of their files.
+/// The targets, from the names of their files.
 fn targets(folder: &Path) -> Outcome<Vec<String>> {
     let folder = folder.join("fuzz_targets");
     let files = fs::read_dir(&folder)
@@ -121,7 +121,8 @@ fn unwritable(path: &Path, error: &std::io::Error) -> String {
     format!("{} cannot be written: {error}.", workspace::shown(path))
 }
 
-/// The sanitizer and the coverage counters are features of the nightly compiler.
+/// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
+/// compiler, which the fuzzer's library needs.
 fn toolchain() -> Outcome {
     if !process::succeeds("rustup", &["run", "nightly", "rustc", "--version"]) {
         return Err("fuzzing needs a nightly toolchain. Run this line and try again:\n\n    \
@@ -137,12 +138,13 @@ fn toolchain() -> Outcome {
     Ok(())
 }
 
-/// How many inputs the fuzzer says it has run.
+/// The number of inputs in the fuzzer's output.
 fn runs(said: &str) -> Option<u64> {
     said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
 }
 
-/// What of a failed run tells why: the panic with its message, and where the input is.
+/// The part of a failed run's output with the reason: the panic with its message, and the place of
+/// the input.
 fn excerpt(said: &str) -> String {
     let mut text = String::new();
     let mut more = 0;

@@ -1,7 +1,7 @@
-//! `cargo xtask header`: the ABI for applications in C.
+//! `cargo xtask header`: writes the C header of the ABI.
 //!
-//! Every number in it comes from shared-abi: sizes, offsets and values are asked for, not typed.
-//! The text around them is `header.h`, in which `@NAME@` stands for what [`parts`] makes.
+//! Every number in it is computed from shared-abi: sizes, offsets and values. The text around the
+//! numbers is `header.h`; [`parts`] makes the replacement for each `@NAME@` in it.
 
 use std::fmt::Write as _;
 use std::mem::{offset_of, size_of};
@@ -40,7 +40,7 @@ pub fn header() -> String {
     })
 }
 
-/// What goes into the template, by name.
+/// The replacements in the template, by name.
 fn parts() -> Vec<(&'static str, String)> {
     vec![
         ("CHECK", check()),
@@ -54,14 +54,14 @@ fn parts() -> Vec<(&'static str, String)> {
     ]
 }
 
-/// A field as C sees it: name, offset and size in bytes.
+/// A field as declared in C: name, offset and size in bytes.
 struct Field {
     name: &'static str,
     offset: usize,
     size: usize,
 }
 
-/// The size of a field, told by a way to get at it.
+/// The size of a field, from an accessor function.
 fn size_of_field<S, F>(_: impl Fn(&S) -> &F) -> usize {
     size_of::<F>()
 }
@@ -77,9 +77,9 @@ macro_rules! structure {
     };
 }
 
-/// The declaration of a structure, and the assertions that hold its C layout to that in Rust.
+/// The declaration of a structure, and the assertions that its layout in C equals the one in Rust.
 ///
-/// All fields of the ABI are unsigned numbers or arrays of words, so the size tells the type.
+/// All fields of the ABI are unsigned numbers or arrays of words, so the size determines the type.
 fn structure(name: &str, size: usize, fields: &[Field]) -> String {
     let mut text = format!("struct {name} {{\n");
     let mut assertions = format!("COBOOT_STATIC_ASSERT(sizeof(struct {name}) == {size}, \"{name}\");\n");
@@ -121,7 +121,7 @@ fn label() -> String {
         + &structure!("coboot_label", Label, magic, vendor_id, product_code, version, reserved, check)
 }
 
-/// Any owed answer: all have the same request.
+/// Any owed answer: all owed answers have the same request number.
 const OWED: Owed = Owed { program: 1, value: 0, node_id: 1 };
 
 fn warm_start() -> String {
@@ -263,7 +263,7 @@ mod tests {
         assert!(!header().contains('@'));
     }
 
-    /// The documented values (the check word's in shared-abi), typed again.
+    /// The documented values (the check word's are in shared-abi), typed a second time.
     #[test]
     fn what_c_sees_are_the_documented_values() {
         let header = header();

@@ -1,4 +1,4 @@
-//! A JSON reader, just large enough for `cargo metadata`.
+//! A JSON reader with the parts that `cargo metadata` needs.
 
 use std::collections::BTreeMap;
 use std::iter::Peekable;
@@ -13,9 +13,9 @@ pub enum Value {
     Null,
     /// `true`, `false`
     Bool(bool),
-    /// A number, as it is written: nobody here reckons with one.
+    /// A number, as text: nothing here calculates with one.
     Number(String),
-    /// A string, escapes resolved.
+    /// A string without escapes.
     String(String),
     /// `[…]`
     Array(Vec<Value>),
@@ -23,15 +23,15 @@ pub enum Value {
     Object(BTreeMap<String, Value>),
 }
 
-/// Deeper nesting than any file of cargo's is refused, so that hostile text does not exhaust the
-/// stack.
+/// The greatest permitted depth of nesting. It is deeper than in any file of cargo's, and keeps
+/// hostile text from exhausting the stack.
 const MAX_DEPTH: usize = 64;
 
 impl Value {
-    /// Reads one value, with nothing behind it.
+    /// Reads exactly one value.
     ///
     /// # Errors
-    /// When the text is no JSON.
+    /// When the text is not JSON.
     pub fn parse(text: &str) -> Outcome<Self> {
         let mut reader = Reader { chars: text.chars().peekable() };
         let value = reader.value(0)?;
@@ -41,7 +41,7 @@ impl Value {
         }
     }
 
-    /// The member of an object; `Null` where there is none.
+    /// The member of an object; `Null` if it is missing.
     pub fn get(&self, key: &str) -> &Self {
         match self {
             Self::Object(members) => members.get(key).unwrap_or(&Self::Null),
@@ -49,7 +49,7 @@ impl Value {
         }
     }
 
-    /// The elements of an array; none of anything else.
+    /// The elements of an array; none for any other value.
     pub fn items(&self) -> &[Self] {
         match self {
             Self::Array(items) => items,
@@ -171,7 +171,7 @@ impl Reader<'_> {
             Some('u') => {
                 let digits: String = self.chars.by_ref().take(4).collect();
                 let code = u32::from_str_radix(&digits, 16).ok().filter(|_| digits.len() == 4);
-                // Halves of surrogate pairs do not occur in what cargo prints of a workspace.
+                // Cargo's output about a workspace contains no surrogate pairs.
                 Ok(code.and_then(char::from_u32).unwrap_or(char::REPLACEMENT_CHARACTER))
             }
             _ => Err("JSON: an unknown escape.".into()),

@@ -1,4 +1,4 @@
-//! `cargo xtask layout`: the memory map, for people and for linkers.
+//! `cargo xtask layout`: prints the memory map, as text and for linkers.
 
 use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{Image, Layout};
@@ -70,12 +70,12 @@ mod tests {
             readme.split_once("<!-- memory map: `cargo xtask layout` prints it -->\n\n```text\n").unwrap();
         let (copy, _) = behind.split_once("```").unwrap();
         let map = LAYOUT.to_string();
-        // Blanks at the end of a line are not worth keeping in a document.
+        // The README leaves out blanks at the end of a line.
         let lines = |text: &str| text.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>();
         assert_eq!(lines(copy), lines(&map), "copy the output of `cargo xtask layout` into README.md");
     }
 
-    /// The block that the guide for applications shows links as it stands there: it is what is printed.
+    /// The block in the guide for applications can be linked unchanged: it is the printed one.
     #[test]
     fn the_guide_shows_the_linker_block_as_it_is() {
         let guide = fs::read_to_string(workspace::root().join("docs/application.md")).unwrap();

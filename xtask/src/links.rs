@@ -1,4 +1,4 @@
-//! The links of the pages: each leads to a file of the repository, and to a heading that it has.
+//! The links of the pages: each must lead to a file of the repository, and to an existing heading.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -12,16 +12,16 @@ pub const AT_ROOT: [&str; 4] = ["README.md", "CHANGELOG.md", "LICENSES.md", "SEC
 /// A link within the repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Link {
-    /// The page and the line of it.
+    /// The page and the line number.
     pub place: String,
-    /// The file, from the root of the repository on.
+    /// The file, as a path from the root of the repository.
     pub file: PathBuf,
-    /// The heading, as a browser names it.
+    /// The heading's anchor.
     pub heading: Option<String>,
 }
 
-/// Every page, from the root of the repository on: those at the root, all in `docs/`, and the README
-/// of each example.
+/// Every page, as a path from the root of the repository: those at the root, all in `docs/`, and
+/// the README of each example.
 ///
 /// # Errors
 /// When a folder cannot be read.
@@ -47,7 +47,7 @@ pub fn pages() -> Outcome<Vec<PathBuf>> {
     Ok(pages)
 }
 
-/// What is in a folder, from the root of the repository on.
+/// The files in a folder, as paths from the root of the repository.
 fn within(folder: &Path) -> Outcome<Vec<PathBuf>> {
     let entries = fs::read_dir(workspace::root().join(folder))
         .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
@@ -75,7 +75,7 @@ pub fn all() -> Outcome<Vec<Link>> {
     Ok(links)
 }
 
-/// What is wrong with the links of the pages, a line each.
+/// The faults of the pages' links, one a line.
 ///
 /// # Errors
 /// When a page cannot be read.
@@ -97,7 +97,7 @@ pub fn faults() -> Outcome<Vec<String>> {
     Ok(all()?.iter().filter_map(fault).collect())
 }
 
-/// The lines of a page that are no code, with their numbers; code within a line is blanked.
+/// The lines of a page outside code blocks, with their numbers; code within a line is blanked.
 fn prose(text: &str) -> Vec<(usize, String)> {
     let mut is_code = false;
     let mut prose = Vec::new();
@@ -113,7 +113,7 @@ fn prose(text: &str) -> Vec<(usize, String)> {
     prose
 }
 
-/// The links of a page that stay within the repository. A link's target stands in one line.
+/// The links of a page within the repository. The target of a link must be in one line.
 pub fn of_page(page: &Path, text: &str) -> Vec<Link> {
     let mut links = Vec::new();
     for (number, line) in prose(text) {
@@ -134,7 +134,7 @@ pub fn of_page(page: &Path, text: &str) -> Vec<Link> {
     links
 }
 
-/// A path without `..` in it.
+/// The path without `..`.
 fn plain(path: &Path) -> PathBuf {
     let mut plain = PathBuf::new();
     for part in path.components() {
@@ -146,9 +146,9 @@ fn plain(path: &Path) -> PathBuf {
     plain
 }
 
-/// The headings of a page as links name them. GitHub and mdBook make a name in the same way: small
-/// letters, digits, `_` and `-` stay, a blank becomes `-`, the rest goes; the second of two equal
-/// names has `-1` behind it.
+/// The anchors of a page's headings. GitHub and mdBook make them in the same way: small letters,
+/// digits, `_` and `-` stay, a blank becomes `-`, all else is removed; the second of two equal
+/// names gets `-1` at its end.
 fn headings(text: &str) -> Vec<String> {
     let mut is_code = false;
     let mut names: Vec<String> = Vec::new();
@@ -196,7 +196,7 @@ mod tests {
         );
     }
 
-    /// Names of headings as GitHub shows them for these very lines.
+    /// The anchors on GitHub for these lines.
     #[test]
     fn headings_have_the_names_that_browsers_use() {
         let page = "# 1F51h: commands\n```sh\n# no heading\n```\n## `read` and write\n### CANopenNode's \

@@ -1,4 +1,4 @@
-//! `cargo xtask lint`: formatting, clippy and rustdoc, with warnings denied.
+//! `cargo xtask lint`: runs formatting, clippy and rustdoc, with warnings denied.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
@@ -21,12 +21,12 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup.prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
 
-    // All of them, so that one run shows all there is to mend.
+    // All checks run, so that one run shows all problems.
     let mut problems = Vec::new();
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
         problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
     }
-    // The boards, which build scripts find and `cargo fmt` does not.
+    // The files of the boards: build scripts find them, `cargo fmt` does not.
     for folder in build::BOARD_FOLDERS {
         let mut rustfmt = std::process::Command::new("rustfmt");
         rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
@@ -40,7 +40,8 @@ pub fn run(mut args: Args) -> Outcome {
         problems.extend(process::run(&mut clippy).err());
     };
     clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
-    // The library without the command line; and the package for Python, which is no default member.
+    // The library without the command line; and the package for Python, which is not a default
+    // member.
     clippy(&["--package", "coflash", "--lib", "--no-default-features"].map(str::to_owned));
     clippy(&["--package", "coflash-python"].map(str::to_owned));
     clippy(&build::firmware_args("bsp", board, ""));

@@ -1,8 +1,8 @@
 //! The jobs of the repository: `cargo xtask` lists them.
 //!
-//! One file per job. This crate depends on the standard library, on `shared-abi` and on two small
-//! crates, so that it compiles in seconds on a machine that has a Rust toolchain and nothing else;
-//! the jobs that need more call [`setup`] first.
+//! There is one file for each job. This crate depends only on the standard library, on `shared-abi`
+//! and on two small crates, so that it compiles in seconds on a machine with only a Rust toolchain.
+//! Jobs that need more call [`setup`] first.
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;
@@ -50,22 +50,22 @@ mod zx0;
 
 use args::Args;
 
-/// What a job gives back: nothing, or what went wrong and what to do about it, in words.
+/// The result of a job: nothing, or a message with the error and its remedy.
 type Outcome<T = ()> = Result<T, String>;
 
 /// One job.
 struct Job {
-    /// The word behind `cargo xtask`.
+    /// The word after `cargo xtask`.
     name: &'static str,
     /// One line for the list.
     about: &'static str,
     /// The text of `cargo xtask NAME --help`.
     help: &'static str,
-    /// Carries it out.
+    /// Runs the job.
     run: fn(Args) -> Outcome,
 }
 
-/// In the order in which a newcomer meets them.
+/// The jobs, in the order in which a newcomer needs them.
 const JOBS: &[Job] = &[
     Job {
         name: "demo",

@@ -1,19 +1,19 @@
-//! Which file of a crate uses which: the module graph, read off the sources.
+//! The module graph of a crate, from its sources: which file uses which.
 //!
-//! A use is a path that names a module: in a `use` item, nested groups included, or in code, by
-//! `crate::`, `super::`, `self::` or the name of a child module. `mod x;` declares and uses nothing.
-//! What tests use is theirs.
+//! A use is a path that names a module: in a `use` item, nested groups included, or in code, with
+//! `crate::`, `super::`, `self::` or the name of a child module. `mod x;` declares a module, but
+//! does not use it. Uses in tests do not count.
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// A module by its path below the crate's root: `device::session`. The root is the empty one.
+/// A module by its path below the crate's root: `device::session`. The root is the empty path.
 pub type Module = Vec<String>;
 
-/// Which file uses which.
+/// For each file, the files that it uses.
 pub type Graph = BTreeMap<Module, BTreeSet<Module>>;
 
-/// Reads the graph off the sources of a crate: the path of each below `src/`, and its text. `krate`
-/// is the name by which a binary beside the library calls that.
+/// Reads the graph from the sources of a crate: the path of each below `src/`, and its text.
+/// `krate` is the name of the library in the code of a binary beside it.
 pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
     let modules: Vec<(Module, &str)> =
         sources.iter().filter_map(|(path, text)| Some((module(path)?, text.as_str()))).collect();
@@ -32,7 +32,7 @@ pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
     graph
 }
 
-/// The module of a file; `None` for the root of a binary, which nobody can use.
+/// The module of a file; `None` for the root of a binary, which no other file can use.
 fn module(path: &str) -> Option<Module> {
     let path = path.strip_suffix(".rs")?;
     if path == "main" || path.starts_with("bin/") {
@@ -45,19 +45,19 @@ fn module(path: &str) -> Option<Module> {
     Some(parts)
 }
 
-/// A source without comments, texts and tests.
+/// A source without comments, strings and tests.
 pub fn code(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
     let mut code = String::new();
     for line in text.lines().filter(|line| !line.trim_start().starts_with("//")) {
-        // What stands between quotation marks is no path.
+        // Text between quotation marks is not a path.
         code.extend(line.split('"').step_by(2));
         code.push('\n');
     }
     code
 }
 
-/// All paths of two or more segments, groups taken apart: `a::{b, c::d}` is `a::b` and `a::c::d`.
+/// All paths of two or more segments, with groups resolved: `a::{b, c::d}` is `a::b` and `a::c::d`.
 pub fn paths(code: &str) -> Vec<Vec<String>> {
     let tokens = tokens(code);
     let mut found = Vec::new();
@@ -65,12 +65,12 @@ pub fn paths(code: &str) -> Vec<Vec<String>> {
     while at < tokens.len() {
         let next = tokens.get(at + 1).map(String::as_str);
         if tokens[at] == "pub" && next == Some("(") {
-            // For whom it is visible.
+            // It skips the visibility.
             at += tokens[at..].iter().position(|token| token == ")").unwrap_or(1);
         } else if is_name(&tokens[at]) && next == Some("::") {
             at = tree(&tokens, at, &mut Vec::new(), &mut found);
         } else if tokens[at] == "use" && next.is_some_and(is_name) {
-            // A name alone is a path, too: `use x;`.
+            // A single name is a path, too: `use x;`.
             at = tree(&tokens, at + 1, &mut Vec::new(), &mut found);
         } else {
             at += 1;
@@ -79,7 +79,7 @@ pub fn paths(code: &str) -> Vec<Vec<String>> {
     found
 }
 
-/// Reads one path from a token on; gives where it ends.
+/// Reads one path from a token on; returns its end.
 fn tree(tokens: &[String], from: usize, before: &mut Vec<String>, found: &mut Vec<Vec<String>>) -> usize {
     let mut at = from;
     let depth = before.len();
@@ -88,7 +88,7 @@ fn tree(tokens: &[String], from: usize, before: &mut Vec<String>, found: &mut Ve
             Some("{") => {
                 at += 1;
                 while tokens.get(at).is_some_and(|token| token != "}") {
-                    // A comma, the star of a glob, `as` and what behind it is.
+                    // A comma, the star of a glob, or `as` with its name.
                     let other = !tokens.get(at).is_some_and(|token| is_name(token) && token != "as");
                     at = if other { at + 1 } else { tree(tokens, at, before, found) };
                 }
@@ -115,7 +115,7 @@ fn tree(tokens: &[String], from: usize, before: &mut Vec<String>, found: &mut Ve
     at
 }
 
-/// Names, `::`, and everything else letter by letter.
+/// Splits code into names, `::`, and single other characters.
 fn tokens(code: &str) -> Vec<String> {
     let mut tokens: Vec<String> = Vec::new();
     let mut letters = code.chars().peekable();
@@ -139,7 +139,7 @@ fn is_name(token: &str) -> bool {
     token.starts_with(|letter: char| letter.is_alphabetic() || letter == '_')
 }
 
-/// The file that a path leads into: the longest part of it that is a module.
+/// The file of a path: the longest part of the path that is a module.
 fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module>) -> Option<Module> {
     let mut at = own.to_vec();
     let mut rest = path;
@@ -155,7 +155,7 @@ fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module
             at.clear();
             rest = &rest[1..];
         }
-        // A child's name; any other is of another crate, or was brought in by a `use`.
+        // The name of a child; any other name is of another crate, or was imported by a `use`.
         name => {
             at.push(name.to_owned());
             if !known.contains(&at) {
@@ -171,7 +171,7 @@ fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module
             break;
         }
     }
-    // Inside a module without a file of its own: of no interest here.
+    // A module without a file of its own is left out.
     known.contains(&at).then_some(at)
 }
 

@@ -1,4 +1,4 @@
-//! `cargo xtask new-board`: lays down the three files of a port. No other file changes.
+//! `cargo xtask new-board`: creates the three files of a port. It changes no other file.
 
 use std::fs;
 use std::path::Path;
@@ -70,7 +70,7 @@ fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {
     })
 }
 
-/// The files that make a board: their paths, and what is in them.
+/// The files of a board: their paths and contents.
 fn files(name: &str, chip: &'static Geometry) -> Outcome<[(String, String); 3]> {
     let good = name.starts_with(|c: char| c.is_ascii_lowercase())
         && !name.ends_with('-')
@@ -83,7 +83,7 @@ fn files(name: &str, chip: &'static Geometry) -> Outcome<[(String, String); 3]> 
              40 at most."
         ));
     }
-    // Its file would be a module that is there.
+    // Its file would be an existing module.
     if layout::by_name(name).is_some() || name == "toml" {
         return Err(format!("there is a board \"{name}\" already; choose another name."));
     }
@@ -95,12 +95,12 @@ fn files(name: &str, chip: &'static Geometry) -> Outcome<[(String, String); 3]> 
     ])
 }
 
-/// What the chip's geometry is called in `shared_abi::geometry`.
+/// The name of the chip's geometry in `shared_abi::geometry`.
 fn constant(chip: &Geometry) -> String {
     chip.chip.to_uppercase()
 }
 
-/// A map that fits the chip, but for the programs: the smallest sectors for bootloader and
+/// A memory map for the chip, with its programs separate: the smallest sectors for bootloader and
 /// parameters, and the rest for one program.
 fn map(chip: &'static Geometry) -> (Layout, Region) {
     let (flash, ram_end) = (chip.flash.base, chip.sram.end());
@@ -164,15 +164,15 @@ pub const LAYOUT: Layout = Layout {{
     )
 }
 
-/// What differs between the chips in the files that are laid down.
+/// The differences between the chips in the created files.
 struct Fit {
     /// The core's clock in MHz, and the dividers of the buses.
     mhz: u32,
     apb1: u32,
     apb2: u32,
     wait_states: u32,
-    /// Port of the CAN pins, receive and transmit. The application in C knows alternate function 9
-    /// alone, which PB8 and PB9 have not on all chips.
+    /// Port of the CAN pins, receive and transmit. The application in C uses only alternate
+    /// function 9, which PB8 and PB9 do not have on all chips.
     can: (char, u8, u8),
 }
 
@@ -344,7 +344,7 @@ mod tests {
         assert!(other.contains("of this line there is: ") && other.contains("stm32f446re"), "{other}");
     }
 
-    /// Every step once in all three files, in order.
+    /// All three files together have every step once, in order.
     #[test]
     fn the_steps_are_numbered_once() {
         for chip in CHIPS {
@@ -376,7 +376,7 @@ mod tests {
         }
     }
 
-    /// The map that was worked out by hand for a board with this chip.
+    /// The map that was made by hand for a board with this chip.
     #[test]
     fn the_map_is_the_one_that_people_make() {
         let file = layout_file("x", &STM32F429ZI);

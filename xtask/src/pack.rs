@@ -1,11 +1,11 @@
-//! Packing after the link: the part of the bootloader that runs from RAM lies in flash as a ZX0
+//! Packs the bootloader after the link: the part that runs from RAM is stored in flash as a ZX0
 //! stream (`shared_abi::ram_image`).
 //!
-//! Sections, symbols and debug information stay as the linker made them, at the addresses in RAM:
-//! only what is loaded into flash becomes another. Programs that load an ELF file go by one of two
-//! tables, so the packed bytes are in both: as a segment (probe-rs, OpenOCD) and as a section (gdb).
-//! `.data` keeps its contents for the debugger, and belongs to no segment with contents any more:
-//! gdb's `load` writes it to the RAM, where the boot stage puts the same bytes later.
+//! Sections, symbols and debug information keep the linker's contents and their addresses in RAM;
+//! only the bytes that are loaded into flash change. Programs that load an ELF file use one of two
+//! tables, so the packed bytes are in both: as a segment (probe-rs, OpenOCD) and as a section
+//! (gdb). `.data` keeps its contents for the debugger, but belongs to no segment with contents any
+//! more: gdb's `load` writes it to the RAM, and the boot stage later puts the same bytes there.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::{fs, process};
@@ -16,11 +16,11 @@ use shared_abi::ram_image::{Method, MAGIC, SERVICES_VERSION};
 use crate::elf::{Elf, Section};
 use crate::{workspace, zx0, Outcome};
 
-/// The section that the linker lays the header down in.
+/// The linker's section with the header.
 const HEADER: &str = ".ram_image";
 /// The section of the image, at its addresses in RAM.
 pub const IMAGE: &str = ".data";
-/// How the stream tells offsets (`shared_abi::ram_image::Method`).
+/// The stream's format of offsets (`shared_abi::ram_image::Method`).
 const OFFSETS: zx0::Offsets = zx0::Offsets { unit: 2, is_low_byte: true };
 /// The section of the packed bytes.
 pub const PACKED: &str = ".ram_image.packed";
@@ -28,7 +28,7 @@ pub const PACKED: &str = ".ram_image.packed";
 /// The bootloader's ELF file with its RAM image packed.
 ///
 /// # Errors
-/// When it is none, or not as the linker makes it.
+/// When it is not an ELF file, or not as the linker makes it.
 pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
     let elf = Elf::parse(file)?;
     let find = |name: &str| -> Outcome<&Section> {
@@ -51,7 +51,7 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
 
     let front = in_front(&elf, header, contents)?;
     let packed = compressed(&front, &with_absolute_calls(contents(image), image.address));
-    // The words behind the CRC, which runs over them too.
+    // The words after the CRC, which covers them too.
     let rest = bytes(&[SERVICES_VERSION, Method::Zx0 as u32, word(packed.len())?, image.size]);
     let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&[&front[..], &rest, &packed].concat());
     let packed_header = [bytes(&[MAGIC, crc]), rest].concat();
@@ -61,7 +61,7 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
     load_instead(out, image, behind_header, &packed)
 }
 
-/// The bootloader's flash in front of the header: the stream copies from it.
+/// The bootloader's flash before the header: the stream can copy from it.
 fn in_front<'a>(elf: &Elf, header: &Section, contents: impl Fn(&Section) -> &'a [u8]) -> Outcome<Vec<u8>> {
     let mut sections: Vec<_> = elf
         .sections
@@ -84,8 +84,8 @@ fn in_front<'a>(elf: &Elf, header: &Section, contents: impl Fn(&Section) -> &'a 
     Ok(front)
 }
 
-/// The image, which stands at this address, with absolute calls (`shared_abi::ram_image::Method`):
-/// two calls of one function are the same bytes then, and pack better.
+/// The image at this address, with absolute calls (`shared_abi::ram_image::Method`): then two calls
+/// of one function are the same bytes, and pack better.
 fn with_absolute_calls(image: &[u8], address: u32) -> Vec<u8> {
     let mut out = image.to_vec();
     let mut at = 0;
@@ -105,8 +105,8 @@ fn with_absolute_calls(image: &[u8], address: u32) -> Vec<u8> {
     out
 }
 
-/// Compresses, the best that the format can do. That takes seconds, so what was compressed before
-/// is kept in the folder of what is built, under a hash of it.
+/// Compresses to the smallest stream of the format. That takes seconds, so the result is kept in
+/// the build folder, under a hash of the input.
 fn compressed(front: &[u8], raw: &[u8]) -> Vec<u8> {
     let mut hasher = DefaultHasher::new();
     (front, raw, OFFSETS.unit, OFFSETS.is_low_byte).hash(&mut hasher);
@@ -114,7 +114,7 @@ fn compressed(front: &[u8], raw: &[u8]) -> Vec<u8> {
     let kept = folder.join(format!("{:016x}.zx0", hasher.finish()));
     fs::read(&kept).unwrap_or_else(|_| {
         let packed = zx0::compress(front, raw, OFFSETS);
-        // Under another name until it is whole. Where it cannot be kept, only time is lost.
+        // It has another name until it is complete. If it cannot be kept, only time is lost.
         let part = kept.with_extension(process::id().to_string());
         let written = fs::create_dir_all(&folder).and_then(|()| fs::write(&part, &packed));
         let _ = written.and_then(|()| fs::rename(&part, &kept));
@@ -122,23 +122,23 @@ fn compressed(front: &[u8], raw: &[u8]) -> Vec<u8> {
     })
 }
 
-/// One of the two tables of an ELF file (System V ABI, chapter 4), by the places of its offset, its
-/// size of an entry and its number of entries in the file's header.
+/// One of the two tables of an ELF file (System V ABI, chapter 4): the positions of its offset, its
+/// entry size and its number of entries in the file's header.
 struct Table(usize, usize, usize);
 
 const PROGRAM_HEADERS: Table = Table(0x1C, 0x2A, 0x2C);
 const SECTION_HEADERS: Table = Table(0x20, 0x2E, 0x30);
-/// The place in the file's header of the number of the section with the sections' names.
+/// The position in the file's header of the number of the section with the sections' names.
 const SECTION_OF_NAMES: usize = 0x32;
 
 impl Table {
-    /// The entries. The parser has found them to be in the file.
+    /// The entries. The parser has checked that they are in the file.
     fn read(&self, file: &[u8]) -> Vec<Vec<u8>> {
         let (at, size, count) = (get(file, self.0), get_half(file, self.1), get_half(file, self.2));
         file[at as usize..][..size * count].chunks(size).map(<[u8]>::to_vec).collect()
     }
 
-    /// Puts the table anew at the end of the file.
+    /// Writes the changed table to the end of the file.
     fn write(&self, file: &mut Vec<u8>, entries: &[Vec<u8>]) -> Outcome {
         let offset = append(file, &entries.concat())?;
         let count = u16::try_from(entries.len()).map_err(|_| "it has too many headers.")?;
@@ -148,8 +148,8 @@ impl Table {
     }
 }
 
-/// Appends `packed` to the file, as a segment and a section at `address`, in the place of what the
-/// segment of `image` loads. That one stays without contents: so much RAM.
+/// Appends `packed` to the file, as a segment and a section at `address`, instead of the contents
+/// of the segment of `image`. That segment stays without contents: it only reserves RAM.
 fn load_instead(mut file: Vec<u8>, image: &Section, address: u32, packed: &[u8]) -> Outcome<Vec<u8>> {
     const PT_LOAD: u32 = 1;
     const PF_R: u32 = 4;
@@ -183,7 +183,7 @@ fn load_instead(mut file: Vec<u8>, image: &Section, address: u32, packed: &[u8])
     Ok(file)
 }
 
-/// Appends to a file, aligned for words; gives the offset.
+/// Appends to a file, aligned to words; returns the offset.
 fn append(file: &mut Vec<u8>, contents: &[u8]) -> Outcome<u32> {
     file.resize(file.len().next_multiple_of(4), 0);
     let offset = word(file.len());
@@ -211,7 +211,8 @@ fn get_half(bytes: &[u8], at: usize) -> usize {
 mod tests {
     use super::*;
 
-    /// A bootloader's file by hand: the header at 0800_0020, the image of 64 bytes behind it.
+    /// A bootloader's file made by hand: the header at 0800_0020, followed by the image of 64
+    /// bytes.
     fn linked() -> Vec<u8> {
         const RAW: u32 = 64;
         let mut file = vec![0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0];
@@ -249,9 +250,9 @@ mod tests {
         let segments: Vec<_> =
             elf.segments.iter().map(|segment| (segment.load_address, segment.file_size)).collect();
         assert_eq!(segments, [(0x0800_0020, 24), (0x0800_0038, packed.size), (0x2000_0000, 0)]);
-        // The image is where it was, for the debugger.
+        // The image is unchanged, for the debugger.
         assert_eq!(after[0x118..0x158], before[0x118..0x158]);
-        // It has no calls; what the stream holds is the business of `zx0`.
+        // It has no calls; `zx0` tests the contents of the stream.
         let stream = &after[packed.offset as usize..][..packed.size as usize];
         assert_eq!(stream, zx0::compress(&[], &before[0x118..0x158], OFFSETS));
         let header: Vec<u32> = (0..6).map(|word| get(&after, 0x100 + word * 4)).collect();

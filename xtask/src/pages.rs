@@ -1,8 +1,7 @@
-//! The commands that the pages show: every line of a block that is for a shell, and every call in
-//! running text.
+//! The commands on the pages: every line of a block for a shell, and every call in running text.
 //!
-//! For tests alone. Those of `coflash` and `coboot-node`, which have the command lines' own readers,
-//! take this file in by its path.
+//! Only for tests. The tests of `coflash` and `coboot-node`, which have the readers of their
+//! command lines, include this file by its path.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -10,22 +9,23 @@ use std::path::{Path, PathBuf};
 /// A command on a page.
 #[derive(Clone, Debug)]
 pub struct Shown {
-    /// Page and line.
+    /// The page and the line number.
     pub place: String,
-    /// Its words, as a shell would take them apart.
+    /// Its words, split as in a shell.
     pub words: Vec<String>,
-    /// Whether it stands in running text: there it may be a mention, without all that a call needs.
+    /// Whether it is in running text: there it may be an incomplete mention of a command.
     pub inline: bool,
 }
 
-/// Calls in running text begin with one of these.
+/// The prefixes of calls in running text.
 const CALLS: [&str; 3] = ["coflash ", "coboot-node ", "cargo xtask "];
-/// The languages of blocks in which every line is a command. In other blocks those behind `$ ` are.
+/// The languages of blocks in which every line is a command. In other blocks a command follows `$
+/// `.
 const SHELLS: [&str; 3] = ["sh", "bash", "shell"];
-/// Folders without pages of ours.
+/// Folders without our pages.
 const FOREIGN: [&str; 4] = ["target", ".git", "corpus", "node_modules"];
 
-/// All of them.
+/// The commands of all pages.
 pub fn commands() -> Vec<Shown> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a crate lies in the workspace");
     let mut pages = Vec::new();
@@ -36,7 +36,7 @@ pub fn commands() -> Vec<Shown> {
     for page in pages {
         let text = fs::read_to_string(&page).expect("a page is text");
         let name = page.strip_prefix(root).expect("below the root").display().to_string();
-        // What was is told by its name of then: no calls in running text there.
+        // Pages about the past use old names: their running text is not searched for calls.
         let history = name == "CHANGELOG.md" || name.contains("adr");
         found.extend(of_page(&name, &text, !history));
     }
@@ -57,7 +57,7 @@ fn find(folder: &Path, pages: &mut Vec<PathBuf>) {
 
 fn of_page(name: &str, text: &str, inline_too: bool) -> Vec<Shown> {
     let mut found = Vec::new();
-    // The language of the block that is open.
+    // The language of the open block.
     let mut block: Option<String> = None;
     let mut lines = text.lines().enumerate();
     while let Some((number, line)) = lines.next() {
@@ -95,8 +95,8 @@ fn spans(line: &str) -> impl Iterator<Item = &str> {
     line.split('`').skip(1).step_by(2)
 }
 
-/// The commands of a line: what stands between `&&`, `|` and `;`, without redirection, comments and
-/// variables in front.
+/// The commands of a line: the parts between `&&`, `|` and `;`, without redirections, comments and
+/// leading variables.
 fn split(place: &str, line: &str, inline: bool) -> Vec<Shown> {
     let mut all = vec![Vec::new()];
     let mut redirected = false;
@@ -119,7 +119,7 @@ fn split(place: &str, line: &str, inline: bool) -> Vec<Shown> {
     bare.filter(|words| !words.is_empty()).map(shown).collect()
 }
 
-/// The words of a line, quotes taken off; a comment ends it.
+/// The words of a line, without quotes; a comment ends the line.
 fn words(line: &str) -> Vec<String> {
     let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
     for character in line.chars() {
@@ -139,8 +139,8 @@ fn words(line: &str) -> Vec<String> {
     words
 }
 
-/// What a program is given, if this runs it: by its name, or by `cargo run -p NAME --`.
-// Not each of those who take this file in asks for it.
+/// The arguments of a program, if the command runs it: by its name, or by `cargo run -p NAME --`.
+// Not every crate that includes this file uses it.
 #[allow(dead_code)]
 pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
     match words {
@@ -154,7 +154,7 @@ pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
     }
 }
 
-/// What is written in capitals stands for something: a command, a board, a file.
+/// A word in capitals is a placeholder: for a command, a board, a file.
 // As above.
 #[allow(dead_code)]
 pub fn is_placeholder(word: &str) -> bool {

@@ -1,4 +1,5 @@
-//! `cargo xtask pairs`: bootloaders in which every pair of choices of a product stands together once.
+//! `cargo xtask pairs`: builds bootloaders so that every pair of choices of a product is together
+//! in at least one.
 
 use shared_abi::layout::{Layout, BOARDS};
 
@@ -19,7 +20,7 @@ build or does not fit its flash. It prints the choices and the size of each.
   --yes      installs what is missing with sudo
 ";
 
-/// The fields of a product that are varied, and how many values each has. The values themselves stand
+/// The fields of a product that are varied, and their numbers of values. The values themselves are
 /// in `bootloader/src/test_products.rs`, in the same order.
 const FIELDS: [(&str, u8); 32] = [
     ("profile", 4),
@@ -56,7 +57,7 @@ const FIELDS: [(&str, u8); 32] = [
     ("counter_with_confirmation", 2),
 ];
 
-/// The values of a product, by the order of [`FIELDS`]; 0 is the default.
+/// The values of a product, in the order of [`FIELDS`]; 0 is the default.
 type Row = [u8; FIELDS.len()];
 
 pub fn run(mut args: Args) -> Outcome {
@@ -79,7 +80,7 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-/// What the bootloader of these choices takes of a board's flash, in bytes.
+/// The size in a board's flash of the bootloader with these choices, in bytes.
 fn size(board: &Layout, row: &Row) -> Outcome<u32> {
     let product: String =
         std::iter::once(':').chain(row.iter().map(|value| char::from(b'0' + value))).collect();
@@ -92,7 +93,7 @@ fn size(board: &Layout, row: &Row) -> Outcome<u32> {
     Ok(used)
 }
 
-/// The fields that are not as by default.
+/// The fields that differ from their default.
 fn words(row: &Row) -> String {
     let others = FIELDS.iter().zip(row).filter(|(_, value)| **value > 0);
     let words: Vec<_> = others
@@ -113,15 +114,16 @@ fn words(row: &Row) -> String {
     }
 }
 
-/// Whether a product may choose this (`Product::checked`): a rescue window holds back a program that
-/// starts by itself, so it needs one. `None` is a field that is not chosen yet.
+/// Whether a product may have these choices (`Product::checked`): a rescue window delays a program
+/// that starts by itself, so it needs such a program. `None` is a field without a choice yet.
 fn allowed(row: &[Option<u8>; FIELDS.len()]) -> bool {
     let (autostart_off, window, window_confirmed) = (row[1] == Some(1), row[2] == Some(0), row[3] == Some(1));
     !(autostart_off && (window || window_confirmed))
 }
 
-/// Rows in which any two values that go together do so at least once. Each row takes a pair that no
-/// row has, and then, field by field, the value that adds most such pairs. The same rows each time.
+/// Rows in which any two compatible values are together at least once. Each row takes a pair that
+/// is in no row yet, and then, field by field, the value that adds most such pairs. The result is
+/// always the same.
 fn covering() -> Vec<Row> {
     let mut open = pairs();
     let mut rows = Vec::new();
@@ -138,7 +140,7 @@ fn covering() -> Vec<Row> {
                 let new = open.iter().filter(|(a, b)| with[a.0] == Some(a.1) && with[b.0] == Some(b.1));
                 allowed(&with).then(|| new.count())
             };
-            // Of equals the first: the default.
+            // Of equal values it takes the first: the default.
             row[field] = (0..FIELDS[field].1).rev().max_by_key(|value| adds(*value));
         }
         let row = row.map(|value| value.unwrap_or(0));
@@ -151,7 +153,7 @@ fn covering() -> Vec<Row> {
 /// A field and one of its values.
 type Choice = (usize, u8);
 
-/// All pairs of values of two fields that may stand together.
+/// All permitted pairs of values of two fields.
 fn pairs() -> Vec<(Choice, Choice)> {
     let mut pairs = Vec::new();
     for a in 0..FIELDS.len() {
@@ -174,11 +176,12 @@ fn pairs() -> Vec<(Choice, Choice)> {
 mod tests {
     use super::*;
 
-    /// Counted by hand: 30 fields of two values, one of three, one of four.
+    /// Counted by hand: 30 fields with two values, one with three, one with four.
     #[test]
     fn every_pair_stands_in_a_row_and_no_row_contradicts_itself() {
         let rows = covering();
-        // 4 for each pair of the 30, 6 and 8 with the larger ones, 12 between these; two contradict.
+        // 4 for each pair of the 30, 6 and 8 with the larger ones, 12 between these; two are not
+        // permitted.
         assert_eq!(pairs().len(), 30 * 29 / 2 * 4 + 30 * 6 + 30 * 8 + 12 - 2);
         for ((a, value_a), (b, value_b)) in pairs() {
             assert!(rows.iter().any(|row| row[a] == value_a && row[b] == value_b), "{a} {b}");
@@ -190,7 +193,7 @@ mod tests {
         assert!((12..=24).contains(&rows.len()), "{} rows", rows.len());
     }
 
-    /// The names are those of the struct: a field that a product gained is varied, too.
+    /// The names are those of the struct, so that a new field of the product is varied, too.
     #[test]
     fn the_fields_are_those_of_the_product() {
         let source = include_str!("../../bootloader/src/product.rs");

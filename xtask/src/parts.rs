@@ -1,4 +1,4 @@
-//! Which part of the house each byte of a program comes from, as its debug information tells.
+//! Finds the part of the sources for each byte of a program, from its debug information.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -7,13 +7,13 @@ use addr2line::Loader;
 
 use crate::{workspace, Outcome};
 
-/// The part of long runs of zeros: statics that begin as nothing.
+/// The part for long runs of zeros: statics that start as zero.
 pub const ZEROS: &str = "(zeros)";
-/// Fewer zeros in a row belong to the code or data that they stand in.
+/// A shorter run of zeros belongs to the code or data around it.
 const LONG: usize = 64;
 
-/// Bytes by part of the code and data with these contents from this address of an ELF file on. A part
-/// is a module of one of our crates (`boot-core/intake`), or somebody else's crate.
+/// The number of bytes of each part, for these contents at this address of an ELF file. A part is a
+/// module of one of our crates (`boot-core/intake`), or another author's crate.
 ///
 /// # Errors
 /// When the file has no debug information that can be read.
@@ -47,10 +47,10 @@ pub fn of(elf: &Path, address: u32, contents: &[u8]) -> Outcome<BTreeMap<String,
     Ok(parts)
 }
 
-/// The part that code belongs to: the innermost file of ours, else the outermost file.
+/// The part of code: the innermost file of ours, otherwise the outermost file.
 fn part(files: &[String], root: &Path) -> String {
     let ours = files.iter().find_map(|file| {
-        // The build of the firmware may name files relative to the workspace.
+        // The firmware's debug information may name files relative to the workspace.
         let file = Path::new(file).strip_prefix(root).unwrap_or(Path::new(file));
         let mut names = file.iter().filter_map(|name| name.to_str());
         let (krate, src, module) = (names.next()?, names.next()?, names.next()?);

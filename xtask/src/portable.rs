@@ -1,4 +1,4 @@
-//! `cargo xtask portable`: the host tools' code compiles for other systems.
+//! `cargo xtask portable`: checks that the code of the host tools compiles for other systems.
 
 use crate::args::Args;
 use crate::{process, setup, Outcome};
@@ -13,9 +13,9 @@ be had, a line says so and that system is left out.
   --strict        a system that was left out is a failure
 ";
 
-/// The systems, as Rust names them.
+/// The systems, by Rust's names.
 const TARGETS: [&str; 2] = ["x86_64-pc-windows-gnu", "aarch64-apple-darwin"];
-/// What has to compile there.
+/// The packages that must compile there.
 const PACKAGES: [&str; 2] = ["coflash", "coboot-node"];
 
 pub fn run(mut args: Args) -> Outcome {

@@ -1,4 +1,4 @@
-//! `cargo xtask powercut`: the proof that no power cut bricks a device.
+//! `cargo xtask powercut`: tests that no power cut bricks a device.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};

@@ -1,4 +1,4 @@
-//! Starting other programs.
+//! Starts other programs.
 
 use std::env;
 use std::ffi::OsStr;
@@ -8,28 +8,28 @@ use std::process::{Command, Stdio};
 use crate::workspace;
 use crate::Outcome;
 
-/// The cargo that started us, on this workspace, in the caller's folder.
+/// The cargo that started this program, on this workspace, in the caller's folder.
 pub fn cargo(subcommand: &str) -> Command {
     cargo_on(workspace::root(), subcommand)
 }
 
-/// The cargo that started us, on the package in a folder, in the caller's folder.
+/// The cargo that started this program, on the package in a folder, in the caller's folder.
 pub fn cargo_on(folder: &Path, subcommand: &str) -> Command {
     let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.arg(subcommand).arg("--manifest-path").arg(folder.join("Cargo.toml"));
     if env::var_os("CARGO_TARGET_DIR").is_some() {
-        // It may be relative, and a job may start cargo in another folder.
+        // The path may be relative, and a job may start cargo in another folder.
         command.env("CARGO_TARGET_DIR", workspace::target_dir());
     }
     command
 }
 
-/// The C compiler for the chip: clang, or what the variable `CLANG` names.
+/// The C compiler for the chip: clang, or the program in the variable `CLANG`.
 pub fn clang() -> Command {
     Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()))
 }
 
-/// Runs a program to its end; what it prints is seen.
+/// Runs a program to its end; its output is shown.
 ///
 /// # Errors
 /// When it cannot be started, or fails.
@@ -42,10 +42,10 @@ pub fn run(command: &mut Command) -> Outcome {
     }
 }
 
-/// Runs a program to its end and gives back what it printed to its standard output.
+/// Runs a program to its end and returns its standard output.
 ///
 /// # Errors
-/// When it cannot be started, fails, or prints no UTF-8.
+/// When it cannot be started, fails, or its output is not UTF-8.
 pub fn output(command: &mut Command) -> Outcome<String> {
     let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
     if !output.status.success() {
@@ -55,7 +55,7 @@ pub fn output(command: &mut Command) -> Outcome<String> {
     String::from_utf8(output.stdout).map_err(|_| format!("`{}` printed what is no text.", line(command)))
 }
 
-/// Runs a program to its end and gives back what it printed to its standard error.
+/// Runs a program to its end and returns its standard error.
 ///
 /// # Errors
 /// When it cannot be started, or fails.
@@ -68,19 +68,19 @@ pub fn messages(command: &mut Command) -> Outcome<String> {
     Ok(said)
 }
 
-/// Whether a program can be started and ends well; what it prints is not shown.
+/// Whether a program can be started and succeeds; its output is not shown.
 pub fn succeeds(program: impl AsRef<OsStr>, args: &[&str]) -> bool {
     let mut command = Command::new(program);
     command.args(args).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command.status().is_ok_and(|status| status.success())
 }
 
-/// Why a program could not be started.
+/// The message for a program that could not be started.
 pub fn not_started(command: &Command, error: &std::io::Error) -> String {
     format!("`{}` could not be started: {error}.", line(command))
 }
 
-/// A command as a person would type it, as far as that is needed to recognise it.
+/// The command as text, with enough of it to recognise it.
 pub fn line(command: &Command) -> String {
     let mut line = String::from("");
     let name = std::path::Path::new(command.get_program()).file_name().unwrap_or(command.get_program());

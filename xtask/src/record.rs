@@ -1,4 +1,4 @@
-//! `cargo xtask record`: the picture of the two windows, out of what the programs print.
+//! `cargo xtask record`: makes the picture of the two windows from the output of the programs.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -23,22 +23,22 @@ are checked in; tests tell when the picture is older than the text, or the text 
   --yes           installs what is missing with sudo
 ";
 
-/// Where the board's bus is.
+/// The address of the board's bus.
 const ADDRESS: &str = "127.0.0.1:29536";
-/// What is called, one after the other, in the folder of the board's images.
+/// The calls, in their order, in the folder of the board's images.
 const CALLS: [&str; 3] = [
     "coflash flash app-v1.elf --board stm32f407g-disc1 --quiet",
     "coflash flash app-v2.elf --board stm32f407g-disc1",
     "coflash read 100A",
 ];
-/// In front of a window's title in the text.
+/// The prefix of a window's title in the text.
 const WINDOW: &str = "== ";
-/// Stands for lines that were left out.
+/// A line that stands for omitted lines.
 const GAP: &str = "   …";
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
-    // The default one: its name is in the calls.
+    // The default board: the calls contain its name.
     let board = workspace::board(&mut args)?;
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
@@ -49,7 +49,7 @@ pub fn run(mut args: Args) -> Outcome {
     emulate.args(["--board", board.board, "--socketcand", ADDRESS, "--bootloader"]);
     let (mut running, lines) = started(emulate.arg(images.join("bootloader.elf")))?;
     let recorded = record(&images, &lines);
-    // It runs until it is ended; nobody waits for its last words.
+    // It runs until it is ended; its last output is not needed.
     let _ = running.kill();
     let _ = running.wait();
 
@@ -66,7 +66,7 @@ fn picture(name: &str) -> PathBuf {
     workspace::root().join("docs/pictures").join(name)
 }
 
-/// A program that runs on, and the lines that it prints.
+/// Starts a program that keeps running, and returns the lines of its output.
 fn started(command: &mut Command) -> Outcome<(Child, Receiver<String>)> {
     let mut child = command
         .stdin(Stdio::null())
@@ -76,19 +76,19 @@ fn started(command: &mut Command) -> Outcome<(Child, Receiver<String>)> {
     let (sender, lines) = mpsc::channel();
     if let Some(out) = child.stdout.take() {
         thread::spawn(move || {
-            // Ends with the program, or with the one who listens.
+            // It ends with the program, or when the receiver is dropped.
             let _ = BufReader::new(out).lines().map_while(Result::ok).try_for_each(|line| sender.send(line));
         });
     }
     Ok((child, lines))
 }
 
-/// Updates the board, and gives back both windows as text.
+/// Updates the board, and returns both windows as text.
 fn record(images: &PathBuf, board: &Receiver<String>) -> Outcome<String> {
     let first = board
         .recv_timeout(Duration::from_secs(30))
         .map_err(|_| "the emulated board does not come up; its own words above tell why.".to_owned())?;
-    // Until the boot-up is over.
+    // Waits until the boot-up is over.
     thread::sleep(Duration::from_secs(2));
     let bus = format!("socketcand://{ADDRESS}/can0");
     let mut tool = format!("$ export COFLASH_BUS={bus}\n");
@@ -105,7 +105,7 @@ fn record(images: &PathBuf, board: &Receiver<String>) -> Outcome<String> {
     Ok(format!("{text}{WINDOW}the tool\n{tool}"))
 }
 
-/// What a call printed, with one line of progress in the place of all.
+/// The output of a call, with one line of progress instead of all.
 fn shortened(said: &str) -> String {
     let mut lines: Vec<&str> = Vec::new();
     for line in said.lines() {
@@ -124,13 +124,13 @@ fn shortened(said: &str) -> String {
     lines.iter().map(|line| format!("{line}\n")).collect()
 }
 
-/// Measures in pixels.
+/// Sizes in pixels.
 const WIDTH: usize = 800;
 const LINE: usize = 17;
 const TITLE: usize = 26;
 const EDGE: usize = 10;
 
-/// The windows as a picture, below each other.
+/// The windows as a picture, one below the other.
 fn drawn(text: &str) -> String {
     let mut svg = String::new();
     let mut top = 4;

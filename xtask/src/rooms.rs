@@ -1,20 +1,20 @@
 //! The rooms of a crate: its top-level modules, and which of them use which.
 //!
-//! Three checks: what a room of `boot-core` and of `coflash` may use, so that a format cannot reach
-//! the flash and a file knows no device; that no rooms of a crate use each other in a circle; and in
-//! `coflash`, that no files do.
+//! Three checks: the permitted uses of each room of `boot-core` and of `coflash`, so that a format
+//! cannot reach the flash and a file does not depend on a device; that no rooms of a crate use each
+//! other in a circle; and that no files of `coflash` do.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use crate::modules;
 
-/// What a room may use, of its own crate.
+/// The rooms of its own crate that a room may use.
 struct Rule {
     room: &'static str,
     may_use: &'static [&'static str],
 }
 
-/// The rooms of `boot-core`. A new one needs a row.
+/// The rooms of `boot-core`. A new room needs a row.
 const BOOT_CORE: &[Rule] = &[
     Rule { room: "crc", may_use: &[] },
     Rule { room: "flash", may_use: &["crc"] },
@@ -27,11 +27,11 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "refusal", may_use: &[] },
     Rule { room: "policy", may_use: &["crc"] },
     Rule { room: "session", may_use: &["policy", "refusal"] },
-    // Bytes in, judged and placed pieces out: no flash, no store, no command.
+    // It turns bytes into judged pieces with an address: no flash, no store, no command.
     Rule { room: "intake", may_use: &["policy", "program", "queue", "refusal", "session"] },
-    // From the queue to the flash: no session, no object.
+    // It works from the queue to the flash: no session, no object.
     Rule { room: "unseal", may_use: &["flash", "keys", "policy", "program", "queue", "store"] },
-    // Pieces and addresses: no format, no object.
+    // It works on pieces and addresses: no format, no object.
     Rule {
         room: "programmer",
         may_use: &["crc", "flash", "program", "queue", "sequence", "store", "unseal"],
@@ -58,7 +58,7 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "profile", may_use: &["bootloader", "policy"] },
 ];
 
-/// The rooms of `coflash`. A new one needs a row. `update` uses `bus` for several devices at once,
+/// The rooms of `coflash`. A new room needs a row. `update` uses `bus` for several devices at once,
 /// which share an adapter.
 const COFLASH: &[Rule] = &[
     Rule { room: "setters", may_use: &[] },
@@ -71,11 +71,11 @@ const COFLASH: &[Rule] = &[
     Rule { room: "ui", may_use: &["bus", "canopen", "device", "file", "shared_abi", "update"] },
 ];
 
-/// The crates that `coflash` depends on and that a room of it may use only where its row says so.
+/// The dependencies of `coflash` that a room may use only if its row lists them.
 const OURS: [&str; 2] = ["canopen", "shared_abi"];
 
-/// The crates whose rooms are checked for circles. Of the others the knots are known: `emulator`
-/// (cpu, machine).
+/// The crates that are checked for circles of rooms. The circles of the others are known:
+/// `emulator` (cpu, machine).
 pub const WITHOUT_CIRCLES: &[&str] = &[
     "bootloader",
     "boot-core",
@@ -88,16 +88,16 @@ pub const WITHOUT_CIRCLES: &[&str] = &[
     "xtask",
 ];
 
-/// Knots that are known and have yet to be untied: the crate, and the arrow of it that is let pass.
+/// Known circles that are still to be resolved: the crate, and its use that is permitted.
 const KNOWN: &[(&str, &str, &str)] = &[("shared-abi", "callgate", "layout"), ("xtask", "size", "build")];
 
-/// The crates in which no files use each other in a circle, either.
+/// The crates that are checked for circles of files, too.
 const FILES_WITHOUT_CIRCLES: &[&str] = &["coflash"];
 
-/// Which room uses which.
+/// For each room, the rooms that it uses.
 pub type Graph = BTreeMap<String, BTreeSet<String>>;
 
-/// The rooms out of the graph of all files. What the root uses is of no interest.
+/// The graph of the rooms, from the graph of all files. Uses by the root are left out.
 pub fn graph(files: &modules::Graph) -> Graph {
     let mut graph = Graph::new();
     for (file, uses) in files {
@@ -108,7 +108,7 @@ pub fn graph(files: &modules::Graph) -> Graph {
     graph
 }
 
-/// Which room names which of [`OURS`].
+/// For each room, the crates of [`OURS`] that it names.
 fn crates(sources: &[(String, String)]) -> Graph {
     let mut graph = Graph::new();
     for (path, text) in sources {
@@ -120,7 +120,7 @@ fn crates(sources: &[(String, String)]) -> Graph {
     graph
 }
 
-/// A circle in the graph, if there is one: each room uses the next, and the last one the first.
+/// A circle in the graph, if there is one: each room uses the next one, and the last one the first.
 pub fn circle(graph: &Graph) -> Option<Vec<String>> {
     fn walk(
         graph: &Graph,
@@ -143,7 +143,7 @@ pub fn circle(graph: &Graph) -> Option<Vec<String>> {
     graph.keys().find_map(|room| walk(graph, room, &mut Vec::new(), &mut done))
 }
 
-/// What is wrong with the modules of a crate, in words. `sources` are the path of each file below
+/// The faults in the modules of a crate, as messages. `sources` are the path of each file below
 /// `src/`, and its text.
 pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     let files = modules::graph(name, sources);
@@ -185,7 +185,7 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     broken
 }
 
-/// The graph of the files as [`circle`] takes it. The root stands over all of them.
+/// The graph of the files in the form for [`circle`], without the root, which may use all files.
 fn by_name(files: &modules::Graph) -> Graph {
     let name = |module: &modules::Module| match module.as_slice() {
         [] => "(root)".to_owned(),

@@ -1,9 +1,9 @@
-//! `cargo xtask sbom`: the software bills of materials of what is released.
+//! `cargo xtask sbom`: makes the software bills of materials for the released programs.
 //!
-//! cargo-cyclonedx makes them. It writes a file beside the manifest of every crate of the workspace
-//! and puts the time, a random number and this machine's folders into it. This job takes the file
-//! that was asked for, takes those three out, so that the same sources give the same bytes, and
-//! holds the rest against what CycloneDX demands and against cargo.
+//! cargo-cyclonedx makes them. It writes a file beside the manifest of every crate of the
+//! workspace, and the file contains the time, a random number and this machine's folders. This job
+//! takes the file of the requested package and removes those three, so that the same sources give
+//! the same bytes. It checks the rest against the requirements of CycloneDX and against cargo.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -28,10 +28,10 @@ room for. The same sources give the same bytes. The host tool's one is that of a
 cargo-cyclonedx is installed into target/tools where it is missing, which takes some minutes once.
 ";
 
-/// The version that is installed where there is none.
+/// The version to install if there is none.
 const VERSION: &str = "0.5.7";
 
-/// What is released, and how cargo is told of it.
+/// A released program, and its arguments for cargo.
 struct Released {
     package: &'static str,
     /// The target, or `all`.
@@ -78,9 +78,9 @@ fn unwritable(path: &std::path::Path, error: &std::io::Error) -> String {
     format!("{} cannot be written: {error}.", workspace::shown(path))
 }
 
-/// What cargo-cyclonedx makes of a package.
+/// The output of cargo-cyclonedx for a package.
 fn generate(released: &Released, path: &std::ffi::OsStr) -> Outcome<String> {
-    // Beside each manifest; the number keeps two runs apart.
+    // The files are beside the manifests; the number keeps two runs apart.
     let name = format!("sbom-{}", std_process::id());
     let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.args(["cyclonedx", "--quiet", "--format", "json", "--spec-version", "1.5"]);
@@ -94,7 +94,7 @@ fn generate(released: &Released, path: &std::ffi::OsStr) -> Outcome<String> {
             text = fs::read_to_string(&file)
                 .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&file)));
         }
-        // Where there is none, there is nothing to take away.
+        // A missing file needs no removal.
         let _ = fs::remove_file(&file);
     }
     made.and(text)
@@ -114,8 +114,8 @@ fn members() -> Outcome<Vec<(String, PathBuf)>> {
     Ok(Value::parse(&said)?.get("packages").items().iter().filter_map(member).collect())
 }
 
-/// Takes out of a bill of materials what differs from run to run and from machine to machine: the
-/// time, the serial number (both are optional in CycloneDX 1.5) and the folder of the repository.
+/// Removes all that differs between runs and machines from a bill of materials: the time, the
+/// serial number (both are optional in CycloneDX 1.5) and the folder of the repository.
 fn tidy(text: &str, root: &str) -> String {
     let varies = |line: &&str| {
         let line = line.trim_start();
@@ -128,8 +128,8 @@ fn tidy(text: &str, root: &str) -> String {
 /// Name and version.
 type Crate = (String, String);
 
-/// What a package is built from, by cargo: itself and everything that it depends on, build
-/// dependencies too.
+/// The crates that a package is built from, according to cargo: itself and all its dependencies,
+/// build dependencies too.
 fn closure(released: &Released) -> Outcome<BTreeSet<Crate>> {
     let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     command.args(["tree", "--locked", "--prefix", "none", "--edges", "normal,build", "--no-dedupe"]);
@@ -138,7 +138,7 @@ fn closure(released: &Released) -> Outcome<BTreeSet<Crate>> {
     Ok(crates(&process::output(&mut command)?))
 }
 
-/// The crates in what `cargo tree` prints with the format `{p}`: `name v1.2.3`, and more.
+/// The crates in the output of `cargo tree` with the format `{p}`: `name v1.2.3`, and more.
 fn crates(tree: &str) -> BTreeSet<Crate> {
     let line = |line: &str| {
         let mut words = line.split(' ');
@@ -147,7 +147,7 @@ fn crates(tree: &str) -> BTreeSet<Crate> {
     tree.lines().filter_map(line).collect()
 }
 
-/// What of a bill of materials is not as CycloneDX 1.5 demands it, or misses a crate.
+/// The faults of a bill of materials: broken requirements of CycloneDX 1.5, and missing crates.
 fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
     let mut faults = Vec::new();
     for (name, wanted) in [("bomFormat", "CycloneDX"), ("specVersion", "1.5")] {
@@ -161,7 +161,7 @@ fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
     for component in [main].into_iter().chain(sbom.get("components").items()) {
         let text = |name: &str| component.get(name).text().unwrap_or_default().to_owned();
         let (name, version) = (text("name"), text("version"));
-        // `version` is optional there; a bill without is of no use.
+        // `version` is optional there, but a bill without it is of no use.
         for needed in ["type", "name", "version", "bom-ref", "purl"] {
             if text(needed).is_empty() {
                 faults.push(format!("the component \"{name}\" has no {needed}"));
@@ -187,7 +187,7 @@ fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// As cargo-cyclonedx 0.5.7 writes it, shortened.
+    /// The output of cargo-cyclonedx 0.5.7, shortened.
     const MADE: &str = r#"{
   "bomFormat": "CycloneDX",
   "specVersion": "1.5",
@@ -220,7 +220,7 @@ mod tests {
   ]
 }"#;
 
-    /// As `cargo tree` prints it.
+    /// The output of `cargo tree`.
     const TREE: &str = "bootloader v0.1.0 (/home/me/coboot/bootloader)\ncrc v3.4.0\ncrc v3.4.0\n\n";
 
     fn faults_of(text: &str, tree: &str) -> Vec<String> {
@@ -261,8 +261,8 @@ mod tests {
         assert_eq!(faults_of(&twice, TREE), ["x is there twice"]);
     }
 
-    /// What cargo says of our own bootloader: what it is linked from and what builds it, and neither
-    /// what its tests use nor what the emulator links.
+    /// Cargo's data about our own bootloader: the crates that are linked into it and that build it,
+    /// without those of its tests or the emulator.
     #[test]
     fn cargo_tells_what_the_bootloader_is_built_from() {
         let features = ["--no-default-features", "--features", "bsp/chip-stm32f407"];

@@ -1,7 +1,7 @@
-//! What the jobs need on a machine, installed where it is missing and where that is allowed.
+//! Installs what the jobs need on a machine, if it is missing and may be installed.
 //!
-//! A fresh Debian 12 or Ubuntu 24.04 with rustup, git and a C compiler is enough to start from.
-//! When nothing is missing this takes a fraction of a second.
+//! A new Debian 12 or Ubuntu 24.04 with rustup, git and a C compiler is enough. If nothing is
+//! missing, this takes a fraction of a second.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -26,7 +26,7 @@ anyone else it stops with the line to run, or, with --yes, runs that line.
   --yes           installs missing packages with sudo
 ";
 
-/// A part of the product that needs something on the machine.
+/// A part of the product with needs on the machine.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// Code for the chip: the Rust target.
@@ -35,7 +35,7 @@ pub enum Part {
     C,
     /// The examples in C and C++: two compilers for the chip, and CMake.
     Examples,
-    /// The emulator: Unicorn is C built by cmake, and its bindings are made with libclang.
+    /// The emulator: cmake builds Unicorn from C, and libclang makes its bindings.
     Emulator,
     /// The third-party CANopen client: a Python environment.
     Python,
@@ -51,9 +51,9 @@ pub enum Part {
     Windows,
 }
 
-/// How far the set-up may go.
+/// The permissions of the set-up.
 pub struct Setup {
-    /// Whether packages may be installed through sudo.
+    /// Whether packages may be installed with sudo.
     yes: bool,
 }
 
@@ -80,11 +80,11 @@ impl Setup {
         Self { yes: args.flag("--yes") }
     }
 
-    /// Sees to it that what these parts need is there.
+    /// Installs what these parts need and is missing.
     ///
     /// # Errors
-    /// When something is missing and may not or cannot be installed; the message has the line to
-    /// run.
+    /// When something is missing and cannot be installed or may not be; the message has the command
+    /// to run.
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
         if parts.contains(&Part::Firmware) {
@@ -99,7 +99,7 @@ impl Setup {
         Ok(())
     }
 
-    /// Debian's packages.
+    /// Installs Debian's packages.
     fn packages(&self, parts: &[Part]) -> Outcome {
         let missing = missing_packages(parts, Tool::is_there);
         if missing.is_empty() {
@@ -138,8 +138,8 @@ impl Setup {
             ]);
             process::run(command.args(words))
         };
-        // A fresh machine has no package lists. Where one source of several cannot be reached, the
-        // install may still work, and tells if not.
+        // A new machine has no package lists. If one of several sources cannot be reached, the
+        // install may still work; if not, it reports that.
         let _ = apt_get(&["update"]);
         let install = ["install", "-y", "--no-install-recommends"];
         apt_get(&[&install[..], &missing[..]].concat())
@@ -176,7 +176,7 @@ enum Tool {
 }
 
 impl Tool {
-    /// The package that brings it, on Debian and Ubuntu.
+    /// The package with the program, on Debian and Ubuntu.
     fn package(self) -> &'static str {
         match self {
             Self::CCompiler => "build-essential",
@@ -201,24 +201,25 @@ impl Tool {
                 let compiler = env::var_os("CC").unwrap_or_else(|| "cc".into());
                 process::succeeds(compiler, &["--version"])
             }
-            // cmake takes either.
+            // cmake works with either.
             Self::Make => {
                 process::succeeds("make", &["--version"]) || process::succeeds("ninja", &["--version"])
             }
             Self::Cmake => process::succeeds("cmake", &["--version"]),
-            // The configure script inside Unicorn stops without it, and the build then misses a
+            // Without it the configure script inside Unicorn stops, and the build then lacks a
             // header.
             Self::PkgConfig => process::succeeds("pkg-config", &["--version"]),
             Self::Libclang => libclang_is_there(),
-            // One without the target for Arm is of no use here.
+            // clang without the target for Arm is of no use here.
             Self::Clang => {
                 let arm = ["--target=thumbv7em-none-eabi", "-E", "-x", "c", "/dev/null"];
                 process::succeeds(process::clang().get_program(), &arm)
             }
-            // C and C++ without their libraries, which are ten times as large: the examples need none.
+            // C and C++ without their libraries, which are ten times as large: the examples do not
+            // need them.
             Self::ArmGcc => process::succeeds("arm-none-eabi-g++", &["--version"]),
             Self::Python => process::succeeds("python3", &["--version"]),
-            // Debian's python3 comes without ensurepip.
+            // Debian's python3 does not contain ensurepip.
             Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
             Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
             Self::Dpkg => process::succeeds("dpkg-deb", &["--version"]),
@@ -234,7 +235,7 @@ impl Tool {
     }
 }
 
-/// The packages that these parts need and that are not there, each once.
+/// The missing packages for these parts, each once.
 fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'static str> {
     let mut tools = Vec::new();
     for part in parts {
@@ -254,16 +255,16 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
     missing.into_iter().collect()
 }
 
-/// libclang with the compiler's own headers, where the bindings' generator (clang-sys) looks for
-/// it.
+/// Whether libclang with the compiler's own headers is in a folder in which the bindings' generator
+/// (clang-sys) looks.
 fn libclang_is_there() -> bool {
     if env::var_os("LIBCLANG_PATH").is_some() {
-        // Whoever sets it knows better; the build tells if not.
+        // The user has set the path; the build reports it if it is wrong.
         return true;
     }
     let homes = ["/usr/lib/llvm-*/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"];
     let library = homes.iter().any(|home| {
-        // `libclang-14.so.14` and the like; libclang-cpp is another library.
+        // For example `libclang-14.so.14`; libclang-cpp is another library.
         ["libclang.so", "libclang.so.*", "libclang-1*", "libclang-2*"]
             .iter()
             .any(|name| exists(&format!("{home}/{name}")))
@@ -272,7 +273,7 @@ fn libclang_is_there() -> bool {
     library && headers.iter().any(|home| exists(&format!("{home}/*/include/stdbool.h")))
 }
 
-/// Whether a path exists; a part of it may hold one `*`.
+/// Whether a path exists; a component may contain one `*`.
 fn exists(pattern: &str) -> bool {
     fn below(folder: &Path, parts: &[&str]) -> bool {
         let Some((part, rest)) = parts.split_first() else { return folder.exists() };
@@ -292,10 +293,10 @@ fn exists(pattern: &str) -> bool {
     below(Path::new("/"), &parts)
 }
 
-/// Sees to it that the libraries of a Rust target are there.
+/// Installs the libraries of a Rust target if they are missing.
 ///
 /// # Errors
-/// When they are missing and cannot be had; the message has the line to run.
+/// When they are missing and cannot be installed; the message has the command to run.
 pub fn rust_target(target: &str) -> Outcome {
     let is_there = || -> Outcome<bool> {
         let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
@@ -315,8 +316,8 @@ pub fn rust_target(target: &str) -> Outcome {
     ))
 }
 
-/// Sees to it that there is a program that cargo installs, in the PATH or in `target/tools`; gives
-/// the PATH with it.
+/// Provides a program that cargo installs, in the PATH or in `target/tools`; returns the PATH with
+/// it.
 ///
 /// # Errors
 /// When it is missing and cannot be installed.
@@ -331,8 +332,8 @@ pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
     env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
 }
 
-/// Sees to it that a program that cargo installs is in `target/tools`, in this version and no other;
-/// gives its path. `options` go to `cargo install`.
+/// Provides a program that cargo installs in `target/tools`, in exactly this version; returns its
+/// path. `options` are for `cargo install`.
 ///
 /// # Errors
 /// When it is missing and cannot be installed.
@@ -355,7 +356,7 @@ fn install(name: &str, version: &str, options: &[&str]) -> Outcome {
     install.arg("--root").arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
     process::run(&mut install)
         .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
-    // What it was built from is large and not needed again.
+    // The build files are large and not needed again.
     let _ = fs::remove_dir_all(tools.join("build"));
     Ok(())
 }
@@ -390,7 +391,7 @@ fn requirements() -> PathBuf {
     workspace::root().join("tests/python/requirements.txt")
 }
 
-/// What was installed into the environment: a copy of the requirements, written last.
+/// The file that records the environment's contents: a copy of the requirements, written last.
 fn stamp() -> PathBuf {
     workspace::target_dir().join("python/requirements.installed")
 }
@@ -455,7 +456,7 @@ mod tests {
         assert!(!exists("/no/such/folder/*/at.all"));
     }
 
-    /// Exact versions alone, so that every machine runs the same client.
+    /// Only exact versions, so that every machine runs the same client.
     #[test]
     fn every_python_requirement_is_pinned() {
         let text = fs::read_to_string(requirements()).unwrap();

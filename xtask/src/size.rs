@@ -1,4 +1,4 @@
-//! `cargo xtask size`: the bootloader's flash against its budget.
+//! `cargo xtask size`: compares the bootloader's flash with its budget.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -27,8 +27,8 @@ for long runs of zeros, which take next to nothing.
   --yes           installs what is missing with sudo
 ";
 
-/// What the bootloader may take on any board, in bytes, with every dialect and option in it. The aim
-/// is 20 KiB; the region has 32, of which sealed images will want the rest.
+/// The largest permitted size of the bootloader on any board, in bytes, with every dialect and
+/// option in it. The aim is 20 KiB; the region has 32 KiB, and sealed images need the rest.
 pub const BUDGET: u32 = 22 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
@@ -84,26 +84,26 @@ fn tables(board: &Layout, name: &str) -> Outcome<Flash> {
 /// Reads an ELF file.
 ///
 /// # Errors
-/// When it cannot be read or is none; the message names the file.
+/// When it cannot be read or is not an ELF file; the message names the file.
 pub fn read(path: &Path) -> Outcome<Elf> {
     let file =
         fs::read(path).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(path)))?;
     Elf::parse(&file).map_err(|problem| format!("{}: {problem}", workspace::shown(path)))
 }
 
-/// What an image occupies of its flash region.
+/// The part of its flash region that an image occupies.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Flash {
     /// Name, load address and length of each loaded section, in the order of addresses.
     pub sections: Vec<(String, u32, u32)>,
-    /// Bytes from the region's base to the last loaded one: what has to be written and what the CRC
-    /// runs over, gaps included.
+    /// Bytes from the region's base to the last loaded one, gaps included: they are written, and
+    /// the CRC covers them.
     pub used: u32,
-    /// What is packed, if anything is.
+    /// The packed part, if there is one.
     pub packed: Option<Packed>,
 }
 
-/// The part of an image that lies in flash packed (`pack.rs`).
+/// The part of an image that is packed in flash (`pack.rs`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Packed {
     /// Bytes in flash.
@@ -113,13 +113,13 @@ pub struct Packed {
 }
 
 impl Packed {
-    /// What is packed of an image.
+    /// The packed part of an image.
     fn of(elf: &Elf) -> Option<Self> {
         let size_of = |name| Some(elf.sections.iter().find(|section| section.name == name)?.size);
         Some(Self { stored: size_of(pack::PACKED)?, raw: size_of(pack::IMAGE)? })
     }
 
-    /// The share of so many raw bytes, where so many of all are zeros that take nothing.
+    /// The share of `raw` bytes in the packed bytes, with `zeros` of all raw bytes taking no room.
     fn share(self, raw: u32, zeros: u32) -> u32 {
         let counted = u64::from(self.raw.saturating_sub(zeros).max(1));
         (u64::from(raw) * u64::from(self.stored)).div_ceil(counted) as u32
@@ -130,7 +130,7 @@ impl Flash {
     /// Measures an image.
     ///
     /// # Errors
-    /// When the image loads nothing, or anything outside its region.
+    /// When the image loads nothing, or loads a byte outside its region.
     pub fn of(elf: &Elf, region: Region) -> Outcome<Self> {
         let mut used = 0;
         for segment in elf.segments.iter().filter(|segment| segment.file_size > 0) {
@@ -168,15 +168,15 @@ impl Flash {
         Ok(Self { sections, used, packed: Packed::of(elf) })
     }
 
-    /// Bytes as [`used`](Self::used), if nothing were packed.
+    /// Bytes as in [`used`](Self::used), if nothing were packed.
     pub fn raw(&self) -> u32 {
         self.packed.map_or(self.used, |packed| self.used - packed.stored + packed.raw)
     }
 
-    /// The gate.
+    /// The size gate.
     ///
     /// # Errors
-    /// When more is used than the budget allows.
+    /// When the image uses more than the budget.
     pub fn within(&self, budget: u32) -> Outcome {
         match self.used.checked_sub(budget) {
             None | Some(0) => Ok(()),
@@ -198,7 +198,7 @@ impl Flash {
     }
 }
 
-/// What the bootloaders of other products take, and those with what no product has.
+/// The sizes of the bootloaders of other products, and of those with features that no product has.
 fn by_variant(board: &Layout) -> Outcome<String> {
     let measure = |features: &str, product| -> Outcome<Flash> {
         Flash::of(&Elf::parse(&build::to_look_at(board, features, product)?)?, board.bootloader)
@@ -212,8 +212,8 @@ fn by_variant(board: &Layout) -> Outcome<String> {
     Ok(text)
 }
 
-/// Flash by part: raw, and the share of what is packed. `image` tells the parts of the RAM image;
-/// what runs from flash is told by its section.
+/// Flash by part: raw, and the share of the packed bytes. `image` has the parts of the RAM image;
+/// code that runs from flash is listed by its section.
 fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
     let packed = Packed::of(elf);
     let zeros = image.get(parts::ZEROS).copied().unwrap_or(0);
@@ -240,7 +240,7 @@ fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
     text
 }
 
-/// A number of bytes, in KiB where it is whole.
+/// A number of bytes, in KiB if it is a whole number of them.
 pub fn kib(bytes: u32) -> String {
     if bytes.is_multiple_of(1024) {
         format!("{} KiB", bytes / 1024)

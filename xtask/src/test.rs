@@ -1,4 +1,4 @@
-//! `cargo xtask test`: every test, with one summary at the end.
+//! `cargo xtask test`: runs every test, with one summary at the end.
 
 use std::ffi::{OsStr, OsString};
 use std::io::{BufRead, BufReader, Write};
@@ -41,16 +41,16 @@ pub fn run(mut args: Args) -> Outcome {
         Part::Browser,
     ])?;
     let chosen = args.rest();
-    // A run without arguments takes the main tests through the other chips, too.
+    // A run without arguments runs the main tests for the other chips, too.
     let others: Vec<&Layout> = BOARDS
         .iter()
         .copied()
         .filter(|other| !chosen_board && chosen.is_empty() && other.chip.chip != board.chip.chip)
         .collect();
-    // The boards with room for two programs are for the tests of that.
+    // The boards with room for two programs are for the tests of two programs.
     let two = BOARDS.iter().copied().filter(|other| other.programs.len() > 1 && other.board != board.board);
     build::boards(&[board].into_iter().chain(two).chain(others.iter().copied()).collect::<Vec<_>>())?;
-    // And one that talks through CAN2.
+    // A board with CAN2.
     build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
     examples::all()?;
     let programs = ["--package", "coflash", "--package", "coboot-node"];
@@ -90,8 +90,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
-/// The test programs that every board goes through each time: what a port can get wrong shows in
-/// them.
+/// The test programs that run for every board: they show the mistakes that a port can have.
 const MAIN_TESTS: [&str; 11] = [
     "main_job",
     "device",
@@ -106,7 +105,7 @@ const MAIN_TESTS: [&str; 11] = [
     "virtual_can",
 ];
 
-/// What has been tested so far, and what the tests need to know.
+/// The results of the run so far, and the needs of the tests.
 struct Suite {
     summary: Summary,
     coflash: OsString,
@@ -154,7 +153,7 @@ impl Summary {
         if let Some(printed) = tests.stdout.take() {
             let mut printed = BufReader::new(printed);
             let mut line = Vec::new();
-            // By bytes: a test may print what is no text.
+            // The output is read as bytes: a test may print invalid UTF-8.
             while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
                 let mut out = std::io::stdout().lock();
                 let _ = out.write_all(&line).and_then(|()| out.flush());
@@ -164,7 +163,7 @@ impl Summary {
         }
         let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
         if !status.success() && self.failed == failed {
-            // It counts as a failure, so that the last line never looks better than the run was.
+            // It counts as a failure, so that the last line is never better than the run.
             self.failed += 1;
             self.names_of_failed
                 .push("something that did not build, or a test program that broke off".into());
@@ -172,7 +171,7 @@ impl Summary {
         Ok(())
     }
 
-    /// Takes one line of what a test program prints.
+    /// Takes one line of a test program's output.
     fn take(&mut self, line: &str) {
         let line = line.trim_end();
         if let Some((_, counts)) = line.strip_prefix("test result: ").and_then(|line| line.split_once(". ")) {
@@ -191,7 +190,7 @@ impl Summary {
         }
     }
 
-    /// The line that ends a run; `.ci/run` repeats it.
+    /// The last line of a run; `.ci/run` repeats it.
     fn line(&self) -> String {
         let mut line = format!("{} passed, {} failed", self.passed, self.failed);
         if self.ignored > 0 {
@@ -205,7 +204,7 @@ impl Summary {
 mod tests {
     use super::*;
 
-    /// Lines as libtest prints them.
+    /// Lines in libtest's format.
     #[test]
     fn totals_are_summed_over_the_programs() {
         let mut summary = Summary::default();

@@ -1,6 +1,6 @@
-//! Timing diagrams of the pages, drawn from text: what is on the bus, and who runs meanwhile.
+//! Timing diagrams of the pages, drawn from text: the messages on the bus, and the work meanwhile.
 //!
-//! A line is one of these; `#` in front of a line makes it a remark. Times are in milliseconds.
+//! A line is one of these; a line that starts with `#` is a remark. Times are in milliseconds.
 //!
 //! ```text
 //! panel TITLE                        another diagram below the last one
@@ -14,7 +14,7 @@ use std::fmt::Write;
 
 use crate::Outcome;
 
-/// Something that lasts.
+/// An event with a duration.
 struct Bar<'t> {
     from: f64,
     to: f64,
@@ -27,24 +27,24 @@ struct Panel<'t> {
     from: f64,
     to: f64,
     frames: Vec<Bar<'t>>,
-    /// The lanes by name, in the order in which they are named first.
+    /// The lanes by name, in the order of their first appearance.
     lanes: Vec<(&'t str, Vec<Bar<'t>>)>,
     marks: Vec<(f64, &'t str)>,
 }
 
-/// Measures in pixels.
+/// Sizes in pixels.
 const NAMES: f64 = 96.0;
 const AXIS: f64 = 640.0;
 const WIDTH: f64 = NAMES + AXIS + 24.0;
 const ROW: f64 = 20.0;
 const LANE: f64 = 44.0;
-/// Width of a letter of 12 pixels, on the safe side.
+/// Width of a letter of 12 pixels, at most.
 const LETTER: f64 = 6.6;
 
 /// Draws the text.
 ///
 /// # Errors
-/// When a line is none of the above; the message names it.
+/// When a line is not one of the above; the message names it.
 pub fn drawn(text: &str) -> Outcome<String> {
     let mut svg = String::new();
     let mut top = 8.0;
@@ -87,7 +87,7 @@ fn time(line: &str) -> Option<(f64, &str)> {
 }
 
 impl<'t> Panel<'t> {
-    /// Takes a line; `None` where it is not understood.
+    /// Takes a line; `None` if it is invalid.
     fn take(&mut self, kind: &str, line: &'t str) -> Option<()> {
         match kind {
             "span" => {
@@ -123,15 +123,16 @@ impl<'t> Panel<'t> {
         }
     }
 
-    /// Where a time is on the axis.
+    /// The position of a time on the axis.
     fn x(&self, time: f64) -> f64 {
         round(NAMES + (time - self.from) / (self.to - self.from) * AXIS)
     }
 
-    /// Draws from `top` on, and gives back where the next one may begin.
+    /// Draws from `top` on, and returns the position for the next diagram.
     fn draw(&self, svg: &mut String, top: f64) -> f64 {
         words(svg, 8.0, top + 16.0, "font-weight=\"bold\" font-size=\"13\"", self.title);
-        // Words that would run into the next frame's stand in a row above, where no line crosses them.
+        // Words that would run into the next frame's are in a row above, where no line crosses
+        // them.
         let mut placed: Vec<(f64, usize)> = Vec::new();
         for frame in self.frames.iter().rev() {
             let x = self.x(frame.from);
@@ -179,7 +180,8 @@ impl<'t> Panel<'t> {
     }
 }
 
-/// To a tenth of a pixel, so that the text of the picture is short and the same everywhere.
+/// Rounds to a tenth of a pixel, so that the text of the picture is short and the same on every
+/// machine.
 fn round(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
 }

@@ -1,4 +1,4 @@
-//! Where things are, and which board is meant.
+//! The folders of the repository, and the selected board.
 
 use std::env;
 use std::path::{Path, PathBuf};
@@ -9,12 +9,12 @@ use shared_abi::layout::{self, Layout};
 use crate::args::Args;
 use crate::Outcome;
 
-/// What the firmware runs on: Armv7E-M with the single-precision FPU.
+/// The target of the firmware: Armv7E-M with the single-precision FPU.
 pub const TARGET: &str = "thumbv7em-none-eabihf";
-/// Cargo's profile of everything that goes onto the chip.
+/// Cargo's profile of the firmware.
 pub const PROFILE: &str = "firmware";
-/// The root of the repository: of the one that cargo runs this in. (A copy of it may hold a program
-/// that was built in the original.)
+/// The root of the repository in which cargo runs this program. (A copy of the repository may
+/// contain a program that was built in the original.)
 pub fn root() -> &'static Path {
     static ROOT: OnceLock<PathBuf> = OnceLock::new();
     ROOT.get_or_init(|| {
@@ -23,16 +23,17 @@ pub fn root() -> &'static Path {
     })
 }
 
-/// Cargo's folder for what it builds; ours for the firmware and the Python environment.
+/// Cargo's folder for build results; this program puts the firmware and the Python environment
+/// there.
 pub fn target_dir() -> PathBuf {
     match env::var_os("CARGO_TARGET_DIR") {
-        // Relative to the folder that cargo was started in, as cargo itself reads it.
+        // A path relative to the folder in which cargo was started, as cargo itself reads it.
         Some(dir) => env::current_dir().unwrap_or_default().join(dir),
         None => root().join("target"),
     }
 }
 
-/// Where the built images of a board are put.
+/// The folder of a board's built images.
 pub fn firmware_dir(board: &Layout) -> PathBuf {
     target_dir().join("firmware").join(board.board)
 }
@@ -49,7 +50,7 @@ pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
     })
 }
 
-/// A path as it is shown to a person: from the root on where it lies below it.
+/// A path for messages: relative to the root if it is below the root.
 pub fn shown(path: &Path) -> String {
     path.strip_prefix(root()).unwrap_or(path).display().to_string()
 }

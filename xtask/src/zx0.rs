@@ -1,38 +1,38 @@
-//! The smallest ZX0 stream (format version 2, Einar Saukas) of some bytes.
+//! Finds the smallest ZX0 stream (format version 2, Einar Saukas) of some bytes.
 //!
-//! A stream is literals and copies in turn: literals; a copy from the last offset, behind literals
-//! alone; a copy from another offset. Numbers are interlaced Elias gamma codes. Which of them to
-//! take is found by trying all: for each prefix of the input, what is the cheapest stream of it?
+//! A stream consists of literals and copies in turn: literals; a copy from the last offset, only
+//! after literals; a copy from another offset. Numbers are interlaced Elias gamma codes. The choice
+//! between them is found by trying all: for each prefix of the input, the cheapest stream of it.
 //!
 //! The format counts offsets in bytes, and has seven bits for their lower part. Thumb code consists
-//! of half-words, and nearly every copy in it comes from an even offset, often from far away; so both
-//! are a choice here ([`Offsets`]). A copy may come from in front of the output, too, where the
-//! unpacker has bytes to copy from. What that saves stands in docs/adr/0011-packed-ram-image.md.
+//! of half-words, and nearly every copy in it comes from an even offset, often from far away; so
+//! both are a choice here ([`Offsets`]). A copy may also come from data before the output, if the
+//! unpacker has such data. The savings are in docs/adr/0011-packed-ram-image.md.
 
-/// The upper part of an offset that stands for the end of the stream.
+/// The upper part of an offset that marks the end of the stream.
 const END: usize = 256;
 
-/// How a stream tells offsets.
+/// The format of the offsets in a stream.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Offsets {
-    /// Bytes that they count.
+    /// The unit of an offset in bytes.
     pub unit: usize,
-    /// Whether the lower part fills its byte. Else it has seven bits, and the eighth is the first
-    /// one of the length.
+    /// Whether the lower part fills its byte. Otherwise it has seven bits, and the eighth is the
+    /// first one of the length.
     pub is_low_byte: bool,
 }
 
 impl Offsets {
-    /// Those of the format.
+    /// The offsets of the standard format.
     #[cfg(test)]
     const ZX0: Self = Self { unit: 1, is_low_byte: false };
 
-    /// Bits of the lower part.
+    /// Number of bits of the lower part.
     fn low_bits(self) -> u32 {
         7 + u32::from(self.is_low_byte)
     }
 
-    /// The upper part, from 1 on, and the lower part, which goes downwards to 0.
+    /// The upper part, from 1 on, and the lower part, which counts down to 0.
     fn parts(self, offset: usize) -> (usize, usize) {
         let values = 1 << self.low_bits();
         ((offset - 1) / values + 1, values - 1 - (offset - 1) % values)
@@ -41,28 +41,28 @@ impl Offsets {
 /// A piece of a stream: literals, or a copy.
 #[derive(Clone, Copy)]
 struct Piece {
-    /// Bits of the stream up to its end.
+    /// Bits of the stream up to the end of the piece.
     bits: u32,
-    /// Bytes of the input up to its end.
+    /// Bytes of the input up to the end of the piece.
     end: usize,
-    /// 0 for literals; else from how many units before a copy comes.
+    /// 0 for literals; otherwise the distance of the copy's source in units.
     offset: usize,
     /// The piece before it.
     before: usize,
 }
 
-/// What is known of one offset.
+/// The state of one offset.
 #[derive(Clone, Copy, Default)]
 struct Offset {
-    /// How many bytes up to here equal those that far before.
+    /// The number of bytes up to here that equal the bytes at this distance before.
     equal: usize,
-    /// The cheapest stream whose last copy came from here: that copy.
+    /// The last copy of the cheapest stream whose last offset is this one.
     copy: Option<usize>,
-    /// The same with literals behind it, up to where the equal bytes begin.
+    /// The same with literals after the copy, up to the start of the equal bytes.
     literals: Option<usize>,
 }
 
-/// Packs some bytes, at least one, behind `before`, whose length is a multiple of the unit.
+/// Packs some bytes, at least one. They follow `before`, whose length is a multiple of the unit.
 pub fn compress(before: &[u8], bytes: &[u8], offsets: Offsets) -> Vec<u8> {
     let input = [before, bytes].concat();
     write(&input, before.len(), offsets, &cheapest(&input, before.len(), offsets))
@@ -70,8 +70,8 @@ pub fn compress(before: &[u8], bytes: &[u8], offsets: Offsets) -> Vec<u8> {
 
 /// The pieces of the smallest stream of `input` from `start` on, in order.
 fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
-    // Before the first byte the last offset is 1, and the flag in front of the first literals is
-    // left out.
+    // Before the first byte the last offset is 1, and the flag before the first literals is left
+    // out.
     const START: usize = 0;
     let unit = coding.unit;
     let mut pieces = vec![Piece { bits: u32::MAX, end: start, offset: 1, before: START }];
@@ -79,7 +79,7 @@ fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
     let mut best = vec![START; input.len() + 1];
     let mut offsets = vec![Offset::default(); input.len() / unit + 2];
     offsets[1].copy = Some(START);
-    // For each number of equal bytes, how many of them a copy should take.
+    // For each number of equal bytes, the best length of a copy.
     let mut lengths = vec![2; input.len() + 3];
 
     for end in start + 1..=input.len() {
@@ -88,8 +88,8 @@ fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
         let reach = ((end - 1) / unit).max(1);
         for (offset, state) in offsets[..=reach].iter_mut().enumerate().skip(1) {
             let here = end - 1;
-            // A stream begins with a literal. In RAM the output does not follow what is in front of
-            // it: no copy goes over there.
+            // A stream begins with a literal. In RAM the output does not follow the data before it:
+            // no copy crosses that border.
             let from =
                 here.checked_sub(offset * unit).filter(|from| here > start && (*from != start || start == 0));
             let is_equal = from.is_some_and(|from| input[here] == input[from]);
@@ -154,18 +154,18 @@ fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
     found
 }
 
-/// Bits of a stream that ends with this copy, with literals behind it up to `end`.
+/// Bits of a stream that ends with this copy and literals after it up to `end`.
 fn with_literals(copy: &Piece, end: usize) -> u32 {
     let length = end - copy.end;
     copy.bits.wrapping_add(1 + number_bits(length) + 8 * length as u32)
 }
 
-/// Bits of a number, from 1 on.
+/// Bits of the code of a number, from 1 on.
 fn number_bits(number: usize) -> u32 {
     2 * number.ilog2() + 1
 }
 
-/// Writes the pieces down.
+/// Writes the pieces as a stream.
 fn write(input: &[u8], start: usize, offsets: Offsets, pieces: &[Piece]) -> Vec<u8> {
     let mut stream = Stream { bytes: Vec::new(), bits: 0, left: 0, in_last: false };
     let (mut at, mut offset) = (start, 1);
@@ -206,7 +206,7 @@ fn write(input: &[u8], start: usize, offsets: Offsets, pieces: &[Piece]) -> Vec<
 /// Bytes, with bytes of bits between them.
 struct Stream {
     bytes: Vec<u8>,
-    /// Where the byte of bits stands, and how many of its bits are free.
+    /// The position of the byte of bits, and the number of its free bits.
     bits: usize,
     left: u32,
     /// The next bit is the lowest one of the byte that was written last.
@@ -227,8 +227,8 @@ impl Stream {
         self.bytes[self.bits] |= u8::from(bit) << self.left;
     }
 
-    /// An interlaced Elias gamma code: in front of each binary digit behind the first one a 0, and a
-    /// 1 at the end. `inverted`: the digits are.
+    /// An interlaced Elias gamma code: a 0 before each binary digit after the first one, and a 1 at
+    /// the end. `inverted`: the digits are inverted.
     fn number(&mut self, number: usize, inverted: bool) {
         for digit in (0..number.ilog2()).rev() {
             self.bit(false);
@@ -261,8 +261,8 @@ mod tests {
         bytes
     }
 
-    /// With bytes as the unit it is the format itself: somebody else's unpacker reads it, and
-    /// somebody else's packer, which finds the smallest stream too, finds none that is smaller.
+    /// With bytes as the unit it is the format itself: another author's unpacker reads it, and
+    /// another author's packer, which also finds the smallest stream, finds no smaller one.
     #[test]
     fn with_offsets_in_bytes_it_is_the_format() {
         for (seed, len) in [(1, 1), (2, 2), (3, 40), (4, 1000), (5, 6000)] {
@@ -277,8 +277,8 @@ mod tests {
     #[test]
     fn with_offsets_in_half_words() {
         let bits = [
-            // Four literals. A copy of 5 from two units before: 1, the upper part 1, and of 4 the bits
-            // behind the first one, which is in the byte of the lower part.
+            // Four literals. A copy of 5 from two units before: 1, the upper part 1, and of 4 the
+            // bits after the first one, which is in the byte of the lower part.
             0b0000_1110,
             // Its last bits. One literal. A copy of 2 from the last offset.
             0b0010_1000,
@@ -292,12 +292,12 @@ mod tests {
         assert_eq!(compress(&[], b"abcdabcdaXcd", offsets), stream);
     }
 
-    /// By hand, as the bootloader has it.
+    /// By hand, in the format of the bootloader.
     #[test]
     fn with_a_byte_for_the_lower_part_and_behind_other_bytes() {
         let bits = [
-            // One literal, though it could be copied, too. A copy of 6 from four units before, which is
-            // in front of the output: 1, the upper part 1, all bits of 5.
+            // One literal, though it could be copied, too. A copy of 6 from four units before,
+            // which is before the output: 1, the upper part 1, all bits of 5.
             0b1110_0011,
             // One literal, the end.
             0b0110_1010,

@@ -1,4 +1,4 @@
-//! What `defmt` writes to: the ring that a debug probe reads, a frame at a time.
+//! The output of `defmt`: it writes one frame at a time to the ring that a debug probe reads.
 
 use core::cell::UnsafeCell;
 
@@ -13,29 +13,30 @@ struct Logger;
 struct State {
     encoder: Encoder,
     message: Option<Message>,
-    /// Interrupts were on when the frame began.
+    /// Whether interrupts were on when the frame began.
     interrupts: bool,
 }
 
 struct Guarded(UnsafeCell<State>);
 
-// SAFETY: used between `acquire` and `release` alone, with interrupts off, on a chip with one core.
+// SAFETY: it is used only between `acquire` and `release`, with interrupts off, on a chip with one
+// core.
 unsafe impl Sync for Guarded {}
 
 static STATE: Guarded =
     Guarded(UnsafeCell::new(State { encoder: Encoder::new(), message: None, interrupts: false }));
 
-/// Does something with the state.
+/// Gives a function access to the state.
 ///
 /// # Safety
-/// Interrupts are off, and stay so.
+/// Interrupts are off, and stay off.
 unsafe fn with<T>(act: impl FnOnce(&mut State) -> T) -> T {
-    // SAFETY: interrupts are off, as the caller vouches for, so nobody else is here.
+    // SAFETY: the caller guarantees that interrupts are off, so no other code uses the state.
     act(unsafe { &mut *STATE.0.get() })
 }
 
-// SAFETY: between `acquire` and `release` interrupts are off, so there is one frame at a time; what
-// `defmt` formats has no formatters of ours that would log themselves.
+// SAFETY: between `acquire` and `release` interrupts are off, so only one frame is written at a
+// time. None of the values that `defmt` formats here has a formatter that logs.
 unsafe impl defmt::Logger for Logger {
     fn acquire() {
         let interrupts = primask::read().is_active();
@@ -52,7 +53,7 @@ unsafe impl defmt::Logger for Logger {
     }
 
     unsafe fn flush() {
-        // Who reads it does so when they like.
+        // There is nothing to flush: the probe reads the ring at its own speed.
     }
 
     unsafe fn release() {

@@ -1,10 +1,10 @@
-//! RTT (SEGGER UM08001 section 16.4): a ring buffer in RAM that a debug probe finds by its first
-//! bytes and reads while the program runs. A message that finds no room is left out: nobody waits
-//! for a probe.
+//! RTT (SEGGER UM08001 section 16.4): a ring buffer in RAM. A debug probe finds it by its first
+//! bytes and reads it while the program runs. A message is left out if the ring has no room for it:
+//! the bootloader never waits for a probe.
 
 use core::sync::atomic::{AtomicPtr, AtomicU32, AtomicU8, Ordering};
 
-/// SEGGER's control block with one buffer up and none down.
+/// SEGGER's control block with one up buffer and no down buffer.
 #[repr(C)]
 struct ControlBlock {
     id: [AtomicU32; 4],
@@ -13,21 +13,21 @@ struct ControlBlock {
     name: AtomicPtr<u8>,
     buffer: AtomicPtr<u8>,
     size: AtomicU32,
-    /// Where the next byte goes; ours.
+    /// Index of the next byte to write; changed by this program.
     written: AtomicU32,
-    /// Where the probe reads next; the probe's.
+    /// Index of the next byte to read; changed by the probe.
     read: AtomicU32,
-    /// 0: what finds no room is left out.
+    /// 0: a message without room is left out.
     flags: AtomicU32,
 }
 
 const SIZE: u32 = 1024;
 static BUFFER: [AtomicU8; SIZE as usize] = [const { AtomicU8::new(0) }; SIZE as usize];
 
-/// What a viewer shows as the buffer's name; viewers decode the one that is called `defmt`.
+/// The buffer's name in a viewer; viewers decode a buffer with the name `defmt`.
 const NAME: &core::ffi::CStr = if cfg!(feature = "log-defmt") { c"defmt" } else { c"log" };
 
-/// The name by which a viewer may find it in the ELF file.
+/// A viewer can find the block in the ELF file by this name.
 #[export_name = "_SEGGER_RTT"]
 static CONTROL: ControlBlock = ControlBlock {
     id: [const { AtomicU32::new(0) }; 4],
@@ -41,8 +41,8 @@ static CONTROL: ControlBlock = ControlBlock {
     flags: AtomicU32::new(0),
 };
 
-/// Makes the block known. The first bytes come last: a probe may look at any time, and must not
-/// find them anywhere else.
+/// Makes the block visible. Its first bytes are written last: a probe may look at any time, and
+/// must not find these bytes in an incomplete block.
 fn open() {
     CONTROL.up_buffers.store(1, Ordering::Relaxed);
     CONTROL.name.store(NAME.as_ptr().cast_mut().cast(), Ordering::Relaxed);
@@ -53,15 +53,15 @@ fn open() {
     }
 }
 
-/// A message that is being written, one at a time and with interrupts off. The probe sees it when
-/// it has ended.
+/// A message that is being written: only one at a time, and with interrupts off. The probe sees it
+/// when it has ended.
 pub struct Message {
     at: u32,
     fits: bool,
 }
 
 impl Message {
-    /// Begins one.
+    /// Begins a message.
     pub fn begin() -> Self {
         if CONTROL.size.load(Ordering::Relaxed) == 0 {
             open();
@@ -69,11 +69,11 @@ impl Message {
         Self { at: CONTROL.written.load(Ordering::Relaxed), fits: true }
     }
 
-    /// Adds bytes to it.
+    /// Adds bytes to the message.
     pub fn put(&mut self, bytes: impl IntoIterator<Item = u8>) {
         for byte in bytes {
             let next = (self.at + 1) % SIZE;
-            // A full ring would look like an empty one.
+            // One byte stays free: a full ring would look like an empty one.
             self.fits &= next != CONTROL.read.load(Ordering::Acquire);
             if self.fits {
                 BUFFER[(self.at % SIZE) as usize].store(byte, Ordering::Relaxed);
@@ -82,7 +82,7 @@ impl Message {
         }
     }
 
-    /// Hands it to the probe, if there was room for all of it.
+    /// Makes the message visible to the probe, if there was room for all of it.
     pub fn end(self) {
         if self.fits {
             CONTROL.written.store(self.at, Ordering::Release);

@@ -1,10 +1,9 @@
-//! The caches of the flash interface (RM0090 section 3.5): off while the flash is programmed, since
-//! an application may have switched them on, and on while the boot stage works.
+//! The caches of the flash interface (RM0090 section 3.5). They are off while the flash is
+//! programmed, because an application may have enabled them, and on while the boot stage works.
 
 use bsp::pac;
 
-/// Keeps them as they have to be for a while; when dropped, makes them forget what they hold and
-/// leaves them as they were.
+/// Keeps the caches on or off. When it is dropped, it empties the caches and restores their state.
 pub struct Caches {
     registers: pac::FLASH,
     before: u32,
@@ -12,32 +11,33 @@ pub struct Caches {
 
 /// `ICEN`, `DCEN` of the access control register (section 3.8.1).
 const CACHES: u32 = 0b11 << 9;
-/// `PRFTEN`. The boot stage does without: the first revision of the chip cannot prefetch.
+/// `PRFTEN`. The boot stage does not use it: the first revision of the chip cannot prefetch.
 const PREFETCH: u32 = 1 << 8;
-/// `ICRST`, `DCRST`: only while the caches are off.
+/// `ICRST`, `DCRST`: they may be set only while the caches are off.
 const RESETS: u32 = 0b11 << 11;
 
 impl Caches {
-    /// Off, and the prefetch with them.
+    /// Switches the caches and the prefetch off.
     ///
     /// # Safety
-    /// Nobody else may change the access control register until this is dropped.
+    /// Nothing else may change the access control register until this value is dropped.
     pub unsafe fn off() -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         unsafe { Self::set(0) }
     }
 
-    /// On: code in flash is some five times as fast at the full clock.
+    /// Switches the caches on: code in flash is some five times as fast at the full clock.
     ///
     /// # Safety
-    /// As for [`off`](Self::off); and they were off since the flash was programmed last.
+    /// As for [`off`](Self::off). The caches must also have been off since the flash was last
+    /// programmed.
     pub unsafe fn on() -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         unsafe { Self::set(CACHES) }
     }
 
     unsafe fn set(enabled: u32) -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         let registers = unsafe { pac::FLASH::steal() };
         let before = registers.acr().read().bits();
         let this = Self { registers, before };
@@ -45,14 +45,14 @@ impl Caches {
         this
     }
 
-    /// The register as it was, with everything off.
+    /// The register's original value, with caches and prefetch off.
     fn disabled(&self) -> u32 {
         self.before & !(CACHES | PREFETCH)
     }
 
     fn write(&self, bits: u32) {
-        // SAFETY: the wait states stay, and the rest may be switched at any time, the resets while
-        // the caches are off.
+        // SAFETY: the wait states stay. The other bits may change at any time; the resets are set
+        // only while the caches are off.
         self.registers.acr().write(|w| unsafe { w.bits(bits) });
     }
 }

@@ -1,11 +1,11 @@
-//! The callgate: what an application may call (`shared_abi::callgate`).
+//! The callgate: the services that an application may call (`shared_abi::callgate`).
 //!
-//! The flash controller may be the application's otherwise, and so may the CRC unit and the caches
-//! of the flash: they are taken when they are free, and left as they were found.
+//! The application may use the flash controller, the CRC unit and the caches of the flash itself.
+//! The callgate takes them when they are free, and leaves them as it found them.
 //!
-//! In front of a sealed program the flash is locked (`flash_lock.rs`): nothing can be stored then
-//! before the next reset, and a key that is written would be a bus error in the application. The
-//! application leaves what it wants in the warm-start cell, and the boot stage stores it.
+//! Before a sealed program starts, the boot stage locks the flash (`flash_lock.rs`): nothing can be
+//! stored then before the next reset, and a write of a key would be a bus error in the application.
+//! The application leaves its request in the warm-start cell, and the boot stage stores it.
 
 use core::ffi::c_void;
 
@@ -29,11 +29,11 @@ use crate::flash_controller::FlashController;
 use crate::product::{self, NO_NODE_ID};
 use crate::storing::{crash_count, store};
 
-/// One way in for all services: the argument structure is looked at, the flash is taken once, the
-/// service does its work, and everything is given back as it was found.
+/// The entry of all services: it checks the argument structure, takes the flash once, calls the
+/// service, and leaves everything as it found it.
 ///
 /// # Safety
-/// `args` must point to the argument structure of `selector`; what can be told of a wrong pointer
+/// `args` must point to the argument structure of `selector`; a pointer that is wrong beyond doubt
 /// is refused.
 pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     let Some(selector) = Selector::from_number(selector) else { return Status::UnknownSelector as i32 };
@@ -45,21 +45,21 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     if !is_in_ram(args as u32, size as u32) {
         return Status::BadPointer as i32;
     }
-    // Before the CRC unit gets its clock.
-    // SAFETY: two registers are read, which has no effect on their owner.
+    // This check comes before the CRC unit gets its clock.
+    // SAFETY: it reads two registers, which has no effect on their owner.
     if unsafe { FlashController::steal() }.is_in_use() {
         return Status::Busy as i32;
     }
     // SAFETY: the application calls one service at a time and does not use the flash controller
-    // meanwhile.
+    // during the call.
     let rcc = unsafe { pac::RCC::steal() };
     let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
-    // SAFETY: as above; the CRC unit only where its clock is off.
+    // SAFETY: as above; the CRC unit is taken only if its clock is off.
     let mut flash = unsafe { ResidentFlash::steal(crc_is_free) };
     if crc_is_free {
         ResidentFlash::switch_crc_unit_on(&rcc);
     }
-    // SAFETY: the caller vouches for the structure, and it lies in RAM, aligned.
+    // SAFETY: the caller guarantees the structure, and it lies in RAM, aligned.
     let outcome = unsafe {
         match selector {
             Selector::Crc32 => crc32(&flash, &mut *args.cast()),
@@ -73,7 +73,7 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     outcome.err().unwrap_or(Status::Ok) as i32
 }
 
-/// Whether a structure of this size lies there in RAM, aligned.
+/// Whether the address is aligned and a structure of this size there is in RAM.
 fn is_in_ram(address: u32, size: u32) -> bool {
     let chip = LAYOUT.chip;
     address.is_multiple_of(4) && (chip.sram.contains(address, size) || chip.ccm.contains(address, size))
@@ -92,21 +92,21 @@ fn keep(
     store(parameters, flash, key, value).map_err(|_| Status::Failed)
 }
 
-/// Whether the boot stage has locked the flash in front of the program that runs.
+/// Whether the boot stage locked the flash before it started the running program.
 #[cfg(feature = "sealed")]
 fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
-    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
     let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
     let record = ProgramRecord::load(parameters, flash, program);
     record.is_some_and(|record| record.seal == Some(Seal::Locked))
 }
 
-/// Stores what an application has asked for through a reset. What is refused stays as it was; the
-/// application sees that when it looks.
+/// Stores the values that an application requested before its reset. A refused request changes
+/// nothing; the application sees that when it reads the values.
 #[cfg(feature = "sealed")]
 pub fn store_after_reset(flash: &mut ResidentFlash, request: Option<BootRequest>) {
-    // The program that the lock was for does not run any more.
-    // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+    // The program for which the flash was locked does not run any more.
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
     let unlock = || unsafe { Handoff::erase(LAYOUT.handoff.base as *mut Handoff) };
     let (selector, number) = match request {
         Some(BootRequest::Confirm(number)) => (Selector::Confirm, number),
@@ -157,8 +157,8 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     keep(&mut parameters, flash, Key::Node, node.value())
 }
 
-/// Tells of a program; confirms it, which releases it for autostart, or takes both away. A confirmed
-/// program has not crashed.
+/// Reports about a program, confirms it (which also signs it, so that it may start by itself), or
+/// takes back both. A confirmation clears the crash count.
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
     LAYOUT.program(number).ok_or(Status::BadArgument)?;

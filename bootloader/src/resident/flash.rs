@@ -1,5 +1,5 @@
-//! The flash as the resident part sees it: all of it, with sectors, CRC unit (RM0090 section 4) and
-//! blank check. The RAM part asks for these through [`services`](crate::services).
+//! The flash for the resident part, with sectors, CRC unit (RM0090 section 4) and blank check. The
+//! RAM part uses these through [`services`](crate::services).
 
 use core::task::Poll;
 
@@ -10,19 +10,19 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::flash_controller::{FlashController, FLASH};
 
-/// The controller, and the CRC unit where it is not somebody else's.
+/// The controller, and the CRC unit if no other code uses it.
 pub struct ResidentFlash {
     controller: FlashController,
     has_crc_unit: bool,
 }
 
 impl ResidentFlash {
-    /// Takes the controller, and the CRC unit if it has its clock for us.
+    /// Takes the controller, and the CRC unit if `has_crc_unit` is true.
     ///
     /// # Safety
-    /// Nobody else may use the two until this is dropped.
+    /// Nothing else may use the two until this value is dropped.
     pub unsafe fn steal(has_crc_unit: bool) -> Self {
-        // SAFETY: the caller vouches for it.
+        // SAFETY: the caller guarantees it.
         Self { controller: unsafe { FlashController::steal() }, has_crc_unit }
     }
 
@@ -31,10 +31,10 @@ impl ResidentFlash {
         rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
     }
 
-    /// Leaves both as after a reset.
+    /// Leaves both in their reset state.
     pub fn release(self, rcc: &pac::RCC) {
         if self.has_crc_unit {
-            // SAFETY: `steal` has taken it.
+            // SAFETY: `steal` has taken the unit.
             unsafe { pac::CRC::steal() }.cr().write(|w| w.reset().set_bit());
             rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
         }
@@ -58,7 +58,7 @@ impl Flash for ResidentFlash {
     fn is_blank(&self, region: Region) -> bool {
         let (mut address, end) = (region.base, region.end());
         if address.is_multiple_of(4) && FLASH.contains(address, region.size) {
-            // By words, in a short loop: a journal is looked through on the way of every start.
+            // It compares words, in a short loop: every start checks a journal.
             while end - address >= 4 {
                 // SAFETY: inside the memory-mapped flash, which is always readable, and aligned.
                 if unsafe { (address as *const u32).read_volatile() } != u32::MAX {
@@ -70,25 +70,26 @@ impl Flash for ResidentFlash {
         (address..end).all(|address| self.controller.read_byte(address) == u8::MAX)
     }
 
-    /// Whole words by the unit, the rest without. The unit has the polynomial, but takes words with
-    /// the most significant bit first, and starts anew: what went before comes back as one word
-    /// that leaves it in the same state.
+    /// The CRC unit computes whole words, software the rest. The unit has the right polynomial, but
+    /// it takes words with the most significant bit first and always starts from its initial value.
+    /// One additional word first brings it to the state of the previous CRC.
     #[inline(never)]
     fn crc32(&self, mut crc: u32, region: Region) -> u32 {
         let (mut address, end) = (region.base, region.end());
         if self.has_crc_unit && address.is_multiple_of(4) && FLASH.contains(address, region.size) {
-            // SAFETY: `steal` has taken it.
+            // SAFETY: `steal` has taken the unit.
             let unit = unsafe { pac::CRC::steal() };
             unit.cr().write(|w| w.reset().set_bit());
             let data = unit.dr().as_ptr();
-            // SAFETY: every word may be written to DR. The region was checked to be inside the
-            // memory-mapped flash, which is always readable, and is aligned.
+            // SAFETY: every word may be written to DR. The region was checked to be aligned and
+            // inside the memory-mapped flash, which is always readable.
             unsafe {
                 if crc != 0 {
                     data.write_volatile(u32::MAX ^ word_before((!crc).reverse_bits()));
                 }
-                // Four at a time, and in assembly: on the way from reset to a large program this
-                // loop is most of the time, and the compiler would make a function of its body.
+                // The loop takes four words at a time and is in assembly: it takes most of the time
+                // from reset to a large program, and the compiler would move its body into a
+                // function.
                 while end - address >= 16 {
                     core::arch::asm!(
                         "ldmia {from}!, {{r2, r3, r4, r5}}",
@@ -128,7 +129,7 @@ impl Flash for ResidentFlash {
     }
 }
 
-/// The word that takes the CRC unit from 0 to this state: its 32 steps backwards.
+/// The word that takes the CRC unit from 0 to this state, found by 32 steps backwards.
 fn word_before(mut state: u32) -> u32 {
     /// The polynomial of the unit.
     const POLYNOMIAL: u32 = 0x04C1_1DB7;

@@ -1,13 +1,14 @@
-//! The flash lock: shuts flash and option bytes until the next reset, so that a sealed program stays
-//! the one that was verified when it was installed.
+//! The flash lock: it locks flash and option bytes until the next reset, so that a sealed program
+//! cannot change after its verification at installation.
 //!
-//! A wrong key does it (RM0090 sections 3.5.1 and 3.6.2): the chip shuts FLASH_CR and FLASH_OPTCR,
-//! and answers with a bus error. That has to end nowhere:
+//! A wrong key locks them (RM0090 sections 3.5.1 and 3.6.2): the chip locks FLASH_CR and
+//! FLASH_OPTCR, and answers with a bus error. This bus error must have no effect:
 //!
-//! - without the write buffer (`DISDEFWBUF`) the fault is precise, and under FAULTMASK, with
-//!   `BFHFNMIGN`, the core goes on behind the store (PM0214 sections 4.4.1 and 4.4.7);
-//! - should a fault come late all the same, it is a BusFault, which is enabled and pending then, and
-//!   no longer when this is over. (HardFault, which it would be otherwise, cannot be taken back.)
+//! - without the write buffer (`DISDEFWBUF`) the fault is precise; under FAULTMASK with `BFHFNMIGN`
+//!   the core continues after the store (PM0214 sections 4.4.1 and 4.4.7);
+//! - a fault that comes late all the same is a BusFault, because BusFault is enabled. It is only
+//!   pending, and `lock_flash` clears it at its end. (A HardFault, which it would be otherwise,
+//!   cannot be cleared.)
 
 /// The system control space.
 const CORE: u32 = 0xE000_E000;
@@ -23,14 +24,14 @@ const CCR: u32 = 1 << 9;
 /// CCR, `BFHFNMIGN`.
 const IGNORE: u32 = 1 << 8;
 
-/// Shuts flash and option bytes. Leaves the registers of the core as after a reset.
+/// Locks flash and option bytes. Leaves the registers of the core in their reset state.
 ///
 /// # Safety
-/// Nobody writes the flash until the next reset. The core is privileged, in thread mode, with no
-/// exception active or enabled.
+/// Nothing writes the flash until the next reset. The core is privileged and in thread mode, and no
+/// exception is active or enabled.
 pub unsafe fn lock_flash() {
-    // SAFETY: the addresses are those of ARMv7-M (B3.2) and RM0090 (section 3.9). Nothing is stored
-    // elsewhere, and the caller vouches that nobody has other values in these registers.
+    // SAFETY: the addresses are those of ARMv7-M (B3.2) and RM0090 (section 3.9). The code writes
+    // to no other address, and the caller guarantees that these registers have their reset values.
     unsafe {
         core::arch::asm!(
             "cpsid f",
@@ -39,11 +40,11 @@ pub unsafe fn lock_flash() {
             "str {enabled}, [{core}, #0xD24]",
             "dsb",
             "isb",
-            // 0 is a wrong key, whatever came before it.
+            // 0 is a wrong key in every state of the key sequence.
             "str {zero}, [{flash}, #4]",
             "str {zero}, [{flash}, #8]",
             "dsb",
-            // Not enabled and not pending any more; what the status tells is cleared by ones.
+            // The BusFault is disabled and no longer pending; ones clear the fault status.
             "str {zero}, [{core}, #0xD24]",
             "str {ones}, [{core}, #0xD28]",
             "str {ccr}, [{core}, #0xD14]",

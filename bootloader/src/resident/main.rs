@@ -1,22 +1,21 @@
-//! The resident part of the bootloader: what runs from flash, beside an application that owns all
-//! RAM.
+//! The resident part of the bootloader: the code that runs from flash. An application that calls it
+//! owns all RAM.
 //!
 //! | file | what it does | unsafe |
 //! |---|---|---|
 //! | `main.rs` | the header at the layout's fixed address | no |
 //! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
 //! | `callgate.rs` | services for the application | its ABI |
-//! | `service_table.rs` | services for the RAM part: the one owner of what is non-volatile | their ABI |
+//! | `service_table.rs` | services for the RAM part: all access to non-volatile data | their ABI |
 //! | `flash.rs` | the flash with sectors and CRC unit | registers |
-//! | `flash_lock.rs` | shuts the flash in front of a sealed program (feature `sealed`) | assembly |
-//! | `storing.rs` | a value stored while nothing else runs | no |
-//! | `ram_image.rs` | the rest of the bootloader, checked and unpacked to RAM | memory |
+//! | `flash_lock.rs` | locks the flash for a sealed program (feature `sealed`) | assembly |
+//! | `storing.rs` | stores a value while nothing else runs | no |
+//! | `ram_image.rs` | checks the rest of the bootloader and unpacks it to RAM | memory |
 //! | `unpack.rs` | the unpacker of ZX0 | assembly |
 //! | `caches.rs` | the caches of the flash, off or on for a while | registers |
 //!
-//! It is a program of its own, so that the linker can see that it has no variables: nothing but the
-//! stack and its own code is there when it runs. `build.rs` builds it, and the bootloader
-//! carries it as bytes.
+//! It is a separate program, so that the linker can check that it has no variables: it uses only
+//! the stack and its own code. `build.rs` builds it, and the bootloader contains its bytes.
 #![no_std]
 #![no_main]
 
@@ -44,8 +43,8 @@ mod unpack;
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::warm_start::BootRequest;
 
-/// What lies at the callgate's address: its table, and behind it the ways in for the bootloader's
-/// own start-up (`start.rs`).
+/// The contents at the callgate's address: the callgate's table, then the entries for the
+/// bootloader's own start-up (`start.rs`).
 #[repr(C)]
 struct Header {
     callgate: Table<Entry>,
@@ -71,7 +70,7 @@ static HEADER: Header = Header {
 };
 const _: () = assert!(size_of::<Table<Entry>>() == TABLE_SIZE as usize);
 
-/// A fault before the RAM image runs. There is nobody to tell but the bootloader after the reset.
+/// A fault before the RAM image runs. The bootloader reports it after the reset.
 extern "C" fn fault() -> ! {
     product::warm_start_cell().put(BootRequest::Fault);
     cortex_m::peripheral::SCB::sys_reset()

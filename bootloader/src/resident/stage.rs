@@ -1,8 +1,9 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
-//! It runs before any peripheral but the reset flags, the warm-start cell, the flash controller,
-//! the CRC unit and the entry strap was touched, and leaves those to a program as after a reset. The
-//! rest of the bootloader gets the CRC unit switched on, for the services.
+//! Before it, nothing has used a peripheral. It uses only the reset flags, the warm-start cell, the
+//! flash controller, the CRC unit and the entry strap, and leaves the peripherals to a program in
+//! their reset state. The rest of the bootloader gets the CRC unit with its clock on, for the
+//! services.
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
@@ -23,27 +24,29 @@ use crate::flash::ResidentFlash;
 use crate::product::{self, NO_NODE_ID, PRODUCT};
 use crate::{ram_image, storing};
 
-/// About how long the warm-start cell can be read in peace between two resets where nothing can run.
+/// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
+/// the warm-start cell in this time.
 const RESET_PERIOD_MS: u32 = 100;
 
-/// Decides. Comes back if the bootloader stays, with the rest of it in RAM, and tells in `report`
-/// what there is to do.
+/// Decides between a program and the bootloader. It returns if the bootloader stays; the rest of
+/// the bootloader is then in RAM, and `report` says what is left for it.
 ///
-/// A RAM image that is damaged does not run: it is told in the warm-start cell, and a program starts
-/// that would start by itself. Without one the chip is reset again and again.
+/// A damaged RAM image does not run. The warm-start cell records the damage, and the program with
+/// autostart starts. If there is none, the chip resets again and again.
 ///
 /// # Safety
-/// `image` must be the address of the RAM image's header, and `report` writable behind the image's
-/// RAM; nothing else may run yet.
+/// `image` must be the address of the RAM image's header. `report` must be writable and outside the
+/// image's RAM. Nothing else may run yet.
 pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
-    // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this has returned.
+    // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this function has
+    // returned.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
     let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
-    // No reset: an application has jumped here, and the flash may be locked. A reset opens it; the
-    // request stays in the cell.
+    // Without a reset cause an application has jumped here, and the flash may be locked. A reset
+    // unlocks it; the request stays in the cell.
     #[cfg(feature = "sealed")]
     if reset_cause == ResetCause::Unknown {
         SCB::sys_reset();
@@ -53,7 +56,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let request = cell.take();
     let strap = bsp::entry_strap();
 
-    // CRCs and unpacking want speed. Exact it need not be, and the crystal would take its time.
+    // CRCs and unpacking need speed, but no exact clock. The crystal would take time to start.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { ResidentFlash::steal(true) };
@@ -67,8 +70,8 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    // A bootloader that cannot run resumes what would start by itself, at once: a rescue window would
-    // need the RAM image, and the strap asks for what is not there.
+    // If the RAM image is damaged, the program with autostart is resumed at once: a rescue window
+    // would need the RAM image, and so would the entry strap.
     let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
     for is_damaged in [false, true] {
         if is_damaged {
@@ -93,23 +96,23 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
             });
             #[cfg(feature = "sealed")]
             if program.locks_flash() {
-                // SAFETY: nothing runs yet but this, and nothing is written any more.
+                // SAFETY: only this code runs, and it writes the flash no more.
                 unsafe { crate::flash_lock::lock_flash() };
             }
             if let Some(ms) = PRODUCT.program_watchdog_ms {
                 bsp::watchdog::start(&iwdg, ms);
             }
-            // SAFETY: the layout's handoff region, checked to be RAM of that size in no image. No
-            // interrupt was enabled and no bus master started since the reset.
+            // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
+            // image. Since the reset no interrupt was enabled and no bus master started.
             unsafe {
                 handoff.write(LAYOUT.handoff.base as *mut Handoff);
                 program.vectors().jump()
             }
         }
-        // SAFETY: the caller vouches for the address; of the RAM nothing is in use but the stack.
+        // SAFETY: the caller guarantees the address; only the stack uses the RAM.
         match unsafe { ram_image::load(image, &flash) } {
             Ok(()) => {
-                // SAFETY: the caller vouches for the address.
+                // SAFETY: the caller guarantees the address.
                 unsafe { report.write(boot_report(&decision, request, node_id, node.bit_rate)) };
                 return;
             }
@@ -117,12 +120,12 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
         }
     }
     CLOCK_TREE.slow_down(&rcc);
-    // A round of the loop takes three cycles.
+    // One pass of the loop takes three cycles.
     cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
     SCB::sys_reset()
 }
 
-/// What the RAM part is told.
+/// The report to the RAM part.
 fn boot_report(
     decision: &BootDecision,
     request: Option<BootRequest>,
@@ -134,10 +137,10 @@ fn boot_report(
         BootDecision::Hold { program, window_ms } => (StayReason::Rescue, *program, *window_ms),
         BootDecision::Start { program, .. } => (StayReason::Rescue, program.number(), 0),
     };
-    // An application that asks for the bootloader has shown that it can be called back. Which one
-    // it was stands in the handoff, which nobody has written since.
+    // An application that requests the bootloader has shown that it can be called back. The handoff
+    // has its number; nothing has written it since.
     let returned = match request {
-        // SAFETY: the layout's handoff region, checked to be RAM of that size in no image.
+        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
         Some(BootRequest::Stay | BootRequest::Owed(_)) => unsafe {
             Handoff::read_program(LAYOUT.handoff.base as *const Handoff)
         },
@@ -155,10 +158,10 @@ fn boot_report(
     }
 }
 
-/// The product's policy.
+/// The product's policy for the decision.
 const DECISION: boot_core::decision::Policy = PRODUCT.decision();
 
-/// Keeps the number of resets in a row by which an application ended without being asked to.
+/// Updates the number of resets in a row by which an application ended without a request.
 fn count_crash_resets(
     parameters: &mut product::Parameters,
     flash: &mut ResidentFlash,
@@ -168,7 +171,7 @@ fn count_crash_resets(
     let before = storing::crash_count(parameters, flash);
     let now = DECISION.crash_resets(before, reset_cause, request);
     if now != before {
-        // A store that fails costs the count, not the start.
+        // If the store fails, the count is lost, but the start continues.
         let _ = storing::store(parameters, flash, Key::CrashCount, [now, 0, 0, 0]);
     }
     now

@@ -1,4 +1,4 @@
-//! Storing for boot stage and callgate, which nothing else is kept waiting by.
+//! Storing for the boot stage and the callgate: both wait until the value is stored.
 
 use boot_core::flash::run;
 use boot_core::store::{Key, Parameters as _, StoreError, Value};
@@ -15,14 +15,14 @@ pub fn store(
     key: Key,
     value: Value,
 ) -> Result<(), StoreError> {
-    // They would show words as they were before they were programmed.
-    // SAFETY: whoever has the flash has its caches.
+    // The caches would return the old words.
+    // SAFETY: the owner of the flash also owns its caches.
     let _caches = unsafe { Caches::off() };
     parameters.store(key, value);
     run(flash, |flash, outcome| parameters.next(flash, outcome))
 }
 
-/// Resets in a row by which an application ended without being asked to.
+/// Resets in a row by which an application ended without a request.
 pub fn crash_count(parameters: &Parameters, flash: &ResidentFlash) -> u32 {
     parameters.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count)
 }

@@ -1,10 +1,12 @@
-//! The unpacker of ZX0 streams (format version 2, Einar Saukas) with offsets of our own
-//! (`shared_abi::ram_image::Method`). It is in assembly: half as long and three times as fast as what
-//! the compiler makes of one in Rust, and it is on the way from "call back" to the answer.
+//! The unpacker of ZX0 streams (format version 2, Einar Saukas) with our own offsets
+//! (`shared_abi::ram_image::Method`). It is in assembly: half as long and three times as fast as
+//! compiled Rust code. Its speed matters, because it runs between the call of the bootloader and
+//! the answer.
 //!
-//! A stream is literals and copies in turn. Flags and numbers are bits, which stand in bytes between
-//! the other bytes; literals and the lower parts of offsets are bytes. A number is an interlaced
-//! Elias gamma code: from 1 on, a 0 and a bit that is shifted in for each binary digit, then a 1.
+//! A stream consists of literals and copies in turn. Flags and numbers are bits; the bits are in
+//! bytes between the other bytes. Literals and the lower parts of offsets are bytes. A number is an
+//! interlaced Elias gamma code: it starts as 1; for each further binary digit come a 0 and the
+//! digit, which is shifted in; a 1 ends it.
 
 use core::arch::global_asm;
 
@@ -20,35 +22,37 @@ extern "C" {
     fn calls_to_relative(image: *mut u8, end: *mut u8);
 }
 
-/// Unpacks a stream into all of `to`, and takes all of `packed` for it; whether that went well.
-/// `front` is what copies from in front of the output come from.
+/// Unpacks a stream. Returns whether it used all of `packed` and filled all of `to`. `front` is the
+/// data before the output; copies may come from there, too.
 ///
-/// Whatever the stream says, nothing outside the three is written or read, and it comes to an end:
-/// every step takes from `packed` or writes to `to`.
+/// No stream can make it read or write outside the three slices, and every stream ends: each step
+/// takes a byte from `packed` or writes a byte to `to`.
 pub fn unpack(front: &[u8], packed: &[u8], to: &mut [u8]) -> bool {
     let (packed, to) = (packed.as_ptr_range(), to.as_mut_ptr_range());
-    // SAFETY: the three slices. The code reads `packed` between its ends, and writes and reads `to`
-    // between its own: `literals`, `another` and `refill` compare with the end of `packed`, `copy`
-    // with that of `to`, and `match` with its start. A copy from in front of that is compared with
-    // the length of `front`, and its own length with what is left there.
+    // SAFETY: the three slices are valid. The code reads `packed` between its ends, and writes and
+    // reads `to` between its own: `literals`, `another` and `refill` compare with the end of
+    // `packed`, `copy` with the end of `to`, and `match` with its start. For a copy from before
+    // that start, the code compares the distance with the length of `front`, and the copy's length
+    // with the bytes left there.
     unsafe {
         zx0_unpack(packed.start, packed.end, to.start, to.end, front.as_ptr_range().end, front.len()) == 0
     }
 }
 
-/// Puts calls back as the core wants them. Before the image was packed, the target of each `BL` was
-/// made absolute, so that two calls of one function are the same bytes (`xtask/src/pack.rs`).
+/// Restores the calls of the image to the encoding of the core. Before the image was packed, the
+/// target of each `BL` was made absolute, so that two calls of one function are the same bytes
+/// (`xtask/src/pack.rs`).
 pub fn restore_calls(image: &mut [u8]) {
     let image = image.as_mut_ptr_range();
-    // SAFETY: the slice. The code reads and writes half-words while four bytes are left; the image
-    // is in RAM, aligned.
+    // SAFETY: the slice is valid. The code reads and writes half-words while four bytes are left;
+    // the image is in RAM, aligned.
     unsafe { calls_to_relative(image.start, image.end) };
 }
 
-// r0 next byte of the stream, r1 its end; r2 next byte of the output, r3 its end, r4 its start;
-// r5 offset of the last copy; r6 the bits that are left of a byte of bits, from bit 31 on, and a 1
-// behind them; r7 the number; r8 what to copy from; r9 the end of what is in front of the output,
-// r10 its length; r12 is free.
+// r0 next byte of the stream, r1 its end; r2 next byte of the output, r3 its end, r4 its start; r5
+// offset of the last copy; r6 the unused bits of a byte of bits, from bit 31 down, followed by a 1;
+// r7 the number; r8 the source of a copy; r9 the end of the data before the output, r10 their
+// length; r12 is free.
 global_asm!(
     ".section .text.zx0_unpack, \"ax\"",
     ".syntax unified",
@@ -61,7 +65,7 @@ global_asm!(
     "mov r4, r2",
     "movs r5, #2",
     "mov r6, #0x80000000",
-    // Literals: as many bytes of the stream as the number says.
+    // Literals: the number of bytes to copy from the stream.
     ".Lzx0_literals:",
     "movs r7, #1",
     "bl .Lzx0_number",
@@ -75,14 +79,14 @@ global_asm!(
     // A copy from the last offset.
     "movs r7, #1",
     "bl .Lzx0_number",
-    // A copy: from what was written already, or from what is in front of the output. (An offset of 0
-    // reads what is overwritten.)
+    // A copy from the bytes that were already written, or from the data before the output. (An
+    // offset of 0 reads the byte that it overwrites.)
     ".Lzx0_match:",
     "subs r8, r2, r5",
     "subs r12, r2, r4",
     "subs r12, r5, r12",
     "bls .Lzx0_from_output",
-    // From r12 bytes in front of the output.
+    // The copy starts r12 bytes before the output.
     "cmp r12, r10",
     "bhi .Lzx0_damaged",
     "cmp r7, r12",
@@ -91,8 +95,8 @@ global_asm!(
     ".Lzx0_from_output:",
     "bl .Lzx0_copy",
     "bcc .Lzx0_literals",
-    // A copy from another offset: the upper part is a number, whose bits are inverted; the end of
-    // the stream is 256 in its place. The lower part is a byte. Offsets count half-words.
+    // A copy from a new offset: the upper part is a number with inverted bits; 256 in its place is
+    // the end of the stream. The lower part is a byte. Offsets count half-words.
     ".Lzx0_another:",
     "mvn r7, #1",
     "bl .Lzx0_number",
@@ -108,17 +112,18 @@ global_asm!(
     "bl .Lzx0_number",
     "adds r7, #1",
     "b .Lzx0_match",
-    // Stopped: the stream is damaged.
+    // The stream is damaged: unpacking stops.
     ".Lzx0_damaged:",
     "movs r0, #1",
     "pop {{r4-r10, pc}}",
-    // The end: well if both end here.
+    // The end of the stream: success if both stream and output end here.
     ".Lzx0_end:",
     "subs r0, r1",
     "subs r2, r3",
     "orrs r0, r2",
     "pop {{r4-r10, pc}}",
-    // Shifts a number into r7. One that is too long goes over its upper end; who uses it looks.
+    // Shifts a number into r7. A number that is too long loses its upper bits; the code that uses
+    // it checks its range.
     ".Lzx0_number:",
     "mov r12, lr",
     ".Lzx0_digit:",
@@ -133,7 +138,7 @@ global_asm!(
     "b .Lzx0_digit",
     ".Lzx0_whole:",
     "bx r12",
-    // Copies r7 bytes, 1 at least, and takes the flag behind them into the carry.
+    // Copies r7 bytes (at least 1), and takes the flag after them into the carry.
     ".Lzx0_copy:",
     "subs r7, #1",
     "subs r12, r3, r2",
@@ -146,7 +151,7 @@ global_asm!(
     "bpl .Lzx0_byte",
     "adds r6, r6",
     "bne .Lzx0_taken",
-    // Takes a bit where no more are left, into the carry.
+    // Takes a bit from the next byte of bits into the carry.
     ".Lzx0_refill:",
     "cmp r0, r1",
     "bhs .Lzx0_damaged",
@@ -160,8 +165,8 @@ global_asm!(
 );
 
 // r0 next half-word of the image, r1 its end; r2 the first half-word of a call, r12 the second one,
-// then the target in half-words; r3 is free. (BL, encoding T1, as ARMv6-M has it: a call that far
-// is all that a RAM image has.)
+// then the target in half-words; r3 is free. (BL in encoding T1 with the range of ARMv6-M: a RAM
+// image needs no farther calls.)
 global_asm!(
     ".section .text.calls_to_relative, \"ax\"",
     ".syntax unified",

@@ -20,12 +20,12 @@ pub const NODE_ID: u8 = 1;
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would do for the core,
-/// but 1 % is too much for CAN above 125 kbit/s. Where the ST-LINK has been broken off and no
-/// crystal X3 is fitted, the bootloader falls back to HSI.
+/// 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would be enough for the
+/// core, but its error of 1 % is too large for CAN above 125 kbit/s. If the ST-LINK has been broken
+/// off and no crystal X3 is fitted, the bootloader falls back to HSI.
 ///
-/// 160 MHz and not the 180 MHz that the chip could do with over-drive: APB1 at 40 MHz makes each
-/// bit rate of CiA 301, 45 MHz and 42 MHz do not make 800 kbit/s.
+/// The core runs at 160 MHz instead of the 180 MHz that the chip reaches with over-drive: APB1 at
+/// 40 MHz makes each bit rate of CiA 301; 45 MHz and 42 MHz do not make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
     hse_bypass: true,
@@ -38,7 +38,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset: the blue button B1 on PC13, low when pressed; the board pulls it up (UM1724).
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PC13, low when
+/// pressed; the board pulls it up (UM1724).
 pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.

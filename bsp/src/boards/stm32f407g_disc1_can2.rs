@@ -1,4 +1,4 @@
-//! STM32F407G-DISC1 with a CAN transceiver on PB12 and PB13: CAN2 in the place of CAN1.
+//! STM32F407G-DISC1 with a CAN transceiver on PB12 and PB13: CAN2 instead of CAN1.
 
 use crate::clock::ClockTree;
 use crate::{Identity, Pull, Strap};
@@ -34,7 +34,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed (UM1472 section 6.4).
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed
+/// (UM1472 section 6.4).
 pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'A', pin: 0, pressed: true, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.

@@ -1,8 +1,8 @@
 //! STM32F429I-DISC1 with a CAN transceiver on PB8 and PB9.
 //!
 //! Every pin of CAN1 has another use on this board (UM1670): PD0 and PD1 are data lines of the
-//! SDRAM, PA11, PA12, PB8 and PB9 go to the display's parallel interface, where they end in inputs.
-//! So PB8 and PB9 are free as long as the display stays dark.
+//! SDRAM; PA11, PA12, PB8 and PB9 go to the display's parallel interface, where they are connected
+//! to inputs. So PB8 and PB9 are free as long as the display is not used.
 
 use crate::clock::ClockTree;
 use crate::{Identity, Pull, Strap};
@@ -24,8 +24,9 @@ pub const NODE_ID: u8 = 1;
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). 160 MHz and not 168 (180 with over-drive): APB1
-/// at 40 MHz makes each bit rate of CiA 301, 42 MHz and 45 MHz do not make 800 kbit/s.
+/// A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). The core runs at 160 MHz instead of 168 MHz (180
+/// MHz with over-drive): APB1 at 40 MHz makes each bit rate of CiA 301; 42 MHz and 45 MHz do not
+/// make 800 kbit/s.
 pub const CLOCK_TREE: ClockTree = ClockTree {
     hse: 8_000_000,
     hse_bypass: false,
@@ -38,7 +39,8 @@ pub const CLOCK_TREE: ClockTree = ClockTree {
 }
 .checked();
 
-/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed (UM1670).
+/// The pin that asks for the bootloader after a reset: the blue button B1 on PA0, high when pressed
+/// (UM1670).
 pub const ENTRY_STRAP: Option<Strap> = Some(Strap { port: 'A', pin: 0, pressed: true, pull: Pull::None });
 
 /// Bit rate of the UART, in bit/s.

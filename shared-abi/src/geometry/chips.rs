@@ -1,8 +1,8 @@
-//! Every chip of the lines, as it can be ordered: line, package and flash.
+//! All order codes of chips of the lines: line, package and flash.
 
 use super::{Geometry, Line};
 
-/// A constant for each chip, and the list of all.
+/// Defines a constant for each chip, and the list of all chips.
 macro_rules! chips {
     ($($line:ident: $($chip:ident)+;)+) => {
         $($(
@@ -18,7 +18,7 @@ macro_rules! chips {
     };
 }
 
-/// A name as it is printed here.
+/// The name in lower case.
 const fn lower_case(name: &str) -> [u8; 11] {
     let mut lower = [0; 11];
     let mut i = 0;
@@ -29,7 +29,7 @@ const fn lower_case(name: &str) -> [u8; 11] {
     lower
 }
 
-// Ordering information of the datasheets. The letter behind the line is the package (C 48, R 64, M
+// Ordering information of the datasheets. The letter after the line is the package (C 48, R 64, M
 // 81, O 90, V 100, Z 144, A 169, I 176, B 208 and N 216 pins or balls), the last one the flash.
 chips! {
     F405: STM32F405OE STM32F405OG STM32F405RG STM32F405VG STM32F405ZG;

@@ -1,7 +1,7 @@
-//! The lines of the family, and what all chips of a line share.
+//! The lines of the family, and the properties that all chips of a line share.
 
-/// A line of the STM32F4 family that has CAN controllers of the kind bxCAN. (STM32F401, F410 and
-/// F411 have none.)
+/// A line of the STM32F4 family with CAN controllers of the type bxCAN. (STM32F401, F410 and F411
+/// have none.)
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 #[allow(missing_docs)]
@@ -22,26 +22,26 @@ pub enum Line {
     F479,
 }
 
-/// How fast the clocks of a chip may run at 2.7 to 3.6 V. (The flash is programmed by words, which
-/// takes 2.7 V: RM0090 table 7. So no board with less can have this bootloader.)
+/// The highest clocks of a chip at 2.7 to 3.6 V. (The bootloader programs the flash by words, which
+/// needs at least 2.7 V: RM0090 table 7. So it cannot run on a board with a lower voltage.)
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// The core's clock in Hz. Over-drive is off: nothing here switches it on.
+    /// The core's clock in Hz. Over-drive is off: this firmware does not use it.
     pub sysclk: u32,
-    /// The core's clock in Hz with the regulator's scale as a reset leaves it (`PWR_CR.VOS`). Above
-    /// it, the scale has to be raised first.
+    /// The core's clock in Hz with the regulator's scale after a reset (`PWR_CR.VOS`). For a faster
+    /// clock the scale must be raised first.
     pub sysclk_after_reset: u32,
     /// Clock of APB1 in Hz.
     pub apb1: u32,
     /// Clock of APB2 in Hz.
     pub apb2: u32,
-    /// By how many Hz each wait state of the flash makes the core faster; the first so many need
-    /// none.
+    /// Each wait state of the flash allows this many Hz more. Up to this clock no wait state is
+    /// needed.
     pub per_wait_state: u32,
 }
 
 impl Line {
-    /// All of them.
+    /// All lines.
     pub const ALL: [Self; 14] = [
         Self::F405,
         Self::F407,
@@ -59,7 +59,7 @@ impl Line {
         Self::F479,
     ];
 
-    /// Its name as the HAL's features and chips' names begin: `stm32f407`.
+    /// The line's name, as the HAL's features and the chips' names begin: `stm32f407`.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -80,17 +80,17 @@ impl Line {
         }
     }
 
-    /// The line of a chip, by the first nine letters of its name in any case.
+    /// The line of a chip, from the first nine letters of its name in any case.
     #[must_use]
     pub fn of(chip: &str) -> Option<Self> {
         let line = chip.get(..9)?;
         Self::ALL.into_iter().find(|known| known.name().eq_ignore_ascii_case(line))
     }
 
-    /// Bytes of the SRAM that both the CPU and the bus masters reach, from 2000_0000h on.
+    /// Size in bytes of the SRAM for both the CPU and the bus masters, from 2000_0000h on.
     ///
-    /// Memory maps of RM0090 (SRAM1, SRAM2 and SRAM3 follow one another), RM0402, RM0430, RM0390 and
-    /// RM0386.
+    /// Memory maps of RM0090 (SRAM1, SRAM2 and SRAM3 follow one another), RM0402, RM0430, RM0390
+    /// and RM0386.
     #[must_use]
     pub const fn sram(self) -> u32 {
         const KIB: u32 = 1024;
@@ -103,7 +103,7 @@ impl Line {
         }
     }
 
-    /// Bytes of the core-coupled RAM at 1000_0000h; 0 where there is none. The same memory maps.
+    /// Size in bytes of the core-coupled RAM at 1000_0000h, from the same memory maps; 0 for none.
     #[must_use]
     pub const fn ccm(self) -> u32 {
         match self {
@@ -112,8 +112,8 @@ impl Line {
         }
     }
 
-    /// Interrupt lines behind the 16 exceptions of the core: the vector tables of RM0090 (tables 61
-    /// and 62), RM0402, RM0430, RM0390 and RM0386.
+    /// Number of interrupt lines after the 16 exceptions of the core: the vector tables of RM0090
+    /// (tables 61 and 62), RM0402, RM0430, RM0390 and RM0386.
     #[must_use]
     pub const fn interrupts(self) -> u16 {
         match self {
@@ -125,8 +125,8 @@ impl Line {
         }
     }
 
-    /// How many of them the PAC has vectors for: the last four of the STM32F427 and F437 (SAI1 and
-    /// DMA2D, two are reserved) are missing there.
+    /// Number of interrupt lines with vectors in the PAC: it lacks the last four of the STM32F427
+    /// and F437 (SAI1 and DMA2D, two are reserved).
     #[must_use]
     pub const fn pac_interrupts(self) -> u16 {
         match self {
@@ -135,7 +135,8 @@ impl Line {
         }
     }
 
-    /// GPIO ports, from A on (tables of register boundary addresses). Packages have fewer.
+    /// Number of GPIO ports, from A on (tables of register boundary addresses). Packages have
+    /// fewer.
     #[must_use]
     pub const fn ports(self) -> u8 {
         match self {
@@ -145,8 +146,8 @@ impl Line {
         }
     }
 
-    /// CAN controllers. Of three, the third (a pair of its own beside CAN1 and CAN2) is not supported
-    /// here.
+    /// Number of CAN controllers. The third one of three (a pair of its own beside CAN1 and CAN2)
+    /// is not supported here.
     #[must_use]
     pub const fn can_controllers(self) -> u8 {
         match self {
@@ -155,7 +156,7 @@ impl Line {
         }
     }
 
-    /// How fast its clocks may run.
+    /// The highest clocks.
     ///
     /// "General operating conditions" of the datasheets DS8626 and DS8597 (F405 to F417, table 14),
     /// DS11139 (F412), DS11581 and DS11582 (F413, F423), DS9405 and DS9484 (F42x, F43x), DS10693
@@ -172,7 +173,7 @@ impl Line {
             apb2: 84 * MHZ,
             per_wait_state: 30 * MHZ,
         };
-        // A reset leaves their regulator at scale 2 (RM0402 and RM0430, PWR_CR).
+        // After a reset their regulator is at scale 2 (RM0402 and RM0430, PWR_CR).
         let slow = Limits {
             sysclk: 100 * MHZ,
             sysclk_after_reset: 84 * MHZ,

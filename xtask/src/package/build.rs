@@ -1,4 +1,4 @@
-//! The programs: built by cargo so that the same sources give the same bytes wherever they lie.
+//! Builds the programs with cargo, so that the same sources give the same bytes in every folder.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -8,7 +8,7 @@ use std::{env, fs};
 use super::{copy, notices, remove, unreadable, write, Release, LINUX};
 use crate::{process, setup, workspace, Outcome};
 
-/// Cargo's profile of what is handed out.
+/// Cargo's profile of the released programs.
 const PROFILE: &str = "dist";
 
 /// Builds `coflash` from the workspace at `root`.
@@ -38,13 +38,13 @@ pub fn wheel(release: &Release) -> Outcome {
     process::run(reproducible(&mut maturin, workspace::root()))
 }
 
-/// Whether a file is a wheel, by its name.
+/// Whether a file is a wheel, judged by its name.
 pub fn is_wheel(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension == "whl")
 }
 
-/// The program for Linux, and beside it what an installer puts elsewhere: `man`, `completions`,
-/// `udev`, `THIRD-PARTY.txt`.
+/// The program for Linux, and beside it the files for other folders of a system: `man`,
+/// `completions`, `udev`, `THIRD-PARTY.txt`.
 pub fn with_extras(release: &Release, folder: &Path) -> Outcome {
     let built = program(workspace::root(), &release.build, LINUX)?;
     let program = folder.join("coflash");
@@ -61,8 +61,8 @@ pub fn with_extras(release: &Release, folder: &Path) -> Outcome {
     write(&folder.join("THIRD-PARTY.txt"), &notices::text()?)
 }
 
-/// Takes this machine's folders out of what the compiler writes into a program (the places of
-/// panics).
+/// Removes this machine's folders from the paths that the compiler writes into a program (the
+/// locations of panics).
 fn reproducible<'c>(command: &'c mut Command, root: &Path) -> &'c mut Command {
     let cargo_home = match env::var_os("CARGO_HOME") {
         Some(home) => PathBuf::from(home),

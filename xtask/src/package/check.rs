@@ -1,4 +1,4 @@
-//! Each package as a user has it: installed into an empty root, and run.
+//! Checks each package as a user gets it: installed into an empty root, and run.
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
@@ -25,10 +25,10 @@ pub fn part(release: &Release, setup: &Setup, part: &str) -> Outcome {
             setup.prepare(&[setup::Part::Python])?;
             wheel(release, &root)?;
         }
-        // The job that makes them checks them.
+        // The job that makes it checks it.
         "sbom" => {}
         _ => {
-            // One of them is the emulator.
+            // One of the crates is the emulator.
             setup.prepare(&[setup::Part::Emulator])?;
             crates(release, &root)?;
         }
@@ -36,12 +36,12 @@ pub fn part(release: &Release, setup: &Setup, part: &str) -> Outcome {
     remove(&root)
 }
 
-/// The sums, by the program that users have for it.
+/// Checks the sums, with the program that users have for it.
 pub fn sums(dist: &Path) -> Outcome {
     process::run(Command::new("sha256sum").args(["--check", "--strict", "--quiet", SUMS]).current_dir(dist))
 }
 
-/// The sources build without a connection, and give the very program that the repository gives.
+/// The sources build without a connection, and give the same program as the repository.
 fn source(release: &Release, root: &Path) -> Outcome {
     unpack(&release.source(), root)?;
     let sources = root.join(format!("coboot-{VERSION}"));
@@ -98,7 +98,7 @@ fn debian(release: &Release, root: &Path) -> Outcome {
     )?;
     let pages = deb::files(&root.join("usr/share/man/man1"))?;
     process::run(Command::new("gzip").arg("--test").args(&pages))?;
-    // That of the program, and one for each of its commands.
+    // The page of the program, and one for each of its commands.
     let names: Vec<_> = pages.iter().filter_map(|page| page.file_name()?.to_str()).collect();
     for name in ["coflash.1.gz", "coflash-flash.1.gz", "coflash-convert.1.gz"] {
         if !names.contains(&name) {
@@ -118,7 +118,7 @@ fn debian(release: &Release, root: &Path) -> Outcome {
     Ok(())
 }
 
-/// The wheel in an environment of its own updates a node.
+/// The wheel updates a node, in an environment of its own.
 fn wheel(release: &Release, root: &Path) -> Outcome {
     let entries = fs::read_dir(&release.dist).map_err(|error| unreadable(&release.dist, &error))?;
     let wheel = entries.flatten().map(|entry| entry.path()).find(|path| build::is_wheel(path));
@@ -141,7 +141,7 @@ fn wheel(release: &Release, root: &Path) -> Outcome {
     said_in(&said, &sample().len().to_string(), "coflash.flash")
 }
 
-/// A node on a bus of its own; ended when it is dropped.
+/// A node on a bus of its own; it ends when it is dropped.
 struct Node {
     child: Child,
     bus: String,
@@ -169,7 +169,7 @@ impl Node {
         if read.is_err() || node.bus.is_empty() {
             return Err(format!("the node says \"{}\" and not where its bus is.", line.trim()));
         }
-        // Somebody has to read on, lest the pipe fill up.
+        // The rest of its output must be read, so that the pipe does not fill up.
         std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
         Ok(node)
     }
@@ -182,7 +182,7 @@ impl Drop for Node {
     }
 }
 
-/// The crates build from what the registry would hand out, and `coflash` installs from its folder.
+/// The crates build from the files for the registry, and `coflash` installs from its folder.
 fn crates(release: &Release, root: &Path) -> Outcome {
     process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     let mut install = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
@@ -195,8 +195,8 @@ fn crates(release: &Release, root: &Path) -> Outcome {
     said_in(&said, VERSION, "coflash --version")
 }
 
-/// Runs the program in a folder that has nothing else of a system: with `root` as its root where we
-/// may set that, and without an environment.
+/// Runs the program in a folder without any other file of a system: with `root` as its root if the
+/// system allows that, and without an environment.
 fn works(root: &Path, program: &str) -> Outcome {
     let file = root.join(program);
     let bytes = fs::read(&file).map_err(|error| unreadable(&file, &error))?;
@@ -225,7 +225,7 @@ fn works(root: &Path, program: &str) -> Outcome {
     Ok(())
 }
 
-/// A program for 0801_0000h: the initial stack pointer, the reset vector, and no code to speak of.
+/// A program for 0801_0000h: the initial stack pointer, the reset vector, and almost no code.
 fn sample() -> Vec<u8> {
     let mut image = [0x2001_0000_u32, 0x0801_0201].map(u32::to_le_bytes).concat();
     image.resize(1024, 0xBF);
@@ -248,7 +248,7 @@ fn is_static(file: &[u8]) -> bool {
     elf64 && kinds().is_some_and(|kinds| !kinds.is_empty() && !kinds.contains(&3))
 }
 
-/// An executable for 64-bit Windows that needs nothing but the libraries of the system.
+/// An executable for 64-bit Windows that needs only the libraries of the system.
 fn windows(file: &[u8]) -> Outcome {
     let at = |at: usize, size: usize| file.get(at..at + size);
     let header =
@@ -266,7 +266,7 @@ fn windows(file: &[u8]) -> Outcome {
     foreign_libraries(&said?)
 }
 
-/// Judges the libraries that `objdump -p` lists: those of the compiler begin with `lib`.
+/// Checks the libraries in the output of `objdump -p`: those of the compiler begin with `lib`.
 fn foreign_libraries(listing: &str) -> Outcome {
     let libraries: Vec<&str> =
         listing.lines().filter_map(|line| line.trim().strip_prefix("DLL Name: ")).map(str::trim).collect();
@@ -316,7 +316,7 @@ mod tests {
     fn a_program_with_a_dynamic_linker_is_not_static() {
         assert!(is_static(&elf(&[1, 1, 2])));
         assert!(!is_static(&elf(&[1, 3, 1])));
-        // This test itself is linked against the system's libraries.
+        // This test program itself is linked against the system's libraries.
         assert!(!is_static(&fs::read(std::env::current_exe().unwrap()).unwrap()));
         assert!(!is_static(b"#!/bin/sh") && !is_static(&elf(&[])) && !is_static(&elf(&[1, 1])[..80]));
         let mut hostile = elf(&[1]);

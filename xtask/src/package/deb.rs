@@ -1,4 +1,4 @@
-//! The package for Debian and Ubuntu, by `dpkg-deb`.
+//! Makes the package for Debian and Ubuntu, with `dpkg-deb`.
 
 use std::fmt::Write as _;
 use std::fs;
@@ -8,14 +8,15 @@ use std::process::Command;
 use super::{build, remove, unreadable, write, Release, VERSION};
 use crate::{process, workspace, Outcome};
 
-/// Where the parts go: from a file or folder beside the program to a file or folder of the system.
+/// The places of the parts: from a file or folder beside the program to a file or folder of the
+/// system.
 const PLACES: [(&str, &str); 7] = [
     ("coflash", "usr/bin/coflash"),
     ("man", "usr/share/man/man1"),
     ("completions/coflash.bash", "usr/share/bash-completion/completions/coflash"),
     ("completions/_coflash", "usr/share/zsh/vendor-completions/_coflash"),
     ("completions/coflash.fish", "usr/share/fish/vendor_completions.d/coflash.fish"),
-    // In front of the rules that hand out what is tagged (73-seat-late.rules).
+    // Before the rules that give users access to tagged devices (73-seat-late.rules).
     ("udev/70-coflash.rules", "usr/lib/udev/rules.d/70-coflash.rules"),
     ("THIRD-PARTY.txt", "usr/share/doc/coflash/THIRD-PARTY.txt"),
 ];
@@ -53,9 +54,9 @@ pub fn make(release: &Release) -> Outcome {
     write(&root.join("DEBIAN/control"), &control(bytes.div_ceil(1024)))?;
     let mut dpkg = Command::new("dpkg-deb");
     dpkg.args(["--root-owner-group", "-Zxz", "--build"]).arg(&root).arg(release.deb());
-    // Times are clamped to that of the commit; with several threads the packed bytes may differ.
+    // Times are clamped to the commit's; with several threads the packed bytes may differ.
     dpkg.env("SOURCE_DATE_EPOCH", &release.epoch).env("DPKG_DEB_THREADS_MAX", "1");
-    // The program is the one file that may be run; it is so by its build.
+    // Only the program is executable; its build makes it so.
     process::run(Command::new("chmod").args(["--recursive", "u=rwX,go=rX"]).arg(&root))?;
     set_times(&root, &release.epoch)?;
     process::run(&mut dpkg)?;
@@ -83,7 +84,8 @@ fn control(kib: u64) -> String {
             SLCAN, gs_usb, PEAK\n and Kvaser adapters.\n"
 }
 
-/// The form of Debian (DEP 5): the head, and the text of the MIT license, which is not on every system.
+/// The copyright file in Debian's form (DEP 5): the head, and the text of the MIT license, which is
+/// not on every system.
 fn copyright() -> Outcome<String> {
     let read = |file: &str| {
         let file = workspace::root().join(file);
@@ -96,7 +98,7 @@ fn copyright() -> Outcome<String> {
     Ok(text)
 }
 
-/// Debian wants one, with the date in the form of a mail.
+/// The changelog that Debian requires, with the date in the form of a mail.
 fn changelog(epoch: &str) -> Outcome<String> {
     let date =
         process::output(Command::new("date").args(["--utc", "--rfc-email", "--date", &format!("@{epoch}")]))?;
@@ -106,7 +108,7 @@ fn changelog(epoch: &str) -> Outcome<String> {
     ))
 }
 
-/// Every file and folder gets the time of the commit.
+/// Sets the time of every file and folder to the commit's.
 fn set_times(root: &Path, epoch: &str) -> Outcome {
     let date = format!("--date=@{epoch}");
     let mut all = files(root)?;
@@ -126,7 +128,7 @@ pub fn files(root: &Path) -> Outcome<Vec<PathBuf>> {
     below(root).map(|all| all.into_iter().filter(|path| !path.is_dir()).collect())
 }
 
-/// The folder and all below it, sorted.
+/// The folder and all folders below it, sorted.
 fn folders(root: &Path) -> Outcome<Vec<PathBuf>> {
     let mut found: Vec<_> = below(root)?.into_iter().filter(|path| path.is_dir()).collect();
     found.push(root.to_owned());

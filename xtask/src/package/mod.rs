@@ -1,4 +1,5 @@
-//! `cargo xtask package`: what is handed out of the host tool, and the crates for the registry.
+//! `cargo xtask package`: makes the release files of the host tool, and the crates for the
+//! registry.
 
 mod build;
 mod check;
@@ -42,22 +43,22 @@ SHA256SUMS has the sums of all files in target/dist.
   --yes     installs missing packages with sudo
 ";
 
-/// Linux, without a C library of the system.
+/// Linux; the program does not need a C library of the system.
 const LINUX: &str = "x86_64-unknown-linux-musl";
 const WINDOWS: &str = "x86_64-pc-windows-gnu";
-/// All members of the workspace have the same.
+/// The version; all members of the workspace have the same one.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// The names of the parts, in the order in which they are made.
 const PARTS: [&str; 7] = ["source", "linux", "deb", "windows", "python", "sbom", "crates"];
 
-/// Where things go, and the time that they carry.
+/// The folders of a release, and the time of its files.
 struct Release {
-    /// What is handed out.
+    /// The folder of the release files.
     dist: PathBuf,
-    /// Cargo's folder for it, and what is made in between.
+    /// Cargo's folder for the release, and intermediate files.
     build: PathBuf,
-    /// The time of the commit, in seconds since 1970: archives carry it, and no other time.
+    /// The time of the commit, in seconds since 1970: all files in archives have this time.
     epoch: String,
     draft: bool,
 }
@@ -83,7 +84,7 @@ impl Release {
         self.file("-x86_64-windows.exe")
     }
 
-    /// An empty folder of this name among what is made in between.
+    /// An empty folder with this name among the intermediate files.
     fn empty(&self, name: &str) -> Outcome<PathBuf> {
         let folder = self.build.join(name);
         remove(&folder)?;
@@ -126,7 +127,7 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-/// The parts that are named, or all; in the order of [`PARTS`].
+/// The named parts, or all parts if none is named; in the order of [`PARTS`].
 fn parts(words: Vec<String>) -> Outcome<Vec<&'static str>> {
     if let Some(unknown) = words.iter().find(|word| !PARTS.contains(&word.as_str())) {
         return Err(format!("there is no part \"{unknown}\"; there is: {}.", PARTS.join(", ")));
@@ -135,7 +136,7 @@ fn parts(words: Vec<String>) -> Outcome<Vec<&'static str>> {
     Ok(PARTS.into_iter().filter(wanted).collect())
 }
 
-/// Whether a commit may be released: nothing is changed beside it, and it has the tag of its version.
+/// Whether a commit may be released: there are no other changes, and it has the tag of its version.
 fn releasable(status: &str, tags: &str) -> Outcome {
     let changed: Vec<&str> = status.lines().collect();
     if let Some(first) = changed.first() {
@@ -191,7 +192,7 @@ fn source(release: &Release) -> Outcome {
     copy(&release.build.join("source.tar.gz"), &release.source())
 }
 
-/// The program for Linux and what belongs to it, as an archive.
+/// The program for Linux and its other files, as an archive.
 fn linux(release: &Release) -> Outcome {
     let stage = release.empty("stage")?;
     let name = format!("coflash-{VERSION}");
@@ -210,7 +211,7 @@ fn linux(release: &Release) -> Outcome {
     remove(&stage)
 }
 
-/// The notices of what is linked into the program, for the files that have no room for them.
+/// The notices of the crates in the program, for the release files that cannot contain them.
 fn notices_beside(release: &Release) -> Outcome {
     write(&release.file("-THIRD-PARTY.txt"), &notices::text()?)
 }
@@ -224,13 +225,13 @@ fn bills(release: &Release) -> Outcome {
     copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
 }
 
-/// The crates for the registry. What is in them is checked by [`check::part`].
+/// The crates for the registry. [`check::part`] checks their contents.
 fn crates(release: &Release) -> Outcome {
     process::run(package_crates(release)?.arg("--no-verify"))
 }
 
-/// `cargo package` of all crates that may be published. They go in one call, since they depend on each
-/// other and none is in the registry yet.
+/// `cargo package` of all crates that may be published. One call does all, since they depend on
+/// each other and none is in the registry yet.
 fn package_crates(release: &Release) -> Outcome<Command> {
     let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
     let mut command = process::cargo("package");
@@ -251,7 +252,7 @@ fn published(metadata: &Value) -> Vec<String> {
     published.filter_map(|package| package.get("name").text().map(str::to_owned)).collect()
 }
 
-/// Writes SHA256SUMS, as `sha256sum --check` reads it.
+/// Writes SHA256SUMS in the form for `sha256sum --check`.
 fn sums(dist: &Path) -> Outcome {
     let entries = fs::read_dir(dist).map_err(|error| unreadable(dist, &error))?;
     let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
@@ -303,7 +304,7 @@ fn write(file: &Path, text: &str) -> Outcome {
     written().map_err(|error| unwritable(file, &error))
 }
 
-/// Removes a folder with all that is in it, if it is there.
+/// Removes a folder with its contents, if it exists.
 fn remove(folder: &Path) -> Outcome {
     match fs::remove_dir_all(folder) {
         Err(error) if error.kind() != io::ErrorKind::NotFound => {
@@ -356,7 +357,7 @@ mod tests {
         assert_eq!(published(&Value::parse(text).unwrap()), ["a"]);
     }
 
-    /// No adapter that the tool knows is without its rule, and the rules speak of no other.
+    /// Each adapter that the tool supports has a rule, and the rules name no other.
     #[test]
     fn the_udev_rules_are_those_of_the_adapters() {
         let read = |file: &str| fs::read_to_string(workspace::root().join("coflash").join(file)).unwrap();

@@ -1,4 +1,5 @@
-//! What others wrote of the program: each crate with its licence, and the texts of the licences.
+//! The notices for the parts of the program by other authors: each crate with its licence, and the
+//! texts of the licences.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -9,10 +10,10 @@ use super::unreadable;
 use crate::json::Value;
 use crate::{process, workspace, Outcome};
 
-/// What is no crate, by name, with its licence's file.
+/// Parts that are not crates, by name, with the file of the licence.
 const OTHERS: [(&str, &str); 1] =
     [("uPlot 1.6.32: MIT (https://github.com/leeoniya/uPlot)", "coflash/src/ui/page/uPlot.LICENSE")];
-/// How the files begin that have to go with a copy.
+/// The first letters of the names of files that must go with a copy.
 const NOTICES: [&str; 6] = ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTICE", "UNLICENSE"];
 
 /// The notices of all crates that are linked into `coflash`, of every system. The same Cargo.lock
@@ -37,13 +38,13 @@ pub fn text() -> Outcome<String> {
     Ok(page(&crates))
 }
 
-/// `name v1.2.3 (…)` as `name 1.2.3`.
+/// Converts `name v1.2.3 (…)` to `name 1.2.3`.
 fn name_and_version(line: &str) -> Option<String> {
     let mut words = line.split(' ');
     Some(format!("{} {}", words.next()?, words.next()?.strip_prefix('v')?))
 }
 
-/// The line of a crate of others among those that are linked, and its folder.
+/// The entry of another author's crate that is linked, and its folder.
 fn of(package: &Value, linked: &BTreeSet<String>) -> Option<(String, PathBuf)> {
     package.get("source").text()?;
     let name = format!("{} {}", package.get("name").text()?, package.get("version").text()?);
@@ -53,7 +54,7 @@ fn of(package: &Value, linked: &BTreeSet<String>) -> Option<(String, PathBuf)> {
     linked.contains(&name).then(|| (format!("{name}: {licence}{home}"), folder))
 }
 
-/// The texts in a crate's folder that have to go with a copy.
+/// The texts in a crate's folder that must go with a copy.
 fn notices_in(folder: &Path) -> Outcome<Vec<String>> {
     let entries = fs::read_dir(folder).map_err(|error| unreadable(folder, &error))?;
     let is_notice = |path: &PathBuf| {
@@ -66,7 +67,7 @@ fn notices_in(folder: &Path) -> Outcome<Vec<String>> {
     files.iter().map(read).collect()
 }
 
-/// The page: all names with their licences, then every text once, under the names that have it.
+/// The page: all names with their licences, then every text once, with the names of its crates.
 fn page(crates: &BTreeMap<String, Vec<String>>) -> String {
     let mut page = String::from(
         "coflash contains the work of others, listed here with licences and notices. The sources of each crate\n\
@@ -103,8 +104,8 @@ mod tests {
         assert!(page.contains("b 2.0.0:\n\nOr that."), "{page}");
     }
 
-    /// What cargo says of the program itself: crates of each system, no tools of tests, nothing of
-    /// ours, and a text for the licences that demand one.
+    /// Cargo's data about the program itself: crates of each system, no tools of tests, none of our
+    /// crates, and a text for the licences that require one.
     #[test]
     fn every_linked_crate_is_named() {
         let text = text().unwrap();

@@ -1,4 +1,4 @@
-//! The workflow that a public forge runs for a release: it can be read, and runs jobs that are there.
+//! The workflow that a public forge runs for a release: it must be readable, and run existing jobs.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use yaml_rust2::{Yaml, YamlLoader};
 use crate::pages::Shown;
 use crate::{docs, workspace};
 
-/// What is wrong with a workflow; nothing if it is right.
+/// The faults of a workflow; empty if it is right.
 fn faults(text: &str) -> Vec<String> {
     let documents = match YamlLoader::load_from_str(text) {
         Ok(documents) => documents,
@@ -46,7 +46,7 @@ fn faults(text: &str) -> Vec<String> {
     faults
 }
 
-/// What is wrong with a line for the shell. The forge's own tool is not ours to judge.
+/// The fault of a line for the shell. The forge's own tool is not checked.
 fn command(place: &str, line: &str) -> Option<String> {
     let words: Vec<String> = line.split_whitespace().map(str::to_owned).collect();
     if words.is_empty() || words.starts_with(&["gh".to_owned(), "release".to_owned()]) {

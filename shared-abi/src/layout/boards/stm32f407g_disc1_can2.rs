@@ -1,4 +1,5 @@
-//! The STM32F407G-DISC1 with its transceiver at CAN2: the same map under another name.
+//! The STM32F407G-DISC1 with its transceiver at CAN2: it has the same memory map, with another
+//! name.
 
 use crate::layout::{stm32f407g_disc1, Layout};
 
