@@ -26,7 +26,7 @@ fn example() -> PathBuf {
 
 /// The ELF file of the example. `None` if the tests run for another board.
 fn built() -> Option<Vec<u8>> {
-    build(&example())
+    build(&example(), "no-stack")
 }
 
 /// The ELF file of a copy of the example in which `old` is replaced by `new`: a change by its
@@ -37,7 +37,10 @@ fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
     for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/main.rs"] {
         let text = fs::read_to_string(example().join(file)).expect(file);
         let text = match file {
-            "Cargo.toml" => text.replace("../../", &format!("{}/../", env!("CARGO_MANIFEST_DIR"))),
+            // Of another name: cargo takes packages of one name in a folder for the same one.
+            "Cargo.toml" | "Cargo.lock" => text
+                .replace("\"no-stack\"", &format!("{name:?}"))
+                .replace("../../", &format!("{}/../", env!("CARGO_MANIFEST_DIR"))),
             "src/main.rs" => {
                 assert_eq!(text.matches(old).count(), 1, "{old:?} is to be altered");
                 text.replace(old, new)
@@ -46,10 +49,10 @@ fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
         };
         fs::write(copy.join(file), text).expect("the copy can be written");
     }
-    build(&copy)
+    build(&copy, name)
 }
 
-fn build(folder: &Path) -> Option<Vec<u8>> {
+fn build(folder: &Path, program: &str) -> Option<Vec<u8>> {
     /// One build at a time: they share the folder of `cargo xtask examples`.
     static BUILD: Mutex<()> = Mutex::new(());
     if firmware::board().board != LAYOUT.board {
@@ -66,7 +69,7 @@ fn build(folder: &Path) -> Option<Vec<u8>> {
         .status()
         .expect("cargo can be started");
     assert!(status.success(), "{} does not build", folder.display());
-    Some(fs::read(target.join("thumbv7em-none-eabihf/release/no-stack")).expect("it was built"))
+    Some(fs::read(target.join("thumbv7em-none-eabihf/release").join(program)).expect("it was built"))
 }
 
 fn blocks(elf: &[u8]) -> BlockFile {
