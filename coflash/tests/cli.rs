@@ -376,7 +376,7 @@ fn wrong_usage_is_explained() {
         (&["flash", &hex][..], "give --bus URL or set COFLASH_BUS"),
         (&["--bus", "can0", "flash", &hex], "it has no ':' after the adapter's name"),
         (&["flash", &hex, "--node", "128"], "node-IDs are 1 to 127"),
-        (&["flash", &hex, "--board", "arduino"], "known boards: stm32f407g-disc1"),
+        (&["flash", &hex, "--board", "arduino"], "known boards: nucleo-f446re, stm32f407g-disc1"),
         (&["flash", &hex, "--board", "stm32f407g-disc1", "--program", "2"], "its programs are 1 to 1"),
         (&["convert", &hex, "out", "--vid", "1"], "--pid"),
         (&["convert", &hex, "out", "--block-size", "16"], "must be 24 to 16384"),

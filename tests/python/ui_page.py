@@ -275,8 +275,8 @@ def refused(bench):
     (folder / "app.hex").write_text(":00000001FF\n")
     files = {
         "empty.hex": (b"", "empty"),
-        "page.html": (b"<!doctype html><title>404 not found</title>", "no firmware file"),
-        "zeros.elf": (bytes(3000), "no firmware file"),
+        "page.html": (b"<!doctype html><title>404 not found</title>", "not a firmware file"),
+        "zeros.elf": (bytes(3000), "not a firmware file"),
     }
     for name, (content, _) in files.items():
         (bench.folder / name).write_bytes(content)
