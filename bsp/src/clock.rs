@@ -245,7 +245,7 @@ mod registers {
         rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PWREN) });
         // SAFETY: nothing else uses it; only the scale in its register is written.
         let pwr = unsafe { pac::PWR::steal() };
-        // SAFETY: a scale that the line has (`VOS_SCALE_1`, `VOS_SCALE_2`); the other bits stay.
+        // SAFETY: a scale that the line has (1 or 2); the other bits stay.
         pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !VOS | scale) });
     }
 
