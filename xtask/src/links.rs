@@ -6,8 +6,9 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::{workspace, Outcome};
 
-/// The pages outside `docs/`.
-pub const AT_ROOT: [&str; 4] = ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md"];
+/// The pages outside `docs/` and `examples/`.
+pub const ELSEWHERE: [&str; 5] =
+    ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md", "python/README.md"];
 
 /// A link within the repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -20,13 +21,13 @@ pub struct Link {
     pub heading: Option<String>,
 }
 
-/// Every page, as a path from the root of the repository: those at the root, all in `docs/`, and
-/// the README of each example.
+/// Every page, as a path from the root of the repository: all in `docs/`, the README of each
+/// example, and those of [`ELSEWHERE`].
 ///
 /// # Errors
 /// When a folder cannot be read.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
-    let mut pages: Vec<PathBuf> = AT_ROOT.iter().map(PathBuf::from).collect();
+    let mut pages: Vec<PathBuf> = ELSEWHERE.iter().map(PathBuf::from).collect();
     for example in within(Path::new("examples"))? {
         let page = example.join("README.md");
         if workspace::root().join(&page).is_file() {
@@ -89,6 +90,11 @@ pub fn faults() -> Outcome<Vec<String>> {
         let shown = link.file.display();
         if !workspace::root().join(&link.file).is_file() {
             return Some(format!("{}: {shown} is not there, or is no file", link.place));
+        }
+        // The site has pages only.
+        if link.file.extension().is_some_and(|extension| extension == "md") && !known.contains_key(&link.file)
+        {
+            return Some(format!("{}: {shown} is no page of the site (xtask/src/links.rs)", link.place));
         }
         let heading = link.heading.as_ref()?;
         let there = known.get(&link.file).is_some_and(|headings| headings.contains(heading));
