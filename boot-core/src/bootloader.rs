@@ -10,9 +10,10 @@ use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
-    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES, SOFTWARE_VERSION, UNLOCK,
-    UNLOCK_ENTRIES,
+    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES, SECOND_SERVER,
+    SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
 };
+use canopen::sdo::second::{self, Channel, SecondServer};
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
@@ -62,7 +63,7 @@ pub enum PasswordObject {
 pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LEN> {
     let data_access = if extras.read_back { Access::Rw } else { Access::Wo };
     let data = Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, data_access);
-    let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
+    let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES).with(&second::ENTRIES);
     let table = table.with_array("Program data", data, programs).with_program_control(programs);
     let table = if extras.sealed { table.with(&SEALED_ENTRIES) } else { table };
     match extras.password {
@@ -86,7 +87,13 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
         PasswordObject::EnableFlash => array,
     };
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
-    device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + password + sealed
+    device::ENTRIES.len()
+        + emcy::ENTRIES.len()
+        + second::ENTRIES.len()
+        + array
+        + control_count(programs)
+        + password
+        + sealed
 }
 
 /// 1018h/4.
@@ -132,6 +139,7 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     flash: F,
     download: Downloader<'b, P, PROGRAMS>,
     emcy: Emcy,
+    second_server: SecondServer,
     lock: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
@@ -162,6 +170,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             flash,
             download,
             emcy: Emcy::new(),
+            second_server: SecondServer::NONE,
             lock: Lock::new(config.password),
             now: Instant::from_millis(0),
             stored_version: StoredVersion::new(),
@@ -293,6 +302,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
             PROGRAM_ID => self.download.identification(at.sub),
+            SECOND_SERVER => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -314,6 +324,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                     return Err(AbortCode::DEVICE_STATE);
                 }
                 self.download.unsealer_mut().ask(&self.flash, request)
+            }
+            (SECOND_SERVER, &[a, b, c, d]) => {
+                self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
             (ENABLE_FLASH | UNLOCK, password) => {
@@ -365,6 +378,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         Ok(len)
     }
 
+    fn second_server(&self) -> Channel {
+        self.second_server.channel()
+    }
+
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
         self.emcy.next_message()
     }
@@ -405,6 +422,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<
 
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
+        // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
+        self.second_server = SecondServer::NONE;
         if id.is_some() && self.config.boot_up_emergency {
             self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
         }

@@ -134,7 +134,7 @@ impl<I: Controller> Port<I> {
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
     /// FIFO 0. The other controller's filters stay as they are.
     #[inline(never)]
-    pub fn accept(&mut self, [a, b, c]: [u16; 3]) {
+    pub fn accept(&mut self, [a, b, c, d]: [u16; 4]) {
         let change = |offset: usize, clear: u32, set: u32| {
             // SAFETY: the offset is one of a register above, in the registers of the master. Only
             // the bits of this controller change, which this port owns.
@@ -157,7 +157,7 @@ impl<I: Controller> Port<I> {
         let pair = |low: u16, high: u16| u32::from(low) << 5 | u32::from(high) << 21;
         let words = F0R1 + 8 * bank as usize;
         change(words, u32::MAX, pair(a, b));
-        change(words + 4, u32::MAX, pair(c, c));
+        change(words + 4, u32::MAX, pair(c, d));
         change(FA1R, 0, 1 << bank);
         change(FMR, FINIT, 0);
     }

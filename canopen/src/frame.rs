@@ -50,6 +50,14 @@ impl CobId {
     /// LSS, master to slave (CiA 305).
     pub const LSS_REQUEST: Self = Self(0x7E5);
 
+    /// The COB-ID of no frame.
+    pub(crate) const NONE: Self = Self(u16::MAX);
+
+    /// A COB-ID whose word in the object dictionary was found to be valid.
+    pub(crate) const fn of_word(word: u32) -> Self {
+        Self(word as u16)
+    }
+
     /// `None` for a number that does not fit into 11 bits.
     #[must_use]
     pub const fn new(number: u16) -> Option<Self> {

@@ -42,6 +42,7 @@
 use core::fmt;
 
 use crate::abort::AbortCode;
+use crate::sdo::second::Channel;
 
 /// Index and sub-index of a value: the multiplexer of an SDO.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -408,6 +409,11 @@ pub trait Objects {
     /// The download ended before the domain was complete.
     fn download_cancel(&mut self, at: Address) {
         let _ = at;
+    }
+
+    /// The COB-IDs of the second SDO server (1201h).
+    fn second_server(&self) -> Channel {
+        Channel::NONE
     }
 
     /// The data of the next emergency to send, `None` if there is none ([`Emcy`](crate::emcy::Emcy)

@@ -25,6 +25,8 @@ pub const COB_ID_EMCY: u16 = 0x1014;
 pub const HEARTBEAT_TIME: u16 = 0x1017;
 /// Identity: 1 vendor-ID, 2 product code, 3 revision, 4 serial number.
 pub const IDENTITY: u16 = 0x1018;
+/// SDO server parameter of the second server.
+pub const SECOND_SERVER: u16 = 0x1201;
 /// Program data; the sub-index is the program's number.
 pub const PROGRAM_DATA: u16 = 0x1F50;
 /// Program control: takes a [`ProgramControl`].

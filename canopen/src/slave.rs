@@ -64,7 +64,7 @@ pub enum Output {
     /// Start the controller's recovery from bus-off.
     RecoverFromBusOff,
     /// Accept exactly the frames with these identifiers; the list may contain one twice.
-    Accept([CobId; 3]),
+    Accept([CobId; 4]),
 }
 
 /// A device on the bus.
@@ -77,8 +77,8 @@ pub struct Slave {
     lss: Lss,
     line: Line,
     losses: Losses,
-    /// The node-ID has changed, and the owner must still set the filters for it.
-    accept: bool,
+    /// The identifiers that the owner has set the filters to.
+    accepted: [CobId; 4],
 }
 
 #[derive(Debug)]
@@ -103,7 +103,7 @@ impl Slave {
             lss: Lss::new(address, id, config.lss.unwrap_or_default()),
             line: Line::Down(rate),
             losses: Losses::default(),
-            accept: false,
+            accepted: [CobId::NONE; 4],
         }
     }
 
@@ -194,8 +194,9 @@ impl Slave {
             self.restart(self.lss.node_id(), device);
         }
         loop {
-            if core::mem::take(&mut self.accept) {
-                return Some(Output::Accept(self.identifiers()));
+            let identifiers = self.identifiers(device);
+            if core::mem::replace(&mut self.accepted, identifiers) != identifiers {
+                return Some(Output::Accept(identifiers));
             }
             match &mut self.line {
                 Line::Down(BitRate::Auto) => {
@@ -238,11 +239,15 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
-    fn identifiers(&self) -> [CobId; 3] {
+    fn identifiers(&self, device: &impl Objects) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
-            Some(node) => [CobId::NMT, lss, self.config.node.sdo.request(node.id())],
-            None => [lss; 3],
+            Some(node) => {
+                let second = device.second_server().request;
+                let second = if second == CobId::NONE { lss } else { second };
+                [CobId::NMT, lss, self.config.node.sdo.request(node.id()), second]
+            }
+            None => [lss; 4],
         }
     }
 
@@ -253,7 +258,6 @@ impl Slave {
             node.end_transfer(device);
         }
         self.node = id.map(|id| Node::new(id, self.config.node));
-        self.accept = true;
         device.node_id_changed(id);
     }
 }

@@ -73,6 +73,8 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     programs: [Program; PROGRAMS],
     programmer: Programmer<'b>,
     transfer: Option<Transfer>,
+    /// The CRC of the last block of data.
+    last_block: u32,
     /// The abort for a client that continues to send after the flash has failed.
     fault: AbortCode,
     /// A request to leave the bootloader, not yet carried out.
@@ -118,6 +120,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             programs,
             programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
             transfer: None,
+            last_block: 0,
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
             outcome: None,

@@ -109,7 +109,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             #[cfg(feature = "sealed")]
             sealed_only: self.programmer.unsealer().takes_no_other(),
         };
-        let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
+        let mut to = Destination {
+            judge,
+            queue: self.programmer.queue_mut(),
+            last: &mut self.last_block,
+            progress: Progress::default(),
+        };
         let outcome = match data {
             Some(bytes) => intake.data(bytes, &mut to),
             None => intake.end(&mut to),

@@ -81,6 +81,8 @@ pub(crate) struct Destination<'a, 'b> {
     pub judge: Judge<'a>,
     /// The pieces.
     pub queue: &'a mut Queue<'b>,
+    /// The CRC of the last block of data.
+    pub last: &'a mut u32,
     /// The results so far.
     pub progress: Progress,
 }

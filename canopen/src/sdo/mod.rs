@@ -7,6 +7,7 @@
 pub mod block;
 pub mod client;
 mod fields;
+pub mod second;
 pub mod server;
 pub mod wire;
 

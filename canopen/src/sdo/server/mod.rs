@@ -15,6 +15,7 @@ use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, Entry, Objects};
 use crate::sdo::block::{Receiver, BLKSIZE_MAX, SEGMENT};
 use crate::sdo::fields::{self, ccs, scs};
+use crate::sdo::second::Channel;
 use crate::time::Instant;
 
 mod block_download;
@@ -78,6 +79,12 @@ impl Config {
         response_base: 0x580,
     };
 
+    /// The COB-IDs of a node.
+    #[must_use]
+    pub const fn channel(&self, node: NodeId) -> Channel {
+        Channel { request: self.request(node), response: self.response(node) }
+    }
+
     /// The COB-ID of the requests to a node.
     #[must_use]
     pub const fn request(&self, node: NodeId) -> CobId {
@@ -110,6 +117,8 @@ impl Default for Config {
 pub struct SdoServer {
     node: NodeId,
     config: Config,
+    /// The COB-ID of answers: the client's of the last request.
+    response: CobId,
     /// The object of the running transfer, or of the last one.
     at: Address,
     state: State,
@@ -149,6 +158,7 @@ impl SdoServer {
         Self {
             node,
             config,
+            response: config.response(node),
             at: Address::new(0, 0),
             state: State::Idle,
             moved: Instant::from_millis(0),
@@ -214,10 +224,15 @@ impl SdoServer {
 
     /// Processes any received frame; frames that are not SDO requests to this server are ignored.
     pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
-        if !frame.has_cob_id(self.config.request(self.node)) {
-            return;
+        let mut channel = self.config.channel(self.node);
+        if !frame.has_cob_id(channel.request) {
+            channel = objects.second_server();
+            if !frame.has_cob_id(channel.request) {
+                return;
+            }
         }
         let Some(bytes) = frame.exactly() else { return };
+        self.response = channel.response;
         match &self.state {
             State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
@@ -257,7 +272,7 @@ impl SdoServer {
         if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
             self.moved = now;
         }
-        Some(Frame::full(self.config.response(self.node), answer))
+        Some(Frame::full(self.response, answer))
     }
 
     /// Aborts a transfer with a silent client, and acknowledges a sub-block that stopped early.
