@@ -10,8 +10,8 @@ use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
-    PROGRAM_DATA, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES, SECOND_SERVER,
-    SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
+    PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES,
+    SECOND_SERVER, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, Channel, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -25,6 +25,7 @@ use {canopen::program::ACCESS, seal::access::right};
 use crate::control::{Downloader, Policy, Step};
 use crate::decision::StayReason;
 use crate::flash::Flash;
+use crate::policy::ROOM_FOR_FLEETS;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
 use crate::unseal::Unsealer;
@@ -38,11 +39,21 @@ pub struct Extras {
     pub read_back: bool,
     /// Whether 2002h and 2003h exist, which belong to devices with sealed images.
     pub sealed: bool,
+    /// Whether 1201h exists, the second SDO server.
+    pub second_server: bool,
+    /// Whether 2006h exists, which tells where a download goes on.
+    pub resume: bool,
 }
 
 impl Extras {
-    /// No additional objects.
-    pub const NONE: Self = Self { password: PasswordObject::None, read_back: false, sealed: false };
+    /// The objects of the standard dialect.
+    pub const STANDARD: Self = Self {
+        password: PasswordObject::None,
+        read_back: false,
+        sealed: false,
+        second_server: true,
+        resume: true,
+    };
 }
 
 /// The object for a password.
@@ -63,8 +74,16 @@ pub enum PasswordObject {
 pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LEN> {
     let data_access = if extras.read_back { Access::Rw } else { Access::Wo };
     let data = Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, data_access);
-    let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES).with(&second::ENTRIES);
+    let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
+    let table = if extras.second_server { table.with(&second::ENTRIES) } else { table };
     let table = table.with_array("Program data", data, programs).with_program_control(programs);
+    let table = if extras.resume {
+        let element =
+            Entry::sub(PROGRAM_PARTIAL, 1, "Begun download of a program", DataType::Unsigned64, Access::Ro);
+        table.with_array("Begun download", element, programs)
+    } else {
+        table
+    };
     let table = if extras.sealed { table.with(&SEALED_ENTRIES) } else { table };
     match extras.password {
         PasswordObject::None => table,
@@ -87,13 +106,10 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
         PasswordObject::EnableFlash => array,
     };
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
-    device::ENTRIES.len()
-        + emcy::ENTRIES.len()
-        + second::ENTRIES.len()
-        + array
-        + control_count(programs)
-        + password
-        + sealed
+    let second_server = if extras.second_server { second::ENTRIES.len() } else { 0 };
+    let resume = if extras.resume { array } else { 0 };
+    let always = device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs);
+    always + password + sealed + second_server + resume
 }
 
 /// 1018h/4.
@@ -119,6 +135,8 @@ pub struct Config {
     pub boot_up_emergency: bool,
     /// Whether layer setting services may store node-ID and bit rate.
     pub lss_store: bool,
+    /// Whether there is a second SDO server (1201h).
+    pub second_server: bool,
     /// How programs are downloaded.
     pub download: Policy,
     /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
@@ -281,6 +299,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 }
 
 impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
+    const HAS_SECOND_SERVER: bool = ROOM_FOR_FLEETS;
+
     fn entries(&self) -> &'static [Entry] {
         self.config.entries
     }
@@ -301,8 +321,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
+            PROGRAM_PARTIAL if ROOM_FOR_FLEETS => return put(buf, &self.download.partial(at.sub)),
             PROGRAM_ID => self.download.identification(at.sub),
-            SECOND_SERVER => self.second_server.read(at.sub),
+            SECOND_SERVER if ROOM_FOR_FLEETS && self.config.second_server => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -325,7 +346,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 }
                 self.download.unsealer_mut().ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) => {
+            (SECOND_SERVER, &[a, b, c, d]) if ROOM_FOR_FLEETS && self.config.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
@@ -379,7 +400,11 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn second_server(&self) -> Channel {
-        self.second_server.channel()
+        if ROOM_FOR_FLEETS && self.config.second_server {
+            self.second_server.channel()
+        } else {
+            Channel::NONE
+        }
     }
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {

@@ -5,6 +5,10 @@ use shared_abi::block_file::Control;
 
 use crate::crc::CrcKind;
 
+/// Whether the second SDO server and downloads that go on after a cut are compiled in: the 32 KiB
+/// of a bootloader with sealed images have no room for them.
+pub const ROOM_FOR_FLEETS: bool = !cfg!(feature = "sealed");
+
 /// The time of the erase for CLEAR.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {
@@ -61,6 +65,8 @@ pub struct Policy {
     pub read_back: bool,
     /// Whether a download replaces the existing program without CLEAR.
     pub replaces: bool,
+    /// Whether a download of block files that was cut off can go on where it stopped.
+    pub resume: bool,
     /// The CRC of blocks and programs.
     pub crc: CrcKind,
     /// The bytes of flash that one step of a CRC covers. One step is the longest time that other
@@ -125,6 +131,7 @@ impl Policy {
         locked: false,
         read_back: false,
         replaces: false,
+        resume: true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
         #[cfg(feature = "sealed")]

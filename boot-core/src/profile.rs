@@ -39,7 +39,7 @@ impl Profile {
         device_type: BOOTLOADER_DEVICE_TYPE,
         node_id: None,
         default_node: None,
-        extras: Extras::NONE,
+        extras: Extras::STANDARD,
         password: b"",
         unknown_request: AbortCode::COMMAND,
         download: Policy::DEFAULT,
@@ -56,7 +56,7 @@ impl Profile {
             Some(id) => Some((id, BitRate::K125)),
             None => None,
         },
-        extras: Extras { password: PasswordObject::EnableFlash, ..Extras::NONE },
+        extras: Extras { password: PasswordObject::EnableFlash, ..Extras::STANDARD },
         password: &Self::INIT.to_le_bytes(),
         download: Policy { locked: true, reset_starts: true, starts_by_itself: true, ..Policy::DEFAULT },
         ..Self::STANDARD
@@ -69,7 +69,7 @@ impl Profile {
     pub const LIFT: Self = Self {
         device_type: LIFT_DEVICE_TYPE,
         node_id: NodeId::new(LIFT_NODE_ID),
-        extras: Extras { password: PasswordObject::Unlock, read_back: true, ..Extras::NONE },
+        extras: Extras { password: PasswordObject::Unlock, read_back: true, ..Extras::STANDARD },
         password: LIFT_PASSWORD,
         download: Policy {
             locked: true,

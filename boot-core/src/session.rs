@@ -14,11 +14,15 @@ pub(crate) enum Session {
     Idle,
     /// CLEAR was acknowledged; nothing is lost yet. `just`: no block has arrived since.
     Cleared { just: bool },
-    /// Blocks are being accepted; `next` is the number of the next one.
+    /// Blocks are being accepted; `next` is the number of the next one, [`ANY`] for a download that
+    /// goes on: its blocks begin at most where the existing data end.
     Open { next: u32 },
     /// The flash contains an incomplete program: only CLEAR allows a new download.
     Failed,
 }
+
+/// The number of a block that is not known yet.
+pub(crate) const ANY: u32 = 0;
 
 impl Session {
     /// Whether a new download may begin. `installed`: a program exists.

@@ -82,7 +82,12 @@ mod app {
     const TICK_MS: u32 = 2;
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    const EXTRAS: Extras = Extras { sealed: cfg!(feature = "sealed"), ..PRODUCT.profile.extras };
+    const EXTRAS: Extras = Extras {
+        sealed: cfg!(feature = "sealed"),
+        second_server: PRODUCT.second_server,
+        resume: PRODUCT.resume,
+        ..PRODUCT.profile.extras
+    };
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
     static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
 
@@ -104,6 +109,7 @@ mod app {
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
         lss_store: PRODUCT.lss_store,
+        second_server: PRODUCT.second_server,
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };

@@ -74,6 +74,11 @@ pub struct Product {
     pub lss_store: bool,
     /// Whether objects can be read by SDO block upload.
     pub block_upload: bool,
+    /// Whether there is a second SDO server (1201h), by which one client writes a program to several
+    /// devices at once.
+    pub second_server: bool,
+    /// Whether a download of block files that was cut off can go on where it stopped (2006h).
+    pub resume: bool,
     /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
@@ -135,6 +140,9 @@ impl Product {
         lss_announce: false,
         lss_store: true,
         block_upload: true,
+        // There is no room for them beside sealed images.
+        second_server: !cfg!(feature = "sealed"),
+        resume: !cfg!(feature = "sealed"),
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -250,6 +258,7 @@ impl Product {
                 Some(erase) => erase,
                 None => self.profile.download.erase,
             },
+            resume: self.resume,
             crc: self.crc,
             crc_step: self.crc_step,
             #[cfg(feature = "sealed")]

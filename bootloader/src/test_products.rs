@@ -32,6 +32,8 @@ const fn named(this: Product, name: &str) -> Product {
             watchdog_ms: None,
             lss: false,
             block_upload: false,
+            second_server: false,
+            resume: false,
             ..this
         }
     } else if equal(name, "switches") {
@@ -68,7 +70,7 @@ const SWITCHES: NodeSource = NodeSource::Function(|| {
 /// The product of a row of choices: a colon, then a digit for each field. `cargo xtask pairs` makes
 /// the rows; it has the same fields in the same order. A digit without a meaning fails the build.
 const fn of_choices(this: Product, row: &[u8]) -> Product {
-    assert!(row.len() == 33, "COBOOT_PRODUCT: a row has a colon and 32 digits");
+    assert!(row.len() == 35, "COBOOT_PRODUCT: a row has a colon and 34 digits");
     Product {
         profile: match row[1] {
             b'0' => Profile::STANDARD,
@@ -114,6 +116,8 @@ const fn of_choices(this: Product, row: &[u8]) -> Product {
         // Without the feature `sealed` these two have no effect.
         security_counter: if second(row, 31) { 5 } else { 0 },
         counter_with_confirmation: second(row, 32),
+        second_server: !second(row, 33),
+        resume: !second(row, 34),
     }
 }
 

@@ -351,6 +351,10 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
 /// or starts another transfer, after a time-out, after an error of `download_data`, or if the sizes
 /// do not match. After an error of `download_start` it calls neither.
 pub trait Objects {
+    /// Whether the device may have a second SDO server (1201h). Without it, the code for the server
+    /// is left out.
+    const HAS_SECOND_SERVER: bool = false;
+
     /// The table.
     fn entries(&self) -> &'static [Entry];
 
@@ -411,7 +415,7 @@ pub trait Objects {
         let _ = at;
     }
 
-    /// The COB-IDs of the second SDO server (1201h).
+    /// The COB-IDs of the second SDO server.
     fn second_server(&self) -> Channel {
         Channel::NONE
     }

@@ -96,6 +96,11 @@ pub const PROGRAM_REGION: u16 = 0x2004;
 /// 16-31 (SYS TEC manual L-1112d_10, figure 13); 0 for a program without a version, or no program.
 pub const PROGRAM_VERSION: u16 = 0x2005;
 
+/// The download of a program that can go on after a cut, an object of coboot: the sub-index is the
+/// program's number. The lower 32 bits are the CRC of its control block, the upper 32 bits the
+/// address up to which its data have arrived; 0 if there is none.
+pub const PROGRAM_PARTIAL: u16 = 0x2006;
+
 /// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`
 /// bytes.
 #[must_use]

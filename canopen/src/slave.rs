@@ -239,12 +239,12 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
-    fn identifiers(&self, device: &impl Objects) -> [CobId; 4] {
+    fn identifiers<O: Objects>(&self, device: &O) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
             Some(node) => {
                 let second = device.second_server().request;
-                let second = if second == CobId::NONE { lss } else { second };
+                let second = if O::HAS_SECOND_SERVER && second != CobId::NONE { second } else { lss };
                 [CobId::NMT, lss, self.config.node.sdo.request(node.id()), second]
             }
             None => [lss; 4],

@@ -25,13 +25,13 @@ const TIME: &str = "12:00AM";
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
 /// The tables of the bootloader: standard and Paulus, ESAcademy, lift.
-static STANDARD: [Entry; len(Extras::NONE)] = entries(PROGRAMS, Extras::NONE).entries();
+static STANDARD: [Entry; len(Extras::STANDARD)] = entries(PROGRAMS, Extras::STANDARD).entries();
 static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
     entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
 static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
 
 /// The same with sealed images.
-const SEALED: Extras = Extras { sealed: true, ..Extras::NONE };
+const SEALED: Extras = Extras { sealed: true, ..Extras::STANDARD };
 static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
 
 const fn len(extras: Extras) -> usize {

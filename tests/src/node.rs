@@ -21,7 +21,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 use crate::bench::NODE;
 
-static ENTRIES: [Entry; entry_count(1, Extras::NONE)] = entries(1, Extras::NONE).entries();
+static ENTRIES: [Entry; entry_count(1, Extras::STANDARD)] = entries(1, Extras::STANDARD).entries();
 static CONFIG: bootloader::Config = bootloader::Config {
     entries: &ENTRIES,
     device: Says {

@@ -22,7 +22,7 @@ build or does not fit its flash. It prints the choices and the size of each.
 
 /// The fields of a product that are varied, and their numbers of values. The values themselves are
 /// in `bootloader/src/test_products.rs`, in the same order.
-const FIELDS: [(&str, u8); 32] = [
+const FIELDS: [(&str, u8); 34] = [
     ("profile", 4),
     ("autostart", 2),
     ("rescue_window_ms", 2),
@@ -55,6 +55,8 @@ const FIELDS: [(&str, u8); 32] = [
     ("max_crash_resets", 2),
     ("security_counter", 2),
     ("counter_with_confirmation", 2),
+    ("second_server", 2),
+    ("resume", 2),
 ];
 
 /// The values of a product, in the order of [`FIELDS`]; 0 is the default.

@@ -26,12 +26,12 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
-use crate::intake::{Intake, Judge};
+use crate::intake::{Intake, Judge, LastBlock};
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::session::Session;
-use crate::store::{NodeParameters, Parameters, ProgramRecord};
+use crate::store::{NodeParameters, Parameters, Partial, ProgramRecord};
 use crate::unseal::Unsealer;
 
 pub use crate::policy::{Erase, Policy, Verdict};
@@ -49,6 +49,8 @@ struct Program {
     /// The result of the last block or command.
     error: Option<FlashError>,
     session: Session,
+    /// The download that was cut off or is going on, as stored; a copy for the same reason.
+    partial: Partial,
     /// The version in the last control block.
     version: u32,
     /// The last complete transfer was a raw image or Intel HEX, and no command followed.
@@ -73,8 +75,8 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     programs: [Program; PROGRAMS],
     programmer: Programmer<'b>,
     transfer: Option<Transfer>,
-    /// The CRC of the last block of data.
-    last_block: u32,
+    /// The last block of data.
+    last_block: LastBlock,
     /// The abort for a client that continues to send after the flash has failed.
     fault: AbortCode,
     /// A request to leave the bootloader, not yet carried out.
@@ -107,6 +109,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 identification: record.map_or(0, |record| record.crc),
                 error: None,
                 session: Session::Idle,
+                partial: ProgramRecord::load_partial(&parameters, flash, number),
                 version: 0,
                 streamed: false,
                 start_when_verified: false,
@@ -120,7 +123,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             programs,
             programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
             transfer: None,
-            last_block: 0,
+            last_block: LastBlock::default(),
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
             outcome: None,
@@ -172,6 +175,19 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     #[must_use]
     pub fn version(&self, program: u8) -> u32 {
         self.program(program).and_then(|state| state.record).map_or(0, |record| record.version)
+    }
+
+    /// 2006h: the download that can go on, as the CRC of its control block and the address up to
+    /// which its data have arrived, little-endian; zeros if there is none.
+    #[must_use]
+    pub fn partial(&self, program: u8) -> [u8; 8] {
+        let Some(state) = self.program(program) else { return [0; 8] };
+        let Partial { id, end } = match (state.session, state.partial) {
+            (Session::Idle, partial) => partial,
+            (Session::Open { .. }, partial) => Partial { end: self.last_block.end, ..partial },
+            _ => Partial::NONE,
+        };
+        region_value(id, end)
     }
 
     /// 2004h: address and size of the program's flash, little-endian.
@@ -267,8 +283,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
             Some(Event::Stored { program, ends }) => {
                 let record = load(&self.parameters, flash, program, self.programmer.unsealer());
+                let partial = ProgramRecord::load_partial(&self.parameters, flash, program);
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
+                    state.partial = partial;
                     if record.is_none() {
                         state.identification = 0;
                     }

@@ -16,11 +16,12 @@ use shared_abi::block_file::{
 use shared_abi::geometry::Region;
 
 use super::stream::judge_start;
-use super::{Begin, Destination, Format, Judge, Recognition, SMALLEST_PROGRAM};
+use super::{Begin, Destination, Format, Judge, LastBlock, Recognition, SMALLEST_PROGRAM};
+use crate::policy::ROOM_FOR_FLEETS;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::session::Session;
+use crate::session::{Session, ANY};
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
 
@@ -91,11 +92,18 @@ impl Format for BlockFile {
         }
         let malformed = Refusal::unfit(FlashError::Format);
         if is_data(&header) {
-            let last = core::mem::replace(to.last, self.crc);
             // A client that sends to several devices repeats a block until all of them have it.
-            if !matches!(to.judge.session, Session::Open { next } if next == header.number) {
+            if ROOM_FOR_FLEETS
+                && !matches!(to.judge.session, Session::Open { next } if next == ANY || next == header.number)
+            {
+                if self.crc != to.last.crc {
+                    return Err(Refusal::untimely(FlashError::Sequence));
+                }
                 to.queue.discard();
-                return if last == self.crc { Ok(()) } else { Err(Refusal::untimely(FlashError::Sequence)) };
+                return Ok(());
+            }
+            if ROOM_FOR_FLEETS {
+                *to.last = LastBlock { crc: self.crc, end: header.flash_address + header.size };
             }
         }
         let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
@@ -103,14 +111,17 @@ impl Format for BlockFile {
             NUMBER_CONTROL => {
                 let control = fields.and_then(Control::parse).ok_or(malformed)?;
                 to.judge.check_identity(&control)?;
+                let id = self.crc;
                 to.progress.begins = Some(match control {
-                    Control::Plain => Begin { size: 0, version: 0 },
-                    Control::Identity(identity) => Begin { size: identity.app_size, version: 0 },
-                    Control::Dated { identity, version, .. } => Begin { size: identity.app_size, version },
+                    Control::Plain => Begin { size: 0, version: 0, id },
+                    Control::Identity(identity) => Begin { size: identity.app_size, version: 0, id },
+                    Control::Dated { identity, version, .. } => {
+                        Begin { size: identity.app_size, version, id }
+                    }
                 });
                 #[cfg(feature = "sealed")]
                 if to.judge.sealed_only {
-                    to.progress.begins = Some(Begin { size: 0, version: 0 });
+                    to.progress.begins = Some(Begin { size: 0, version: 0, id: 0 });
                     to.progress.sealed = true;
                 }
             }
@@ -125,7 +136,7 @@ impl Format for BlockFile {
                     return Err(Refusal::unfit(FlashError::NoAccess));
                 }
                 to.queue.commit_bytes();
-                to.progress.block = true;
+                to.progress.block = Some(header.number);
             }
             NUMBER_LAST => {
                 let last = fields.and_then(Last::parse).ok_or(malformed)?;
@@ -141,7 +152,7 @@ impl Format for BlockFile {
             _ => {
                 judge_start(to)?;
                 to.queue.commit();
-                to.progress.block = true;
+                to.progress.block = Some(header.number);
             }
         }
         Ok(())
@@ -208,7 +219,9 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
         (NUMBER_LAST, Session::Open { next }) if next > 1 => return Ok(()),
-        (number, Session::Open { next }) if number == next || number.wrapping_add(1) == next => {}
+        (_, Session::Open { next: ANY }) if ROOM_FOR_FLEETS && header.flash_address <= to.last.end => {}
+        (number, Session::Open { next })
+            if number == next || ROOM_FOR_FLEETS && number.wrapping_add(1) == next => {}
         _ => return Err(Refusal::untimely(FlashError::Sequence)),
     }
     if header.size == 0 {

@@ -81,8 +81,8 @@ pub(crate) struct Destination<'a, 'b> {
     pub judge: Judge<'a>,
     /// The pieces.
     pub queue: &'a mut Queue<'b>,
-    /// The CRC of the last block of data.
-    pub last: &'a mut u32,
+    /// The last block of data.
+    pub last: &'a mut LastBlock,
     /// The results so far.
     pub progress: Progress,
 }
@@ -92,13 +92,22 @@ pub(crate) struct Destination<'a, 'b> {
 pub(crate) struct Progress {
     /// The download begins: the data so far are for this device.
     pub begins: Option<Begin>,
-    /// A block of data joined the queue.
-    pub block: bool,
+    /// The block of data with this number joined the queue.
+    pub block: Option<u32>,
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
     /// The download is a sealed image.
     #[cfg(feature = "sealed")]
     pub sealed: bool,
+}
+
+/// The last block of data that was accepted.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct LastBlock {
+    /// Its CRC.
+    pub crc: u32,
+    /// The address after its data.
+    pub end: u32,
 }
 
 /// What is known about a program when its download begins.
@@ -109,6 +118,8 @@ pub(crate) struct Begin {
     pub size: u32,
     /// Its version, 0 if unknown.
     pub version: u32,
+    /// The CRC of its control block, 0 if it has none: such a download cannot go on later.
+    pub id: u32,
 }
 
 /// One transfer.

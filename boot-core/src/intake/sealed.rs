@@ -33,7 +33,7 @@ impl Format for Sealed {
             return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
         }
         if !to.judge.has_begun() {
-            to.progress.begins = Some(Begin { size: 0, version: 0 });
+            to.progress.begins = Some(Begin { size: 0, version: 0, id: 0 });
             to.progress.sealed = true;
         }
         Ok(())

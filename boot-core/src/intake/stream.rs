@@ -98,7 +98,7 @@ impl Stream {
     fn close(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if to.queue.open_size() > 0 && !to.judge.has_begun() && to.progress.begins.is_none() {
             judge_start(to)?;
-            to.progress.begins = Some(Begin { size: self.size, version: 0 });
+            to.progress.begins = Some(Begin { size: self.size, version: 0, id: 0 });
         }
         to.queue.commit();
         Ok(())

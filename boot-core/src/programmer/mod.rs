@@ -21,9 +21,10 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
+use crate::policy::ROOM_FOR_FLEETS;
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
-use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
+use crate::store::{Key, NodeParameters, Parameters, Partial, ProgramRecord, Value};
 use crate::unseal::Unsealer;
 use write::WritePiece;
 
@@ -72,6 +73,10 @@ struct Target {
     clearing: bool,
     /// See [`ProgramRecord::half_erased`]; not including the present work.
     half_erased: bool,
+    /// What is stored of its progress.
+    partial: Partial,
+    /// It goes on where it was cut off: its data may already be in flash.
+    resumed: bool,
     /// The program to verify when the queue is empty.
     expected: Option<Expected>,
 }
@@ -168,17 +173,30 @@ impl<'b> Programmer<'b> {
     /// Prepares for pieces of this program, and of no other. The first piece removes its record.
     /// With `erase`, its sectors are erased, those of the first `size` bytes before data arrive;
     /// otherwise each piece must find its place erased.
-    pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32) {
+    /// `partial` is the progress to begin with: a download that goes on begins behind its region's
+    /// start.
+    pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
-            (region.base, region.base + size.min(region.size))
+            (partial.end, region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
         let (untouched, clearing, half_erased, expected) = (Some(ahead), false, false, None);
         let ahead = erased;
         self.unsealer.rest();
-        self.target =
-            Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, expected });
+        let resumed = ROOM_FOR_FLEETS && partial.end != region.base;
+        self.target = Some(Target {
+            program,
+            region,
+            erased,
+            ahead,
+            untouched,
+            clearing,
+            half_erased,
+            partial,
+            resumed,
+            expected,
+        });
     }
 
     /// The [opened](Self::open) program arrives as a sealed image.
@@ -202,7 +220,7 @@ impl<'b> Programmer<'b> {
 
     /// Removes the record of a program, then erases all its sectors that are not erased.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
-        self.open(program, region, true, region.size);
+        self.open(program, region, true, region.size, Partial { id: 0, end: region.base });
         if let Some(target) = &mut self.target {
             target.clearing = true;
         }
@@ -455,6 +473,7 @@ impl<'b> Programmer<'b> {
                 if self.unsealer.is_active() {
                     self.unsealer.written();
                 } else {
+                    self.note();
                     self.queue.pop();
                 }
                 None
@@ -462,6 +481,20 @@ impl<'b> Programmer<'b> {
             (Job::Verify { expected, crc }, Ok(())) => {
                 Some(Event::Written { program: self.program()?, expected, crc: crc.value() })
             }
+        }
+    }
+
+    /// Notes the progress of a download that could go on, sixteen times in the program.
+    fn note(&mut self) {
+        let (Some(target), Some(piece)) = (&mut self.target, self.queue.first()) else { return };
+        let end = piece.address + piece.size;
+        if ROOM_FOR_FLEETS
+            && target.partial.id != 0
+            && end.wrapping_sub(target.partial.end) >= (target.ahead - target.region.base) / 16
+        {
+            target.partial.end = end;
+            let program = target.program;
+            self.void(program);
         }
     }
 
@@ -502,6 +535,15 @@ impl<'b> Programmer<'b> {
                 if let Some(ahead) = target.untouched.take() {
                     target.ahead = target.ahead.max(ahead);
                     let program = target.program;
+                    target.half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+                    if target.resumed {
+                        // The data end within a sector that was erased for them; or at the start of
+                        // one that may be half erased.
+                        let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
+                        if sector.region.base != target.erased {
+                            target.erased = sector.region.end();
+                        }
+                    }
                     self.void(program);
                 }
             }
@@ -516,11 +558,14 @@ impl<'b> Programmer<'b> {
                     return Ok(Some(Job::Store(Change::Counter, program)));
                 }
             }
-            let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
-            if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
-                target.half_erased = core::mem::replace(&mut half_erased, true);
-            }
-            return Ok(Some(store(parameters, Change::Void, program, ProgramRecord::none(half_erased))));
+            let value = match &self.target {
+                Some(target) if target.program == program => ProgramRecord::none(true, target.partial),
+                _ => {
+                    let half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+                    ProgramRecord::none(half_erased, Partial::NONE)
+                }
+            };
+            return Ok(Some(store(parameters, Change::Void, program, value)));
         }
         let Some(target) = &mut self.target else { return Ok(None) };
         let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
@@ -533,10 +578,11 @@ impl<'b> Programmer<'b> {
             return Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }));
         }
         if core::mem::take(&mut target.clearing) {
-            return Ok(Some(store(parameters, Change::Record, target.program, ProgramRecord::none(false))));
+            let value = ProgramRecord::none(false, Partial::NONE);
+            return Ok(Some(store(parameters, Change::Record, target.program, value)));
         }
         if let Some(piece) = piece {
-            let write = WritePiece::new(flash, piece).ok_or(FlashError::NotCleared)?;
+            let write = WritePiece::new(flash, piece, target.resumed).ok_or(FlashError::NotCleared)?;
             return Ok(Some(Job::Write(write)));
         }
         #[cfg(feature = "sealed")]

@@ -16,10 +16,11 @@ pub(super) struct WritePiece {
 }
 
 impl WritePiece {
-    /// `None` if its place is not erased.
-    pub(super) fn new<F: Flash>(flash: &F, piece: Piece) -> Option<Self> {
+    /// `None` if its place is not erased. With `again`, some of the data may already be in flash:
+    /// each word is written once more, and reading it back shows whether it was the same.
+    pub(super) fn new<F: Flash>(flash: &F, piece: Piece, again: bool) -> Option<Self> {
         let place = Region::new(piece.address, piece.size);
-        if !flash.is_blank(place) {
+        if !again && !flash.is_blank(place) {
             return None;
         }
         let (first, last) = (place.base & !3, (place.end() - 1) & !3);

@@ -16,7 +16,7 @@ pub mod record;
 
 pub use journal::Journal;
 pub use node::NodeParameters;
-pub use record::ProgramRecord;
+pub use record::{Partial, ProgramRecord};
 
 use crate::flash::{Flash, FlashFault, Next};
 

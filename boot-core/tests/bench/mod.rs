@@ -30,7 +30,7 @@ pub const START: u8 = 0x01;
 pub const SET_SIGNATURE: u8 = 0x83;
 pub const CLR_SIGNATURE: u8 = 0x84;
 
-pub static ENTRIES: [Entry; entry_count(1, Extras::NONE)] = entries(1, Extras::NONE).entries();
+pub static ENTRIES: [Entry; entry_count(1, Extras::STANDARD)] = entries(1, Extras::STANDARD).entries();
 
 pub const CONFIG: Config = Config {
     entries: &ENTRIES,
@@ -40,6 +40,7 @@ pub const CONFIG: Config = Config {
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
     lss_store: true,
+    second_server: true,
     download: Policy::DEFAULT,
     password: b"",
 };

@@ -72,6 +72,7 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
         supports: |_| true,
         boot_up_emergency: false,
         lss_store: true,
+        second_server: true,
         download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
         password: profile.password,
     }

@@ -26,8 +26,8 @@ use super::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 pub static LAYOUT: Layout = TWO_PROGRAMS;
 
 const PROGRAMS: usize = 2;
-static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Extras::NONE)] =
-    entries(PROGRAMS as u8, Extras::NONE).entries();
+static ENTRIES: [Entry; entry_count(PROGRAMS as u8, Extras::STANDARD)] =
+    entries(PROGRAMS as u8, Extras::STANDARD).entries();
 /// 6005h/1.
 const LIFT_PASSWORD: Address = Address::new(0x6005, 1);
 

@@ -15,7 +15,6 @@ use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, Entry, Objects};
 use crate::sdo::block::{Receiver, BLKSIZE_MAX, SEGMENT};
 use crate::sdo::fields::{self, ccs, scs};
-use crate::sdo::second::Channel;
 use crate::time::Instant;
 
 mod block_download;
@@ -78,12 +77,6 @@ impl Config {
         request_base: 0x600,
         response_base: 0x580,
     };
-
-    /// The COB-IDs of a node.
-    #[must_use]
-    pub const fn channel(&self, node: NodeId) -> Channel {
-        Channel { request: self.request(node), response: self.response(node) }
-    }
 
     /// The COB-ID of the requests to a node.
     #[must_use]
@@ -223,16 +216,17 @@ impl SdoServer {
     }
 
     /// Processes any received frame; frames that are not SDO requests to this server are ignored.
-    pub fn handle(&mut self, frame: &Frame, now: Instant, objects: &mut impl Objects) {
-        let mut channel = self.config.channel(self.node);
-        if !frame.has_cob_id(channel.request) {
-            channel = objects.second_server();
-            if !frame.has_cob_id(channel.request) {
+    pub fn handle<O: Objects>(&mut self, frame: &Frame, now: Instant, objects: &mut O) {
+        let mut response = self.config.response(self.node);
+        if !frame.has_cob_id(self.config.request(self.node)) {
+            let second = objects.second_server();
+            if !O::HAS_SECOND_SERVER || !frame.has_cob_id(second.request) {
                 return;
             }
+            response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
-        self.response = channel.response;
+        self.response = response;
         match &self.state {
             State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
