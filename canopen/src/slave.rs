@@ -77,8 +77,10 @@ pub struct Slave {
     lss: Lss,
     line: Line,
     losses: Losses,
-    /// The identifiers that the owner has set the filters to.
-    accepted: [CobId; 4],
+    /// The COB-ID of requests to the second SDO server.
+    second: CobId,
+    /// The node-ID or `second` has changed, and the owner must still set the filters for it.
+    accept: bool,
 }
 
 #[derive(Debug)]
@@ -103,7 +105,8 @@ impl Slave {
             lss: Lss::new(address, id, config.lss.unwrap_or_default()),
             line: Line::Down(rate),
             losses: Losses::default(),
-            accepted: [CobId::NONE; 4],
+            second: CobId::NONE,
+            accept: false,
         }
     }
 
@@ -144,7 +147,7 @@ impl Slave {
 
     /// Processes any received frame; returns whether the NMT master requested a restart of the
     /// device. In this case a running transfer has ended, and a waiting answer was dropped.
-    pub fn handle(&mut self, frame: &Frame, now: Instant, device: &mut impl SlaveDevice) -> bool {
+    pub fn handle<D: SlaveDevice>(&mut self, frame: &Frame, now: Instant, device: &mut D) -> bool {
         // A controller that only listens cannot send answers.
         if !matches!(self.line, Line::Up { .. }) {
             return false;
@@ -163,6 +166,10 @@ impl Slave {
                 self.restart(id, device);
             }
             _ => {}
+        }
+        if D::HAS_SECOND_SERVER {
+            let second = device.second_server().request;
+            self.accept |= core::mem::replace(&mut self.second, second) != second;
         }
         false
     }
@@ -194,9 +201,8 @@ impl Slave {
             self.restart(self.lss.node_id(), device);
         }
         loop {
-            let identifiers = self.identifiers(device);
-            if core::mem::replace(&mut self.accepted, identifiers) != identifiers {
-                return Some(Output::Accept(identifiers));
+            if core::mem::take(&mut self.accept) {
+                return Some(Output::Accept(self.identifiers()));
             }
             match &mut self.line {
                 Line::Down(BitRate::Auto) => {
@@ -239,12 +245,11 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
-    fn identifiers<O: Objects>(&self, device: &O) -> [CobId; 4] {
+    fn identifiers(&self) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
             Some(node) => {
-                let second = device.second_server().request;
-                let second = if O::HAS_SECOND_SERVER && second != CobId::NONE { second } else { lss };
+                let second = if self.second == CobId::NONE { lss } else { self.second };
                 [CobId::NMT, lss, self.config.node.sdo.request(node.id()), second]
             }
             None => [lss; 4],
@@ -258,6 +263,7 @@ impl Slave {
             node.end_transfer(device);
         }
         self.node = id.map(|id| Node::new(id, self.config.node));
+        self.accept = true;
         device.node_id_changed(id);
     }
 }

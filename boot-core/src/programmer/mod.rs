@@ -177,7 +177,7 @@ impl<'b> Programmer<'b> {
     /// start.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
-            (partial.end, region.base + size.min(region.size))
+            (if ROOM_FOR_FLEETS { partial.end } else { region.base }, region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
@@ -536,7 +536,7 @@ impl<'b> Programmer<'b> {
                     target.ahead = target.ahead.max(ahead);
                     let program = target.program;
                     target.half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
-                    if target.resumed {
+                    if ROOM_FOR_FLEETS && target.resumed {
                         // The data end within a sector that was erased for them; or at the start of
                         // one that may be half erased.
                         let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
@@ -582,7 +582,8 @@ impl<'b> Programmer<'b> {
             return Ok(Some(store(parameters, Change::Record, target.program, value)));
         }
         if let Some(piece) = piece {
-            let write = WritePiece::new(flash, piece, target.resumed).ok_or(FlashError::NotCleared)?;
+            let write = WritePiece::new(flash, piece, ROOM_FOR_FLEETS && target.resumed)
+                .ok_or(FlashError::NotCleared)?;
             return Ok(Some(Job::Write(write)));
         }
         #[cfg(feature = "sealed")]

@@ -74,7 +74,8 @@ impl ProgramRecord {
     /// The stored form of "no program", with the download that is going on.
     #[must_use]
     pub const fn none(half_erased: bool, partial: Partial) -> Value {
-        [if half_erased { HALF_ERASED } else { 0 }, partial.id, partial.end, 0]
+        let [id, end] = if ROOM_FOR_FLEETS { [partial.id, partial.end] } else { [0; 2] };
+        [if half_erased { HALF_ERASED } else { 0 }, id, end, 0]
     }
 
     /// The download of a program that was cut off.

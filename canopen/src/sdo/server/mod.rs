@@ -217,16 +217,18 @@ impl SdoServer {
 
     /// Processes any received frame; frames that are not SDO requests to this server are ignored.
     pub fn handle<O: Objects>(&mut self, frame: &Frame, now: Instant, objects: &mut O) {
-        let mut response = self.config.response(self.node);
-        if !frame.has_cob_id(self.config.request(self.node)) {
+        if frame.has_cob_id(self.config.request(self.node)) {
+            if O::HAS_SECOND_SERVER {
+                self.response = self.config.response(self.node);
+            }
+        } else {
             let second = objects.second_server();
             if !O::HAS_SECOND_SERVER || !frame.has_cob_id(second.request) {
                 return;
             }
-            response = second.response;
+            self.response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
-        self.response = response;
         match &self.state {
             State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
@@ -250,7 +252,7 @@ impl SdoServer {
 
     /// The next frame to send; `None` if there is none. If the caller's transmit queue is full, it
     /// calls again later.
-    pub fn poll(&mut self, now: Instant, objects: &mut impl Objects) -> Option<Frame> {
+    pub fn poll<O: Objects>(&mut self, now: Instant, objects: &mut O) -> Option<Frame> {
         self.check_time(now, objects);
         if self.answer.is_none() {
             if let Err(code) = self.next_block_segment(objects) {
@@ -266,7 +268,8 @@ impl SdoServer {
         if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
             self.moved = now;
         }
-        Some(Frame::full(self.response, answer))
+        let response = if O::HAS_SECOND_SERVER { self.response } else { self.config.response(self.node) };
+        Some(Frame::full(response, answer))
     }
 
     /// Aborts a transfer with a silent client, and acknowledges a sub-block that stopped early.
