@@ -25,7 +25,7 @@ use {canopen::program::ACCESS, seal::access::right};
 use crate::control::{Downloader, Policy, Step};
 use crate::decision::StayReason;
 use crate::flash::Flash;
-use crate::policy::ROOM_FOR_FLEETS;
+use crate::resume;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
 use crate::unseal::Unsealer;
@@ -299,7 +299,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 }
 
 impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
-    const HAS_SECOND_SERVER: bool = ROOM_FOR_FLEETS;
+    const HAS_SECOND_SERVER: bool = resume::HAS_ROOM;
 
     fn entries(&self) -> &'static [Entry] {
         self.config.entries
@@ -321,9 +321,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
-            PROGRAM_PARTIAL if ROOM_FOR_FLEETS => return put(buf, &self.download.partial(at.sub)),
+            PROGRAM_PARTIAL if resume::HAS_ROOM => return put(buf, &self.download.partial(at.sub)),
             PROGRAM_ID => self.download.identification(at.sub),
-            SECOND_SERVER if ROOM_FOR_FLEETS && self.config.second_server => self.second_server.read(at.sub),
+            SECOND_SERVER if resume::HAS_ROOM && self.config.second_server => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -346,7 +346,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 }
                 self.download.unsealer_mut().ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) if ROOM_FOR_FLEETS && self.config.second_server => {
+            (SECOND_SERVER, &[a, b, c, d]) if resume::HAS_ROOM && self.config.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
@@ -400,7 +400,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn second_server(&self) -> Channel {
-        if ROOM_FOR_FLEETS && self.config.second_server {
+        if resume::HAS_ROOM && self.config.second_server {
             self.second_server.channel()
         } else {
             Channel::NONE
@@ -448,7 +448,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
         // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
-        self.second_server = SecondServer::NONE;
+        if resume::HAS_ROOM {
+            self.second_server = SecondServer::NONE;
+        }
         if id.is_some() && self.config.boot_up_emergency {
             self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
         }

@@ -29,6 +29,7 @@ pub mod program;
 mod programmer;
 mod queue;
 mod refusal;
+mod resume;
 mod sequence;
 mod session;
 pub mod store;

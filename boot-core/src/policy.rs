@@ -5,10 +5,6 @@ use shared_abi::block_file::Control;
 
 use crate::crc::CrcKind;
 
-/// Whether the second SDO server and downloads that go on after a cut are compiled in: the 32 KiB
-/// of a bootloader with sealed images have no room for them.
-pub const ROOM_FOR_FLEETS: bool = !cfg!(feature = "sealed");
-
 /// The time of the erase for CLEAR.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Erase {

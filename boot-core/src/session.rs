@@ -4,6 +4,8 @@ use canopen::program::FlashError;
 
 use crate::policy::Policy;
 use crate::refusal::Refusal;
+#[cfg(doc)]
+use crate::resume::ANY;
 
 /// The state of a program's download. It continues from one SDO transfer to the next.
 // No comparison of the whole value, which costs 140 bytes of flash: `matches!` only looks at the
@@ -15,14 +17,11 @@ pub(crate) enum Session {
     /// CLEAR was acknowledged; nothing is lost yet. `just`: no block has arrived since.
     Cleared { just: bool },
     /// Blocks are being accepted; `next` is the number of the next one, [`ANY`] for a download that
-    /// goes on: its blocks begin at most where the existing data end.
+    /// goes on.
     Open { next: u32 },
     /// The flash contains an incomplete program: only CLEAR allows a new download.
     Failed,
 }
-
-/// The number of a block that is not known yet.
-pub(crate) const ANY: u32 = 0;
 
 impl Session {
     /// Whether a new download may begin. `installed`: a program exists.

@@ -26,12 +26,13 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
-use crate::intake::{Intake, Judge, LastBlock};
+use crate::intake::{Intake, Judge};
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
+use crate::resume::{LastBlock, Partial};
 use crate::session::Session;
-use crate::store::{NodeParameters, Parameters, Partial, ProgramRecord};
+use crate::store::{NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Unsealer;
 
 pub use crate::policy::{Erase, Policy, Verdict};
@@ -123,7 +124,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             programs,
             programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
             transfer: None,
-            last_block: LastBlock::default(),
+            last_block: LastBlock::none(0),
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
             outcome: None,
@@ -182,10 +183,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     #[must_use]
     pub fn partial(&self, program: u8) -> [u8; 8] {
         let Some(state) = self.program(program) else { return [0; 8] };
-        let Partial { id, end } = match (state.session, state.partial) {
-            (Session::Idle, partial) => partial,
-            (Session::Open { .. }, partial) => Partial { end: self.last_block.end, ..partial },
-            _ => Partial::NONE,
+        let [id, stored] = state.partial.words();
+        let (id, end) = match state.session {
+            Session::Idle => (id, stored),
+            Session::Open { .. } => (id, self.last_block.end()),
+            _ => (0, 0),
         };
         region_value(id, end)
     }

@@ -5,11 +5,11 @@ use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
 use super::{find, Downloader, Transfer};
-use crate::intake::{Destination, Intake, Judge, LastBlock, Progress};
-use crate::policy::ROOM_FOR_FLEETS;
+use crate::intake::{Destination, Intake, Judge, Progress};
 use crate::refusal::Refusal;
-use crate::session::{Session, ANY};
-use crate::store::{Parameters, Partial};
+use crate::resume::{LastBlock, Partial, ANY};
+use crate::session::Session;
+use crate::store::Parameters;
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// 1F50h: the client starts a transfer, with its size if it is known.
@@ -149,20 +149,19 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(begin) = progress.begins {
             state.version = begin.version;
             let mut next = 1;
-            let goes_on =
-                ROOM_FOR_FLEETS && self.policy.resume && begin.id != 0 && begin.id == state.partial.id;
+            let goes_on = self.policy.resume && state.partial.is_of(begin.id);
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
                     next = ANY;
                 }
             } else {
-                let mut partial = Partial { id: begin.id, end: state.region.base };
+                let mut partial = Partial::begin(begin.id, state.region.base);
                 if goes_on && matches!(state.session, Session::Idle) {
                     partial = state.partial;
                     next = ANY;
                 }
-                self.last_block = LastBlock { crc: 0, end: partial.end };
+                self.last_block = LastBlock::none(partial.start(state.region.base));
                 let erases = next == ANY || state.session.erases(self.policy);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
                 state.partial = partial;
@@ -173,8 +172,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             state.session = Session::Open { next };
         }
-        if let (Some(number), Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = number.wrapping_add(1);
+        if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
+            *next = self.last_block.next(*next);
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);

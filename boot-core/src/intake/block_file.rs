@@ -16,12 +16,11 @@ use shared_abi::block_file::{
 use shared_abi::geometry::Region;
 
 use super::stream::judge_start;
-use super::{Begin, Destination, Format, Judge, LastBlock, Recognition, SMALLEST_PROGRAM};
-use crate::policy::ROOM_FOR_FLEETS;
+use super::{Begin, Destination, Format, Judge, Recognition, SMALLEST_PROGRAM};
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::session::{Session, ANY};
+use crate::session::Session;
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
 
@@ -91,20 +90,16 @@ impl Format for BlockFile {
             return Err(Refusal::unfit(FlashError::Crc));
         }
         let malformed = Refusal::unfit(FlashError::Format);
-        if is_data(&header) {
+        if let (true, Session::Open { next }) = (is_data(&header), to.judge.session) {
             // A client that sends to several devices repeats a block until all of them have it.
-            if ROOM_FOR_FLEETS
-                && !matches!(to.judge.session, Session::Open { next } if next == ANY || next == header.number)
-            {
-                if self.crc != to.last.crc {
+            if to.last.is_again(next, header.number) {
+                if !to.last.has_crc(self.crc) {
                     return Err(Refusal::untimely(FlashError::Sequence));
                 }
                 to.queue.discard();
                 return Ok(());
             }
-            if ROOM_FOR_FLEETS {
-                *to.last = LastBlock { crc: self.crc, end: header.flash_address + header.size };
-            }
+            to.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
         let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
         match header.number {
@@ -136,7 +131,7 @@ impl Format for BlockFile {
                     return Err(Refusal::unfit(FlashError::NoAccess));
                 }
                 to.queue.commit_bytes();
-                to.progress.block = Some(header.number);
+                to.progress.block = true;
             }
             NUMBER_LAST => {
                 let last = fields.and_then(Last::parse).ok_or(malformed)?;
@@ -152,7 +147,7 @@ impl Format for BlockFile {
             _ => {
                 judge_start(to)?;
                 to.queue.commit();
-                to.progress.block = Some(header.number);
+                to.progress.block = true;
             }
         }
         Ok(())
@@ -219,9 +214,7 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
         (NUMBER_LAST, Session::Open { next }) if next > 1 => return Ok(()),
-        (_, Session::Open { next: ANY }) if ROOM_FOR_FLEETS && header.flash_address <= to.last.end => {}
-        (number, Session::Open { next })
-            if number == next || ROOM_FOR_FLEETS && number.wrapping_add(1) == next => {}
+        (number, Session::Open { next }) if to.last.may_follow(next, number, header.flash_address) => {}
         _ => return Err(Refusal::untimely(FlashError::Sequence)),
     }
     if header.size == 0 {

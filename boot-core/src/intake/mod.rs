@@ -24,6 +24,7 @@ use canopen::AbortCode;
 
 use crate::queue::Queue;
 use crate::refusal::Refusal;
+use crate::resume::LastBlock;
 pub(crate) use judge::Judge;
 
 #[cfg(not(feature = "sealed"))]
@@ -92,22 +93,13 @@ pub(crate) struct Destination<'a, 'b> {
 pub(crate) struct Progress {
     /// The download begins: the data so far are for this device.
     pub begins: Option<Begin>,
-    /// The block of data with this number joined the queue.
-    pub block: Option<u32>,
+    /// A block of data joined the queue.
+    pub block: bool,
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
     /// The download is a sealed image.
     #[cfg(feature = "sealed")]
     pub sealed: bool,
-}
-
-/// The last block of data that was accepted.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct LastBlock {
-    /// Its CRC.
-    pub crc: u32,
-    /// The address after its data.
-    pub end: u32,
 }
 
 /// What is known about a program when its download begins.

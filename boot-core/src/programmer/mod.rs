@@ -21,10 +21,10 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
-use crate::policy::ROOM_FOR_FLEETS;
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
-use crate::store::{Key, NodeParameters, Parameters, Partial, ProgramRecord, Value};
+use crate::resume::{self, Partial};
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
 use crate::unseal::Unsealer;
 use write::WritePiece;
 
@@ -71,12 +71,11 @@ struct Target {
     untouched: Option<u32>,
     /// All of it is being erased for a command.
     clearing: bool,
-    /// See [`ProgramRecord::half_erased`]; not including the present work.
+    /// See [`ProgramRecord::half_erased`]; not including the present work, which begins with the
+    /// removal of the record.
     half_erased: bool,
     /// What is stored of its progress.
     partial: Partial,
-    /// It goes on where it was cut off: its data may already be in flash.
-    resumed: bool,
     /// The program to verify when the queue is empty.
     expected: Option<Expected>,
 }
@@ -177,14 +176,13 @@ impl<'b> Programmer<'b> {
     /// start.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
-            (if ROOM_FOR_FLEETS { partial.end } else { region.base }, region.base + size.min(region.size))
+            (partial.start(region.base), region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
-        let (untouched, clearing, half_erased, expected) = (Some(ahead), false, false, None);
+        let (untouched, clearing, half_erased, expected) = (Some(ahead), false, true, None);
         let ahead = erased;
         self.unsealer.rest();
-        let resumed = ROOM_FOR_FLEETS && partial.end != region.base;
         self.target = Some(Target {
             program,
             region,
@@ -194,7 +192,6 @@ impl<'b> Programmer<'b> {
             clearing,
             half_erased,
             partial,
-            resumed,
             expected,
         });
     }
@@ -220,7 +217,7 @@ impl<'b> Programmer<'b> {
 
     /// Removes the record of a program, then erases all its sectors that are not erased.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
-        self.open(program, region, true, region.size, Partial { id: 0, end: region.base });
+        self.open(program, region, true, region.size, Partial::begin(0, region.base));
         if let Some(target) = &mut self.target {
             target.clearing = true;
         }
@@ -473,7 +470,9 @@ impl<'b> Programmer<'b> {
                 if self.unsealer.is_active() {
                     self.unsealer.written();
                 } else {
-                    self.note();
+                    if resume::HAS_ROOM {
+                        self.note();
+                    }
                     self.queue.pop();
                 }
                 None
@@ -487,12 +486,7 @@ impl<'b> Programmer<'b> {
     /// Notes the progress of a download that could go on, sixteen times in the program.
     fn note(&mut self) {
         let (Some(target), Some(piece)) = (&mut self.target, self.queue.first()) else { return };
-        let end = piece.address + piece.size;
-        if ROOM_FOR_FLEETS
-            && target.partial.id != 0
-            && end.wrapping_sub(target.partial.end) >= (target.ahead - target.region.base) / 16
-        {
-            target.partial.end = end;
+        if target.partial.note(piece.address + piece.size, target.ahead - target.region.base) {
             let program = target.program;
             self.void(program);
         }
@@ -535,8 +529,7 @@ impl<'b> Programmer<'b> {
                 if let Some(ahead) = target.untouched.take() {
                     target.ahead = target.ahead.max(ahead);
                     let program = target.program;
-                    target.half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
-                    if ROOM_FOR_FLEETS && target.resumed {
+                    if target.partial.is_resumed() {
                         // The data end within a sector that was erased for them; or at the start of
                         // one that may be half erased.
                         let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
@@ -558,13 +551,14 @@ impl<'b> Programmer<'b> {
                     return Ok(Some(Job::Store(Change::Counter, program)));
                 }
             }
-            let value = match &self.target {
-                Some(target) if target.program == program => ProgramRecord::none(true, target.partial),
-                _ => {
-                    let half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
-                    ProgramRecord::none(half_erased, Partial::NONE)
-                }
-            };
+            let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+            let mut partial = Partial::NONE;
+            if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
+                // From the second time on, the stored value is that of the present work.
+                target.half_erased &= core::mem::replace(&mut half_erased, true);
+                partial = target.partial;
+            }
+            let value = ProgramRecord::none(half_erased, partial);
             return Ok(Some(store(parameters, Change::Void, program, value)));
         }
         let Some(target) = &mut self.target else { return Ok(None) };
@@ -582,8 +576,8 @@ impl<'b> Programmer<'b> {
             return Ok(Some(store(parameters, Change::Record, target.program, value)));
         }
         if let Some(piece) = piece {
-            let write = WritePiece::new(flash, piece, ROOM_FOR_FLEETS && target.resumed)
-                .ok_or(FlashError::NotCleared)?;
+            let write =
+                WritePiece::new(flash, piece, target.partial.is_resumed()).ok_or(FlashError::NotCleared)?;
             return Ok(Some(Job::Write(write)));
         }
         #[cfg(feature = "sealed")]

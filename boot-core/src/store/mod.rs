@@ -16,7 +16,7 @@ pub mod record;
 
 pub use journal::Journal;
 pub use node::NodeParameters;
-pub use record::{Partial, ProgramRecord};
+pub use record::ProgramRecord;
 
 use crate::flash::{Flash, FlashFault, Next};
 

@@ -2,7 +2,7 @@
 
 use super::{Key, Parameters, Value};
 use crate::flash::Flash;
-use crate::policy::ROOM_FOR_FLEETS;
+use crate::resume::Partial;
 
 /// The stored record of a program that was downloaded completely with a correct CRC.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -24,20 +24,6 @@ pub struct ProgramRecord {
     /// The kind of sealed image; `None` for a program that was not sealed.
     #[cfg(feature = "sealed")]
     pub seal: Option<Seal>,
-}
-
-/// A download that has begun and not ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Partial {
-    /// The CRC of its control block, 0 if it cannot go on.
-    pub id: u32,
-    /// The address up to which its data have arrived; in the store, up to which they are in flash.
-    pub end: u32,
-}
-
-impl Partial {
-    /// No download.
-    pub const NONE: Self = Self { id: 0, end: 0 };
 }
 
 /// What a sealed program may do to the flash.
@@ -74,17 +60,14 @@ impl ProgramRecord {
     /// The stored form of "no program", with the download that is going on.
     #[must_use]
     pub const fn none(half_erased: bool, partial: Partial) -> Value {
-        let [id, end] = if ROOM_FOR_FLEETS { [partial.id, partial.end] } else { [0; 2] };
+        let [id, end] = partial.words();
         [if half_erased { HALF_ERASED } else { 0 }, id, end, 0]
     }
 
     /// The download of a program that was cut off.
     pub fn load_partial<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Partial {
-        if !ROOM_FOR_FLEETS {
-            return Partial::NONE;
-        }
         match parameters.get(flash, Key::Program(number)) {
-            Some([first, id, end, _]) if first & SIZE == 0 => Partial { id, end },
+            Some([first, id, end, _]) if first & SIZE == 0 => Partial::of_words([id, end]),
             _ => Partial::NONE,
         }
     }

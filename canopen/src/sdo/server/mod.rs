@@ -151,7 +151,7 @@ impl SdoServer {
         Self {
             node,
             config,
-            response: config.response(node),
+            response: CobId::NMT,
             at: Address::new(0, 0),
             state: State::Idle,
             moved: Instant::from_millis(0),

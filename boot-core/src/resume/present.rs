@@ -1,0 +1,114 @@
+//! The real types.
+
+use super::ANY;
+
+/// How often the progress of a download is stored.
+const NOTES: u32 = 16;
+
+/// The progress of a download of block files.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Partial {
+    /// The CRC of its control block, 0 if it cannot go on.
+    id: u32,
+    /// The address up to which its data are in flash.
+    end: u32,
+    /// It went on behind a cut: its data may already be in flash.
+    resumed: bool,
+}
+
+impl Partial {
+    /// No download.
+    pub const NONE: Self = Self::of_words([0; 2]);
+
+    /// A download with this control block, which begins at `base`.
+    #[must_use]
+    pub const fn begin(id: u32, base: u32) -> Self {
+        Self { id, end: base, resumed: false }
+    }
+
+    /// From its stored form.
+    #[must_use]
+    pub const fn of_words([id, end]: [u32; 2]) -> Self {
+        Self { id, end, resumed: true }
+    }
+
+    /// The stored form: the CRC of its control block, and the address up to which its data are in
+    /// flash.
+    #[must_use]
+    pub const fn words(self) -> [u32; 2] {
+        [self.id, self.end]
+    }
+
+    /// Whether it began with the control block with this CRC.
+    pub(crate) const fn is_of(self, id: u32) -> bool {
+        id != 0 && self.id == id
+    }
+
+    /// Whether it goes on behind a cut.
+    pub(crate) const fn is_resumed(self) -> bool {
+        self.resumed
+    }
+
+    /// The address of its first data that are not in flash; `base` for a new one.
+    pub(crate) const fn start(self, _base: u32) -> u32 {
+        self.end
+    }
+
+    /// Takes note of data in flash up to `end`, of a program with `size` bytes. Returns whether the
+    /// progress must be stored.
+    pub(crate) const fn note(&mut self, end: u32, size: u32) -> bool {
+        let is_far = self.id != 0 && end.wrapping_sub(self.end) as i32 >= (size / NOTES) as i32;
+        if is_far {
+            self.end = end;
+        }
+        is_far
+    }
+}
+
+/// The last block of data that was accepted.
+#[derive(Clone, Copy, Debug)]
+pub struct LastBlock {
+    crc: u32,
+    number: u32,
+    /// The address after its data.
+    end: u32,
+}
+
+impl LastBlock {
+    /// No block yet; the data so far end at this address.
+    #[must_use]
+    pub const fn none(end: u32) -> Self {
+        Self { crc: 0, number: ANY, end }
+    }
+
+    /// The address up to which the blocks have come.
+    pub(crate) const fn end(&self) -> u32 {
+        self.end
+    }
+
+    /// Whether a block may come when number `next` is expected: the next one, the last one again,
+    /// or any that joins the existing data.
+    pub(crate) const fn may_follow(&self, next: u32, number: u32, address: u32) -> bool {
+        number == next || self.number == number || next == ANY && address <= self.end
+    }
+
+    /// Whether a block that [may come](Self::may_follow) is the last one again.
+    pub(crate) const fn is_again(&self, next: u32, number: u32) -> bool {
+        self.number == number && number != next
+    }
+
+    /// Whether it had this CRC.
+    pub(crate) const fn has_crc(&self, crc: u32) -> bool {
+        self.crc == crc
+    }
+
+    /// Replaces it, and returns the number of the next one.
+    pub(crate) const fn replace(&mut self, number: u32, crc: u32, end: u32) {
+        *self = Self { crc, number, end };
+    }
+
+    /// The number of the block after it; `next` was expected.
+    pub(crate) const fn next(&self, _next: u32) -> u32 {
+        self.number.wrapping_add(1)
+    }
+}
