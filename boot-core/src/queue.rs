@@ -5,6 +5,8 @@
 //! ([`Queue::commit`]) or is dropped ([`Queue::discard`]). In the ring each piece is its address,
 //! its size and its bytes.
 
+use crate::resume::LastBlock;
+
 /// The bytes before each piece's data.
 pub(crate) const PIECE_HEADER: usize = 8;
 
@@ -24,11 +26,13 @@ pub(crate) struct Queue<'b> {
     queued: usize,
     /// The size of the open piece in bytes, including its header; 0 without one.
     open: usize,
+    /// The last block of data that was accepted.
+    pub last: LastBlock,
 }
 
 impl<'b> Queue<'b> {
     pub(crate) fn new(buffer: &'b mut [u8]) -> Self {
-        Self { buffer, front: 0, queued: 0, open: 0 }
+        Self { buffer, front: 0, queued: 0, open: 0, last: LastBlock::none(0) }
     }
 
     pub(crate) fn into_buffer(self) -> &'b mut [u8] {

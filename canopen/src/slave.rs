@@ -245,13 +245,11 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
+    #[inline(never)]
     fn identifiers(&self) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         match &self.node {
-            Some(node) => {
-                let second = if self.second == CobId::NONE { lss } else { self.second };
-                [CobId::NMT, lss, self.config.node.sdo.request(node.id()), second]
-            }
+            Some(node) => [CobId::NMT, lss, self.config.node.sdo.request(node.id()), self.second],
             None => [lss; 4],
         }
     }

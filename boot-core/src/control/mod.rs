@@ -30,7 +30,7 @@ use crate::intake::{Intake, Judge};
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
-use crate::resume::{LastBlock, Partial};
+use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Unsealer;
@@ -76,8 +76,6 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     programs: [Program; PROGRAMS],
     programmer: Programmer<'b>,
     transfer: Option<Transfer>,
-    /// The last block of data.
-    last_block: LastBlock,
     /// The abort for a client that continues to send after the flash has failed.
     fault: AbortCode,
     /// A request to leave the bootloader, not yet carried out.
@@ -124,7 +122,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             programs,
             programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
             transfer: None,
-            last_block: LastBlock::none(0),
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
             outcome: None,
@@ -186,7 +183,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let [id, stored] = state.partial.words();
         let (id, end) = match state.session {
             Session::Idle => (id, stored),
-            Session::Open { .. } => (id, self.last_block.end()),
+            Session::Open { .. } => (id, self.programmer.queue().last.end()),
             _ => (0, 0),
         };
         region_value(id, end)

@@ -110,12 +110,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             #[cfg(feature = "sealed")]
             sealed_only: self.programmer.unsealer().takes_no_other(),
         };
-        let mut to = Destination {
-            judge,
-            queue: self.programmer.queue_mut(),
-            last: &mut self.last_block,
-            progress: Progress::default(),
-        };
+        let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
         let outcome = match data {
             Some(bytes) => intake.data(bytes, &mut to),
             None => intake.end(&mut to),
@@ -161,7 +156,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     partial = state.partial;
                     next = ANY;
                 }
-                self.last_block = LastBlock::none(partial.start(state.region.base));
+                self.programmer.queue_mut().last = LastBlock::none(partial.start(state.region.base));
                 let erases = next == ANY || state.session.erases(self.policy);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
                 state.partial = partial;
@@ -173,7 +168,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.session = Session::Open { next };
         }
         if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = self.last_block.next(*next);
+            *next = self.programmer.queue().last.next(*next);
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);

@@ -92,14 +92,14 @@ impl Format for BlockFile {
         let malformed = Refusal::unfit(FlashError::Format);
         if let (true, Session::Open { next }) = (is_data(&header), to.judge.session) {
             // A client that sends to several devices repeats a block until all of them have it.
-            if to.last.is_again(next, header.number) {
-                if !to.last.has_crc(self.crc) {
+            if to.queue.last.is_again(next, header.number) {
+                if !to.queue.last.has_crc(self.crc) {
                     return Err(Refusal::untimely(FlashError::Sequence));
                 }
                 to.queue.discard();
                 return Ok(());
             }
-            to.last.replace(header.number, self.crc, header.flash_address + header.size);
+            to.queue.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
         let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
         match header.number {
@@ -214,7 +214,7 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
         (NUMBER_LAST, Session::Open { next }) if next > 1 => return Ok(()),
-        (number, Session::Open { next }) if to.last.may_follow(next, number, header.flash_address) => {}
+        (number, Session::Open { next }) if to.queue.last.may_follow(next, number, header.flash_address) => {}
         _ => return Err(Refusal::untimely(FlashError::Sequence)),
     }
     if header.size == 0 {

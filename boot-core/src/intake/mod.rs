@@ -24,7 +24,6 @@ use canopen::AbortCode;
 
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::resume::LastBlock;
 pub(crate) use judge::Judge;
 
 #[cfg(not(feature = "sealed"))]
@@ -82,8 +81,6 @@ pub(crate) struct Destination<'a, 'b> {
     pub judge: Judge<'a>,
     /// The pieces.
     pub queue: &'a mut Queue<'b>,
-    /// The last block of data.
-    pub last: &'a mut LastBlock,
     /// The results so far.
     pub progress: Progress,
 }
