@@ -7,7 +7,7 @@ use shared_abi::block_file::FRAMING;
 use super::{find, Downloader, Transfer};
 use crate::intake::{Destination, Intake, Judge, Progress};
 use crate::refusal::Refusal;
-use crate::resume::{LastBlock, Partial, ANY};
+use crate::resume::{LastBlock, ANY};
 use crate::session::Session;
 use crate::store::Parameters;
 
@@ -144,14 +144,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(begin) = progress.begins {
             state.version = begin.version;
             let mut next = 1;
-            let goes_on = self.policy.resume && state.partial.is_of(begin.id);
+            let goes_on = self.policy.resume && state.partial.is_same(begin.partial);
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
                     next = ANY;
                 }
             } else {
-                let mut partial = Partial::begin(begin.id, state.region.base);
+                let mut partial = begin.partial;
                 if goes_on && matches!(state.session, Session::Idle) {
                     partial = state.partial;
                     next = ANY;

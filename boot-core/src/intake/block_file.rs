@@ -20,6 +20,7 @@ use super::{Begin, Destination, Format, Judge, Recognition, SMALLEST_PROGRAM};
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
+use crate::resume::Partial;
 use crate::session::Session;
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
@@ -106,17 +107,17 @@ impl Format for BlockFile {
             NUMBER_CONTROL => {
                 let control = fields.and_then(Control::parse).ok_or(malformed)?;
                 to.judge.check_identity(&control)?;
-                let id = self.crc;
+                let partial = Partial::begin(self.crc, to.judge.region.base);
                 to.progress.begins = Some(match control {
-                    Control::Plain => Begin { size: 0, version: 0, id },
-                    Control::Identity(identity) => Begin { size: identity.app_size, version: 0, id },
+                    Control::Plain => Begin { size: 0, version: 0, partial },
+                    Control::Identity(identity) => Begin { size: identity.app_size, version: 0, partial },
                     Control::Dated { identity, version, .. } => {
-                        Begin { size: identity.app_size, version, id }
+                        Begin { size: identity.app_size, version, partial }
                     }
                 });
                 #[cfg(feature = "sealed")]
                 if to.judge.sealed_only {
-                    to.progress.begins = Some(Begin { size: 0, version: 0, id: 0 });
+                    to.progress.begins = Some(Begin { size: 0, version: 0, partial });
                     to.progress.sealed = true;
                 }
             }

@@ -24,6 +24,7 @@ use canopen::AbortCode;
 
 use crate::queue::Queue;
 use crate::refusal::Refusal;
+use crate::resume::Partial;
 pub(crate) use judge::Judge;
 
 #[cfg(not(feature = "sealed"))]
@@ -107,8 +108,8 @@ pub(crate) struct Begin {
     pub size: u32,
     /// Its version, 0 if unknown.
     pub version: u32,
-    /// The CRC of its control block, 0 if it has none: such a download cannot go on later.
-    pub id: u32,
+    /// Its progress: at its start, with the identity of its block file.
+    pub partial: Partial,
 }
 
 /// One transfer.

@@ -9,6 +9,7 @@ use super::{Begin, Destination, Format, Judge, Recognition};
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
+use crate::resume::Partial;
 
 pub(super) struct Sealed;
 
@@ -33,7 +34,8 @@ impl Format for Sealed {
             return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
         }
         if !to.judge.has_begun() {
-            to.progress.begins = Some(Begin { size: 0, version: 0, id: 0 });
+            to.progress.begins =
+                Some(Begin { size: 0, version: 0, partial: Partial::begin(0, to.judge.region.base) });
             to.progress.sealed = true;
         }
         Ok(())

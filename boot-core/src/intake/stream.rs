@@ -10,6 +10,7 @@ use super::{Begin, Destination, Judge, SMALLEST_PROGRAM};
 use crate::program::Expected;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
+use crate::resume::Partial;
 
 /// Data of a piece: long enough to keep the flash busy, short enough that a small queue holds
 /// several.
@@ -98,7 +99,8 @@ impl Stream {
     fn close(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         if to.queue.open_size() > 0 && !to.judge.has_begun() && to.progress.begins.is_none() {
             judge_start(to)?;
-            to.progress.begins = Some(Begin { size: self.size, version: 0, id: 0 });
+            let partial = Partial::begin(0, to.judge.region.base);
+            to.progress.begins = Some(Begin { size: self.size, version: 0, partial });
         }
         to.queue.commit();
         Ok(())

@@ -26,7 +26,7 @@ impl Partial {
         [0; 2]
     }
 
-    pub(crate) const fn is_of(self, _id: u32) -> bool {
+    pub(crate) const fn is_same(self, _other: Self) -> bool {
         false
     }
 

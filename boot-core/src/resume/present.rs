@@ -20,7 +20,8 @@ impl Partial {
     /// No download.
     pub const NONE: Self = Self::of_words([0; 2]);
 
-    /// A download with this control block, which begins at `base`.
+    /// A download that begins at `base`, with the CRC of its control block; 0 for one that cannot go
+    /// on after a cut.
     #[must_use]
     pub const fn begin(id: u32, base: u32) -> Self {
         Self { id, end: base, resumed: false }
@@ -39,9 +40,9 @@ impl Partial {
         [self.id, self.end]
     }
 
-    /// Whether it began with the control block with this CRC.
-    pub(crate) const fn is_of(self, id: u32) -> bool {
-        id != 0 && self.id == id
+    /// Whether it is a download of the same block file.
+    pub(crate) const fn is_same(self, other: Self) -> bool {
+        self.id != 0 && self.id == other.id
     }
 
     /// Whether it goes on behind a cut.
