@@ -299,7 +299,9 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 }
 
 impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
-    const HAS_SECOND_SERVER: bool = resume::HAS_ROOM;
+    fn has_second_server() -> bool {
+        resume::HAS_ROOM
+    }
 
     fn entries(&self) -> &'static [Entry] {
         self.config.entries

@@ -542,7 +542,7 @@ fn a_start_or_a_block_during_an_erase_is_told_to_wait() {
 }
 
 #[test]
-fn repeated_and_overlapping_blocks_are_refused_and_the_program_goes_on() {
+fn blocks_out_of_order_and_overlapping_ones_are_refused_and_the_program_goes_on() {
     let image = program(192, 0x22);
     let good = block_file(&image, 96);
     let mut flash = ModelFlash::new(&CHIP);
@@ -550,8 +550,8 @@ fn repeated_and_overlapping_blocks_are_refused_and_the_program_goes_on() {
     assert_eq!(bench.command(CLEAR), 0);
     bench.good(&good[0]);
     bench.good(&good[1]);
-    assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x88), "repeated: SEQUENCE");
     bench.good(&good[2]);
+    assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), 0x88), "SEQUENCE");
     // Correct by its number, but over existing data: the check of the flash detects it.
     let over = block(3, PROGRAM.base + 100, &[0; 16]);
     assert_eq!(bench.block(&over), (Ok(()), 0x08), "NOTCLEARED");

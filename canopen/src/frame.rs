@@ -50,8 +50,8 @@ impl CobId {
     /// LSS, master to slave (CiA 305).
     pub const LSS_REQUEST: Self = Self(0x7E5);
 
-    /// The COB-ID of no frame.
-    pub(crate) const NONE: Self = Self(u16::MAX);
+    /// The COB-ID that no frame has: it has more than 11 bits.
+    pub const NONE: Self = Self(u16::MAX);
 
     /// A COB-ID whose word in the object dictionary was found to be valid.
     pub(crate) const fn of_word(word: u32) -> Self {

@@ -351,9 +351,15 @@ pub fn put(buf: &mut [u8], value: &[u8]) -> Result<usize, AbortCode> {
 /// or starts another transfer, after a time-out, after an error of `download_data`, or if the sizes
 /// do not match. After an error of `download_start` it calls neither.
 pub trait Objects {
-    /// Whether the device may have a second SDO server (1201h). Without it, the code for the server
-    /// is left out.
-    const HAS_SECOND_SERVER: bool = false;
+    /// Whether the device may have a second SDO server (1201h). Without it, the compiler leaves out
+    /// the code for it.
+    #[must_use]
+    fn has_second_server() -> bool
+    where
+        Self: Sized,
+    {
+        false
+    }
 
     /// The table.
     fn entries(&self) -> &'static [Entry];

@@ -63,7 +63,8 @@ pub enum Output {
     Listen(BitRate),
     /// Start the controller's recovery from bus-off.
     RecoverFromBusOff,
-    /// Accept exactly the frames with these identifiers; the list may contain one twice.
+    /// Accept exactly the frames with these identifiers; the list may contain one twice, and
+    /// [`CobId::NONE`].
     Accept([CobId; 4]),
 }
 
@@ -167,7 +168,7 @@ impl Slave {
             }
             _ => {}
         }
-        if D::HAS_SECOND_SERVER {
+        if D::has_second_server() {
             let second = device.second_server().request;
             self.accept |= core::mem::replace(&mut self.second, second) != second;
         }
@@ -245,13 +246,15 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
+    // Not inlined: this is shorter.
     #[inline(never)]
     fn identifiers(&self) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
-        match &self.node {
-            Some(node) => [CobId::NMT, lss, self.config.node.sdo.request(node.id()), self.second],
-            None => [lss; 4],
-        }
+        let [nmt, request] = match &self.node {
+            Some(node) => [CobId::NMT, self.config.node.sdo.request(node.id())],
+            None => [lss; 2],
+        };
+        [nmt, lss, request, self.second]
     }
 
     /// Starts the node (again) with this node-ID: a transfer ends, and the boot-up message is sent

@@ -107,14 +107,15 @@ impl Format for BlockFile {
             NUMBER_CONTROL => {
                 let control = fields.and_then(Control::parse).ok_or(malformed)?;
                 to.judge.check_identity(&control)?;
-                let partial = Partial::begin(self.crc, to.judge.region.base);
-                to.progress.begins = Some(match control {
-                    Control::Plain => Begin { size: 0, version: 0, partial },
-                    Control::Identity(identity) => Begin { size: identity.app_size, version: 0, partial },
-                    Control::Dated { identity, version, .. } => {
-                        Begin { size: identity.app_size, version, partial }
-                    }
-                });
+                let (size, version) = match control {
+                    Control::Plain => (0, 0),
+                    Control::Identity(identity) => (identity.app_size, 0),
+                    Control::Dated { identity, version, .. } => (identity.app_size, version),
+                };
+                // A control block without a size is the same for too many programs.
+                let id = if size == 0 { 0 } else { self.crc };
+                let partial = Partial::begin(id, to.judge.region.base);
+                to.progress.begins = Some(Begin { size, version, partial });
                 #[cfg(feature = "sealed")]
                 if to.judge.sealed_only {
                     to.progress.begins = Some(Begin { size: 0, version: 0, partial });
@@ -214,7 +215,7 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         }
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
-        (NUMBER_LAST, Session::Open { next }) if next > 1 => return Ok(()),
+        (NUMBER_LAST, Session::Open { next }) if next != 1 => return Ok(()),
         (number, Session::Open { next }) if to.queue.last.may_follow(next, number, header.flash_address) => {}
         _ => return Err(Refusal::untimely(FlashError::Sequence)),
     }

@@ -2,8 +2,10 @@
 
 use super::ANY;
 
-/// How often the progress of a download is stored.
+/// How often the progress of a download is stored, at most.
 const NOTES: u32 = 16;
+/// The fewest bytes after which it is stored.
+const STEP: u32 = 1024;
 
 /// The progress of a download of block files.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -58,7 +60,8 @@ impl Partial {
     /// Takes note of data in flash up to `end`, of a program with `size` bytes. Returns whether the
     /// progress must be stored.
     pub(crate) const fn note(&mut self, end: u32, size: u32) -> bool {
-        let is_far = self.id != 0 && end.wrapping_sub(self.end) as i32 >= (size / NOTES) as i32;
+        let step = if size > NOTES * STEP { size / NOTES } else { STEP };
+        let is_far = self.id != 0 && end.wrapping_sub(self.end) as i32 >= step as i32;
         if is_far {
             self.end = end;
         }

@@ -218,12 +218,12 @@ impl SdoServer {
     /// Processes any received frame; frames that are not SDO requests to this server are ignored.
     pub fn handle<O: Objects>(&mut self, frame: &Frame, now: Instant, objects: &mut O) {
         if frame.has_cob_id(self.config.request(self.node)) {
-            if O::HAS_SECOND_SERVER {
+            if O::has_second_server() {
                 self.response = self.config.response(self.node);
             }
         } else {
             let second = objects.second_server();
-            if !O::HAS_SECOND_SERVER || !frame.has_cob_id(second.request) {
+            if !O::has_second_server() || !frame.has_cob_id(second.request) {
                 return;
             }
             self.response = second.response;
@@ -268,7 +268,7 @@ impl SdoServer {
         if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
             self.moved = now;
         }
-        let response = if O::HAS_SECOND_SERVER { self.response } else { self.config.response(self.node) };
+        let response = if O::has_second_server() { self.response } else { self.config.response(self.node) };
         Some(Frame::full(response, answer))
     }
 

@@ -1,0 +1,261 @@
+//! A download of block files that was cut off goes on where it stopped, and a block may come twice.
+#![cfg(not(feature = "sealed"))]
+
+mod bench;
+mod model;
+
+use bench::{block, block_file, last, program, Bench, CLEAR, LAYOUT, PROGRAM};
+use boot_core::crc::CrcKind;
+use boot_core::program::verify;
+use boot_core::store::Journal;
+use canopen::od::{Address, Objects};
+use canopen::AbortCode;
+use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use shared_abi::geometry::Region;
+
+/// 2006h/1.
+const PARTIAL: Address = Address::new(0x2006, 1);
+/// Data of a block: sixteen of them are the step in which progress is stored.
+const CHUNK: usize = 64;
+
+/// A block file with an identity.
+fn named(image: &[u8]) -> Vec<Vec<u8>> {
+    let mut file = block_file(image, CHUNK);
+    // Reserved word with the size, vendor-ID, product code (manual L-1112d_10, figure 13).
+    let words: Vec<u8> = [image.len() as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
+    file[0] = block(0, 0, &words);
+    file
+}
+
+/// What the device tells of a begun download: the CRC of block 0, and the address.
+fn partial(bench: &mut Bench<'_>) -> (u32, u32) {
+    let mut bytes = [0; 8];
+    assert_eq!(bench.node.read(PARTIAL, &mut bytes), Ok(8));
+    let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+    (word(0), word(4))
+}
+
+/// The CRC that ends a block.
+fn crc_of(block: &[u8]) -> u32 {
+    u32::from_le_bytes(block[block.len() - 4..].try_into().unwrap())
+}
+
+/// What a host does that goes on if the device can; returns the number of data blocks that it sent.
+fn send(flash: &mut ModelFlash, file: &[Vec<u8>]) -> usize {
+    let (sent, status) = try_send(flash, file);
+    assert_eq!(status, 0);
+    sent
+}
+
+/// The same, with the status at the end.
+fn try_send(flash: &mut ModelFlash, file: &[Vec<u8>]) -> (usize, u32) {
+    let mut bench = Bench::new(flash);
+    let (id, end) = partial(&mut bench);
+    let goes_on = id == crc_of(&file[0]);
+    let done = if goes_on { (end - PROGRAM.base) as usize / CHUNK } else { 0 };
+    if !goes_on {
+        assert_eq!(bench.command(CLEAR), 0);
+    }
+    bench.good(&file[0]);
+    let data = &file[1 + done..file.len() - 1];
+    for block in data {
+        bench.good(block);
+    }
+    let (outcome, status) = bench.block(&file[file.len() - 1]);
+    assert_eq!(outcome, Ok(()));
+    (data.len(), status)
+}
+
+fn is_installed(flash: &ModelFlash, image: &[u8]) -> bool {
+    let journal = Journal::open(flash, LAYOUT.parameters);
+    verify(flash, &journal, &LAYOUT, CrcKind::Crc32, 1).is_ok()
+        && flash.cells(PROGRAM)[..image.len()] == *image
+}
+
+#[test]
+fn a_cut_download_goes_on_after_a_cut_at_any_operation() {
+    quiet_power_cuts();
+    // From the middle of a sector to the middle of another one.
+    let (old, new) = (program(0x1200, 0x11), program(0x1A40, 0x22));
+    let file = named(&new);
+    let blocks = file.len() - 2;
+    let mut installed = ModelFlash::new(&CHIP);
+    send(&mut installed, &named(&old));
+    installed.power_on();
+    let operations = {
+        let mut flash = installed.clone();
+        assert_eq!(send(&mut flash, &file), blocks);
+        flash.operations
+    };
+    let mut went_on = 0;
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(3), Cut::Torn(4), Cut::Unstable(5), Cut::Unstable(6)] {
+            let mut flash = installed.clone();
+            flash.cut = Some((operation, cut));
+            let mut sent = 0;
+            assert!(until_power_cut(|| {
+                sent = send(&mut flash, &file);
+            }));
+            flash.power_on();
+            if is_installed(&flash, &old) || is_installed(&flash, &new) {
+                continue;
+            }
+            let again = send(&mut flash, &file);
+            went_on += u32::from(again < blocks);
+            let what = format!("{cut:?} at operation {operation} of {operations}");
+            assert!(is_installed(&flash, &new), "{what}");
+            assert!(
+                flash.is_stable(Region::new(PROGRAM.base, new.len() as u32)),
+                "{what}: bits between 0 and 1 are left"
+            );
+        }
+    }
+    assert!(went_on > 6 * operations / 2, "only {went_on} of {} went on", 6 * operations);
+}
+
+/// The bus is lost, or the host: the device keeps all that it has.
+#[test]
+fn a_host_that_comes_back_goes_on_with_the_next_block() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(partial(&mut bench), (0, 0));
+    for block in &file[..6] {
+        bench.good(block);
+    }
+    let end = PROGRAM.base + 5 * CHUNK as u32;
+    assert_eq!(partial(&mut bench), (crc_of(&file[0]), end));
+    bench.good(&file[0]);
+    assert_eq!(partial(&mut bench), (crc_of(&file[0]), end), "the same file goes on");
+    // A block that does not join the data.
+    assert_eq!(bench.transfer(&file[7]), Err(AbortCode::DEVICE_STATE));
+    for block in &file[6..] {
+        bench.good(block);
+    }
+    drop(bench);
+    assert!(is_installed(&flash, &image));
+    assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0), "nothing is left to go on with");
+}
+
+/// A host that knows nothing of this sends everything again, with CLEAR or without.
+#[test]
+fn a_host_that_begins_again_gets_through() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    for clear in [false, true] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        for block in &file[..20] {
+            bench.good(block);
+        }
+        drop(bench);
+        let mut bench = Bench::new(&mut flash);
+        assert_ne!(partial(&mut bench).0, 0);
+        if clear {
+            assert_eq!(bench.command(CLEAR), 0);
+        }
+        for block in &file {
+            bench.good(block);
+        }
+        drop(bench);
+        assert!(is_installed(&flash, &image), "clear: {clear}");
+    }
+}
+
+/// Another program never continues the data of the first one, and a program that only says it is
+/// the same is found by the flash or by its CRC.
+#[test]
+fn other_data_do_not_become_a_program() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    let mut cut_off = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut cut_off);
+    for block in &file[..30] {
+        bench.good(block);
+    }
+    drop(bench);
+
+    // The same control block; a byte differs in data that are already there.
+    let mut other = image.clone();
+    other[600] ^= 0x10;
+    let file_of_other = named(&other);
+    assert_eq!(file_of_other[0], file[0]);
+    let mut flash = cut_off.clone();
+    let mut bench = Bench::new(&mut flash);
+    let done = (partial(&mut bench).1 - PROGRAM.base) as usize / CHUNK;
+    assert!(done >= 10, "the byte is there");
+    bench.good(&file_of_other[0]);
+    for block in &file_of_other[1 + done..file.len() - 1] {
+        bench.good(block);
+    }
+    assert_eq!(bench.block(&last(&other)).1, 0x02, "NOVALPROG: the CRC over all decides");
+    drop(bench);
+    assert!(!is_installed(&flash, &other) && !is_installed(&flash, &image));
+
+    // The device's half program was changed by a fault.
+    let mut flash = cut_off.clone();
+    flash.poke(PROGRAM.base + 300, &[0]);
+    assert_eq!(try_send(&mut flash, &file).1, 0x02, "NOVALPROG");
+    assert!(!is_installed(&flash, &image));
+    // CLEAR, and everything anew.
+    flash.power_on();
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    for block in &file {
+        bench.good(block);
+    }
+    drop(bench);
+    assert!(is_installed(&flash, &image));
+}
+
+/// CLEAR gives up what was there; a command of another kind does not.
+#[test]
+fn clear_ends_what_could_go_on() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    for block in &file[..30] {
+        bench.good(block);
+    }
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(partial(&mut bench), (0, 0));
+    // The second CLEAR in a row erases at once.
+    assert_eq!(bench.command(CLEAR), 0);
+    drop(bench);
+    assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0));
+    assert!(flash.cells(PROGRAM).iter().all(|byte| *byte == 0xFF));
+}
+
+/// For a group of devices, a block comes again until all of them have it.
+#[test]
+fn the_last_block_may_come_again_and_is_written_once() {
+    let image = program(0x400, 0x44);
+    let file = named(&image);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    for (number, block) in file.iter().enumerate() {
+        bench.good(block);
+        if (1..file.len() - 1).contains(&number) {
+            bench.good(block);
+        }
+        // Its number with other data.
+        if (2..file.len() - 1).contains(&number) {
+            let mut other = block.clone();
+            other[20] ^= 1;
+            let len = other.len();
+            let crc = bench::block_crc(&other[..len - 4]);
+            other[len - 4..].copy_from_slice(&crc.to_le_bytes());
+            assert_eq!(bench.transfer(&other), Err(AbortCode::DEVICE_STATE), "block {number}");
+        }
+    }
+    drop(bench);
+    assert!(is_installed(&flash, &image));
+    let mut words: Vec<u32> = flash.touched.iter().map(|region| region.base).collect();
+    words.retain(|base| PROGRAM.contains(*base, 4));
+    words.sort_unstable();
+    let all = words.len();
+    words.dedup();
+    assert_eq!(all, words.len(), "each word once");
+}
