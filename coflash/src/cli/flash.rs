@@ -130,6 +130,11 @@ pub(super) struct Flash {
     #[arg(long = "blocks")]
     in_blocks: bool,
 
+    /// Send everything, also if the device could go on with a download of this file that was cut
+    /// off.
+    #[arg(long)]
+    from_start: bool,
+
     /// How many times a block is sent again after a CRC error or a broken transfer.
     #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
     block_repeats: u32,
@@ -308,6 +313,7 @@ impl Flash {
             .alone(!self.not_alone)
             .mastership(!self.no_mastership)
             .blocks(self.in_blocks.then(|| self.source.block_size()))
+            .from_start(self.from_start)
             .force(self.force))
     }
 

@@ -42,6 +42,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
             "not_alone",
             "no_mastership",
             "in_blocks",
+            "from_start",
             "block_repeats",
         ],
     ),
@@ -62,7 +63,7 @@ const GROUPS: [(&str, &[&str]); 5] = [
 ];
 
 /// Options for special cases: only `--help` shows them, not `-h`.
-const RARE: [&str; 38] = [
+const RARE: [&str; 39] = [
     "trace",
     "log_file",
     "report_dir",
@@ -84,6 +85,7 @@ const RARE: [&str; 38] = [
     "not_alone",
     "no_mastership",
     "in_blocks",
+    "from_start",
     "block_repeats",
     "search",
     "sdo_attempts",

@@ -2,6 +2,7 @@
 //! LSS, and errors.
 
 pub mod access;
+pub mod begun;
 pub mod debugger;
 mod device_type;
 pub mod diagnose;

@@ -48,6 +48,8 @@ pub struct FlashOptions {
     /// Send a sealed image in blocks of at most this size, including framing, instead of in one
     /// download.
     pub blocks: Option<usize>,
+    /// Send everything, also if the device could go on with a download that was cut off.
+    pub from_start: bool,
     /// Let the device alone judge the image. If this is off, the tool refuses an image that cannot
     /// be a program, or that is for another device or another region, before it changes the device.
     pub force: bool,
@@ -68,6 +70,7 @@ impl FlashOptions {
         alone: bool,
         mastership: bool,
         blocks: Option<usize>,
+        from_start: bool,
         force: bool,
     }
 }
@@ -128,6 +131,7 @@ impl Default for FlashOptions {
             alone: true,
             mastership: true,
             blocks: None,
+            from_start: false,
             force: false,
         }
     }

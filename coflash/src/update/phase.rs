@@ -37,6 +37,14 @@ pub enum Phase {
         #[serde(rename = "seconds", serialize_with = "json::seconds")]
         took: Duration,
     },
+    /// Instead of steps 4 and 5: the device has a part of this file from a download that was cut
+    /// off.
+    GoingOn {
+        /// The bytes of the program that it has, and all.
+        done: usize,
+        /// See `done`.
+        total: usize,
+    },
     /// The CRC computed by the bootloader matches the file's.
     Verified {
         /// The CRC.
@@ -110,6 +118,11 @@ pub enum Warning {
     },
     /// The NMT mastership was given back, but no node has announced that it is the master.
     MasterMissing,
+    /// The part that the device had does not fit the file: everything is sent again.
+    BeginsAgain {
+        /// What the device found.
+        why: String,
+    },
     /// The device has not answered for a while, and the tool waits for it.
     Silent {
         /// The action that it was asked to do.
@@ -137,6 +150,9 @@ impl fmt::Display for Phase {
                 f.write_str("the device has postponed the erase until the first good block")
             }
             Self::Erased { took } => write!(f, "erased in {:.1} s", took.as_secs_f64()),
+            Self::GoingOn { done, total } => {
+                write!(f, "going on with a download that was cut off: the device has {done} of {total} bytes")
+            }
             Self::Verified { crc } => write!(f, "verified: CRC {crc:08X}h"),
             Self::TrialStarting => f.write_str("starting the program for a trial"),
             Self::TrialPassed(running) => {
@@ -185,6 +201,9 @@ impl fmt::Display for Warning {
             }
             Self::MasterMissing => {
                 f.write_str("NMT mastership given back, but no node has announced that it is the master")
+            }
+            Self::BeginsAgain { why } => {
+                write!(f, "what the device had of this program is not usable ({why}): sending everything")
             }
             Self::Silent { doing, silent, limit } => write!(
                 f,

@@ -4,9 +4,11 @@ use std::time::Duration;
 
 use canopen::program::{self, FlashError};
 use canopen::Address;
+use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::device::begun::{begun, Begun};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
@@ -14,7 +16,7 @@ use crate::file::convert::blocks_of_sealed;
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::course::Course;
-use crate::update::event::{Event, Phase, RepeatReason, Retry};
+use crate::update::event::{Event, Phase, RepeatReason, Retry, Warning};
 use crate::update::judge::{judge, Judgement};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
@@ -52,7 +54,7 @@ impl Procedure for Block {
             }
             (Content::Sealed(sealed), Some(block_size)) => {
                 let blocks = cut(session, sealed, block_size, options.program)?;
-                let (repeats, took) = send(session, &blocks, options, course)?;
+                let (repeats, took) = send(session, &blocks, None, options, course)?;
                 course.state = DeviceState::Written;
                 let crc = file.program_crc();
                 steps::verify(session, options.program, crc, &mut |event| course.tell(event))?;
@@ -60,8 +62,7 @@ impl Procedure for Block {
             }
         };
         let number = options.program;
-        let (repeats, took) = send(session, file, options, course)?;
-        steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
+        let (repeats, took) = send_verified(session, file, options, course)?;
         course.state = DeviceState::Unreleased;
         if !options.start {
             course.tell(Phase::NotReleased.into());
@@ -93,31 +94,81 @@ fn cut(
     blocks_of_sealed(sealed, region.base, block_size).map_err(|error| not_cut(&error.to_string()))
 }
 
-/// Steps 4 to 9: erases and sends all blocks; returns the number of repetitions and the duration.
-fn send(
+impl Begun {
+    /// Whether it is the download of this file.
+    fn is_of(self, file: &BlockFile) -> bool {
+        let control = &file.blocks()[0];
+        let bytes = control.emit_with(file.checksum());
+        bytes.ends_with(&self.control_crc.to_le_bytes())
+    }
+
+    /// Whether the device has this block's data.
+    fn has(self, block: &FileBlock) -> bool {
+        let is_data = block.number != NUMBER_CONTROL && block.number != NUMBER_LAST;
+        is_data && block.flash_address + block.data.len() as u32 <= self.end
+    }
+}
+
+/// Steps 4 to 9, and the comparison of the CRC. Goes on with a download that was cut off; if the
+/// device's part of it proves to be wrong, everything is sent.
+fn send_verified(
     session: &mut Session<'_>,
     file: &BlockFile,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
+    let begun = if options.from_start { None } else { begun(session, number)? };
+    let begun = begun.filter(|begun| begun.is_of(file));
+    let mut all = |from, course: &mut Course<'_>| {
+        let sent = send(session, file, from, options, course)?;
+        steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
+        Ok(sent)
+    };
+    match all(begun, course) {
+        Err(error @ (Error::Failed { .. } | Error::WrongCrc { .. } | Error::Refused { .. }))
+            if begun.is_some() =>
+        {
+            course.tell(Warning::BeginsAgain { why: error.to_string() }.into());
+            all(None, course)
+        }
+        result => result,
+    }
+}
+
+/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing behind a begun
+/// download; returns the number of repetitions and the duration.
+fn send(
+    session: &mut Session<'_>,
+    file: &BlockFile,
+    begun: Option<Begun>,
+    options: &FlashOptions,
+    course: &mut Course<'_>,
+) -> Result<(u32, Duration), Error> {
+    let number = options.program;
     let before = steps::told_before(session, number)?;
     course.erases(before);
-    if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
+    if let Some(begun) = begun {
+        let total = file.program_size() as usize;
+        let done = begun.end.saturating_sub(file.program_start()) as usize;
+        course.tell(Phase::GoingOn { done: done.min(total), total }.into());
+    } else if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
         if error.is_refusal() {
             course.erases_not();
         }
         return Err(error);
     }
     let began = session.now();
-    let repeats = send_blocks(session, file, options, course)?;
+    let repeats = send_blocks(session, file, begun, options, course)?;
     Ok((repeats, session.now().saturating_sub(began)))
 }
 
-/// Steps 6 to 9: sends all blocks; returns the number of repetitions.
+/// Steps 6 to 9: sends all blocks that are not in the begun download; returns the number of
+/// repetitions.
 fn send_blocks(
     session: &mut Session<'_>,
     file: &BlockFile,
+    begun: Option<Begun>,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<u32, Error> {
@@ -128,6 +179,10 @@ fn send_blocks(
     let mut repeats = 0;
     course.tell(Event::Progress { done, total });
     for (block, bytes) in &blocks {
+        if begun.is_some_and(|begun| begun.has(block)) {
+            done += bytes.len();
+            continue;
+        }
         let sent = send_block(session, block.number, bytes, options, &mut |event| match event {
             Event::Progress { done: part, .. } => course.tell(Event::Progress { done: done + part, total }),
             event => course.tell(event),
