@@ -152,6 +152,47 @@ fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
     assert!(folder.read("1.flash")[0x1_0000..] == flashed());
 }
 
+/// The same file goes on where the device's power was cut; with `--from-start` it does not; another
+/// file begins at its start.
+#[test]
+fn a_download_goes_on_where_the_power_was_cut() {
+    let folder = folder("goes-on");
+    let identity = ["-N", "8", "--no-start", "--vid", "0", "--pid", "0"];
+    let flash = [FLASH, &identity].concat();
+    let options = ["--node", "8"];
+    // Progress is stored after each sixteenth of the program: that of 200 KiB stands for 187.5.
+    let cut = || {
+        let nodes = Nodes::start(&folder, &options);
+        let flashing = Coflash::new(&folder, &nodes).spawn(&flash);
+        while folder.read("1.flash")[0x1_0000 + 200 * 1024..][..64] == [0xFF; 64] {
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        drop(nodes);
+        assert_eq!(flashing.wait().exit, 4, "the adapter is gone");
+        Nodes::start(&folder, &options)
+    };
+    let nodes = cut();
+    let coflash = Coflash::new(&folder, &nodes);
+    let begun = coflash.json(&["read", "2006/1", "-N", "8"]);
+    assert_ne!(begun["hex"], "0000000000000000");
+    let said = coflash.done(&flash);
+    let (_, has) = said.split_once("going on with a download that was cut off: the device has ").expect(&said);
+    let has: usize = has.split(' ').next().unwrap().parse().unwrap();
+    assert!((180 * 1024..240 * 1024).contains(&has), "{has}");
+    assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
+    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    drop(nodes);
+
+    // A file that does not fit into the flash's data any more.
+    fs::write(folder.path("1.flash"), vec![0xFF; 1 << 20]).unwrap();
+    let nodes = cut();
+    let coflash = Coflash::new(&folder, &nodes);
+    let said = coflash.done(&[&flash[..], &["--from-start"]].concat());
+    assert!(!said.contains("going on"), "{said}");
+    assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
+    drop(nodes);
+}
+
 #[test]
 fn nodes_are_commissioned_by_layer_setting_services() {
     let folder = folder("lss");
