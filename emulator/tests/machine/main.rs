@@ -202,6 +202,108 @@ fn no_period_of_a_timer_is_lost_while_the_program_writes_registers() {
     assert_eq!(word(&machine, OUT), 1, "a reset starts it anew");
 }
 
+/// A condition that the program polls: address, mask, value.
+type Condition = (u32, u32, u32);
+/// Only an interrupt or a reset ends the wait.
+const NO_CONDITION: Condition = (OUT, 0, 1);
+
+/// Runs [`programs::WRITES_AND_WAITS`] for 100 ms: the stores, then the wait.
+fn wait_after(stores: &[(u32, u32)], condition: Condition) -> (Machine, Stop) {
+    const SEEN: u32 = 0x2000_1027;
+    // RCC_AHB1ENR: port D. DEMCR.TRCENA and DWT_CTRL.CYCCNTENA: the counter of cycles.
+    let common = [(0x4002_3830, 1 << 3), (0xE000_EDFC, 1 << 24), (0xE000_1000, 1)];
+    let mut machine = machine_in_ram(&programs::WRITES_AND_WAITS, 0, Options::default());
+    for exception in [15, 16 + 4] {
+        machine.load_bin(0x0800_0000 + 4 * exception, &u32::to_le_bytes(SEEN)).unwrap();
+    }
+    let script = common.iter().chain(stores).flat_map(|&(address, value)| [address, value]);
+    let script = script.chain([0, 0, condition.0, condition.1, condition.2]);
+    for (n, value) in (0..).zip(script) {
+        put(&mut machine, ARGUMENT + 4 * n, value);
+    }
+    put(&mut machine, OUT + 4, 0);
+    let stop = loop {
+        match machine.run_until(ms(100)) {
+            Stop::Attention => {}
+            stop => break stop,
+        }
+    };
+    (machine, stop)
+}
+
+/// Asserts that the wait ends when the event is due, so many cycles of 16 MHz after the last store.
+/// Every block of the waiting program writes a register; an event that comes due within such a
+/// block is not put off to the end of the slice.
+fn assert_no_delay(stores: &[(u32, u32)], condition: Condition, cycles: u32) {
+    let (machine, stop) = wait_after(stores, condition);
+    assert_eq!(stop, Stop::Deadline);
+    let passed = word(&machine, OUT + 4).wrapping_sub(word(&machine, OUT));
+    assert!((cycles - 30..cycles + 60).contains(&passed), "{passed} cycles");
+    assert_eq!(machine.reports(), []);
+}
+
+/// PM0214 section 4.5: a period of the reload value and one.
+#[test]
+fn systick_is_not_late_because_the_program_writes_registers() {
+    let stores = [(0xE000_E014, 999), (0xE000_E018, 0), (0xE000_E010, 7)];
+    assert_no_delay(&stores, NO_CONDITION, 1_000);
+}
+
+/// Datasheet: 16 µs for a word.
+#[test]
+fn the_flash_is_not_late_because_the_program_writes_registers() {
+    // NVIC line 4, the keys, FLASH_CR: PG, x32, EOPIE.
+    let prepare = [(0xE000_E100, 1 << 4), UNLOCK[0], UNLOCK[1], (0x4002_3C10, 1 | 2 << 8 | 1 << 24)];
+    let stores = [&prepare[..], &[(0x0800_4000, 0x1234_5678)]].concat();
+    assert_no_delay(&stores, NO_CONDITION, 256);
+}
+
+/// RM0090 section 32.4: from sleep mode to normal mode after 11 recessive bits; with the reset
+/// value of CAN_BTR a bit has 8 quanta of a cycle.
+#[test]
+fn can_is_not_late_because_the_program_writes_registers() {
+    const CAN1_MCR: u32 = 0x4000_6400;
+    let not_asleep = (CAN1_MCR + 4, 1 << 1, 0);
+    assert_no_delay(&[(0x4002_3840, 1 << 25), (CAN1_MCR, 0)], not_asleep, 88);
+}
+
+/// RM0090 section 30.3.2: TE sends an idle frame first, as long as the character behind it: 10 bits
+/// each, at 1 Mbit/s.
+#[test]
+fn a_usart_is_not_late_because_the_program_writes_registers() {
+    const USART2_SR: u32 = 0x4000_4400;
+    const TC: u32 = 1 << 6;
+    // Port A beside D; PA2 is TX (AF7).
+    let pin = [(0x4002_3830, 1 << 3 | 1), (0x4002_0020, 7 << 8), (0x4002_0000, 0xA800_0020)];
+    // USART2_CR1: UE, TE. TC is set after a reset, and cleared by writing 0.
+    let set_up = [(0x4002_3840, 1 << 17), (USART2_SR + 8, 16), (USART2_SR + 12, 0x2008)];
+    let stores = [&pin[..], &set_up, &[(USART2_SR + 4, 0x55), (USART2_SR, 0)]].concat();
+    assert_no_delay(&stores, (USART2_SR, TC, TC), 320);
+}
+
+/// RM0090 section 21.3: 10 counts of 4 periods of the LSI's 32 kHz are 1.25 ms.
+#[test]
+fn the_watchdog_is_not_late_because_the_program_writes_registers() {
+    const IWDG: u32 = 0x4000_3000;
+    let stores = [(IWDG, 0x5555), (IWDG + 8, 9), (IWDG, 0xAAAA), (IWDG, 0xCCCC)];
+    let (machine, stop) = wait_after(&stores, NO_CONDITION);
+    assert_eq!(stop, Stop::Reset(ResetCause::IndependentWatchdog));
+    let at = machine.now().0;
+    assert!((MS + MS / 4..MS + MS / 4 + MS / 50).contains(&at), "{}", machine.now());
+}
+
+/// The core goes from 16 MHz to the crystal's 8 MHz when the crystal is ready, after 2 ms.
+#[test]
+fn a_change_of_clocks_is_not_late_because_the_program_writes_registers() {
+    // RCC_CR: HSION, HSITRIM, HSEON. RCC_CFGR.SW: the crystal.
+    let stores = [(0x4002_3800, 0x0001_0081), (0x4002_3808, 1)];
+    let (machine, stop) = wait_after(&stores, NO_CONDITION);
+    assert_eq!((stop, machine.core_clock()), (Stop::Deadline, 8_000_000));
+    let cycles = machine.counters().cycles;
+    let expected = 2 * 16_000 + 98 * 8_000;
+    assert!((expected..expected + 1_000).contains(&cycles), "{cycles} cycles");
+}
+
 /// RM0090 sections 9.2.6 and 12.2: SYSCFG_EXTICR4 gives line 13 to port C.
 #[test]
 fn a_falling_edge_at_a_pin_wakes_the_program() {
