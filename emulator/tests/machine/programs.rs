@@ -1,5 +1,5 @@
-//! Thumb programs as machine code, with the listing of GNU as beside it. None comes from a compiler
-//! of ours, and the tests need no assembler.
+//! Thumb programs as machine code, with the listing of GNU as beside it, so that the tests need no
+//! assembler.
 
 /// A program: its code, where that lies, and the exception handlers by exception number.
 pub struct Program {
@@ -255,7 +255,7 @@ pub const FPU: Program = Program {
     ],
 };
 
-/// Does the bad thing that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The
+/// Causes the fault that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The
 /// handler logs IPSR, CFSR, HFSR, BFAR, the stacked PC.
 pub const FAULTS: Program = Program {
     base: 0x0800_0200,
@@ -1099,8 +1099,8 @@ pub const CONDITIONAL_LOADS: Program = Program {
     ],
 };
 
-/// Reads the word at 0801_0000h, then calls what is there for ever, and keeps its result at
-/// 2000_0000h.
+/// Reads the word at 0801_0000h, then calls the function there again and again, and keeps its
+/// result at 2000_0000h.
 pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
