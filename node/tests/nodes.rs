@@ -176,7 +176,8 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let begun = coflash.json(&["read", "2006/1", "-N", "8"]);
     assert_ne!(begun["hex"], "0000000000000000");
     let said = coflash.done(&flash);
-    let (_, has) = said.split_once("going on with a download that was cut off: the device has ").expect(&said);
+    let (_, has) =
+        said.split_once("going on with a download that was cut off: the device has ").expect(&said);
     let has: usize = has.split(' ').next().unwrap().parse().unwrap();
     assert!((180 * 1024..240 * 1024).contains(&has), "{has}");
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");

@@ -165,6 +165,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// See [`queue`](Self::queue).
+    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn queue_mut(&mut self) -> &mut Queue<'b> {
         &mut self.queue
     }
@@ -225,6 +226,7 @@ impl<'b> Programmer<'b> {
 
     /// Removes the record of a program. The record of the target marks it as half erased until the
     /// work on it has ended.
+    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn void(&mut self, program: u8) {
         self.voids |= bit(program);
     }
@@ -346,6 +348,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// Continues the work with one step.
+    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn step<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -386,6 +389,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// The next action of the job.
+    #[cfg_attr(feature = "sealed", inline(never))]
     fn next<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -506,6 +510,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// Chooses the next work for an idle flash.
+    #[cfg_attr(feature = "sealed", inline(never))]
     fn choose<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,

@@ -2,6 +2,7 @@
 #![allow(dead_code, missing_docs)]
 
 use canopen::od::{put, Access, DataType, Entry};
+use canopen::sdo::second::Channel;
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId, Objects};
 
@@ -70,11 +71,21 @@ pub struct Device {
     pub reserve: usize,
     /// Whether it refuses the end of a domain download.
     pub refuse_end: Option<AbortCode>,
+    /// The second SDO server, if it has one.
+    pub second: Option<Channel>,
 }
 
 impl Objects for Device {
+    fn has_second_server() -> bool {
+        true
+    }
+
     fn entries(&self) -> &'static [Entry] {
         ENTRIES
+    }
+
+    fn second_server(&self) -> Channel {
+        self.second.unwrap_or(Channel::NONE)
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {

@@ -217,20 +217,19 @@ impl SdoServer {
 
     /// Processes any received frame; frames that are not SDO requests to this server are ignored.
     pub fn handle<O: Objects>(&mut self, frame: &Frame, now: Instant, objects: &mut O) {
-        if frame.has_cob_id(self.config.request(self.node)) {
-            if O::has_second_server() {
-                self.response = self.config.response(self.node);
-            }
-        } else {
+        let mut response = self.config.response(self.node);
+        if !frame.has_cob_id(self.config.request(self.node)) {
             let second = objects.second_server();
             if !O::has_second_server() || !frame.has_cob_id(second.request) {
                 return;
             }
-            self.response = second.response;
+            response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
+        let is_other = O::has_second_server() && core::mem::replace(&mut self.response, response) != response;
         match &self.state {
-            State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
+            // A frame of the other server is no segment.
+            State::BlockDownload { receiver, .. } if !receiver.is_complete() && !is_other => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
                     self.abort(code, objects);
                 }
