@@ -5,6 +5,7 @@ use core::task::Poll;
 use canopen::bit_rate::BitRate;
 use canopen::device::{self, Device};
 use canopen::emcy::{self, Emcy};
+use canopen::frame::Channel;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
@@ -13,7 +14,7 @@ use canopen::program::{
     PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES,
     SECOND_SERVER, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
 };
-use canopen::sdo::second::{self, Channel, SecondServer};
+use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};

@@ -4,8 +4,6 @@ use canopen::program::FlashError;
 
 use crate::policy::Policy;
 use crate::refusal::Refusal;
-#[cfg(doc)]
-use crate::resume::ANY;
 
 /// The state of a program's download. It continues from one SDO transfer to the next.
 // No comparison of the whole value, which costs 140 bytes of flash: `matches!` only looks at the
@@ -16,7 +14,7 @@ pub(crate) enum Session {
     Idle,
     /// CLEAR was acknowledged; nothing is lost yet. `just`: no block has arrived since.
     Cleared { just: bool },
-    /// Blocks are being accepted; `next` is the number of the next one, [`ANY`] for a download that
+    /// Blocks are being accepted; `next` is the number of the next one, 0 for a download that
     /// goes on.
     Open { next: u32 },
     /// The flash contains an incomplete program: only CLEAR allows a new download.

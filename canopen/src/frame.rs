@@ -112,6 +112,20 @@ impl fmt::Display for CobId {
     }
 }
 
+/// The two COB-IDs of an SDO server.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channel {
+    /// Of requests.
+    pub request: CobId,
+    /// Of answers.
+    pub response: CobId,
+}
+
+impl Channel {
+    /// No server: no frame has these COB-IDs.
+    pub const NONE: Self = Self { request: CobId::NONE, response: CobId::NONE };
+}
+
 /// A classic CAN frame. Data bytes beyond its length are 0, so that equal frames compare equal.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Frame {

@@ -42,7 +42,7 @@
 use core::fmt;
 
 use crate::abort::AbortCode;
-use crate::sdo::second::Channel;
+use crate::frame::Channel;
 
 /// Index and sub-index of a value: the multiplexer of an SDO.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]

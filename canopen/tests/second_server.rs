@@ -3,7 +3,8 @@
 
 mod common;
 
-use canopen::sdo::second::{Channel, SecondServer, INVALID, REQUEST, RESPONSE};
+use canopen::frame::Channel;
+use canopen::sdo::second::{SecondServer, INVALID, REQUEST, RESPONSE};
 use canopen::sdo::server::Config;
 use canopen::{AbortCode, CobId, Frame};
 use common::{response, Bench, Event};

@@ -19,22 +19,23 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "crc", may_use: &[] },
     Rule { room: "flash", may_use: &["crc"] },
     Rule { room: "sequence", may_use: &["flash"] },
-    Rule { room: "store", may_use: &["crc", "flash", "sequence"] },
+    Rule { room: "store", may_use: &["crc", "flash", "resume", "sequence"] },
     Rule { room: "program", may_use: &["crc", "flash", "keys", "store"] },
     Rule { room: "decision", may_use: &["program"] },
     Rule { room: "keys", may_use: &["flash", "store"] },
-    Rule { room: "queue", may_use: &[] },
+    Rule { room: "queue", may_use: &["resume"] },
     Rule { room: "refusal", may_use: &[] },
+    Rule { room: "resume", may_use: &[] },
     Rule { room: "policy", may_use: &["crc"] },
     Rule { room: "session", may_use: &["policy", "refusal"] },
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
-    Rule { room: "intake", may_use: &["policy", "program", "queue", "refusal", "session"] },
+    Rule { room: "intake", may_use: &["policy", "program", "queue", "refusal", "resume", "session"] },
     // It works from the queue to the flash: no session, no object.
     Rule { room: "unseal", may_use: &["flash", "keys", "policy", "program", "queue", "store"] },
     // It works on pieces and addresses: no format, no object.
     Rule {
         room: "programmer",
-        may_use: &["crc", "flash", "program", "queue", "sequence", "store", "unseal"],
+        may_use: &["crc", "flash", "program", "queue", "resume", "sequence", "store", "unseal"],
     },
     Rule {
         room: "control",
@@ -45,6 +46,7 @@ const BOOT_CORE: &[Rule] = &[
             "program",
             "programmer",
             "refusal",
+            "resume",
             "session",
             "store",
             "unseal",
@@ -53,7 +55,7 @@ const BOOT_CORE: &[Rule] = &[
     Rule { room: "stored_version", may_use: &["flash", "programmer"] },
     Rule {
         room: "bootloader",
-        may_use: &["control", "decision", "flash", "store", "stored_version", "unseal"],
+        may_use: &["control", "decision", "flash", "resume", "store", "stored_version", "unseal"],
     },
     Rule { room: "profile", may_use: &["bootloader", "policy"] },
 ];

@@ -29,7 +29,7 @@ for long runs of zeros, which take next to nothing.
 
 /// The largest permitted size of the bootloader on any board, in bytes, with every dialect and
 /// option in it. The aim is 20 KiB; the region has 32 KiB, and sealed images need the rest.
-pub const BUDGET: u32 = 22 * 1024;
+pub const BUDGET: u32 = 23 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;

@@ -7,7 +7,7 @@
 //! second client would.
 
 use crate::abort::AbortCode;
-use crate::frame::CobId;
+use crate::frame::{Channel, CobId};
 use crate::od::{Access, DataType, Entry};
 use crate::program::SECOND_SERVER;
 
@@ -27,20 +27,6 @@ pub const ENTRIES: [Entry; 3] = [
     Entry::sub(SECOND_SERVER, RESPONSE, "COB-ID server to client", DataType::Unsigned32, Access::Rw)
         .default(INVALID as u64),
 ];
-
-/// The two COB-IDs of a server.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Channel {
-    /// Of requests.
-    pub request: CobId,
-    /// Of answers.
-    pub response: CobId,
-}
-
-impl Channel {
-    /// No server: no frame has these COB-IDs.
-    pub const NONE: Self = Self { request: CobId::NONE, response: CobId::NONE };
-}
 
 /// The values of 1201h.
 #[derive(Clone, Copy, Debug)]

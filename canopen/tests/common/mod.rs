@@ -1,8 +1,8 @@
 //! A device for the tests, and the wire between both ends.
 #![allow(dead_code, missing_docs)]
 
+use canopen::frame::Channel;
 use canopen::od::{put, Access, DataType, Entry};
-use canopen::sdo::second::Channel;
 use canopen::sdo::server::{Config, SdoServer};
 use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId, Objects};
 
