@@ -38,7 +38,7 @@ enum State {
 
 /// A sub-block that is being sent.
 #[derive(Clone, Copy, Debug)]
-struct SubBlock {
+pub(super) struct SubBlock {
     /// The server checks a CRC.
     crc: bool,
     blksize: u8,
@@ -98,7 +98,7 @@ impl<D: AsRef<[u8]>> Download<D> {
                 if at == self.link.at =>
             {
                 let blksize = check_blksize(blksize).map_err(SdoError::Client)?;
-                self.state = State::Blocks(SubBlock { crc, blksize, base: 0, seqno: 0, in_vain: 0 });
+                self.state = State::Blocks(SubBlock::new(crc, blksize));
                 Ok(Next::Wait)
             }
             (Some(Response::Abort(_, code)), State::InitiatingBlock { fallback: true })
@@ -111,9 +111,8 @@ impl<D: AsRef<[u8]>> Download<D> {
                 let arrived = sub_block.acknowledged(ack, data).map_err(SdoError::Client)?;
                 self.link.progress = sub_block.base as u32;
                 let Some(crc) = arrived else { return Ok(Next::Wait) };
-                let unused = data.len().next_multiple_of(SEGMENT).max(SEGMENT) - data.len();
                 self.state = State::EndingBlock;
-                Ok(Next::Send(Request::EndBlockDownload(BlockEnd { unused: unused as u8, crc })))
+                Ok(Next::Send(Request::EndBlockDownload(SubBlock::end(crc, data))))
             }
             // The server repeats its acknowledgement.
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
@@ -146,17 +145,45 @@ fn segment(data: &[u8], start: usize, toggle: bool) -> (Segment, usize) {
 }
 
 impl SubBlock {
+    /// The first one.
+    pub(super) const fn new(crc: bool, blksize: u8) -> Self {
+        Self { crc, blksize, base: 0, seqno: 0, in_vain: 0 }
+    }
+
+    /// The end of a transfer with this CRC.
+    pub(super) fn end(crc: u16, data: &[u8]) -> BlockEnd {
+        let unused = data.len().next_multiple_of(SEGMENT).max(SEGMENT) - data.len();
+        BlockEnd { unused: unused as u8, crc }
+    }
+
+    /// The number of its segments.
+    pub(super) const fn blksize(&self) -> u8 {
+        self.blksize
+    }
+
+    /// Whether an acknowledgement is that of all its segments.
+    pub(super) const fn is_whole(&self, ack: BlockAck) -> bool {
+        ack.ackseq == self.seqno
+    }
+
+    /// Continues with the next sub-block, of this size, after all segments of this one have
+    /// arrived. If that was the last one of the transfer, returns the CRC of all data.
+    pub(super) fn advance(&mut self, blksize: u8, data: &[u8]) -> Option<u16> {
+        // All of it was sent and acknowledged, so this is no error.
+        self.acknowledged(BlockAck { ackseq: self.seqno, blksize }, data).unwrap_or(None)
+    }
+
     /// The offset of the end of the sent data.
     fn sent(&self, data: &[u8]) -> usize {
         (self.base + usize::from(self.seqno) * SEGMENT).min(data.len())
     }
 
     /// Whether everything is sent. Empty data have one segment, too.
-    fn is_sent(&self, data: &[u8]) -> bool {
+    pub(super) fn is_sent(&self, data: &[u8]) -> bool {
         self.seqno == self.blksize || (self.seqno > 0 && self.sent(data) == data.len())
     }
 
-    fn next(&mut self, data: &[u8]) -> BlockSegment {
+    pub(super) fn next(&mut self, data: &[u8]) -> BlockSegment {
         let chunk = Chunk::<SEGMENT>::new(&data[self.sent(data)..]);
         self.seqno += 1;
         let mut bytes = [0; SEGMENT];

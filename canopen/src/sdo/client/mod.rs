@@ -44,9 +44,11 @@ use crate::sdo::wire::{Request, Response};
 use crate::time::Instant;
 
 mod download;
+mod group;
 mod upload;
 
 pub use download::Download;
+pub use group::{GroupDownload, GroupStep, Servers, SERVERS_MAX};
 pub use upload::{Buffer, Sink, Upload};
 
 /// The configuration of a transfer.
