@@ -192,7 +192,9 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
                 if !now.has_reached(deadline) {
                     return GroupStep::Wait(deadline);
                 }
-                self.state = State::Done { missing: *missing };
+                let missing = *missing;
+                let refused = if let State::Ended { refused, .. } = self.state { refused } else { 0 };
+                self.state = State::Done { missing: missing | refused };
                 Request::Abort(self.at, AbortCode::TIMEOUT).emit()
             }
             State::Done { missing } => return GroupStep::Done(*missing),
