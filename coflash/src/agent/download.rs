@@ -10,11 +10,7 @@ use sha2::{Digest, Sha256};
 use super::config::Token;
 use super::controller::{Piece, Wanted};
 use super::http::Client;
-
-/// Digits of a hash, in small letters.
-pub(super) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
+use crate::file::sealed::show::digits;
 
 /// When a transfer pauses.
 pub(super) struct Pause<'p> {
@@ -130,7 +126,7 @@ fn is_right(file: &mut File, wanted: &Wanted) -> io::Result<bool> {
     let mut buffer = [0; 16 * 1024];
     loop {
         match file.read(&mut buffer)? {
-            0 => return Ok(hex(&digest.finalize()) == wanted.sha256),
+            0 => return Ok(digits(&digest.finalize()) == wanted.sha256),
             count => digest.update(&buffer[..count]),
         }
     }
@@ -142,7 +138,7 @@ fn is_right(file: &mut File, wanted: &Wanted) -> io::Result<bool> {
 /// In words, if the file is missing or was changed.
 pub(super) fn bytes(path: &Path, wanted: &Wanted) -> Result<Vec<u8>, String> {
     let bytes = crate::file::limit::read(path).map_err(|cause| format!("{}: {cause}", path.display()))?;
-    if bytes.len() as u64 != wanted.size || hex(&Sha256::digest(&bytes)) != wanted.sha256 {
+    if bytes.len() as u64 != wanted.size || digits(&Sha256::digest(&bytes)) != wanted.sha256 {
         return Err(format!("{}: it was changed after it was checked", path.display()));
     }
     Ok(bytes)

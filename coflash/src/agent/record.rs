@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::download::hex;
+use crate::file::sealed::show::digits;
 
 /// The number of ended actions that are kept.
 const ENDED_MOST: usize = 16;
@@ -87,7 +87,7 @@ impl Store {
     pub(super) fn path(&self, controller: &str, extension: &str) -> PathBuf {
         let safe = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c } else { '_' };
         let name: String = controller.chars().take(40).map(safe).collect();
-        let digest = hex(&Sha256::digest(controller.as_bytes()));
+        let digest = digits(&Sha256::digest(controller.as_bytes()));
         self.folder.join(format!("{name}-{}.{extension}", &digest[..16]))
     }
 

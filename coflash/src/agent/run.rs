@@ -46,7 +46,7 @@ pub struct Order<'o> {
 }
 
 /// The options of a run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 #[non_exhaustive]
 pub struct Options {
     /// End when each device has nothing to do before its next poll.
@@ -65,12 +65,6 @@ impl Options {
         seed: u64,
         times: Times,
         cancelled: Arc<AtomicBool>,
-    }
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self { once: false, seed: 0, times: Times::default(), cancelled: Arc::default() }
     }
 }
 

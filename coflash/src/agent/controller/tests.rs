@@ -107,7 +107,7 @@ impl Drive {
 
     /// From the first poll to the order to flash.
     #[track_caller]
-    fn to_flash(&mut self) -> Flash {
+    fn go_to_flash(&mut self) -> Flash {
         self.deploy(&deployment("8", "forced"));
         assert_eq!(self.feedback(), told("deploymentBase/8", "download", "none"));
         let Step::Fetch(wanted) = self.next() else { panic!("no download") };
@@ -144,7 +144,7 @@ fn artifact(name: &str) -> Value {
 #[test]
 fn a_deployment_is_fetched_flashed_and_reported_once() {
     let mut drive = Drive::new();
-    let flash = drive.to_flash();
+    let flash = drive.go_to_flash();
     assert!(!flash.kept);
     assert!(drive.disk.has_begun("8"), "the record is written before the device is changed");
     drive.controller.flashed(drive.now, Flashed::Done(vec!["done".into()]));
@@ -165,7 +165,7 @@ fn a_deployment_is_fetched_flashed_and_reported_once() {
 #[test]
 fn the_same_action_again_is_reported_and_not_flashed_even_after_a_restart() {
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     drive.controller.flashed(drive.now, Flashed::Failed(vec!["node 5 does not answer".into()]));
     assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "failure"));
     drive.deploy(&deployment("8", "forced"));
@@ -182,7 +182,7 @@ fn the_same_action_again_is_reported_and_not_flashed_even_after_a_restart() {
 #[test]
 fn a_result_that_the_server_did_not_take_is_reported_until_it_does() {
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     drive.controller.flashed(drive.now, Flashed::Done(vec![]));
     for _ in 0..3 {
         assert!(matches!(drive.asks(), Request::Post(path, _) if path == "deploymentBase/8/feedback"));
@@ -193,7 +193,7 @@ fn a_result_that_the_server_did_not_take_is_reported_until_it_does() {
     assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
     // A server that has closed the action is content, too.
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     drive.controller.flashed(drive.now, Flashed::Done(vec![]));
     drive.asks();
     drive.answer(410, &json!({}));
@@ -203,7 +203,7 @@ fn a_result_that_the_server_did_not_take_is_reported_until_it_does() {
 #[test]
 fn what_a_restart_interrupted_goes_on_whatever_the_window() {
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     let mut drive = drive.restarted();
     drive.deploy(&deployment("8", "skip"));
     assert_eq!(drive.feedback(), told("deploymentBase/8", "resumed", "none"));
@@ -257,7 +257,7 @@ fn a_cancellation_is_accepted_until_the_device_is_changed() {
     assert!(drive.controller.is_settled(drive.now));
     // While the device is flashed, even by the agent before this one.
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     assert_eq!(cancelled(&mut drive), rejected);
     assert_eq!(cancelled(&mut drive.restarted()), rejected);
     // And the update goes on to its end.
@@ -444,7 +444,7 @@ fn a_pause_that_the_server_asks_for_is_kept_within_its_limits() {
 #[test]
 fn progress_is_told_sparingly_and_the_device_waits_for_no_message() {
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     let began = drive.now;
     let mut messages = Vec::new();
     for percent in 0..=100 {
@@ -485,7 +485,7 @@ fn progress_is_told_sparingly_and_the_device_waits_for_no_message() {
 #[test]
 fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     let before = drive.now;
     drive.controller.flashed(drive.now, Flashed::NotNow("node 5: another coflash works on it".into()));
     assert_eq!(drive.feedback(), told("deploymentBase/8", "proceeding", "none"));
@@ -518,7 +518,7 @@ fn attributes_are_sent_when_the_server_asks_and_the_device_answers() {
     drive.answer(200, &json!({}));
     // Not while the device is flashed.
     let mut drive = Drive::new();
-    drive.to_flash();
+    drive.go_to_flash();
     drive.poll(&[("deploymentBase", "/d"), ("configData", "/x")]);
     drive.poll(&[("deploymentBase", "/d"), ("configData", "/x")]);
     drive.controller.flashed(drive.now, Flashed::Done(vec![]));
