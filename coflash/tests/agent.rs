@@ -416,6 +416,47 @@ fn a_failure_and_a_silent_device_are_told() {
 }
 
 #[test]
+fn what_was_fetched_is_there_when_the_bus_is_free_again() {
+    let (server, folder) = (Server::start(&[ID]), Folder::new("again"));
+    let not_now = || Flashed::NotNow("in use".to_string());
+    let good = || Flashed::Done(vec!["done".to_string()]);
+    let fake = Fake { answers: Mutex::new(vec![good(), not_now(), not_now(), good()]), ..Fake::default() };
+    for number in [3, 4] {
+        server.assign(ID, Action::new(number, &file()));
+        let (ended, said) = once(&server, &folder, &fake, &[ID]);
+        assert_eq!((ended.updated, ended.failed), (1, 0), "{said}");
+    }
+    assert_eq!((fake.given().len(), server.seen("artifacts").len()), (4, 2));
+    // What is not needed any more is gone.
+    let left = std::fs::read_dir(folder.0.join("agent-state")).unwrap().flatten().map(|file| file.path());
+    assert!(left.into_iter().all(|path| path.extension().is_none_or(|end| end != "part")));
+}
+
+/// The update ends while the agent is being ended: its result must not get lost.
+#[test]
+fn a_result_that_comes_while_the_agent_ends_is_kept() {
+    let (server, folder) = (Server::start(&[ID]), Folder::new("ending"));
+    let busy = Arc::new(AtomicBool::new(true));
+    let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
+    server.assign(ID, Action::new(3, &file()));
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let endless = options().once(false).cancelled(cancelled.clone());
+    let config = config(&server, &folder, &[ID]);
+    thread::scope(|scope| {
+        let agent = scope.spawn(|| run(&config, &endless, &fake, &|_| {}).unwrap());
+        server.wait("progress", |state| {
+            state.targets[ID].action.as_ref().is_some_and(|action| action.progress.contains(&40))
+        });
+        cancelled.store(true, Ordering::Relaxed);
+        busy.store(false, Ordering::Relaxed);
+        agent.join().unwrap();
+    });
+    let (_, said) = once(&server, &folder, &fake, &[ID]);
+    assert_eq!(server.action(ID).result.as_deref(), Some("success"), "{said}");
+    assert_eq!(fake.given().len(), 1, "{said}");
+}
+
+#[test]
 fn two_agents_do_not_share_a_folder() {
     let (server, folder, fake) = (Server::start(&[ID]), Folder::new("lock"), Fake::default());
     while_it_runs(&server, &folder, &fake, || {

@@ -343,6 +343,11 @@ impl Controller {
         self.failures
     }
 
+    /// Whether what was fetched is still needed.
+    pub(super) fn needs_file(&self) -> bool {
+        matches!(self.work, Work::Fetching { .. } | Work::Ready { .. } | Work::Flashing { .. })
+    }
+
     /// Whether the device is being changed.
     pub(super) fn is_flashing(&self) -> bool {
         matches!(self.work, Work::Flashing { started: true, .. })

@@ -20,6 +20,9 @@ pub(super) struct Pause<'p> {
     pub(super) now: &'p dyn Fn() -> bool,
 }
 
+/// How many times that long a transfer may take that cannot pause.
+const LONGEST: u32 = 30;
+
 /// Fetches the next piece of a file into `path`, behind what is there.
 pub(super) fn fetch(
     client: &Client,
@@ -91,6 +94,13 @@ fn piece(
     loop {
         if (pause.now)() || goes_on && began.elapsed() >= pause.after {
             return Ok(Piece::More);
+        }
+        if began.elapsed() >= pause.after * LONGEST {
+            return cut(
+                false,
+                "the transfer takes too long, and the server cannot go on later".to_string(),
+                None,
+            );
         }
         match reader.read(&mut buffer) {
             Ok(0) => break,

@@ -242,16 +242,25 @@ fn serve(shared: &Shared<'_>, device: &Device, root: String, record: Record) -> 
             }
             let now = shared.began.elapsed();
             let over = options.cancelled.load(Ordering::Relaxed);
-            let gives_up =
-                options.once && controller.failures() >= ONCE_FAILURES && !controller.is_flashing();
-            if over && !controller.is_flashing() || options.once && controller.is_settled(now) || gives_up {
+            let flashing = controller.is_flashing();
+            let gives_up = options.once && controller.failures() >= ONCE_FAILURES && !flashing;
+            if gives_up || options.once && controller.is_settled(now) {
                 ended.unserved = usize::from(gives_up && !over);
                 return;
             }
             match controller.next(now) {
+                Step::Save(record) => {
+                    let result = shared.store.save(&device.controller, &record);
+                    if result.is_ok() && !controller.needs_file() {
+                        // Without the file the next download begins anew, which is no harm.
+                        let _ = fs::remove_file(&path);
+                    }
+                    controller.saved(shared.began.elapsed(), result.map_err(|error| error.to_string()));
+                }
                 // While the agent is being ended, only the end of an update is waited for.
+                _ if over && !flashing => return,
                 Step::Wait(until) => wait(shared, &mut controller, &heard, until),
-                _ if over => wait(shared, &mut controller, &heard, now),
+                _ if over => wait(shared, &mut controller, &heard, now + TICK),
                 Step::Ask(request) => {
                     let reply = shared.client.send(&root, &device.token, &request, shared.limits);
                     controller.answered(shared.began.elapsed(), reply);
@@ -261,14 +270,6 @@ fn serve(shared: &Shared<'_>, device: &Device, root: String, record: Record) -> 
                     let pause = Pause { after: options.times.piece, now: &ends };
                     let piece = download::fetch(&shared.client, &device.token, &wanted, &path, &pause);
                     controller.fetched(shared.began.elapsed(), piece);
-                }
-                Step::Save(record) => {
-                    let result = shared.store.save(&device.controller, &record);
-                    if result.is_ok() && record.begun.is_none() && !record.ended.is_empty() {
-                        // What was fetched is not needed any more.
-                        let _ = fs::remove_file(&path);
-                    }
-                    controller.saved(shared.began.elapsed(), result.map_err(|error| error.to_string()));
                 }
                 Step::Look => {
                     let sender = sender.clone();
