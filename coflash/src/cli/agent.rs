@@ -11,6 +11,7 @@ use serde_json::json;
 use super::context::Context;
 use super::device::cancelled;
 use super::output::{Exit, Failure};
+use super::record;
 
 /// Takes updates for devices from an Eclipse hawkBit server, flashes them, and reports progress and
 /// result of each.
@@ -49,7 +50,8 @@ impl Agent {
         let options = Options::default().once(self.once).seed(seed).cancelled(cancelled.clone());
         let tell = |said: &Said| show(context, said);
         let count = config.devices.len();
-        context.out.say(format_args!("{count} devices  (Ctrl-C ends it)"));
+        let noun = if count == 1 { "device" } else { "devices" };
+        context.out.say(format_args!("{count} {noun}  (Ctrl-C ends it)"));
         let open = |bus: &str| {
             context.link_at(Some(bus), None).map_err(|failure| failure.to_string().trim_end().to_string())
         };
@@ -73,6 +75,7 @@ impl Agent {
 fn show(context: &Context, said: &Said) {
     let Said { controller, kind, text, .. } = said;
     if context.out.shows_events() {
+        record::note("said", &format!("{controller}: {text}"));
         context.out.event(&json!(said));
     } else if *kind == Kind::Progress {
         context.out.detail(format_args!("{controller}: {text}"));
