@@ -255,6 +255,7 @@ fn the_token_goes_to_no_other_server() {
     // The other server has the file, and no device of ours.
     other.assign("cdn", Action::new(1, &file()));
     let elsewhere = format!("{}/files/program.blk", other.url);
+    other.fault("/files/", 1, Fault::Redirect("/files/program.blk?again".to_string()));
     for (number, link) in [(1, Some(elsewhere.clone())), (2, None)] {
         server.assign(ID, Action::new(number, &File { link, ..file() }));
         server.fault("artifacts", 1, Fault::Redirect(elsewhere.clone()));
@@ -262,7 +263,7 @@ fn the_token_goes_to_no_other_server() {
         assert_eq!(ended.updated, 1, "{said}");
     }
     let seen = other.seen("/files/");
-    assert_eq!(seen.len(), 2);
+    assert_eq!(seen.len(), 3);
     assert!(seen.iter().all(|seen| seen.token.is_none()), "{seen:?}");
     assert!(server.seen("/").iter().all(|seen| seen.token.as_deref() == Some("TargetToken t-door")));
     // Messages are not for others at all.
@@ -483,6 +484,19 @@ fn what_was_fetched_is_there_when_the_bus_is_free_again() {
     // What is not needed any more is gone.
     let left = std::fs::read_dir(folder.0.join("agent-state")).unwrap().flatten().map(|file| file.path());
     assert!(left.into_iter().all(|path| path.extension().is_none_or(|end| end != "part")));
+}
+
+#[test]
+fn a_bus_that_stays_away_ends_what_is_done_once() {
+    let (server, folder) = (Server::start(&[ID]), Folder::new("away"));
+    let answers = (0..100).map(|_| Flashed::NotNow("the adapter is gone".to_string())).collect();
+    let fake = Fake { answers: Mutex::new(answers), ..Fake::default() };
+    server.assign(ID, Action::new(3, &file()));
+    let (ended, said) = once(&server, &folder, &fake, &[ID]);
+    assert_eq!((ended.updated, ended.failed, ended.unserved), (0, 0, 1), "{said}");
+    assert!(fake.given().len() < 10);
+    // The server may still want it: nothing has ended.
+    assert_eq!(server.action(ID).result, None);
 }
 
 /// The update ends while the agent is being ended: its result must not get lost.

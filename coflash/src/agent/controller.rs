@@ -338,9 +338,13 @@ impl Controller {
         self.polled && held && self.todo.is_empty() && self.look == Look::No && self.poll_at > now
     }
 
-    /// The number of requests in a row that the server did not answer as it should.
+    /// The number of times in a row that the server did not answer as it should, or that the bus or
+    /// the device was in use or absent.
     pub(super) fn failures(&self) -> u32 {
-        self.failures
+        match &self.work {
+            Work::Ready { tries, .. } => self.failures.max(*tries),
+            _ => self.failures,
+        }
     }
 
     /// Whether what was fetched is still needed.

@@ -155,7 +155,12 @@ impl Client {
             if !matches!(opened.status, 301 | 302 | 303 | 307 | 308) {
                 return Ok(opened);
             }
-            link = opened.header("location").ok_or("the server redirects to nowhere")?.to_string();
+            let location = opened.header("location").ok_or("the server redirects to nowhere")?;
+            link = if location.starts_with('/') && !location.starts_with("//") {
+                format!("{}{location}", origin(&url))
+            } else {
+                location.to_string()
+            };
         }
         Err(format!("the server redirects more than {REDIRECTS_MOST} times"))
     }
@@ -175,6 +180,13 @@ impl Opened {
 fn opened(response: Response<Body>) -> Opened {
     let (parts, body) = response.into_parts();
     Opened { status: parts.status.as_u16(), headers: parts.headers, body }
+}
+
+/// Scheme, host and port of an absolute URL.
+fn origin(url: &str) -> &str {
+    let host = url.find("://").map_or(0, |at| at + 3);
+    let end = url[host..].find(['/', '?']).map_or(url.len(), |at| host + at);
+    &url[..end]
 }
 
 /// A URL without its query, which may be a secret of its own.

@@ -119,7 +119,8 @@ pub struct Ended {
     pub updated: usize,
     /// How many updates have failed.
     pub failed: usize,
-    /// How many devices were not served, because the server did not answer as it should.
+    /// How many devices were not served: the server did not answer as it should, or their bus was
+    /// in use or absent.
     pub unserved: usize,
 }
 
