@@ -109,7 +109,7 @@ const RARE: [&str; 39] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 33] = [
+const EXAMPLES: [(&str, &str); 34] = [
     (
         "",
         "\
@@ -340,6 +340,13 @@ Examples:
   coflash ui --bus socketcan:can0 --port 8080 --no-open",
     ),
     (
+        "agent",
+        "\
+Examples:
+  coflash agent --hawkbit https://hawkbit.example.com
+  coflash agent --devices line.toml --once",
+    ),
+    (
         "completions",
         "\
 Examples:
@@ -403,7 +410,7 @@ mod tests {
     fn every_example_is_understood() {
         let mut count = 0;
         for (name, text) in EXAMPLES {
-            if name == "ui" && !cfg!(feature = "ui") {
+            if name == "ui" && !cfg!(feature = "ui") || name == "agent" && !cfg!(feature = "agent") {
                 continue;
             }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {

@@ -13,6 +13,8 @@ use self::values::base_id;
 
 mod access;
 mod adapters;
+#[cfg(feature = "agent")]
+mod agent;
 mod catch;
 mod config;
 mod context;
@@ -143,6 +145,8 @@ enum Command {
     Shell(shell::Shell),
     #[cfg(feature = "ui")]
     Ui(ui::Ui),
+    #[cfg(feature = "agent")]
+    Agent(agent::Agent),
     Completions(generate::Completions),
     Man(generate::Manual),
 }
@@ -201,6 +205,8 @@ impl Command {
             Self::Shell(shell) => shell.run(context, shell_line),
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
+            #[cfg(feature = "agent")]
+            Self::Agent(agent) => agent.run(context),
             Self::Completions(completions) => completions.run(commands()),
             Self::Man(manual) => manual.run(context, commands()),
         }
