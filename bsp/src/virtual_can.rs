@@ -23,7 +23,7 @@ const FOR_FRAMES: usize = 4 * FRAME_TEXT;
 pub struct Port {
     uart: uart::Port<UartController>,
     slcan: Slcan,
-    accepted: Option<[u16; 3]>,
+    accepted: Option<[u16; 4]>,
     lost: Lost,
     /// Whether a good frame came since the previous call.
     heard: bool,
@@ -52,7 +52,7 @@ impl Port {
     pub fn recover_from_bus_off(&mut self) {}
 
     /// Sets the identifiers (data frames, 11 bits) that are received.
-    pub fn accept(&mut self, identifiers: [u16; 3]) {
+    pub fn accept(&mut self, identifiers: [u16; 4]) {
         self.accepted = Some(identifiers);
     }
 
