@@ -52,8 +52,8 @@ impl Extras {
         password: PasswordObject::None,
         read_back: false,
         sealed: false,
-        second_server: true,
-        resume: true,
+        second_server: resume::HAS_ROOM,
+        resume: resume::HAS_ROOM,
     };
 }
 

@@ -55,6 +55,7 @@ const CONFIG: Config = Config {
     password: b"",
     boot_up_emergency: false,
     lss_store: true,
+    second_server: true,
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };
 static SOUND: Config = CONFIG;
