@@ -156,21 +156,14 @@ impl SubBlock {
         BlockEnd { unused: unused as u8, crc }
     }
 
-    /// The number of its segments.
-    pub(super) const fn blksize(&self) -> u8 {
-        self.blksize
+    /// Whether this is the number of its last segment, and all are sent.
+    pub(super) const fn is_whole(&self, ackseq: u8) -> bool {
+        ackseq == self.seqno
     }
 
-    /// Whether an acknowledgement is that of all its segments.
-    pub(super) const fn is_whole(&self, ack: BlockAck) -> bool {
-        ack.ackseq == self.seqno
-    }
-
-    /// Continues with the next sub-block, of this size, after all segments of this one have
-    /// arrived. If that was the last one of the transfer, returns the CRC of all data.
-    pub(super) fn advance(&mut self, blksize: u8, data: &[u8]) -> Option<u16> {
-        // All of it was sent and acknowledged, so this is no error.
-        self.acknowledged(BlockAck { ackseq: self.seqno, blksize }, data).unwrap_or(None)
+    /// Whether the segments up to this one are sent.
+    pub(super) const fn has_sent(&self, ackseq: u8) -> bool {
+        ackseq <= self.seqno
     }
 
     /// The offset of the end of the sent data.
@@ -193,7 +186,7 @@ impl SubBlock {
 
     /// Continues with the next sub-block after the last segment that arrived. If that was the last
     /// segment of the transfer, returns the CRC of all data, 0 if the server does not check it.
-    fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
+    pub(super) fn acknowledged(&mut self, ack: BlockAck, data: &[u8]) -> Result<Option<u16>, AbortCode> {
         let blksize = check_blksize(ack.blksize)?;
         if ack.ackseq > self.seqno {
             // Before everything is sent: the acknowledgement of the previous sub-block again.

@@ -6,7 +6,7 @@ use crate::od::Address;
 use crate::sdo::block::check_blksize;
 use crate::sdo::client::download::SubBlock;
 use crate::sdo::client::Config;
-use crate::sdo::wire::{Request, Response};
+use crate::sdo::wire::{BlockAck, Request, Response};
 use crate::time::Instant;
 
 /// A set of the servers of a group: bit n is server n.
@@ -15,12 +15,20 @@ pub type Servers = u128;
 /// The most servers of a group.
 pub const SERVERS_MAX: usize = Servers::BITS as usize;
 
+/// How long the answers of single servers are awaited when all others have acknowledged the whole
+/// sub-block, in milliseconds: longer than a server waits for a missing segment.
+const LATE_MS: u32 = 150;
+
 /// A block download to several servers that have the same COB-ID for requests and different ones
 /// for answers (1201h).
 ///
-/// Nothing is sent twice: if one server misses a segment or refuses, the download is broken off for
-/// all, and the caller begins it again. So the data must be such that a server which has taken them
-/// already takes them again.
+/// A segment that all servers miss is sent again within the transfer, as in any block download. A
+/// server that misses one alone stays behind: the others go on, and its CRC at the end does not
+/// match. So each server takes the whole data or none, and the caller sends them again to those
+/// that have none. They must be such that a server which has taken them takes them again.
+///
+/// No server ever gets more bytes than it was told: that would end its transfer, and it would take
+/// the segments behind that for requests.
 #[derive(Debug)]
 pub struct GroupDownload<D> {
     request: CobId,
@@ -38,19 +46,50 @@ enum State {
     /// The initiate must be sent.
     Begin,
     /// Servers have not answered the initiate yet; with their block size, once it is known.
-    Begun { missing: Servers, crc: bool, blksize: Option<u8> },
-    /// A sub-block is being sent.
-    Sending(SubBlock),
-    /// It was sent, and servers have not acknowledged it yet; with the size of the next one.
-    Sent { sub_block: SubBlock, missing: Servers, blksize: u8 },
-    /// All data have arrived everywhere; the end must be sent.
-    End { crc: u16 },
+    Begun {
+        missing: Servers,
+        crc: bool,
+        blksize: Option<u8>,
+    },
+    /// A sub-block is being sent, or waits for its acknowledgements.
+    Blocks(Sent),
+    /// All data have arrived; the end must be sent.
+    End {
+        crc: u16,
+    },
     /// Servers have not confirmed the end yet, or have refused it.
-    Ended { missing: Servers, refused: Servers },
+    Ended {
+        missing: Servers,
+        refused: Servers,
+    },
     /// The abort must be sent.
-    Break { missing: Servers },
-    /// The servers that have not taken the data.
-    Done { missing: Servers },
+    Break {
+        result: GroupResult,
+        code: AbortCode,
+    },
+    Done(GroupResult),
+}
+
+/// A sub-block and its acknowledgements so far.
+#[derive(Clone, Copy, Debug)]
+struct Sent {
+    sub_block: SubBlock,
+    /// The servers without an acknowledgement.
+    missing: Servers,
+    /// The first and the last acknowledged segment that a server has named.
+    range: Option<(u8, u8)>,
+    /// The size of the next sub-block.
+    blksize: u8,
+}
+
+/// The end of a download.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GroupResult {
+    /// The servers that have not taken the data. Before the end of the download, no server has;
+    /// then these are the ones which caused that it was broken off.
+    pub missing: Servers,
+    /// Whether the end was sent: the servers that are not missing have taken the data.
+    pub ended: bool,
 }
 
 /// The next action for a download.
@@ -60,9 +99,8 @@ pub enum GroupStep {
     Send(Frame),
     /// Wait for frames, at most until this time.
     Wait(Instant),
-    /// The download has ended; with the servers that have not taken the data. Every later call
-    /// returns this, too.
-    Done(Servers),
+    /// The download has ended. Every later call returns this, too.
+    Done(GroupResult),
 }
 
 impl<D: AsRef<[u8]>> GroupDownload<D> {
@@ -90,9 +128,8 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         let response = Response::parse(bytes);
         if let Some(Response::Abort(_, code)) = response {
             match &mut self.state {
-                State::Begun { .. } | State::Sending(_) | State::Sent { .. } | State::End { .. } => {
-                    self.state = State::Break { missing: server };
-                }
+                // Its transfer has ended, so it must get no more segments.
+                State::Begun { .. } | State::Blocks(_) | State::End { .. } => self.break_off(server),
                 // The end of a download is each server's own.
                 State::Ended { missing, refused } if *missing & server != 0 => {
                     *missing &= !server;
@@ -110,27 +147,27 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
             ) if at == self.at => {
                 // One server decides for all: the end carries one CRC, and a sub-block one size.
                 if check_blksize(granted).is_err() || blksize.is_some_and(|other| other != granted) {
-                    self.state = State::Break { missing: server };
+                    self.break_off(server);
                     return Ok(());
                 }
                 *blksize = Some(granted);
                 *crc |= checks;
                 take(missing, server)
             }
-            (State::Sent { sub_block, missing, blksize }, Some(Response::AckBlockDownload(ack))) => {
-                let is_first = *missing == self.servers;
-                let fits = check_blksize(ack.blksize).is_ok() && (is_first || *blksize == ack.blksize);
-                if !fits || !sub_block.is_whole(ack) {
-                    self.state = State::Break { missing: server };
+            (State::Blocks(sent), Some(Response::AckBlockDownload(ack))) => {
+                if sent.missing & server == 0 || !sent.sub_block.has_sent(ack.ackseq) {
+                    // The acknowledgement of the sub-block before, late.
                     return Ok(());
                 }
-                *blksize = ack.blksize;
-                take(missing, server)
-            }
-            // It has missed a segment and did not hear the next one for a while.
-            (State::Sending(_), Some(Response::AckBlockDownload(_))) => {
-                self.state = State::Break { missing: server };
-                return Ok(());
+                let fits = check_blksize(ack.blksize).is_ok();
+                if !fits || (sent.range.is_some() && sent.blksize != ack.blksize) {
+                    self.break_off(server);
+                    return Ok(());
+                }
+                let (first, last) = sent.range.unwrap_or((ack.ackseq, ack.ackseq));
+                sent.range = Some((first.min(ack.ackseq), last.max(ack.ackseq)));
+                sent.blksize = ack.blksize;
+                take(&mut sent.missing, server)
             }
             (State::Ended { missing, .. }, Some(Response::EndBlockDownload)) => take(missing, server),
             _ => false,
@@ -142,22 +179,49 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         Ok(())
     }
 
+    /// Ends the download for all servers, unless it has ended.
+    pub fn abort(&mut self) {
+        if !matches!(self.state, State::Done(_)) {
+            self.break_off(self.servers);
+        }
+    }
+
+    fn break_off(&mut self, missing: Servers) {
+        let result = GroupResult { missing, ended: false };
+        self.state = State::Break { result, code: AbortCode::GENERAL };
+    }
+
     /// Goes on if all servers have answered.
     fn proceed(&mut self) {
-        let data = self.data.as_ref();
-        match &mut self.state {
+        match self.state {
             State::Begun { missing: 0, crc, blksize: Some(blksize) } => {
-                self.state = State::Sending(SubBlock::new(*crc, *blksize));
+                let sub_block = SubBlock::new(crc, blksize);
+                self.state = State::Blocks(Sent { sub_block, missing: self.servers, range: None, blksize });
             }
-            State::Sent { sub_block, missing: 0, blksize } => {
-                self.state = match sub_block.advance(*blksize, data) {
-                    Some(crc) => State::End { crc },
-                    None => State::Sending(*sub_block),
-                };
+            State::Blocks(sent) if sent.missing == 0 => self.next_sub_block(sent),
+            State::Ended { missing: 0, refused: 0 } => {
+                self.state = State::Done(GroupResult { missing: 0, ended: true });
             }
-            State::Ended { missing: 0, refused } => self.state = State::Done { missing: *refused },
+            State::Ended { missing: 0, refused } => self.end_without(refused, AbortCode::GENERAL),
             _ => {}
         }
+    }
+
+    /// Goes on behind the last segment that a server has acknowledged. Who has not got so far stays
+    /// behind.
+    fn next_sub_block(&mut self, mut sent: Sent) {
+        let data = self.data.as_ref();
+        let ackseq = sent.range.map_or(0, |(_, last)| last);
+        self.state = match sent.sub_block.acknowledged(BlockAck { ackseq, blksize: sent.blksize }, data) {
+            Ok(Some(crc)) => State::End { crc },
+            Ok(None) => State::Blocks(Sent { missing: self.servers, range: None, ..sent }),
+            Err(code) => State::Break { result: GroupResult { missing: self.servers, ended: false }, code },
+        };
+    }
+
+    /// After the end, a server that is left in its transfer gets an abort. The others ignore it.
+    fn end_without(&mut self, missing: Servers, code: AbortCode) {
+        self.state = State::Break { result: GroupResult { missing, ended: true }, code };
     }
 
     /// Returns the next action.
@@ -170,37 +234,46 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
                 let size = u32::try_from(data.len()).ok();
                 Request::InitiateBlockDownload { at: self.at, crc: true, size }.emit()
             }
-            State::Sending(sub_block) => {
-                let segment = sub_block.next(data).emit();
-                if sub_block.is_sent(data) {
-                    let blksize = sub_block.blksize();
-                    self.state = State::Sent { sub_block: *sub_block, missing: servers, blksize };
-                }
-                segment
-            }
+            State::Blocks(Sent { sub_block, .. }) if !sub_block.is_sent(data) => sub_block.next(data).emit(),
             State::End { crc } => {
                 let end = SubBlock::end(*crc, data);
                 self.state = State::Ended { missing: servers, refused: 0 };
                 Request::EndBlockDownload(end).emit()
             }
-            State::Break { missing } => {
-                self.state = State::Done { missing: *missing };
-                Request::Abort(self.at, AbortCode::GENERAL).emit()
+            State::Break { result, code } => {
+                let code = *code;
+                self.state = State::Done(*result);
+                Request::Abort(self.at, code).emit()
             }
-            State::Begun { missing, .. } | State::Sent { missing, .. } | State::Ended { missing, .. } => {
-                let deadline = self.moved + self.timeout_ms;
-                if !now.has_reached(deadline) {
-                    return GroupStep::Wait(deadline);
-                }
-                let missing = *missing;
-                let refused = if let State::Ended { refused, .. } = self.state { refused } else { 0 };
-                self.state = State::Done { missing: missing | refused };
-                Request::Abort(self.at, AbortCode::TIMEOUT).emit()
-            }
-            State::Done { missing } => return GroupStep::Done(*missing),
+            State::Begun { .. } | State::Blocks(_) | State::Ended { .. } => return self.wait(now),
+            State::Done(result) => return GroupStep::Done(*result),
         };
         self.moved = now;
         GroupStep::Send(Frame::full(self.request, bytes))
+    }
+
+    /// Waits for the answers that are missing, and goes on without them when it is time.
+    fn wait(&mut self, now: Instant) -> GroupStep {
+        // A single answer may get lost. A server that has really missed a segment says so earlier.
+        let others_have_all = match self.state {
+            State::Blocks(Sent { sub_block, range: Some((first, _)), .. }) => sub_block.is_whole(first),
+            _ => false,
+        };
+        let deadline =
+            self.moved + if others_have_all { LATE_MS.min(self.timeout_ms) } else { self.timeout_ms };
+        if !now.has_reached(deadline) {
+            return GroupStep::Wait(deadline);
+        }
+        match self.state {
+            State::Blocks(sent) if others_have_all => self.next_sub_block(sent),
+            State::Ended { missing, refused } => self.end_without(missing | refused, AbortCode::TIMEOUT),
+            State::Begun { missing, .. } | State::Blocks(Sent { missing, .. }) => {
+                let result = GroupResult { missing, ended: false };
+                self.state = State::Break { result, code: AbortCode::TIMEOUT };
+            }
+            _ => {}
+        }
+        self.poll(now)
     }
 }
 

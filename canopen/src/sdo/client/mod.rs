@@ -48,7 +48,7 @@ mod group;
 mod upload;
 
 pub use download::Download;
-pub use group::{GroupDownload, GroupStep, Servers, SERVERS_MAX};
+pub use group::{GroupDownload, GroupResult, GroupStep, Servers, SERVERS_MAX};
 pub use upload::{Buffer, Sink, Upload};
 
 /// The configuration of a transfer.
