@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::hub::{self, Conversation};
+use coflash::bus::hub::{self, Act, Conversation, Terms};
 use coflash::device::Transfers;
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
@@ -94,7 +94,7 @@ fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
     for id in [0x583, 0x603, 0x703, 0x584, 0x7E4, 0x083] {
         bus.0[0].inject(frame(id));
     }
-    let conversation = |wait: u64| -> Conversation<'static, (Duration, Vec<Frame>)> {
+    let conversation = |wait: u64| -> Act<'static, (Duration, Vec<Frame>)> {
         Box::new(move |port| {
             let began = port.now();
             let mut heard = Vec::new();
@@ -105,9 +105,9 @@ fn a_port_waits_as_long_as_it_says_and_hears_its_own_node() {
         })
     };
     let node = |number| NodeId::new(number).unwrap();
-    let conversations =
-        vec![(node(3), conversation(100)), (node(4), conversation(7)), (node(5), conversation(30))];
-    let ended = hub::run(&mut bus, conversations, 3);
+    let with = |number, wait| Conversation { node: node(number), channel: None, act: conversation(wait) };
+    let terms = Terms { at_once: 3, answer: Duration::from_millis(500), cancelled: Arc::default() };
+    let ended = hub::run(&mut bus, vec![with(3, 100), with(4, 7), with(5, 30)], &terms);
     let ms = Duration::from_millis;
     assert_eq!(ended[0], (ms(100), vec![frame(0x583), frame(0x603), frame(0x703), frame(0x083)]));
     assert_eq!(ended[1], (ms(7), vec![frame(0x584)]));

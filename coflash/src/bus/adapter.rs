@@ -4,7 +4,8 @@ use std::fmt;
 use std::io;
 use std::time::Duration;
 
-use canopen::Frame;
+use canopen::frame::Channel;
+use canopen::{AbortCode, Address, Frame};
 
 use super::health::Health;
 
@@ -37,6 +38,43 @@ pub trait Adapter {
     fn health(&mut self) -> Option<Health> {
         None
     }
+
+    /// The group downloads in which this conversation can take part.
+    fn group(&mut self) -> Option<&mut dyn Group> {
+        None
+    }
+}
+
+/// A conversation's place in a group: the devices that take the same data in one download, each by
+/// its second SDO server (1201h).
+pub trait Group {
+    /// The COB-IDs for the device's second SDO server; `None` after [`leave`](Self::leave).
+    fn channel(&self) -> Option<Channel>;
+
+    /// Waits until all conversations of the group have come here. Those with the lowest turn and
+    /// the same data go first, in one download; the others wait for their turn.
+    ///
+    /// # Errors
+    /// The adapter is gone.
+    fn meet(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Met, AdapterError>;
+
+    /// Leaves the group: it does not wait for this conversation any more.
+    fn leave(&mut self);
+}
+
+/// What became of the data.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Met {
+    /// The device has taken the data, as one of so many devices.
+    Taken(usize),
+    /// The device has refused the data.
+    Refused(AbortCode),
+    /// The device did not confirm the data.
+    NoAnswer,
+    /// Nobody else has the same data, or this device has disturbed the group: write them alone.
+    Alone,
+    /// Somebody else uses a COB-ID of the group: there is no group any more.
+    Disturbed,
 }
 
 impl<A: Adapter + ?Sized> Adapter for &mut A {
@@ -55,6 +93,10 @@ impl<A: Adapter + ?Sized> Adapter for &mut A {
     fn health(&mut self) -> Option<Health> {
         (**self).health()
     }
+
+    fn group(&mut self) -> Option<&mut dyn Group> {
+        (**self).group()
+    }
 }
 
 impl<A: Adapter + ?Sized> Adapter for Box<A> {
@@ -72,6 +114,10 @@ impl<A: Adapter + ?Sized> Adapter for Box<A> {
 
     fn health(&mut self) -> Option<Health> {
         (**self).health()
+    }
+
+    fn group(&mut self) -> Option<&mut dyn Group> {
+        (**self).group()
     }
 }
 

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use canopen::NodeId;
-use clap::Args;
+use clap::{Args, ValueEnum};
 use coflash::bus::Link;
 use coflash::device::lock::Lock;
 use coflash::device::lss::{ensure_node_id, LssAddress};
@@ -34,6 +34,17 @@ use super::progress::Progress;
 use super::values::{nodes, number, program_number};
 use super::verify::{self, is_sealed};
 
+/// When devices get the same program together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Together {
+    /// Devices that can; the others at the same time, each by itself.
+    Auto,
+    /// All devices; one that cannot is not updated.
+    Always,
+    /// None: each device gets it by itself.
+    Never,
+}
+
 /// Downloads a program into a device, or into many devices, and starts it.
 ///
 /// The file may be a block file or a sealed image; any other firmware file is converted first. The
@@ -58,7 +69,7 @@ pub(super) struct Flash {
     legacy_file: Option<PathBuf>,
 
     /// The devices' node-IDs: 5, or a list with ranges like 1,5,9-12.
-    #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = nodes, value_name = "NODES")]
+    #[arg(long, short = 'N', aliases = ["node_id", "nodes"], default_value = "1", value_parser = nodes, value_name = "NODES")]
     node: Vec<Vec<NodeId>>,
 
     /// A job file, which names the devices and their programs (see the manual), in place of FILE
@@ -69,6 +80,10 @@ pub(super) struct Flash {
     /// How many devices are updated at the same time.
     #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8")]
     at_once: u32,
+
+    /// Whether devices get the same program together, in one download for all of them.
+    #[arg(long, value_enum, value_name = "WHEN", default_value = "auto", default_missing_value = "always", num_args = 0..=1, require_equals = true)]
+    together: Together,
 
     /// Write the results to this file as JSON.
     #[arg(long, value_name = "FILE")]
@@ -388,6 +403,10 @@ impl Flash {
     }
 
     fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
+        if self.together == Together::Always && matches!(link, Link::Gateway(_)) {
+            let advice = "leave out --together, or use an adapter on the bus";
+            return Err(Failure::usage("a gateway does one transfer at a time", advice));
+        }
         let mut outcomes: Vec<Option<Outcome>> = Vec::new();
         let mut jobs: Vec<(usize, Job)> = Vec::new();
         let mut locks = Vec::new();
@@ -403,7 +422,8 @@ impl Flash {
                 Ok(node) => match self.lock(context, node) {
                     Ok(lock) => {
                         locks.push(lock);
-                        jobs.push((number, Job::new(node, device.file.clone(), device.options)));
+                        let options = device.options.together(self.together == Together::Always);
+                        jobs.push((number, Job::new(node, device.file.clone(), options)));
                         None
                     }
                     Err(failure) => {
@@ -420,6 +440,7 @@ impl Flash {
             .timing(self.patience.timing())
             .transfers(self.patience.transfers())
             .at_once(self.at_once as usize)
+            .together(self.together != Together::Never)
             .cancelled(cancelled()?);
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
         let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();

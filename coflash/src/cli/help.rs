@@ -8,7 +8,7 @@ use super::output::EXIT_CODES;
 
 /// The groups of `--help`, with the options in each.
 const GROUPS: [(&str, &[&str]); 5] = [
-    ("Devices", &["node", "job", "at_once", "program", "report"]),
+    ("Devices", &["node", "job", "at_once", "together", "program", "report"]),
     (
         "Firmware file",
         &[

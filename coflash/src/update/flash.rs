@@ -16,7 +16,7 @@ use super::options::FlashOptions;
 use super::reach::reach;
 use super::steps::compare_crc;
 use crate::device::session::Silence;
-use crate::device::{flying_master, Error, Session};
+use crate::device::{flying_master, Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
@@ -114,6 +114,9 @@ fn procedure(
     let original = session.node();
     let dialect = reach(session, file, options, course)?;
     let its = dialect::of(dialect);
+    if dialect != Dialect::Block {
+        session.leave_group();
+    }
     if options.alone {
         session.still_alone()?;
     }

@@ -1,12 +1,14 @@
-//! The update of many devices over one bus: while one erases, another receives.
+//! The update of many devices over one bus: while one erases, another receives, and devices with a
+//! second SDO server receive the same program together.
 
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 
-use canopen::NodeId;
+use canopen::frame::Channel;
+use canopen::{CobId, NodeId};
 
 use super::content::Program;
-use super::event::{Event, Report};
+use super::event::{Event, Note, Report, Warning};
 use super::flash::flash_program;
 use super::left::{DeviceState, Left, Look};
 use super::options::FlashOptions;
@@ -42,8 +44,12 @@ pub struct ManyOptions {
     pub timing: Timing,
     /// The form of downloads.
     pub transfers: Transfers,
-    /// How many devices are updated at the same time.
+    /// How many devices are updated at the same time. A device that waits for its group does not
+    /// count.
     pub at_once: usize,
+    /// Whether devices that can are updated together: data blocks go to all of them in one
+    /// download.
+    pub together: bool,
     /// Ends all updates when it is set.
     pub cancelled: Arc<AtomicBool>,
 }
@@ -53,6 +59,7 @@ impl ManyOptions {
         timing: Timing,
         transfers: Transfers,
         at_once: usize,
+        together: bool,
         cancelled: Arc<AtomicBool>,
     }
 }
@@ -63,6 +70,7 @@ impl Default for ManyOptions {
             timing: Timing::default(),
             transfers: Transfers::default(),
             at_once: 8,
+            together: true,
             cancelled: Arc::default(),
         }
     }
@@ -77,28 +85,111 @@ pub struct Failed {
     pub left: Left,
 }
 
-/// Updates all devices; if one fails, the others continue. `tell` gets the events of each job, on
-/// separate threads. The results are in the order of the jobs.
+/// The COB-ID of requests to a group. The predefined connection set has no other use for it, and
+/// for those of the answers.
+const GROUP: u16 = 0x6DF;
+/// The base of the COB-IDs of answers, to which the node-ID is added.
+const GROUP_ANSWERS: u16 = 0x680;
+
+/// Updates all devices; if one fails, the others continue. A device that fails in a group is
+/// updated once more, without the others. `tell` gets the events of each job, on separate threads.
+/// The results are in the order of the jobs.
 pub fn flash_many(
     adapter: &mut dyn Adapter,
     jobs: &[Job],
     options: &ManyOptions,
     tell: &(dyn Fn(usize, Event) + Sync),
 ) -> Vec<Result<Report, Failed>> {
+    let channels = if options.together { channels(jobs) } else { vec![None; jobs.len()] };
+    let all: Vec<Planned<'_>> = jobs
+        .iter()
+        .zip(channels)
+        .enumerate()
+        .map(|(number, (job, channel))| Planned { number, job, channel })
+        .collect();
+    let mut ends = flash_each(adapter, &all, options, tell);
+    let again: Vec<Planned<'_>> = all.into_iter().filter(|plan| ends[plan.number].is_for_another).collect();
+    let again: Vec<Planned<'_>> = again.into_iter().map(|plan| Planned { channel: None, ..plan }).collect();
+    for (plan, end) in again.iter().zip(flash_each(adapter, &again, options, tell)) {
+        ends[plan.number] = end;
+    }
+    ends.into_iter().map(|end| end.result).collect()
+}
+
+/// A job with its place among all, and its part in the group.
+struct Planned<'j> {
+    number: usize,
+    job: &'j Job,
+    channel: Option<Channel>,
+}
+
+/// The end of an attempt.
+struct End {
+    result: Result<Report, Failed>,
+    /// The device gets another attempt, without the others.
+    is_for_another: bool,
+}
+
+/// The COB-IDs for the jobs that can be done together: those that send blocks and have a COB-ID for
+/// answers, if there are several.
+fn channels(jobs: &[Job]) -> Vec<Option<Channel>> {
+    let by_blocks = |job: &&Job| matches!(job.file, Program::Blocks(_));
+    if jobs.iter().filter(by_blocks).count() < 2 {
+        return vec![None; jobs.len()];
+    }
+    let of = |job: &Job| {
+        let response = GROUP_ANSWERS + u16::from(job.node.get());
+        if !by_blocks(&job) || response >= GROUP {
+            return None;
+        }
+        Some(Channel { request: CobId::new(GROUP)?, response: CobId::new(response)? })
+    };
+    jobs.iter().map(of).collect()
+}
+
+/// One attempt for each of these jobs.
+fn flash_each(
+    adapter: &mut dyn Adapter,
+    jobs: &[Planned<'_>],
+    options: &ManyOptions,
+    tell: &(dyn Fn(usize, Event) + Sync),
+) -> Vec<End> {
     let at_once = options.at_once.clamp(1, jobs.len().max(1));
     let sdo = options.timing.sdo.saturating_mul(at_once as u32);
     let timing = Timing { sdo, ..options.timing };
-    let conversation = |(number, job): (usize, &Job)| -> (NodeId, hub::Conversation<'_, _>) {
-        let (node, job, all) = (job.node, job.clone(), options.clone());
+    let conversation = |plan: &Planned<'_>| {
+        let (number, job, all) = (plan.number, plan.job.clone(), options.clone());
         let act = move |port: &mut hub::Port| {
             let mut session = Session::new(port, job.node, timing);
             let one = FlashOptions { follow: false, ..job.options };
-            update(&mut session, &job, &one, &all, &mut |event| tell(number, event))
+            let (mut done, mut was_in_group) = (None, false);
+            let result = update(&mut session, &job, &one, &all, &mut |event| match event {
+                Event::Done(_) => done = Some(event),
+                event => {
+                    was_in_group |= matches!(event, Event::Note(Note::Together { .. }));
+                    tell(number, event);
+                }
+            });
+            let is_over = |error: &Error| {
+                let cancelled = all.cancelled.load(Ordering::Relaxed);
+                cancelled || matches!(error, Error::Adapter(_) | Error::Cancelled)
+            };
+            let is_for_another = was_in_group && result.as_ref().is_err_and(|failed| !is_over(&failed.error));
+            match (&result, done) {
+                // This is not the end.
+                (Err(failed), _) if is_for_another => {
+                    tell(number, Warning::Apart { why: failed.error.to_string() }.into());
+                }
+                (_, Some(done)) => tell(number, done),
+                _ => {}
+            }
+            End { result, is_for_another }
         };
-        (node, Box::new(act))
+        let act: hub::Act<'_, _> = Box::new(act);
+        hub::Conversation { node: plan.job.node, channel: plan.channel, act }
     };
-    let conversations = jobs.iter().enumerate().map(conversation).collect();
-    hub::run(adapter, conversations, at_once)
+    let terms = hub::Terms { at_once, answer: options.timing.sdo, cancelled: options.cancelled.clone() };
+    hub::run(adapter, jobs.iter().map(conversation).collect(), &terms)
 }
 
 /// Updates the devices behind a gateway one after the other, because a gateway does one transfer at

@@ -48,6 +48,8 @@ pub struct FlashOptions {
     /// Send a sealed image in blocks of at most this size, including framing, instead of in one
     /// download.
     pub blocks: Option<usize>,
+    /// Fail before anything is erased if the device cannot be updated together with others.
+    pub together: bool,
     /// Send everything, also if the device could go on with a download that was cut off.
     pub from_start: bool,
     /// Let the device alone judge the image. If this is off, the tool refuses an image that cannot
@@ -70,6 +72,7 @@ impl FlashOptions {
         alone: bool,
         mastership: bool,
         blocks: Option<usize>,
+        together: bool,
         from_start: bool,
         force: bool,
     }
@@ -131,6 +134,7 @@ impl Default for FlashOptions {
             alone: true,
             mastership: true,
             blocks: None,
+            together: false,
             from_start: false,
             force: false,
         }

@@ -91,6 +91,11 @@ pub enum Note {
         #[serde(rename = "to", serialize_with = "json::node")]
         node: NodeId,
     },
+    /// The data go to so many devices at once. Told once.
+    Together {
+        /// The number of devices.
+        devices: usize,
+    },
     /// The NMT mastership was taken over.
     MasterTaken {
         /// The previous master.
@@ -118,6 +123,13 @@ pub enum Warning {
     },
     /// The NMT mastership was given back, but no node has announced that it is the master.
     MasterMissing,
+    /// Somebody else uses a COB-ID of the group: the devices are updated one by one.
+    GroupDisturbed,
+    /// The update in the group has failed: the device is updated once more, without the others.
+    Apart {
+        /// What happened.
+        why: String,
+    },
     /// The part that the device had does not fit the file: everything is sent again.
     BeginsAgain {
         /// What the device found.
@@ -184,6 +196,7 @@ impl fmt::Display for Note {
             }
             Self::Dialect { dialect } => write!(f, "dialect: {dialect}"),
             Self::Unlocked => f.write_str("unlocked"),
+            Self::Together { devices } => write!(f, "receiving the program together: {devices} devices"),
             Self::Moved { node } => write!(f, "the device now answers as node {node}"),
             Self::MasterTaken { node } => write!(f, "NMT mastership taken over from node {node}"),
             Self::MasterBack { node } => {
@@ -201,6 +214,12 @@ impl fmt::Display for Warning {
             }
             Self::MasterMissing => {
                 f.write_str("NMT mastership given back, but no node has announced that it is the master")
+            }
+            Self::GroupDisturbed => {
+                f.write_str("another node uses a COB-ID of the group: the devices are updated one by one")
+            }
+            Self::Apart { why } => {
+                write!(f, "it did not get through with the others ({why}): updating it alone")
             }
             Self::BeginsAgain { why } => {
                 write!(f, "what the device had of this program is not usable ({why}): sending everything")

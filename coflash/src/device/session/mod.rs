@@ -20,6 +20,7 @@ use crate::bus::{Health, Link};
 mod attention;
 mod listen;
 mod remote;
+mod together;
 mod transfer;
 mod watch;
 

@@ -8,15 +8,16 @@ use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::bus::adapter::Met;
 use crate::device::begun::{begun, Begun};
 use crate::device::region::program_region;
-use crate::device::{DeviceType, Dialect, Doing, Error, Session, Transfers};
+use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
 use crate::file::convert::blocks_of_sealed;
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::course::Course;
-use crate::update::event::{Event, Phase, RepeatReason, Retry, Warning};
+use crate::update::event::{Event, Note, Phase, RepeatReason, Retry, Warning};
 use crate::update::judge::{judge, Judgement};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
@@ -24,6 +25,12 @@ use crate::update::{steps, trial};
 
 /// See the [module](self).
 pub(super) struct Block;
+
+const NOT_TOGETHER: Error = Error::NotInDialect {
+    dialect: Dialect::Block,
+    what: "it cannot be updated together with others, which needs a second SDO server (1201h) in its \
+           bootloader and a node-ID of at most 94",
+};
 
 impl Procedure for Block {
     fn enter(
@@ -54,7 +61,7 @@ impl Procedure for Block {
             }
             (Content::Sealed(sealed), Some(block_size)) => {
                 let blocks = cut(session, sealed, block_size, options.program)?;
-                let (repeats, took) = send(session, &blocks, None, options, course)?;
+                let (repeats, took) = send(session, &blocks, None, &mut false, options, course)?;
                 course.state = DeviceState::Written;
                 let crc = file.program_crc();
                 steps::verify(session, options.program, crc, &mut |event| course.tell(event))?;
@@ -62,7 +69,15 @@ impl Procedure for Block {
             }
         };
         let number = options.program;
-        let (repeats, took) = send_verified(session, file, options, course)?;
+        let mut in_group = session.join_group()?;
+        if options.together && !in_group {
+            return Err(NOT_TOGETHER);
+        }
+        let sent = send_verified(session, file, &mut in_group, options, course);
+        if let (Err(error), true) = (&sent, in_group) {
+            leave_after(session, error);
+        }
+        let (repeats, took) = sent?;
         course.state = DeviceState::Unreleased;
         if !options.start {
             course.tell(Phase::NotReleased.into());
@@ -114,6 +129,7 @@ impl Begun {
 fn send_verified(
     session: &mut Session<'_>,
     file: &BlockFile,
+    in_group: &mut bool,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<(u32, Duration), Error> {
@@ -121,7 +137,7 @@ fn send_verified(
     let begun = if options.from_start { None } else { begun(session, number)? };
     let begun = begun.filter(|begun| begun.is_of(file));
     let mut all = |from, course: &mut Course<'_>| {
-        let sent = send(session, file, from, options, course)?;
+        let sent = send(session, file, from, in_group, options, course)?;
         steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
         Ok(sent)
     };
@@ -142,6 +158,7 @@ fn send(
     session: &mut Session<'_>,
     file: &BlockFile,
     begun: Option<Begun>,
+    in_group: &mut bool,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<(u32, Duration), Error> {
@@ -159,16 +176,17 @@ fn send(
         return Err(error);
     }
     let began = session.now();
-    let repeats = send_blocks(session, file, begun, options, course)?;
+    let repeats = send_blocks(session, file, begun, in_group, options, course)?;
     Ok((repeats, session.now().saturating_sub(began)))
 }
 
-/// Steps 6 to 9: sends all blocks that are not in the begun download; returns the number of
-/// repetitions.
+/// Steps 6 to 9: sends all blocks that are not in the begun download, those with data together with
+/// the other devices of a group; returns the number of repetitions.
 fn send_blocks(
     session: &mut Session<'_>,
     file: &BlockFile,
     begun: Option<Begun>,
+    in_group: &mut bool,
     options: &FlashOptions,
     course: &mut Course<'_>,
 ) -> Result<u32, Error> {
@@ -177,16 +195,34 @@ fn send_blocks(
     let total = blocks.iter().map(|(_, bytes)| bytes.len()).sum();
     let mut done = 0;
     let mut repeats = 0;
+    let (mut together, mut disturbed) = (0, false);
     course.tell(Event::Progress { done, total });
     for (block, bytes) in &blocks {
         if begun.is_some_and(|begun| begun.has(block)) {
             done += bytes.len();
             continue;
         }
-        let sent = send_block(session, block.number, bytes, options, &mut |event| match event {
-            Event::Progress { done: part, .. } => course.tell(Event::Progress { done: done + part, total }),
-            event => course.tell(event),
-        });
+        if block.number == NUMBER_LAST && *in_group {
+            session.part_from_group()?;
+            *in_group = false;
+        }
+        let together_now = *in_group && block.number != NUMBER_CONTROL;
+        let sent =
+            send_block(session, block.number, bytes, together_now, options, &mut |event| match event {
+                Event::Progress { done: part, .. } => {
+                    course.tell(Event::Progress { done: done + part, total })
+                }
+                Event::Note(Note::Together { devices }) if devices == together => {}
+                Event::Warning(Warning::GroupDisturbed) if disturbed => {}
+                event => {
+                    match event {
+                        Event::Note(Note::Together { devices }) => together = devices,
+                        Event::Warning(Warning::GroupDisturbed) => disturbed = true,
+                        _ => {}
+                    }
+                    course.tell(event);
+                }
+            });
         // A device that postpones the erase starts it with the first good data: block 0 alone loses
         // nothing.
         course.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
@@ -197,11 +233,25 @@ fn send_blocks(
     Ok(repeats)
 }
 
+/// Takes a device out of its group after a failure, if it still answers: the downloads of the
+/// others do not concern it any more.
+fn leave_after(session: &mut Session<'_>, error: &Error) {
+    session.leave_group();
+    if !matches!(error, Error::Adapter(_)) {
+        let (node, timing) = (session.node(), Timing { attempts: 1, ..*session.timing() });
+        let mut last = session.with(node, timing);
+        last.cancel_by_nobody();
+        // The failure stays the result.
+        let _ = last.part_from_group();
+    }
+}
+
 /// Steps 7 and 8 for one block, with repetition; returns the number of repetitions.
 fn send_block(
     session: &mut Session<'_>,
     block: u32,
     bytes: &[u8],
+    in_group: bool,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<u32, Error> {
@@ -211,8 +261,24 @@ fn send_block(
     // Whether the result of an earlier transfer is unknown: its block may have arrived.
     let mut in_doubt = false;
     loop {
-        let mut progress = |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
-        let sent = session.write(at, bytes, doing, &mut progress);
+        let met = if in_group { session.write_together(block, at, bytes)? } else { Met::Alone };
+        let sent = match met {
+            Met::Taken(devices) => {
+                tell(Note::Together { devices }.into());
+                // A block that the device cannot write is reported with the next one.
+                return Ok(repeat);
+            }
+            Met::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
+            Met::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
+            Met::Alone | Met::Disturbed => {
+                if met == Met::Disturbed {
+                    tell(Warning::GroupDisturbed.into());
+                }
+                let mut progress =
+                    |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
+                session.write(at, bytes, doing, &mut progress)
+            }
+        };
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }

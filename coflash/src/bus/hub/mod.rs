@@ -4,19 +4,51 @@
 //! others. The adapter stays with the hub: when all conversations wait, the hub receives for them,
 //! and each conversation continues when it gets a frame or its time is over. No other thread runs
 //! at the same time, so the same answers always give the same course of events.
+//!
+//! Conversations with devices that have a second SDO server can be a `group`: when all of them
+//! bring the same data, the hub writes the data to their devices in one download.
 
 use std::collections::VecDeque;
 use std::io;
+use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{channel, Receiver, Sender};
+use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use canopen::{Frame, NodeId};
+use canopen::frame::Channel;
+use canopen::sdo::client::SERVERS_MAX;
+use canopen::{Address, Frame, NodeId};
 
-use super::adapter::{Adapter, AdapterError};
+use self::group::Meetings;
+use super::adapter::{Adapter, AdapterError, Group, Met};
 
-/// The work of a conversation with its port. [`run`] collects the results.
-pub type Conversation<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
+mod group;
+
+/// A conversation with one node. [`run`] collects the results.
+pub struct Conversation<'c, R> {
+    /// The node.
+    pub node: NodeId,
+    /// The COB-IDs for its part in the group, if it can have one. The COB-ID of requests is that of
+    /// the whole group.
+    pub channel: Option<Channel>,
+    /// The work with its port.
+    pub act: Act<'c, R>,
+}
+
+/// The work of a conversation.
+pub type Act<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
+
+/// How conversations run.
+#[derive(Clone, Debug)]
+pub struct Terms {
+    /// How many are at work at the same time.
+    pub at_once: usize,
+    /// How long the group waits for the answer of a device.
+    pub answer: Duration,
+    /// Ends a download of the group when it is set.
+    pub cancelled: Arc<AtomicBool>,
+}
 
 /// A frame that is still in the adapter may be the one that a conversation waits for. The time of a
 /// conversation is therefore over only when the adapter has no frames left, or after this
@@ -27,19 +59,35 @@ const GRACE: Duration = Duration::from_secs(1);
 enum Ask {
     Send(usize, Frame),
     Receive { port: usize, until: Duration },
+    Meet { port: usize, item: Item },
+    Leave(usize),
     Gone(usize),
 }
 
 /// The hub's message to a port.
 struct Answer {
-    frame: Result<Option<Frame>, AdapterError>,
+    what: Result<What, AdapterError>,
     now: Duration,
+}
+
+enum What {
+    Frame(Option<Frame>),
+    Met(Met),
+}
+
+/// What a conversation brings to a meeting.
+#[derive(Clone, PartialEq, Eq)]
+struct Item {
+    turn: u32,
+    at: Address,
+    data: Vec<u8>,
 }
 
 /// A conversation's access to the bus: it receives only the frames that concern its node.
 #[derive(Debug)]
 pub struct Port {
     number: usize,
+    channel: Option<Channel>,
     now: Duration,
     asks: Sender<Ask>,
     answers: Receiver<Answer>,
@@ -51,6 +99,14 @@ impl Port {
         let source = io::Error::from(io::ErrorKind::BrokenPipe);
         AdapterError::Lost { adapter: "the hub".to_string(), source }
     }
+
+    /// Asks the hub, and waits for its answer.
+    fn ask(&mut self, ask: Ask) -> Result<What, AdapterError> {
+        self.asks.send(ask).map_err(|_| Self::hub_is_gone())?;
+        let Answer { what, now } = self.answers.recv().map_err(|_| Self::hub_is_gone())?;
+        self.now = now;
+        what
+    }
 }
 
 impl Adapter for Port {
@@ -61,14 +117,42 @@ impl Adapter for Port {
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
         let until = self.now + timeout;
-        self.asks.send(Ask::Receive { port: self.number, until }).map_err(|_| Self::hub_is_gone())?;
-        let Answer { frame, now } = self.answers.recv().map_err(|_| Self::hub_is_gone())?;
-        self.now = now;
-        frame
+        match self.ask(Ask::Receive { port: self.number, until })? {
+            What::Frame(frame) => Ok(frame),
+            What::Met(_) => Err(Self::hub_is_gone()),
+        }
     }
 
     fn now(&self) -> Duration {
         self.now
+    }
+
+    fn group(&mut self) -> Option<&mut dyn Group> {
+        Some(self)
+    }
+}
+
+impl Group for Port {
+    fn channel(&self) -> Option<Channel> {
+        self.channel
+    }
+
+    fn meet(&mut self, turn: u32, at: Address, data: &[u8]) -> Result<Met, AdapterError> {
+        if self.channel.is_none() {
+            return Ok(Met::Alone);
+        }
+        let item = Item { turn, at, data: data.to_vec() };
+        match self.ask(Ask::Meet { port: self.number, item })? {
+            What::Met(met) => Ok(met),
+            What::Frame(_) => Err(Self::hub_is_gone()),
+        }
+    }
+
+    fn leave(&mut self) {
+        if self.channel.take().is_some() {
+            // If the hub is gone, the next wait reports it.
+            let _ = self.asks.send(Ask::Leave(self.number));
+        }
     }
 }
 
@@ -82,11 +166,22 @@ impl Drop for Port {
 /// The hub's record of a port.
 struct Line {
     node: NodeId,
+    /// Its part in the group, until it leaves.
+    channel: Option<Channel>,
     answers: Sender<Answer>,
     state: State,
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
+impl Line {
+    /// Lets the conversation continue.
+    fn wake(&mut self, what: Result<What, AdapterError>, now: Duration) {
+        self.state = State::Running;
+        // If the conversation has ended in the meantime, it reports its end itself.
+        let _ = self.answers.send(Answer { what, now });
+    }
+}
+
+#[derive(Clone, PartialEq, Eq)]
 enum State {
     /// The conversation works, and will send its next request.
     Running,
@@ -94,20 +189,22 @@ enum State {
     Waiting {
         until: Duration,
     },
+    /// The conversation waits for the others of its group.
+    Meeting(Item),
     Gone,
 }
 
-/// Runs the conversations, each with one node and at most `at_once` of them at the same time.
-/// Returns their results in the order of the conversations.
+/// Runs the conversations. Returns their results in the order of the conversations.
 ///
 /// # Panics
 /// If a conversation panics.
 pub fn run<'c, R: Send + 'c>(
     adapter: &mut dyn Adapter,
-    conversations: Vec<(NodeId, Conversation<'c, R>)>,
-    at_once: usize,
+    conversations: Vec<Conversation<'c, R>>,
+    terms: &Terms,
 ) -> Vec<R> {
     let count = conversations.len();
+    let mut meetings = Meetings::new(terms);
     let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
     let (asks, asked) = channel();
     let (done, results) = channel();
@@ -116,14 +213,21 @@ pub fn run<'c, R: Send + 'c>(
         let mut lost = None;
         loop {
             let busy = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state != State::Gone);
-            while lines.iter().filter(|line| busy(line)).count() < at_once.max(1) {
-                let Some((number, (node, conversation))) = waiting.pop_front() else { break };
+            // Who waits for the group has no work.
+            let at_work = |line: &&Line| !matches!(line.state, State::Meeting(_) | State::Gone);
+            while lines.iter().flatten().filter(at_work).count() < terms.at_once.max(1) {
+                let Some((number, Conversation { node, channel: part, act })) = waiting.pop_front() else {
+                    break;
+                };
                 let (answers, answered) = channel();
-                let mut port = Port { number, now: adapter.now(), asks: asks.clone(), answers: answered };
+                // More devices than a group has are updated alone.
+                let part = part.filter(|_| number < SERVERS_MAX);
+                let (now, asks) = (adapter.now(), asks.clone());
+                let mut port = Port { number, channel: part, now, asks, answers: answered };
                 let done = done.clone();
-                lines[number] = Some(Line { node, answers, state: State::Running });
+                lines[number] = Some(Line { node, channel: part, answers, state: State::Running });
                 scope.spawn(move || {
-                    let result = conversation(&mut port);
+                    let result = act(&mut port);
                     let _ = done.send((number, result));
                 });
             }
@@ -131,7 +235,11 @@ pub fn run<'c, R: Send + 'c>(
                 break;
             }
             settle(adapter, &asked, &mut lines, &mut lost);
-            serve(adapter, &mut lines, &mut lost);
+            let is_complete = !waiting.iter().any(|(_, conversation)| conversation.channel.is_some());
+            if lost.is_none() {
+                lost = meetings.go_on(adapter, &mut lines, is_complete).err();
+            }
+            serve(adapter, &mut lines, &mut meetings, &mut lost);
         }
     });
     drop(done);
@@ -158,7 +266,14 @@ fn settle(
                 frames.push((port, frame));
                 continue;
             }
+            Ask::Leave(port) => {
+                if let Some(line) = &mut lines[port] {
+                    line.channel = None;
+                }
+                continue;
+            }
             Ask::Receive { port, until } => (port, State::Waiting { until }),
+            Ask::Meet { port, item } => (port, State::Meeting(item)),
             Ask::Gone(port) => (port, State::Gone),
         };
         if let Some(line) = &mut lines[port] {
@@ -173,20 +288,39 @@ fn settle(
     }
 }
 
-/// Waits until at least one conversation can continue, and wakes it.
-fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Option<AdapterError>) {
+/// Waits until at least one conversation or the group can continue, and wakes it.
+fn serve(
+    adapter: &mut dyn Adapter,
+    lines: &mut [Option<Line>],
+    meetings: &mut Meetings,
+    lost: &mut Option<AdapterError>,
+) {
     let waiting = |line: &Line| match line.state {
         State::Waiting { until } => Some(until),
-        State::Running | State::Gone => None,
+        State::Running | State::Meeting(_) | State::Gone => None,
     };
-    let Some(earliest) = lines.iter().flatten().filter_map(waiting).min() else { return };
-    let received = match lost {
-        Some(error) => Err(copy(error)),
-        None => adapter.receive(earliest.saturating_sub(adapter.now())),
+    if lines.iter().flatten().any(|line| line.state == State::Running) {
+        return;
+    }
+    let deadlines = lines.iter().flatten().filter_map(waiting).chain(meetings.deadline());
+    let received = match (&lost, deadlines.min()) {
+        (Some(error), _) => Err(copy(error)),
+        (None, None) => return,
+        (None, Some(earliest)) => adapter.receive(earliest.saturating_sub(adapter.now())),
     };
     let now = adapter.now();
+    if let Ok(Some(frame)) = &received {
+        meetings.hear(frame, lines, now);
+    }
     for line in lines.iter_mut().flatten() {
-        let Some(until) = waiting(line) else { continue };
+        let until = match (&line.state, &received) {
+            (State::Waiting { until }, _) => *until,
+            (State::Meeting(_), Err(error)) => {
+                line.wake(Err(copy(error)), now);
+                continue;
+            }
+            _ => continue,
+        };
         let frame = match &received {
             Ok(Some(frame)) if concerns(frame, line.node) => Ok(Some(*frame)),
             Ok(Some(_)) if until + GRACE > now => continue,
@@ -194,9 +328,7 @@ fn serve(adapter: &mut dyn Adapter, lines: &mut [Option<Line>], lost: &mut Optio
             Ok(_) => Ok(None),
             Err(error) => Err(copy(error)),
         };
-        line.state = State::Running;
-        // If the conversation has ended in the meantime, it reports its end itself.
-        let _ = line.answers.send(Answer { frame, now });
+        line.wake(frame.map(What::Frame), now);
     }
     if let Err(error) = received {
         lost.get_or_insert(error);
