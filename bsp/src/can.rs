@@ -76,6 +76,9 @@ pub unsafe trait Controller: Instance {
 pub struct Port<I: Controller> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
+    /// If a frame waits, it is a heartbeat: it waits behind the one before, on a bus that is full
+    /// with frames of higher priority. It must not hold up an answer, which takes its place.
+    heartbeat_waits: bool,
     /// A boot-up is waiting; no frame may overtake it, whatever its priority.
     boot_up: bool,
     lost: Lost,
@@ -100,7 +103,7 @@ impl<I: Controller> Port<I> {
     pub fn new(controller: I) -> Self {
         let mut can = Can::builder(controller).leave_disabled();
         can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
-        Self { can, waiting: None, boot_up: false, lost: Lost::default() }
+        Self { can, waiting: None, heartbeat_waits: false, boot_up: false, lost: Lost::default() }
     }
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
@@ -185,7 +188,7 @@ impl<I: Controller> Port<I> {
         self.can.clear_tx_interrupt();
         self.put_waiting();
         self.boot_up &= !self.can.is_transmitter_idle();
-        self.waiting.is_none() && !self.boot_up
+        (self.waiting.is_none() || self.heartbeat_waits) && !self.boot_up
     }
 
     /// Sends a data frame with an identifier of 11 bits. Call it only when there is room; otherwise
@@ -198,7 +201,8 @@ impl<I: Controller> Port<I> {
         let (embedded_can::Id::Standard(id), Some(data)) = (frame.id(), Data::new(frame.data())) else {
             return;
         };
-        self.boot_up = id.as_raw() & 0x780 == BOOT_UP && data[..] == [0];
+        self.heartbeat_waits = id.as_raw() & 0x780 == BOOT_UP;
+        self.boot_up = self.heartbeat_waits && data[..] == [0];
         self.waiting = Some(bxcan::Frame::new_data(standard_id(id.as_raw()), data));
         self.put_waiting();
     }

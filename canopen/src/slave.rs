@@ -63,8 +63,7 @@ pub enum Output {
     Listen(BitRate),
     /// Start the controller's recovery from bus-off.
     RecoverFromBusOff,
-    /// Accept exactly the frames with these identifiers; the list may contain one twice, and
-    /// [`CobId::NONE`].
+    /// Accept exactly the frames with these identifiers; the list may contain one twice.
     Accept([CobId; 4]),
 }
 
@@ -254,7 +253,9 @@ impl Slave {
             Some(node) => [CobId::NMT, self.config.node.sdo.request(node.id())],
             None => [lss; 2],
         };
-        [nmt, lss, request, self.second]
+        // Not 7FFh, which an identifier above 11 bits would be in a filter.
+        let second = if self.second == CobId::NONE { nmt } else { self.second };
+        [nmt, lss, request, second]
     }
 
     /// Starts the node (again) with this node-ID: a transfer ends, and the boot-up message is sent

@@ -5,6 +5,7 @@ pub mod call_back;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;
+pub mod fleet;
 pub mod ihex;
 pub mod listener;
 pub mod masters;

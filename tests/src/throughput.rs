@@ -252,7 +252,7 @@ pub fn program(kib: u32) -> Vec<u8> {
     bytes
 }
 
-fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
+pub(crate) fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
     let region = firmware::board().programs[0];
     let image = read(bytes, Some(Format::Raw), Some(region.base)).expect("a raw image");
     let options = Options::default()

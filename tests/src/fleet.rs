@@ -1,0 +1,126 @@
+//! Many boards on one bus, updated with the same program by `coflash`'s own procedure.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use canopen::{BitRate, NodeId};
+use coflash::bus::{Adapter, AdapterError};
+use coflash::file::block_file::BlockFile;
+use coflash::file::convert::DEFAULT_BLOCK_SIZE;
+use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
+use coflash::update::{Event, FlashOptions, Report};
+use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
+
+use crate::bench::Bench;
+use crate::throughput::{blocks, program};
+
+/// Boards with the node-IDs 1, 2 and so on.
+pub struct Fleet {
+    /// The boards and their bus.
+    pub bench: Bench,
+}
+
+/// What an update of a fleet took and did.
+pub struct Update {
+    /// From its begin to the end of its last device, in virtual time.
+    pub took: Duration,
+    /// The result of each device.
+    pub results: Vec<Result<Report, Failed>>,
+    /// The events, with the number of the device.
+    pub events: Vec<(usize, Event)>,
+}
+
+impl Update {
+    /// The number of devices that are done.
+    #[must_use]
+    pub fn done(&self) -> usize {
+        self.results.iter().filter(|result| result.is_ok()).count()
+    }
+}
+
+/// Something that happens on the bus during an update, at each access of the host.
+pub type Happens<'h> = &'h mut dyn FnMut(&mut Bench);
+
+/// A bus on which something happens.
+struct Eventful<'b> {
+    bench: &'b mut Bench,
+    happens: Happens<'b>,
+}
+
+impl Adapter for Eventful<'_> {
+    fn send(&mut self, frame: &canopen::Frame) -> Result<(), AdapterError> {
+        self.bench.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<canopen::Frame>, AdapterError> {
+        (self.happens)(self.bench);
+        self.bench.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.bench.now()
+    }
+}
+
+impl Fleet {
+    /// `boards` running boards at this bit rate, which share a bus.
+    ///
+    /// # Panics
+    /// If a board refuses its node-ID, or the firmware was not built.
+    #[must_use]
+    pub fn new(boards: u8, rate: BitRate) -> Self {
+        let mut bench = Bench::of_boards(boards.into());
+        for (board, node) in bench.boards().into_iter().zip(1..) {
+            bench.commission(board, node, rate);
+        }
+        bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
+        bench.power_on();
+        bench.run_ms(50);
+        Self { bench }
+    }
+
+    /// Does this to one of so many frames on the bus from now on, on average.
+    pub fn to_one_in(&mut self, frames: u32, seed: u64, action: FaultAction) {
+        let when = When::OneIn { frames, seed };
+        self.bench.world.inject(Fault { frames: FrameMatch::default(), when, action });
+    }
+
+    /// Updates the first `devices` boards with this program.
+    ///
+    /// # Panics
+    /// If a thread of the update panics.
+    pub fn update(&mut self, devices: u8, file: &Arc<BlockFile>, options: &ManyOptions) -> Update {
+        self.update_while(devices, file, options, &mut |_| {})
+    }
+
+    /// The same while something happens.
+    ///
+    /// # Panics
+    /// If a thread of the update panics.
+    pub fn update_while(
+        &mut self,
+        devices: u8,
+        file: &Arc<BlockFile>,
+        options: &ManyOptions,
+        happens: Happens<'_>,
+    ) -> Update {
+        let began = self.bench.time();
+        let job = |node| {
+            let node = NodeId::new(node).expect("1 to 127");
+            Job::new(node, file.clone(), FlashOptions::default())
+        };
+        let jobs: Vec<Job> = (1..=devices).map(job).collect();
+        let events = Mutex::new(Vec::new());
+        let tell = |device, event| events.lock().expect("no panic").push((device, event));
+        let mut bus = Eventful { bench: &mut self.bench, happens };
+        let results = flash_many(&mut bus, &jobs, options, &tell);
+        let took = Duration::from_nanos((self.bench.time() - began).0 / 1000);
+        Update { took, results, events: events.into_inner().expect("no panic") }
+    }
+}
+
+/// The application, extended to so many KiB, in blocks of the default size.
+#[must_use]
+pub fn file(kib: u32) -> Arc<BlockFile> {
+    Arc::new(blocks(&program(kib), DEFAULT_BLOCK_SIZE))
+}

@@ -1,0 +1,207 @@
+//! Boards that get the same program at the same time, with the real firmware.
+
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use canopen::program::PROGRAM_ID;
+use canopen::{Address, BitRate};
+use coboot_tests::fleet::{file, Fleet, Update};
+use coflash::bus::Adapter as _;
+use coflash::update::event::{Note, Warning};
+use coflash::update::many::ManyOptions;
+use coflash::update::Event;
+use coflash::Error;
+use emulator::bus::fault::FaultAction;
+use emulator::frame::Frame;
+use emulator::time::Span;
+
+const KIB: u32 = 40;
+
+fn one_by_one() -> ManyOptions {
+    ManyOptions::default().together(false)
+}
+
+/// Each device runs the program that it was sent, by its own account.
+fn assert_all_have(fleet: &mut Fleet, devices: u8, crc: u32) {
+    for node in 1..=devices {
+        assert!(!fleet.bench.is_bootloader(node), "node {node}");
+        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
+        assert_eq!(told.unwrap(), crc, "node {node}");
+    }
+}
+
+fn together(update: &Update, device: usize) -> Option<usize> {
+    update.events.iter().find_map(|(number, event)| match event {
+        Event::Note(Note::Together { devices }) if *number == device => Some(*devices),
+        _ => None,
+    })
+}
+
+fn warnings(update: &Update) -> Vec<&Event> {
+    let bad = |event: &&Event| matches!(event, Event::Warning(_) | Event::Retry(_));
+    update.events.iter().map(|(_, event)| event).filter(bad).collect()
+}
+
+#[test]
+fn together_takes_little_longer_than_one_and_one_by_one_much() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(4, BitRate::K1000);
+    let one = fleet.update(1, &file, &ManyOptions::default()).took;
+    let all = fleet.update(4, &file, &ManyOptions::default());
+    assert_eq!((all.done(), warnings(&all)), (4, vec![]));
+    assert!((0..4).all(|device| together(&all, device) == Some(4)));
+    assert!(all.took * 100 <= one * 115, "{:?} for four, {one:?} for one", all.took);
+    assert_all_have(&mut fleet, 4, file.program_crc());
+    let apart = fleet.update(4, &file, &one_by_one());
+    assert_eq!((apart.done(), warnings(&apart)), (4, vec![]));
+    assert!((0..4).all(|device| together(&apart, device).is_none()));
+    assert!(apart.took > all.took * 3 / 2, "{:?} one by one, {:?} together", apart.took, all.took);
+    fleet.bench.assert_nothing_unmodelled();
+}
+
+/// The bus is full with requests for seconds: a heartbeat does not get through, and must not hold
+/// up the answers behind it.
+#[test]
+fn eight_transfers_at_once_leave_every_device_its_answers() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(8, BitRate::K1000);
+    let update = fleet.update(8, &file, &one_by_one());
+    assert_eq!((update.done(), warnings(&update)), (8, vec![]));
+}
+
+#[test]
+fn lost_repeated_and_late_frames_cost_time_and_nothing_else() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(4, BitRate::K1000);
+    let one = fleet.update(1, &file, &ManyOptions::default()).took;
+    fleet.to_one_in(1000, 3, FaultAction::Drop);
+    let all = fleet.update(4, &file, &ManyOptions::default());
+    assert_eq!(all.done(), 4);
+    assert!(all.took * 2 <= one * 3, "{:?} for four with lost frames, {one:?} for one without", all.took);
+    assert_all_have(&mut fleet, 4, file.program_crc());
+    for (seed, action) in [
+        (4, FaultAction::Duplicate),
+        (5, FaultAction::Delay(Span::from_millis(3))),
+        (6, FaultAction::Alter { byte: 4, mask: 0x10 }),
+    ] {
+        let mut fleet = Fleet::new(3, BitRate::K1000);
+        fleet.to_one_in(300, seed, action);
+        let all = fleet.update(3, &file, &ManyOptions::default());
+        assert_eq!(all.done(), 3, "{action:?}: {:?}", warnings(&all));
+        fleet.bench.world.clear_faults();
+        assert_all_have(&mut fleet, 3, file.program_crc());
+    }
+}
+
+/// The bus at 125 kbit/s: answers take eight times as long.
+#[test]
+fn a_slow_bus_is_no_obstacle() {
+    let file = file(20);
+    let mut fleet = Fleet::new(3, BitRate::K125);
+    let all = fleet.update(3, &file, &ManyOptions::default());
+    assert_eq!((all.done(), warnings(&all)), (3, vec![]));
+    assert_all_have(&mut fleet, 3, file.program_crc());
+}
+
+/// One device loses its power for a moment in the middle: the others go on, and it is finished
+/// afterwards, from where it was.
+#[test]
+fn a_device_that_falls_out_is_finished_afterwards() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(3, BitRate::K1000);
+    let usual = fleet.update(3, &file, &ManyOptions::default()).took;
+    let from = fleet.bench.now();
+    let board = fleet.bench.boards()[1];
+    let mut state = 0;
+    let update = fleet.update_while(3, &file, &ManyOptions::default(), &mut |bench| {
+        if state == 0 && bench.now() > from + usual / 2 {
+            bench.world.power_off(board);
+            state = 1;
+        } else if state == 1 && bench.now() > from + usual / 2 + Duration::from_millis(100) {
+            bench.world.power_on(board);
+            state = 2;
+        }
+    });
+    assert_eq!((state, update.done()), (2, 3), "{:?}", warnings(&update));
+    let apart = |(device, event): &&(usize, Event)| {
+        *device == 1 && matches!(event, Event::Warning(Warning::Apart { .. }))
+    };
+    assert_eq!(update.events.iter().filter(apart).count(), 1, "{:?}", update.events);
+    assert_all_have(&mut fleet, 3, file.program_crc());
+}
+
+/// A device without power from the middle on: its outcome is told, and the others have theirs.
+#[test]
+fn a_device_that_stays_away_costs_the_others_nothing() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(3, BitRate::K1000);
+    let usual = fleet.update(3, &file, &ManyOptions::default()).took;
+    let from = fleet.bench.now();
+    let board = fleet.bench.boards()[0];
+    let update = fleet.update_while(3, &file, &ManyOptions::default(), &mut |bench| {
+        if bench.now() > from + usual / 2 {
+            bench.world.power_off(board);
+        }
+    });
+    assert_eq!(update.done(), 2);
+    let failed = update.results[0].as_ref().unwrap_err();
+    assert!(matches!(failed.error, Error::NoAnswer { .. }), "{:?}", failed.error);
+    fleet.bench.world.power_on(board);
+    fleet.bench.run_ms(100);
+    // Its half program is not started, and the next update goes on with it.
+    assert!(fleet.bench.is_bootloader(1));
+    assert_eq!(fleet.update(1, &file, &ManyOptions::default()).done(), 1);
+    assert_all_have(&mut fleet, 3, file.program_crc());
+}
+
+/// Another node uses the COB-ID of the group's requests, or of an answer: before the group's first
+/// download, or in the middle of one.
+#[test]
+fn a_cob_id_that_somebody_else_uses_ends_the_group() {
+    let file = file(KIB);
+    for (id, after) in [(0x6DF, 0), (0x682, 0), (0x6DF, 700)] {
+        let mut fleet = Fleet::new(3, BitRate::K1000);
+        let other = fleet.bench.world.add_host_port(1_000_000);
+        let from = fleet.bench.now();
+        let mut sent = false;
+        let update = fleet.update_while(3, &file, &ManyOptions::default(), &mut |bench| {
+            if !sent && bench.now() >= from + Duration::from_millis(after) {
+                sent = true;
+                bench.world.send(other, Frame::standard(id, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]).unwrap());
+            }
+        });
+        assert!(sent);
+        assert_eq!(update.done(), 3, "{id:X}h after {after} ms: {:?}", warnings(&update));
+        let told = |(_, event): &&(usize, Event)| matches!(event, Event::Warning(Warning::GroupDisturbed));
+        assert_eq!(update.events.iter().filter(told).count(), 3, "{id:X}h after {after} ms");
+        assert_all_have(&mut fleet, 3, file.program_crc());
+    }
+}
+
+/// Ctrl-C in the middle: all updates end, no device keeps the COB-IDs of the group, and the next
+/// update goes on.
+#[test]
+fn a_cancelled_group_goes_on_later() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(3, BitRate::K1000);
+    let usual = fleet.update(3, &file, &ManyOptions::default()).took;
+    let from = fleet.bench.now();
+    let options = ManyOptions::default();
+    let cancelled = options.cancelled.clone();
+    let update = fleet.update_while(3, &file, &options, &mut |bench| {
+        if bench.now() > from + usual / 2 {
+            cancelled.store(true, Ordering::Relaxed);
+        }
+    });
+    for result in &update.results {
+        assert!(matches!(result.as_ref().unwrap_err().error, Error::Cancelled), "{result:?}");
+    }
+    for node in 1..=3 {
+        let request = fleet.bench.session_with(node).read_number(Address::new(0x1201, 1)).unwrap();
+        assert_eq!(request, 0x8000_0000, "node {node}");
+    }
+    let rest = fleet.update(3, &file, &ManyOptions::default());
+    assert_eq!(rest.done(), 3, "{:?}", warnings(&rest));
+    assert!(rest.took * 10 < usual * 9, "{:?} for the rest, {usual:?} for all", rest.took);
+    assert_all_have(&mut fleet, 3, file.program_crc());
+}
