@@ -127,7 +127,7 @@ fn frame(id: u16, data: &[u8]) -> Frame {
 /// Without a second SDO server.
 fn accept([a, b, c]: [u16; 3]) -> Output {
     let [a, b, c] = [a, b, c].map(|id| CobId::new(id).unwrap());
-    Output::Accept([a, b, c, CobId::NONE])
+    Output::Accept([a, b, c, a])
 }
 
 fn send(id: u16, data: &[u8]) -> Output {
@@ -179,7 +179,7 @@ fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {
     let config = Config { lss: None, ..Config::default() };
     let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K500, config);
     let mut bench = Bench { slave, device: Device::default(), now: 0 };
-    let ids = [CobId::NMT, CobId::NMT, CobId::sdo_request(NodeId::new(5).unwrap()), CobId::NONE];
+    let ids = [CobId::NMT, CobId::NMT, CobId::sdo_request(NodeId::new(5).unwrap()), CobId::NMT];
     let boot_up = Output::Send(Frame::of(CobId::new(0x705).unwrap(), &[0]));
     assert_eq!(bench.outputs(), [Output::Accept(ids), Output::Join(BitRate::K500), boot_up]);
     // Switch state global to configuration, inquire node-ID.

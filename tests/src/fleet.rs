@@ -124,3 +124,64 @@ impl Fleet {
 pub fn file(kib: u32) -> Arc<BlockFile> {
     Arc::new(blocks(&program(kib), DEFAULT_BLOCK_SIZE))
 }
+
+/// Large blocks, which need fewer answers.
+const LARGE: usize = 4096;
+
+/// How a program gets to several boards.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Way {
+    /// In one download for all.
+    Together,
+    /// In a download for each, at the same time.
+    OneByOne,
+}
+
+/// One measurement of an update of boards at 1 Mbit/s.
+#[derive(Clone, Copy, Debug)]
+pub struct Measurement {
+    /// The number of boards.
+    pub boards: u8,
+    /// The way.
+    pub way: Way,
+    /// Bytes of a block, including framing.
+    pub block_size: usize,
+    /// One of so many frames is lost; 0 for none.
+    pub lost_one_in: u32,
+    /// From the first request until the last board runs its program.
+    pub took: Duration,
+    /// The duration for one board with the same blocks and no lost frames.
+    pub one: Duration,
+}
+
+/// The rows of the bench: a program of 256 KiB at 1 Mbit/s.
+///
+/// # Panics
+/// If an update fails, or the firmware was not built.
+pub fn measure(mut row: impl FnMut(Measurement)) {
+    let mut fleet = Fleet::new(8, BitRate::K1000);
+    for block_size in [DEFAULT_BLOCK_SIZE, LARGE] {
+        let file = Arc::new(blocks(&program(256), block_size));
+        let mut one = None;
+        for (boards, way, lost_one_in) in [
+            (1, Way::OneByOne, 0),
+            (2, Way::Together, 0),
+            (4, Way::Together, 0),
+            (8, Way::Together, 0),
+            (8, Way::OneByOne, 0),
+            (8, Way::Together, 100_000),
+            (8, Way::Together, 1000),
+            (1, Way::OneByOne, 1000),
+        ] {
+            fleet.bench.world.clear_faults();
+            if lost_one_in != 0 {
+                fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
+            }
+            let options = ManyOptions::default().together(way == Way::Together);
+            let update = fleet.update(boards, &file, &options);
+            assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
+            let (took, one) = (update.took, *one.get_or_insert(update.took));
+            row(Measurement { boards, way, block_size, lost_one_in, took, one });
+        }
+    }
+}

@@ -9,11 +9,12 @@ usage: cargo xtask bench [--json] [--board BOARD] [--yes]
 
 Downloads programs of 64, 256 and 900 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
 time, and prints how long that took beside what the wire and the flash allow at best; how busy the
-bus is while `coflash flash` sends a program; and what it costs or gains to seal and to compress one.
+bus is while `coflash flash` sends a program; what it costs or gains to seal and to compress one; and
+how long several boards on one bus take.
 Then, in real time: what a frame costs the host, in an update over socketcand into a node whose flash
 is a file.
 
-  --json          prints the tables as JSON: downloads, bus, forms, host
+  --json          prints the tables as JSON: downloads, bus, forms, fleets, host
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
 ";

@@ -9,13 +9,14 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::{stm32f407g_disc1, Layout};
 
 use crate::args::Args;
-use crate::{process, timing, workspace, Outcome};
+use crate::{fleet, process, timing, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask diagrams
 
 Draws the pictures in docs/diagrams/: each FILE.dot there by Graphviz, each FILE.timing as a timing
-diagram (xtask/src/timing.rs), and the memory map of the stm32f407g-disc1 from its layout. Needs
+diagram (xtask/src/timing.rs), the memory map of the stm32f407g-disc1 from its layout, and the
+durations of docs/fleet.md from their model (xtask/src/fleet.rs) and docs/bench.md. Needs
 `dot` (Debian's package graphviz). The SVG files are checked in; a test tells when one is older than
 what it is drawn from.
 ";
@@ -50,6 +51,7 @@ pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     // The pictures that need no tool come first.
     write(&path("memory.svg"), &memory_map(&stm32f407g_disc1::LAYOUT))?;
+    write(&path("fleet.svg"), &fleet::picture()?)?;
     for name in sources("timing")? {
         write(&path(&format!("{name}.svg")), &timing_diagram(&name)?)?;
     }
@@ -181,6 +183,8 @@ mod tests {
             let picture = fs::read_to_string(path(&format!("{name}.svg"))).unwrap();
             assert!(picture.starts_with(&mark(&source)), "{name}.svg is old: run `cargo xtask diagrams`");
         }
+        let picture = fs::read_to_string(path("fleet.svg")).unwrap();
+        assert!(picture == fleet::picture().unwrap(), "fleet.svg is old: run `cargo xtask diagrams`");
         let picture = fs::read_to_string(path("memory.svg")).unwrap();
         assert!(
             picture == memory_map(&stm32f407g_disc1::LAYOUT),

@@ -21,6 +21,7 @@ mod eds;
 mod elf;
 mod emulate;
 mod examples;
+mod fleet;
 mod fuzz;
 mod header;
 mod json;

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 
 use canopen::BitRate;
+use coboot_tests::fleet::{self, Way};
 use coboot_tests::throughput::{load, measure, measure_form, Form, Load, Measurement, OfForm};
 
 const RATES: [BitRate; 4] = [BitRate::K125, BitRate::K250, BitRate::K500, BitRate::K1000];
@@ -64,12 +65,57 @@ fn main() -> ExitCode {
             }
         }
     }
+    if !json {
+        println!("\nA program of 256 KiB to several boards at 1 Mbit/s, from the first request until the last board runs it.\n");
+        println!("   boards          way  block size   lost frames     measured   of one board");
+    }
+    let mut fleets = Vec::new();
+    fleet::measure(|row| {
+        if json {
+            fleets.push(fleet_as_json(&row));
+        } else {
+            println!("{}", fleet_as_text(&row));
+        }
+    });
     if json {
-        let forms = forms.join(",\n");
+        let (forms, fleets) = (forms.join(",\n"), fleets.join(",\n"));
         let (rows, loads) = (rows.join(",\n"), loads.join(",\n"));
-        println!("{{\"downloads\": [\n{rows}\n],\n\"bus\": [\n{loads}\n],\n\"forms\": [\n{forms}\n]}}");
+        println!("{{\"downloads\": [\n{rows}\n],\n\"bus\": [\n{loads}\n],\n\"forms\": [\n{forms}\n],\n\"fleets\": [\n{fleets}\n]}}");
     }
     ExitCode::SUCCESS
+}
+
+fn way(row: &fleet::Measurement) -> &'static str {
+    match row.way {
+        Way::Together => "together",
+        Way::OneByOne => "one by one",
+    }
+}
+
+fn fleet_as_text(row: &fleet::Measurement) -> String {
+    let lost = match row.lost_one_in {
+        0 => "none".to_string(),
+        frames => format!("1 in {frames}"),
+    };
+    let share = row.took.as_secs_f64() / row.one.as_secs_f64();
+    format!(
+        "{:>9} {:>12} {:>11} {lost:>13} {:>10.3} s {share:>12.2} x",
+        row.boards,
+        way(row),
+        row.block_size,
+        row.took.as_secs_f64()
+    )
+}
+
+fn fleet_as_json(row: &fleet::Measurement) -> String {
+    format!(
+        "  {{\"boards\": {}, \"way\": \"{}\", \"block_size\": {}, \"lost_one_in\": {}, \"measured_us\": {}}}",
+        row.boards,
+        way(row),
+        row.block_size,
+        row.lost_one_in,
+        row.took.as_micros()
+    )
 }
 
 fn load_as_text(row: &Load) -> String {

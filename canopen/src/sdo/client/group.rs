@@ -15,9 +15,9 @@ pub type Servers = u128;
 /// The most servers of a group.
 pub const SERVERS_MAX: usize = Servers::BITS as usize;
 
-/// How long the answers of single servers are awaited when the others have answered the initiate, or
-/// have acknowledged a whole sub-block, in milliseconds: longer than a server waits for a missing
-/// segment.
+/// How long the answers of single servers are awaited when others have answered the initiate or the
+/// end, or have acknowledged a whole sub-block, in milliseconds: longer than a server waits for a
+/// missing segment.
 const LATE_MS: u32 = 120;
 
 /// A block download to several servers that have the same COB-ID for requests and different ones
