@@ -23,6 +23,7 @@ mod emulate;
 mod examples;
 mod fuzz;
 mod header;
+mod hil;
 mod json;
 mod layout;
 mod links;
@@ -85,6 +86,12 @@ const JOBS: &[Job] = &[
         about: "an emulated board for other programs to talk to",
         help: emulate::HELP,
         run: emulate::run,
+    },
+    Job {
+        name: "hil",
+        about: "the main job and the update suite on a real board, through a debug probe",
+        help: hil::HELP,
+        run: hil::run,
     },
     Job {
         name: "layout",
