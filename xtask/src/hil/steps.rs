@@ -198,7 +198,7 @@ fn damaged_file(bench: &mut Bench) -> Outcome<Verdict> {
 fn damaged(bench: &Bench) -> Outcome<PathBuf> {
     let file = bench.work.join("damaged.blk");
     let mut convert: Command = Coflash::plain();
-    convert.arg("convert").arg(bench.images.join(V2)).args(["--board", bench.board.board, "-o"]).arg(&file);
+    convert.arg("convert").arg(bench.images.join(V2)).args(["--board", bench.board.board]).arg(&file);
     command::succeed(&mut convert, START)?;
     let told = |error| format!("{}: {error}.", file.display());
     let mut bytes = fs::read(&file).map_err(told)?;
