@@ -24,6 +24,7 @@ mod examples;
 mod fleet;
 mod fuzz;
 mod header;
+mod hil;
 mod json;
 mod layout;
 mod links;
@@ -86,6 +87,12 @@ const JOBS: &[Job] = &[
         about: "an emulated board for other programs to talk to",
         help: emulate::HELP,
         run: emulate::run,
+    },
+    Job {
+        name: "hil",
+        about: "the main job and the update suite on a real board, through a debug probe",
+        help: hil::HELP,
+        run: hil::run,
     },
     Job {
         name: "layout",
