@@ -282,9 +282,10 @@ fn what_was_given_up_does_not_go_on() {
     let (ended, _) = recover(cleared.clone(), &image, &file, &options());
     assert!(ended.went_on().is_some() && !ended.began_again(), "{:?}", ended.events);
     cleared.power_on();
-    let mut bench = bench::Bench::new(&mut cleared);
-    assert_eq!((bench.command(bench::CLEAR), bench.command(bench::CLEAR)), (0, 0));
-    drop(bench);
+    {
+        let mut bench = bench::Bench::new(&mut cleared);
+        assert_eq!((bench.command(bench::CLEAR), bench.command(bench::CLEAR)), (0, 0));
+    }
     let (ended, data) = recover(cleared, &image, &file, &options());
     assert!(ended.went_on().is_none(), "{:?}", ended.events);
     assert_eq!(data, file.len());
