@@ -57,8 +57,15 @@ impl Session<'_> {
         let mut bytes = [0; VALUE_MAX];
         let mut upload = Upload::new(self.node, at, Buffer::new(&mut bytes), self.config());
         // A value is short: all of it must arrive within the time.
-        self.run(&mut upload, Doing::Read(at), Patience::InAll, &mut |_| {})?;
-        Ok(upload.sink().filled().to_vec())
+        let doing = Doing::Read(at);
+        match self.run(&mut upload, doing, Patience::InAll, &mut |_| {}) {
+            Ok(()) => Ok(upload.sink().filled().to_vec()),
+            // It ends the transfer of a client that stopped in it, and does not answer this read.
+            Err(Error::Refused { code, .. }) if code == AbortCode::TIMEOUT => {
+                Err(Error::Protocol { doing, code })
+            }
+            Err(error) => Err(error),
+        }
     }
 
     /// Reads a value of any length, by block transfer if the device supports it. Calls `progress`
