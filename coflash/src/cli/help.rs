@@ -107,7 +107,7 @@ const RARE: [&str; 38] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 33] = [
+const EXAMPLES: [(&str, &str); 34] = [
     (
         "",
         "\
@@ -331,6 +331,13 @@ Examples:
   coflash debug break 0x08010204 --node 5",
     ),
     (
+        "conform",
+        "\
+Examples:
+  coflash conform --list
+  coflash conform SDO LSS --node 5 --junit report.xml",
+    ),
+    (
         "ui",
         "\
 Examples:
@@ -401,7 +408,7 @@ mod tests {
     fn every_example_is_understood() {
         let mut count = 0;
         for (name, text) in EXAMPLES {
-            if name == "ui" && !cfg!(feature = "ui") {
+            if name == "ui" && !cfg!(feature = "ui") || name == "conform" && !cfg!(feature = "conform") {
                 continue;
             }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {

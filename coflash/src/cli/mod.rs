@@ -15,6 +15,8 @@ mod access;
 mod adapters;
 mod catch;
 mod config;
+#[cfg(feature = "conform")]
+mod conform;
 mod context;
 mod convert;
 mod debug;
@@ -141,6 +143,8 @@ enum Command {
     Debug(debug::Debug),
     Monitor(monitor::Monitor),
     Shell(shell::Shell),
+    #[cfg(feature = "conform")]
+    Conform(conform::Conform),
     #[cfg(feature = "ui")]
     Ui(ui::Ui),
     Completions(generate::Completions),
@@ -199,6 +203,8 @@ impl Command {
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
             Self::Shell(shell) => shell.run(context, shell_line),
+            #[cfg(feature = "conform")]
+            Self::Conform(conform) => conform.run(context),
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
             Self::Completions(completions) => completions.run(commands()),
