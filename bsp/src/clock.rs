@@ -134,6 +134,7 @@ pub(crate) use registers::raise_voltage;
 /// The clock tree in the registers of the chip.
 #[cfg(target_arch = "arm")]
 mod registers {
+    use cortex_m::peripheral::SCB;
     use shared_abi::reset;
     use stm32f4xx_hal::pac;
 
@@ -148,8 +149,8 @@ mod registers {
     /// RCC_CFGR: the system clock in use, as the chip reports it.
     const SWS_PLL: u32 = 0b10 << 2;
     const SWS: u32 = 0b11 << 2;
-    /// Number of checks of a crystal before it is given up: at 16 MHz and 8 cycles a check this is
-    /// 50 ms, ten times the start-up time of a crystal.
+    /// Number of checks of a crystal or of the regulator before it is given up: at 16 MHz and 8
+    /// cycles a check this is 50 ms, ten times the start-up time of a crystal.
     const PATIENCE: u32 = 100_000;
 
     impl ClockTree {
@@ -223,12 +224,17 @@ mod registers {
         }
     }
 
-    /// Waits until the regulator has reached its scale; that happens when the PLL runs.
+    /// Waits until the regulator has reached its scale; that happens when the PLL runs. If it does
+    /// not reach it, the chip resets: the core must not run faster than the scale allows, and a
+    /// supply that was too weak can be better after the reset.
     fn await_voltage() {
         /// PWR_CSR.
         const VOSRDY: u32 = 1 << 14;
         // SAFETY: reading this register changes nothing.
-        while NEEDS_SCALE_1 && unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY == 0 {}
+        let is_ready = || unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY != 0;
+        if NEEDS_SCALE_1 && !(0..PATIENCE).any(|_| is_ready()) {
+            SCB::sys_reset();
+        }
     }
 
     /// Restores the regulator's reset state. The PLL must be off.

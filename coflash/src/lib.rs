@@ -6,6 +6,7 @@
 //! | [`file`](mod@file) | firmware files: read, checked, converted | |
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
+//! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `bus`, `device`, `file`, `update` |
 //! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device` |
 //! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
 //!
@@ -38,6 +39,8 @@ mod json;
 #[macro_use]
 mod setters;
 
+#[cfg(feature = "agent")]
+pub mod agent;
 pub mod bus;
 #[cfg(feature = "conform")]
 pub mod conform;

@@ -163,7 +163,7 @@ fn read_shows_values_as_what_they_are() {
 #[test]
 fn a_program_is_read_back_where_the_device_allows_it() {
     let folder = Folder::new("read-back");
-    // Every byte there is, and an end inside a segment of 7.
+    // Each value of a byte, and an end inside a segment of 7.
     let program: Vec<u8> = (0..=513_u32).map(|i| (i ^ i >> 8) as u8).collect();
     for knows in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
         let fake = || {
@@ -408,7 +408,8 @@ fn lss_says_what_it_does() {
     }
 }
 
-/// A device without node-ID for one dialogue: it answers as CiA 305 says, and notes its orders.
+/// A device without node-ID for one dialogue: it answers according to CiA 305, and logs its
+/// commands.
 #[derive(Default)]
 struct LssDevice {
     configured: bool,
@@ -556,7 +557,7 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     let done = coflash(&["info", "--config", &named]);
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
-    // The file of the current folder; the command line's own node.
+    // The file in the current folder is used; the node of the command line takes precedence.
     let (bus, server) = serve(quick(BOOTLOADER));
     folder.file("coflash.toml", format!("bus = '{bus}'\nnode = 6\n").as_bytes());
     let mut here = Command::new(env!("CARGO_BIN_EXE_coflash"));
@@ -567,8 +568,7 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
         .env_remove("COFLASH_CONFIG"));
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
-    // In the shell, too; but not for those who are meant by --all, and nobody is given it as a
-    // node-ID.
+    // In the shell, too; but not with --all, and it is not assigned as a node-ID.
     let (bus, server) = serve(quick(BOOTLOADER));
     let config = folder.file("node.toml", b"node = 5\n");
     let done = shell(&["--bus", &bus, "--config", &config], "read 1018/2\n");

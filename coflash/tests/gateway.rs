@@ -187,7 +187,7 @@ fn block_files_go_through_a_gateway() {
         let log: Vec<&str> = log.collect();
         assert_eq!(log[0], "command 80", "{log:?}");
         assert_eq!(log[log.len() - 4..], ["command 01", "command 80", "command 83", "command 01"]);
-        // What stands in the standard: number, network, node, command, index, sub-index, type, value.
+        // By the standard: number, network, node, command, index, sub-index, type, value.
         let lines = lines.lock().unwrap();
         assert_eq!(lines[..2], ["[1] 3 set sdo_timeout 50", "[2] 3 5 r 0x1000 0 d"]);
         assert!(lines.iter().any(|line| line.ends_with("] 3 5 w 0x1F51 1 u8 0x80")), "{lines:?}");
@@ -429,7 +429,7 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
     assert!(words(result).contains("it has not answered for 0.3 s"));
 }
 
-/// A late answer belongs to a command that was given up, and to no other.
+/// A late answer belongs to a command that timed out, and to no other.
 #[test]
 fn a_late_answer_is_not_taken_for_another_ones() {
     let mut count = 0;
@@ -445,7 +445,7 @@ fn a_late_answer_is_not_taken_for_another_ones() {
 
 #[test]
 fn a_gateway_that_goes_away_or_takes_nothing_ends_it() {
-    // It closes the connection directly after the connect, and in the middle of a command.
+    // It closes the connection at once, and in the middle of a command.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let mut gateway = Cia309::connect(&listener.local_addr().unwrap().to_string(), 1).unwrap();
     drop(listener.accept().unwrap());

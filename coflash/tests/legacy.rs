@@ -10,7 +10,7 @@ use std::time::Duration;
 use fake::{Fake, Outcome, BOOTLOADER};
 use tool::{coflash, data, run, serve, Folder};
 
-/// What the system shows of a number: Unix keeps eight bits, Windows all of them.
+/// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {
     if cfg!(windows) {
         number as i32
@@ -26,7 +26,7 @@ fn quick(running: u32) -> Fake {
     fake
 }
 
-/// Table 5 of the older manual and table 10 of the newer one: what ERRORLEVEL is.
+/// Table 5 of the older manual and table 10 of the newer one: the values of ERRORLEVEL.
 #[test]
 fn with_legacy_exit_codes_the_program_ends_with_the_manuals_numbers() {
     let file = data("plain-400.blk");
@@ -97,7 +97,7 @@ fn without_a_device_they_are_the_manuals_too() {
     let far = folder.file("far.hex", hex.replacen(":020000040801F1", ":020000040800F2", 1).as_bytes());
     let board = "stm32f407g-disc1";
     for (arguments, number) in [
-        // No CAN interface (CANopen stack), and none of this kind.
+        // No CAN interface (CANopen stack), and an unknown kind of interface.
         (&["--bus", &closed, "flash", &file][..], 0x6000_101B),
         (&["--bus", "nothing:0", "flash", &file], 0x6000_1019),
         (&["--bus", &closed, "flash", &file, "-N", "128"], 0x6000_0017),
@@ -127,7 +127,7 @@ fn without_a_device_they_are_the_manuals_too() {
     assert_eq!(done.exit, 2, "{}", done.err);
 }
 
-/// Tables 12 and 13, asked for as chapter 5.3 says; no file and no bus is needed.
+/// Tables 12 and 13, printed with the options of chapter 5.3; no file and no bus is needed.
 #[test]
 fn a_question_mark_lists_interfaces_and_bit_rates() {
     let done = coflash(&["flash", "--vxd_type", "?"]);

@@ -84,7 +84,7 @@ fn refusing_command(command: u8, outcome: Outcome, running: u32) -> Fake {
 }
 
 const MISTAKES: &[Mistake] = &[
-    // The bus in the forms that people write.
+    // Common mistakes in the URL of the bus.
     Mistake(
         "scan --bus slcan:/dev/ttyACM0@500",
         Nothing,
@@ -373,7 +373,7 @@ impl Room {
         Self { folder, shim }
     }
 
-    /// The command with what stands for something.
+    /// The command, its placeholders replaced.
     fn words(&self, line: &str, bus: &str, server: &str) -> Vec<String> {
         let quick = "--sdo-timeout 60 --sdo-attempts 2 --boot-timeout 300";
         let at = |name: &str| self.folder.path(name);
@@ -447,14 +447,14 @@ impl Room {
     }
 }
 
-/// A server that says this.
+/// A server that sends this text.
 fn say(says: &'static [u8]) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap().to_string();
     thread::spawn(move || {
         let (mut stream, _): (TcpStream, _) = listener.accept().unwrap();
         let mut bytes = [0; 64];
-        // A serial line that talks has talked before, and goes on.
+        // A device on a serial line sends all the time, before the connection and after it.
         while stream.write_all(says).is_ok() && stream.read(&mut bytes).is_ok_and(|len| len > 0) {}
     });
     address

@@ -203,7 +203,7 @@ fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
         fake.refuses_segment = Some((segment, 0x0C));
         let error = fails(&mut fake);
         assert_eq!(error.number(), 0x6000_0006, "{segment}: {error}");
-        // It is noticed long before the 39 segments are sent.
+        // The tool notices the abort long before the 39 segments are sent.
         let sent = fake.sent.iter().filter(|frame| matches!(frame.data()[0], 1..=0x1F | 0x81..=0x9F)).count();
         assert!(sent <= segment + 16, "{segment}: {sent}");
     }
@@ -230,8 +230,9 @@ fn a_file_for_another_device_erases_nothing() {
         let mut fake = Fake::new(running);
         let right = check(Target { vendor_id: 0x3F, product_code: 1234 });
         run(&mut fake, right).0.unwrap();
-        // At first; bootloader and program on trial, which are compared; and the program with the file. What
-        // block 0 tells is compared without being asked to, but for the vendor-ID, which is any there.
+        // Before the update; bootloader and program on trial, which are compared; and the program
+        // with the file. The identity in block 0 is always compared, except for a vendor-ID of
+        // "any".
         assert_eq!((fake.count("read 1018/1"), fake.count("read 1018/2")), (4, 5));
     }
 }
@@ -247,7 +248,7 @@ fn verify_looks_once_more_at_the_running_program() {
     assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
     let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
     assert_eq!(*last, Phase::VerifiedAgain { crc: file().program_crc() }.into());
-    // A program that tells another CRC once it runs.
+    // A program that reports another CRC while it runs.
     let mut fake = Fake::new(BOOTLOADER);
     fake.crc_of_application = Some(0x1234_5678);
     let (result, events) = run(&mut fake, options);
@@ -352,7 +353,7 @@ fn a_device_that_answers_on_before_it_restarts_is_not_taken_for_one_that_stays()
 #[test]
 fn an_answer_left_over_from_before_is_not_taken_for_one_to_this_request() {
     let mut fake = Fake::new(BOOTLOADER);
-    // The late acknowledge of a segment does not say whose it is.
+    // The late acknowledge of a segment does not name its transfer.
     let late = Frame::of(CobId::new(0x585).unwrap(), &[0x20, 0, 0, 0, 0, 0, 0, 0]);
     fake.inject(late);
     let mut session = Session::new(&mut fake, node(), Timing::default());
@@ -445,7 +446,7 @@ fn a_refusal_without_status_gives_the_abort_code() {
     let text = error.to_string();
     assert!(text.starts_with("node 5 refuses writing block 1: abort 06070012h"), "{text}");
     assert!(error.advice().contains("--block-size"));
-    // Codes that speak of lost frames: once more.
+    // Codes that mean lost frames: the tool tries once more.
     let mut fake = Fake::new(BOOTLOADER);
     fake.on_block = script(1, 1, Outcome::Abort(0x0504_0000));
     assert_eq!(run(&mut fake, FlashOptions::default()).0.unwrap().repeats, 1);
@@ -473,8 +474,7 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
             let mut fake = Fake::new(APPLICATION);
             fake.on_command = script(command, 1, outcome);
             let result = run(&mut fake, FlashOptions::default().trial_run(false)).0;
-            // START is given once: a program that is already running would not know what to do with
-            // it.
+            // START is sent once: a program that already runs may not support it.
             let fatal = command == 0x01 && outcome == Outcome::LoseRequest;
             assert_eq!(result.is_err(), fatal, "{command:02X} {outcome:?} {result:?}");
         }
@@ -521,7 +521,7 @@ fn silence_is_told_and_comes_to_an_end_soon() {
         let error = flash(&mut session, &file(), &FlashOptions::default(), &mut |event| events.push(event))
             .unwrap_err();
         assert_eq!(error.to_string(), "node 5 does not answer (erasing the program)");
-        // The last look takes a second, and what came before the erasure some milliseconds.
+        // The last check takes a second, and the steps before the erase some milliseconds.
         let took = fake.now - began;
         assert!(took >= Duration::from_secs(end) && took < Duration::from_secs(end + 3), "{took:?}");
         let told: Vec<String> = events
@@ -532,7 +532,7 @@ fn silence_is_told_and_comes_to_an_end_soon() {
         let line = format!("no answer for 2 s (erasing the program), waiting up to {end} s");
         assert_eq!(told, [line], "once");
     }
-    // A device that answers all the while has nothing of the kind.
+    // For a device that answers all the time nothing of this is reported.
     let mut fake = Fake::new(BOOTLOADER);
     fake.erase_time = Duration::from_secs(30);
     let (result, events) = run(&mut fake, FlashOptions::default());
@@ -565,8 +565,8 @@ fn an_application_that_takes_the_first_call_for_a_confirmation_is_called_again()
     assert!(took < Timing::default().boot, "not after the time that a restart may take: {took:?}");
 }
 
-/// The call goes through 1F51h/1, whichever program runs and whichever is to be written (manual, steps 3
-/// and 12): an application has no other sub-index as a rule.
+/// The call uses 1F51h/1 for every program that runs or is to be written (manual, steps 3 and 12):
+/// as a rule an application has no other sub-index.
 #[test]
 fn a_second_program_is_written_to_a_device_whose_first_one_runs() {
     let mut fake = Fake::new(APPLICATION);
@@ -647,11 +647,11 @@ fn what_others_say_on_the_bus_is_passed_over() {
 #[test]
 fn answers_that_come_late_do_not_stand_for_others() {
     let mut fake = Fake::new(BOOTLOADER);
-    // Each answer takes longer than the time-out: nothing may ever be taken for done.
+    // Each answer takes longer than the time-out: no step may count as done.
     fake.latency = Duration::from_millis(700);
     assert!(run(&mut fake, FlashOptions::default()).0.is_err());
     assert_eq!(fake.count("command 83"), 0);
-    // With a longer time-out all is well.
+    // With a longer time-out the update succeeds.
     let mut fake = Fake::new(BOOTLOADER);
     fake.latency = Duration::from_millis(700);
     let timing = Timing::default().sdo(Duration::from_secs(2));
@@ -673,10 +673,10 @@ fn cancelling_aborts_the_transfer() {
             }
         });
         assert_eq!(result.unwrap_err().number(), 0x6000_0011);
-        // What is asked then is how it was left.
+        // The requests behind it find out the state of the device.
         let aborts = fake.log.iter().rposition(|entry| entry == "abort 08000000").unwrap();
         assert!(fake.log[aborts + 1..].iter().all(|entry| entry.starts_with("read ")), "{:?}", fake.log);
-        // The next run needs nothing but to be started.
+        // The next run works without any other step.
         run(&mut fake, FlashOptions::default()).0.unwrap();
     }
 }

@@ -19,11 +19,11 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use tool::{coflash, serve, Done, Folder};
 
 const START: u32 = 0x0801_0000;
-/// What the fake has in 1018h.
+/// The identity of the fake device (1018h).
 const VENDOR: u32 = 0x3F;
 const PRODUCT: u32 = 1234;
 
-/// A program with a label at 1E0h, as the page about it has it, and some bytes that can be compressed.
+/// A program with a label at 1E0h (docs/protocol.md), and some bytes that can be compressed.
 fn program() -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..9001_u32).map(|at| (at / 5 % 40) as u8).collect();
     bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
@@ -111,13 +111,13 @@ fn keys_are_made_once_and_are_those_of_openssl() {
     assert_eq!(again.exit, 2);
     assert!(again.err.contains("exists already"), "{}", again.err);
     assert_eq!(room.bytes("root.pem"), before);
-    // The public key alone is there.
+    // Only the public key exists.
     fs::remove_file(&root).unwrap();
     assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &root]).exit, 2);
     assert!(!Path::new(&root).exists());
     room.good(&["key", "new", "--role", "root", "-o", &root, "--force"]);
     assert_ne!(room.bytes("root.pem"), before);
-    // A name that both files would have.
+    // With this name both files would have the same path.
     assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &room.path("a.pub")]).exit, 2);
 
     if let Some(public) = openssl(&["pkey", "-in", &root, "-pubout"]) {
@@ -128,7 +128,7 @@ fn keys_are_made_once_and_are_those_of_openssl() {
         let digits: String = der[12..].iter().map(|byte| format!("{byte:02x}")).collect();
         let shown = json(&["key", "show", &made]);
         assert_eq!((&shown["kind"], &shown["public_key"]), (&"private key".into(), &digits.into()));
-        // A curve of another kind is none.
+        // A key of another curve is no key for coflash.
         openssl(&["genpkey", "-algorithm", "x25519", "-out", &made]).unwrap();
         assert_eq!(coflash(&["key", "show", &made]).exit, 3);
     }
@@ -180,8 +180,7 @@ fn a_value_of_128_bits_makes_a_key() {
     }
 }
 
-/// `--key` of the manual's converter: the program comes out with the key of the same value, and with no
-/// other.
+/// `--key` of the manual's converter: only the key of the same value decrypts the program.
 #[test]
 fn the_converter_encrypts_with_a_value() {
     let room = Room::new("convert");
@@ -216,11 +215,11 @@ fn the_converter_encrypts_with_a_value() {
     assert!(program()[0x300..].chunks_exact(32).all(|plain| !has(plain)));
     room.good(&signed);
     assert_eq!(room.bytes("app.blk"), first, "the same input, the same file");
-    // The image itself is what `seal` makes.
+    // The image is the same as that of `seal`.
     room.good(&[&["convert", &app, &room.path("own.cbs")], &signed[2..]].concat());
     room.seal("sealed.cbs", &["--counter", "7", "--encrypt", &kek]);
     assert_eq!(room.bytes("own.cbs"), room.bytes("sealed.cbs"));
-    // Another identity is that of the command line, and the certificate has its say.
+    // The command line sets another identity, and the certificate is checked against it.
     let done = coflash(&[&signed[..], &["--vid", "1", "--pid", "2"]].concat());
     assert!(done.err.contains("the certificate allows the vendor-ID 0000003Fh"), "{}", done.err);
     for (more, words) in [
@@ -246,8 +245,8 @@ fn word(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
 }
 
-/// Takes blocks apart by the manual's figure: each has its number, its CRC, and the address behind the
-/// one before it. Gives the data of block 0 and what the others carry.
+/// Parses blocks by the manual's figure: each has its number, its CRC, and the address behind the
+/// previous block. Returns the data of block 0 and the data of the others.
 fn unwrapped(blocks: &[Vec<u8>]) -> (Vec<u8>, Vec<u8>) {
     let data = |block: &[u8]| {
         let end = block.len() - 4;
@@ -298,7 +297,7 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
         let size = image.len() as u32;
         let words = [size, VENDOR, PRODUCT, 0x0064_0A01, 1_420_070_400, 0];
         assert_eq!(control, words.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<u8>>());
-        // It is taken for what it carries.
+        // The file counts as the image that is in its blocks.
         let verified = room.verify(name, &["--product", "1234"]);
         assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.err);
         let shown = json(&["show", &room.path(name)]);
@@ -315,14 +314,14 @@ fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
         assert!(converted.exit == 3 && converted.err.contains("is a sealed image"), "{}", converted.err);
     }
     assert_eq!(json(&["show", &room.path("app.cbs")])["blocks"], Value::Null);
-    // The name of the result, and what cannot be.
+    // The name of the result, and options that do not fit together.
     let (app, key) = (room.path("app.hex"), room.path("release.pem"));
     let words = ["seal", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
     room.good(&[&words[..], &["--blocks"]].concat());
     assert!(room.bytes("app.blk").len() > image.len());
     let done = coflash(&[&words[..], &["--blocks", "20"]].concat());
     assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
-    // Whatever is wrong with the blocks, every command says it.
+    // Every command reports an error in the blocks.
     let good = room.bytes("small.blk");
     let mut wrong = good.clone();
     wrong[0x300] ^= 1;
@@ -370,7 +369,7 @@ fn a_program_is_sealed_shown_and_verified() {
     );
     let words = room.good(&["show", &room.path("app.cbs")]).out;
     assert!(words.contains("vendor-ID 0000003Fh, product code 000004D2h"), "{words}");
-    // inspect knows it, too, and other commands do not take it for anything else.
+    // `inspect` recognises it, too, and no other command takes it for another format.
     assert_eq!(room.good(&["inspect", &room.path("app.cbs")]).out, words);
     let converted = coflash(&["convert", &room.path("app.cbs"), &room.path("x.blk")]);
     assert_eq!(converted.exit, 3);
@@ -523,7 +522,7 @@ fn a_module_signs_in_two_steps() {
         let key = coflash::file::sealed::SigningKey::from_pem(&key).unwrap();
         fs::write(&signature, key.sign(&room.bytes("app.tbs"))).unwrap();
     }
-    // In blocks, if it is known where they go.
+    // In blocks, if their addresses are known.
     let attach = ["seal", &out, "--key", &key, "--attach", &signature];
     let done = coflash(&[&attach[..], &["--blocks"]].concat());
     assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
@@ -531,7 +530,7 @@ fn a_module_signs_in_two_steps() {
     room.good(&attach);
     assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
     assert!(unwrapped(&split(&room.bytes("app.blk"))).1 == room.bytes("app.cbs"));
-    // What the tool itself has signed, OpenSSL finds right.
+    // OpenSSL accepts the tool's own signature.
     room.seal("own.cbs", &["--counter", "1"]);
     let own = room.bytes("own.cbs");
     let manifest = usize::from(u16::from_le_bytes([own[4], own[5]]));
@@ -615,7 +614,7 @@ fn a_bootloader_gets_its_keys() {
     ]);
     assert_eq!(again.exit, 3);
     assert!(again.err.contains("the place of the keys"), "{}", again.err);
-    // To any other file keys would mean nothing.
+    // For any other file keys have no meaning.
     let other = room.0.file("other.bin", &self::bootloader(b"CBS2"));
     let out = room.path("none.hex");
     let done = coflash(&[&["provision", &other][..], &words_of(&root), &["-o", &out]].concat());
@@ -642,7 +641,7 @@ fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>,
 #[test]
 fn a_sealed_image_goes_into_a_device_as_it_is() {
     let room = Room::new("flash");
-    // A small one: each frame takes its time.
+    // A small image, because each frame takes time.
     let image = raw::read(&program()[..1024], Some(START)).unwrap();
     room.0.file("app.hex", ihex::emit(&image).as_bytes());
     assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
@@ -658,7 +657,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         assert!(done.out.contains(words), "{words}: {}", done.out);
     }
 
-    // What the device says of it.
+    // The results that the device reports.
     for (status, number, words, advice) in [
         (0x8A, "[0x6000018a]", "the program's signature is wrong", "coflash verify"),
         (0x8C, "[0x6000018c]", "the program is older than the device allows", "--counter"),
@@ -699,7 +698,7 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
     }
 }
 
-/// A device with these objects: in its bootloader, and while an application runs.
+/// A device with these objects in its bootloader, and those while an application runs.
 struct Told {
     bootloader: Vec<((u16, u8), Vec<u8>)>,
     application: Vec<((u16, u8), Vec<u8>)>,
@@ -712,7 +711,7 @@ fn challenge(word: u32) -> ((u16, u8), Vec<u8>) {
     ((0x2002, 1), [&UID[..], &[0x5A; 32], &word.to_le_bytes()].concat())
 }
 
-/// An event in 2003h: number, what, counter, version.
+/// An event in 2003h: number, kind, counter, version.
 fn event(place: u8, words: [u32; 4]) -> ((u16, u8), Vec<u8>) {
     ((0x2003, place), words.into_iter().flat_map(u32::to_le_bytes).collect())
 }
@@ -737,7 +736,7 @@ impl Told {
         Self { bootloader, application }
     }
 
-    /// The same with another value in the bootloader, or without one that is empty.
+    /// The same device with another value in the bootloader; an empty value removes the object.
     fn but(mut self, (at, value): ((u16, u8), Vec<u8>)) -> Self {
         self.bootloader.retain(|(own, _)| *own != at);
         if !value.is_empty() {
@@ -794,7 +793,7 @@ fn a_sealed_image_goes_into_a_device_block_by_block() {
             fake.writes().into_iter().filter(|write| write.starts_with("command")).collect();
         assert_eq!(commands, ["command 80", "command 03", "command 01"]);
     }
-    // Without the option the image goes as it is, whatever file it came in.
+    // Without the option the image is sent unchanged, whatever the form of its file.
     let (done, kept, _) = flashed(&room.path("app.blk"), 0x10000, 0, &[]);
     assert_eq!(done.exit, 0, "{}", done.err);
     assert!(kept == image);
@@ -902,7 +901,7 @@ fn a_device_is_compared_with_a_sealed_image() {
     let (done, _) = compared(BOOTLOADER, forgotten, &[]);
     assert!(done.exit == 0 && done.out.contains("not reported 2003h/1"), "{}{}", done.out, done.err);
 
-    // A bad file is refused before a device is asked, a device that is not there has its own code.
+    // A bad file is refused before a device is asked. For a missing device there is another code.
     let other = room.path("release.pub");
     let done = coflash(&["verify-device", &file, "--root", &other, "--bus", "socketcand://127.0.0.1:1/can0"]);
     assert!(done.exit == 3 && done.err.contains("is not one of the given roots"), "{}", done.err);
@@ -914,7 +913,7 @@ fn a_device_is_compared_with_a_sealed_image() {
     server.join().unwrap();
 }
 
-/// The library's own check of what the commands have made.
+/// The library's own check of the results of the commands.
 #[test]
 fn the_commands_make_what_the_library_verifies() {
     let room = Room::new("library");

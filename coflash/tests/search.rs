@@ -76,7 +76,7 @@ fn a_device_that_is_switched_on_later_is_waited_for_and_caught_in_its_rescue_win
     assert!(matches!(run(&mut late, &FlashOptions::default()).0, Err(Error::NoAnswer { .. })));
 }
 
-/// The same as a separate function: the device is held, and not changed.
+/// The same as a separate command: the device stays in its bootloader, and is not changed.
 #[test]
 fn a_device_that_is_switched_on_is_caught() {
     for (millis, within) in [(0, None), (50, None), (60_037, None), (59_000, Some(Duration::from_secs(60)))] {
@@ -298,8 +298,8 @@ fn a_program_on_trial_that_is_another_device_is_called_back_and_never_released()
             fake.log.iter().filter(|entry| entry.starts_with("command")).cloned().collect();
         (result, commands, fake.running)
     };
-    // What the test's device has anyway; no serial number on one side; a revision of its own; a
-    // product code that says nothing.
+    // The identity of the test's device; no serial number on one side; another revision; a product
+    // code of 0.
     let same: fn(u8) -> Option<Result<u32, u32>> = |_| None;
     for told in [
         Told(same, None),

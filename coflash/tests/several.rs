@@ -204,7 +204,7 @@ fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
     let advice = |frames: &[(u16, &[u8])]| {
         let mut bus = device(5, BOOTLOADER);
         bus.running = None;
-        // Heard a while after the question, when the diagnosis listens.
+        // It comes some time after the request, when the diagnosis listens.
         let frames: Vec<Frame> =
             frames.iter().map(|(id, data)| Frame::of(CobId::new(*id).unwrap(), data)).collect();
         let (url, server) = serve(Chatter { fake: bus, frames, next: Duration::ZERO });
@@ -265,7 +265,7 @@ impl coflash::Adapter for Chatter {
 #[test]
 fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
     let mut slow = device(5, BOOTLOADER);
-    // Each block takes its time, so that there is a middle.
+    // Each block takes some time, so that the signal comes in the middle.
     let (told, heard) = std::sync::mpsc::channel();
     slow.on_block = Box::new(move |block| {
         let _ = told.send(block);
@@ -297,7 +297,7 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
         "{:?}",
         fake.log
     );
-    // And so it can.
+    // The update can be repeated.
     fake.on_block = Box::new(|_| Outcome::Accept);
     let (url, server) = serve(fake);
     let done = coflash(&["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]);

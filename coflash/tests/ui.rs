@@ -73,7 +73,7 @@ impl Ui {
     /// Sends these bytes, and reads all of the answer.
     fn raw(&self, request: &[u8]) -> Answer {
         let mut stream = self.stream();
-        // It may answer, and go, before it has heard all.
+        // It may answer and close the connection before it has received all.
         let _ = stream.write_all(request);
         let mut answer = Vec::new();
         let mut part = [0; 4096];
@@ -91,7 +91,7 @@ impl Ui {
         Answer { status, head: head.to_lowercase(), body: body.to_string() }
     }
 
-    /// A request with these lines in its head, and nothing else but what HTTP wants.
+    /// A request with these header lines and those that HTTP requires.
     fn request(&self, method: &str, path: &str, lines: &[&str], body: &[u8]) -> Answer {
         let mut request = format!("{method} {path} HTTP/1.1\r\nConnection: close\r\n");
         for line in lines {
@@ -223,7 +223,7 @@ fn other_names_and_other_origins_are_turned_away() {
     ] {
         assert_eq!(ui.request("GET", &path, &[&host, line], b"").status, 403, "{line}");
     }
-    // A name of another's that leads here (DNS rebinding).
+    // The name of another server with this address (DNS rebinding).
     for line in
         ["Host: evil.example", &format!("Host: evil.example:{port}"), "Host: 127.0.0.1", "Host: ", "X: y"]
     {
@@ -252,7 +252,7 @@ fn the_page_keeps_to_itself() {
         assert!(!answer.head.contains("unsafe-inline") && !answer.head.contains("set-cookie"), "{what}");
     }
     let page = ui.get("").body;
-    // No script and no style stands in the page, and nothing comes from elsewhere.
+    // The page has no inline script or style, and loads nothing from other servers.
     assert!(page.split("<script").skip(1).all(|script| script.trim_start().starts_with("src=\"")), "{page}");
     assert!(!page.contains("style=") && !page.contains("<style") && !page.contains("javascript:"), "{page}");
     let handler = |word: &&str| word.starts_with("on") && word.contains('=');
@@ -308,7 +308,7 @@ fn what_is_no_request_of_the_page_is_refused_with_words() {
         assert_eq!(send(what, &[kind], b"{}").status, 409, "{what}");
     }
     assert_eq!(ui.get("readback").status, 404);
-    // A head without end, and bytes that are no HTTP.
+    // A header without end, and bytes that are no HTTP.
     let endless = [b"GET / HTTP/1.1\r\nX: ".as_slice(), &vec![b'x'; 200_000]].concat();
     assert!(matches!(ui.raw(&endless).status, 0 | 400 | 431), "a head has its limit");
     ui.raw(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03");
@@ -375,7 +375,7 @@ fn a_sealed_image_shows_what_it_says_or_is_refused_with_what_to_do() {
     let words = shown["inspection"].as_str().unwrap();
     assert!(words.starts_with("sealed image, well-formed") && words.contains("counter      7"), "{words}");
 
-    // For another program than the one that was chosen; it is gone then, as any other file.
+    // The image is for another program than the chosen one: it is refused and removed, as any file.
     let other = ui.post("settings", &json!({ "board": null, "program": 2 }));
     assert_eq!(other.status, 422, "{}", other.body);
     let other = other.json();
@@ -426,7 +426,7 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
     }
 }
 
-/// A device that is still erasing when a test has seen all it wants to see.
+/// A device whose erase takes longer than the test.
 fn slow() -> Fake {
     let mut fake = Fake::new(fake::BOOTLOADER);
     fake.erase_time = Duration::from_secs(3600);
@@ -458,7 +458,7 @@ fn a_second_update_is_refused_while_one_runs() {
         assert!(answer.body.contains("the update of 1 device with app.hex"), "{what}: {}", answer.body);
     }
     assert_eq!(ui.file("other.hex", HEX).status, 409);
-    // It is ended from any tab, and says how it leaves the device.
+    // Any tab can cancel it; the message has the state of the device.
     assert_eq!(ui.post("cancel", &json!({})).status, 200);
     let state = ui.until("the end", |state| state["task"].is_null());
     assert_eq!(state["updates"][0]["phase"], "failed");
@@ -478,11 +478,11 @@ fn the_end_of_the_server_ends_an_update_in_order() {
     ui.until("the update", |state| state["updates"][0]["phase"] == "running");
     let words = ui.finish().expect("an update was running");
     assert!(words.contains("node 5: cancelled") && words.contains("The device: "), "{words}");
-    // The bus is let go.
+    // The bus is closed.
     server.join().unwrap();
 }
 
-/// A bus on which frames follow one another without a pause, until the client goes.
+/// A bus on which frames follow one another without a pause, until the client disconnects.
 fn flood() -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let bus = format!("socketcand://{}/can0", listener.local_addr().unwrap());
@@ -513,7 +513,7 @@ fn a_reader_that_stops_reading_is_dropped() {
     let mut head = [0; 12];
     lazy.read_exact(&mut head).unwrap();
     assert_eq!(&head, b"HTTP/1.1 200");
-    // From here on it reads nothing. Others are served, as often as it takes.
+    // From here on it reads nothing. Other pages are served until it is dropped.
     let began = std::time::Instant::now();
     let mut served = 0;
     while (ui.readers)() > 0 {
@@ -523,7 +523,7 @@ fn a_reader_that_stops_reading_is_dropped() {
         thread::sleep(Duration::from_millis(20));
     }
     assert!(served > 0, "it was a reader at first");
-    // Its place is free again, and one who reads gets events.
+    // Its place is free again, and a page that reads gets events.
     ui.until("an event", |state| state["adapter"]["state"] == "open");
 }
 
@@ -552,7 +552,7 @@ fn more_readers_than_there_are_places_are_refused() {
     ui.until("an event", |state| state["adapter"]["state"] == "closed");
 }
 
-/// The adapter's server goes away and comes back; the page is told both.
+/// The adapter's server ends and starts again; the page gets an event for each.
 #[test]
 fn a_lost_adapter_is_shown_and_opened_again() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -571,7 +571,7 @@ fn a_lost_adapter_is_shown_and_opened_again() {
     assert_eq!(ui.post("scan", &json!({})).status, 409);
     let _second = greet(&listener);
     ui.until("the adapter again", |state| state["adapter"]["state"] == "open");
-    // An adapter that was never there is no loss: it is not tried again.
+    // An adapter that was never open is not tried again.
     ui.post("open", &json!({ "url": "slcan:/no/such/port@500k" }));
     let state = ui.until("the refusal", |state| state["adapter"]["state"] == "closed");
     assert!(state["notice"]["words"].as_str().unwrap().contains("/no/such/port"), "{state}");

@@ -102,7 +102,7 @@ const LIES: [(&str, &str, i32, &[&str]); 26] = [
     ("kvaser:0@500k", "lost", 4, &["is gone", "was unplugged"]),
     ("kvaser:0@500k", "garbage status", 4, &["status -123456"]),
     ("kvaser:0@500k", "bus-off", 5, &["the adapter is bus-off"]),
-    // The counter of sending stays at 128.
+    // The transmit error counter stays at 128.
     ("kvaser:0@500k", "passive", 5, &["no other node acknowledges the adapter's frames"]),
     ("kvaser:0@500k", "silent", 5, &["another node acknowledges the adapter's frames"]),
     ("kvaser:0", "", 2, &["it needs the bit rate of the bus"]),
@@ -128,7 +128,7 @@ fn a_library_that_lies_is_named_and_stops_nothing() {
             });
         }
     });
-    // One that accepts no more frames.
+    // An adapter that accepts no more frames.
     for (folder, bus) in [(&peak, "peak:PCAN_USBBUS1@500k"), (&kvaser, "kvaser:0@500k")] {
         let patient = ["read", "1000", "-N", "5", "--sdo-timeout", "20000"];
         let done = call(folder, "full", &[&["--bus", bus][..], &patient].concat());
@@ -168,7 +168,7 @@ fn a_library_that_is_missing_or_old_is_named_with_where_to_get_it() {
             assert!(done.err.contains(words), "'{words}' is not in\n{}", done.err);
         }
     }
-    // The list is whole without them, and says why.
+    // The list has all others, and the reason why these are missing.
     let done = call(&broken, "", &["adapters", "--json"]);
     let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!((done.exit, json["adapters"].as_array().unwrap().len()), (0, 0));
@@ -196,7 +196,7 @@ fn adapters_are_listed_and_the_only_one_is_taken() {
         let done = call(&peak, lie, &["adapters"]);
         assert!(done.out.contains("peak:PCAN_USBBUS1") && !done.out.contains('\u{1B}'), "{}", done.out);
     }
-    // Virtual channels lead nowhere: the other one is the only one. Said on standard error.
+    // Virtual channels have no bus, so only one channel is left. Standard error says so.
     for (folder, words) in [
         (&peak, "no --bus is given: using the only adapter, peak:PCAN_USBBUS1 (PCAN-USB\u{FFFD}[2J)"),
         (&kvaser, "no --bus is given: using the only adapter, kvaser:0 (Kvaser Leaf Light v2)"),

@@ -396,11 +396,11 @@ impl Cpu {
         self.chip_mut().scs.ipsr = u16::try_from(ipsr).unwrap_or(0);
     }
 
-    /// Thread mode, privileged: sets CONTROL whatever it was. In handler mode afterwards if
-    /// `handler` is not 0.
+    /// Sets CONTROL, whatever it was before. The CPU is in the handler of exception `handler`
+    /// afterwards; 0 is thread mode.
     fn set_mode(&mut self, control: u32, handler: u32) {
-        // Only privileged code may write CONTROL, and only thread mode SPSEL: go to a handler, drop
-        // nPRIV, go to thread mode, write the lot.
+        // Only privileged code may write CONTROL, and only in thread mode SPSEL: go to a handler,
+        // clear nPRIV, go to thread mode, write CONTROL.
         self.set_ipsr(u32::from(HARD_FAULT));
         self.set(RegisterARM::CONTROL, 0);
         self.set_ipsr(0);
@@ -639,7 +639,7 @@ impl Cpu {
         let chip = self.chip_mut();
         let (cycles, instructions) = (chip.clock.cycles, chip.counters.instructions);
         chip.block = (0, 0);
-        // Code that was translated without being counted would run on.
+        // Blocks that were translated without the counter of instructions would run to their ends.
         let _ = self.uc.ctl_flush_tb();
         self.uc.get_data_mut().notes.single = true;
         let result = self.start(1);
@@ -735,17 +735,17 @@ impl Cpu {
             Some(EXCP_INVSTATE) => Exit::Fault(Fault::usage(cfsr::INVSTATE)),
             Some(EXCP_UDEF) | Some(_) => Exit::Fault(Fault::usage(cfsr::UNDEFINSTR)),
             None => match result {
-                // A write may have asked to leave in the very block that ends in WFI.
+                // A write in the block that ends in WFI may have set `leave`.
                 Ok(()) if self.chip().leave && !matches!(self.last_hint(pc), Some(Hint::Wfi)) => Exit::Slice,
                 Ok(()) => Exit::WaitForInterrupt,
-                // Every error of memory goes through a hook that notes a fault; what is left is an
-                // access that the model denies without one.
+                // Every memory error calls a hook that records a fault; the only other error is an
+                // access that the model denies without a hook.
                 Err(_) => Exit::Fault(Fault::bus(cfsr::PRECISERR, None)),
             },
         }
     }
 
-    /// The hint instruction that ended the last block, if the CPU stands right behind it.
+    /// The hint instruction that ended the last block, if the PC is right behind it.
     fn last_hint(&self, pc: u32) -> Option<Hint> {
         let (start, size) = self.chip().block;
         if size == 0 || pc != start.wrapping_add(size) {
@@ -759,7 +759,7 @@ impl Cpu {
         }
     }
 
-    /// Unicorn calls WFE, YIELD, undefined instructions and a clear Thumb bit all by the same name.
+    /// Unicorn reports WFE, YIELD, undefined instructions and a clear Thumb bit as the same error.
     fn invalid(&mut self, pc: u32) -> Exit {
         if self.register(RegisterARM::XPSR) & XPSR_T == 0 {
             return Exit::Fault(Fault::usage(cfsr::INVSTATE));
@@ -774,7 +774,8 @@ impl Cpu {
         }
     }
 
-    /// A block was charged as a whole when it started, but ended at `pc`: gives back the rest.
+    /// The cycles of the whole block were counted when it started, but it ended at `pc`: subtracts
+    /// the rest.
     fn uncharge(&mut self, pc: u32) {
         let chip = self.chip_mut();
         let (start, size) = chip.block;
@@ -930,7 +931,7 @@ impl Cpu {
         if handler && control & !CONTROL_NPRIV == 0 {
             self.set_ipsr(back_to);
         } else {
-            // Thread mode's SPSEL is what the value says; a handler keeps its own (0).
+            // In thread mode SPSEL comes from the value; in a handler it is 0.
             let control = if handler { control & !CONTROL_SPSEL } else { control };
             self.set_mode(control, back_to);
         }
@@ -960,8 +961,8 @@ impl Cpu {
     /// (DDI 0403E B1.5.10).
     pub fn take_fault(&mut self, fault: Fault) -> Entry {
         let mut fault = fault;
-        // A fault while entering a fault's handler escalates once, to HardFault; then there is
-        // nothing higher.
+        // A fault while entering a fault's handler escalates once, to HardFault; a fault after that
+        // locks the CPU up.
         for _ in 0..3 {
             let masks = self.privileged(|cpu| cpu.masks());
             let scs = &mut self.chip_mut().scs;
@@ -1028,7 +1029,7 @@ fn masks(uc: &Unicorn<'_, State>) -> Masks {
 // The hooks of loads and stores never stop the engine themselves: it would put the PC back to the
 // instruction, which then runs twice. They set `Chip::leave`, and the next block does not start. The
 // exception is a store with a precise fault, to which the PC has to point.
-//
+
 /// After a store to a peripheral: a bus error becomes a fault, or is ignored.
 fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
     let Some(address) = uc.get_data_mut().chip.bus_error.take() else { return };
@@ -1037,7 +1038,7 @@ fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
     chip.leave = true;
     match chip.scs.refuse_store(address, masks) {
         RefusedStore::Pended => chip.check_exceptions = true,
-        // A program that has the fault ignored means the store as it is: nothing to report.
+        // The program asks to have the fault ignored: nothing to report.
         RefusedStore::Ignored => drop(chip.unlocated.pop()),
         RefusedStore::Taken => {
             notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
@@ -1046,7 +1047,7 @@ fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
     }
 }
 
-/// Finds the instructions of accesses to peripherals that are to be reported.
+/// Finds the instruction of each access to a peripheral that is to be reported.
 fn locate_reports(uc: &mut Unicorn<'_, State>) {
     while let Some(mut report) = uc.get_data_mut().chip.unlocated.pop() {
         let chip = &uc.get_data().chip;
@@ -1118,18 +1119,18 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     chip.counters.instructions += block.instructions;
 }
 
-/// A look over the instructions of a block.
+/// The properties of a block of instructions that the model needs.
 #[derive(Clone, Copy, Debug, Default)]
 struct Block {
     instructions: u64,
-    /// The first one of the FPU.
+    /// Address of the first FPU instruction.
     fpu: Option<u32>,
-    /// Encoding of the last one; a 16-bit one has zeros above.
+    /// Encoding of the last instruction; the upper half of a 16-bit one is zero.
     last: u32,
 }
 
-/// Remembers the blocks looked at last. Whoever changes code forgets them; a program that changes
-/// its own in RAM is charged for the block as it was.
+/// A cache of the blocks that were inspected. [`Cpu::drop_stale`] clears it when code changes. If a
+/// program changes its own code in RAM, the cycles of the old code are counted.
 struct Blocks(Vec<(u32, u32, Block)>);
 
 impl Default for Blocks {
@@ -1192,8 +1193,9 @@ fn is_flash_busy(chip: &mut Chip) -> bool {
     until > now
 }
 
-/// The translator asks what lies in a page. Memory is where it is, flash also at 0; RAM pages are
-/// executable only once something was executed there, because stores to executable pages are slow.
+/// Unicorn asks for the mapping of a page. Memory is mapped to its own address, and flash also to
+/// address 0. A RAM page becomes executable with the first fetch from it, because stores to
+/// executable pages are slow.
 fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Option<TlbEntry> {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
@@ -1202,16 +1204,15 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     if is_flash(chip, address) {
         let paddr = if address < geometry.flash.size { geometry.flash.base + address } else { address };
         return match kind {
-            // Its own entry, which allows nothing else: the store itself is carried out by its
-            // hook.
+            // A separate entry that allows only writes; the hook of stores carries out the store.
             MemType::WRITE => entry(paddr, Prot::WRITE),
             MemType::READ if is_flash_busy(chip) => {
                 state.notes.flash_busy = true;
                 None
             }
             _ => {
-                // As for RAM: a page that was only read so far must come by here when it is fetched
-                // from, to be noted.
+                // As for RAM: the first fetch from a page that was only read so far must come here,
+                // so that the page is recorded as executed.
                 let executed =
                     &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
                 *executed |= kind == MemType::FETCH;
@@ -1247,7 +1248,7 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     entry(address, Prot::READ | Prot::WRITE)
 }
 
-/// A load or store where nothing is.
+/// A load or store at an address without memory or peripheral.
 fn on_unmapped(uc: &mut Unicorn<'_, State>, kind: MemType, address: u32, size: usize, value: u32) -> bool {
     let pc = read(uc, RegisterARM::PC);
     let state = uc.get_data_mut();
@@ -1263,7 +1264,7 @@ fn on_unmapped(uc: &mut Unicorn<'_, State>, kind: MemType, address: u32, size: u
     false
 }
 
-/// A store to flash, or to what is read-only for good.
+/// A store to flash, or to memory that is always read-only.
 fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, value: u64) -> bool {
     let pc = read(uc, RegisterARM::PC);
     let chip = &mut uc.get_data_mut().chip;
@@ -1278,9 +1279,9 @@ fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, va
     true
 }
 
-/// For a hook in the middle of a block, Unicorn writes down where in an IT block the CPU is, and
-/// leaves it at that. The rest of the block does without; but the next one would begin as if it lay
-/// in that IT block.
+/// When a hook runs in the middle of a block, Unicorn stores the position within an IT block in the
+/// xPSR and does not clear it. The rest of the block does not use it; but the next block would
+/// begin as if it were in that IT block.
 fn forget_it_state(uc: &mut Unicorn<'_, State>) {
     let xpsr = read(uc, RegisterARM::XPSR);
     if xpsr & XPSR_IT != 0 {

@@ -159,8 +159,8 @@ fn scaled(duration: Duration, times: f64) -> Span {
 mod tests {
     use super::*;
 
-    /// Milliseconds of virtual time gone after so many milliseconds of wall clock, looked at every
-    /// `tick`.
+    /// The virtual time, in ms, after so many milliseconds of wall clock, if the pacing is asked
+    /// every `tick`.
     fn run(speed: Speed, wall_ms: u64, tick: u64) -> u64 {
         let start = Instant::now();
         let mut pacer = Pacer::new(speed, start, Time(0));
@@ -230,8 +230,8 @@ mod tests {
         said
     }
 
-    /// A loop that does nothing but look would let the world go on at every look, and keep a core
-    /// busy with that.
+    /// A loop without a pause would advance the world in each round, and use all of a core of the
+    /// host.
     #[test]
     fn an_idle_world_goes_on_five_hundred_times_a_second_at_most() {
         for (speed, most) in [(1.0, 501), (0.25, 501), (10.0, 5_001)] {

@@ -1,4 +1,4 @@
-//! The `emulate` command as a person runs it, with programs of a few hand-assembled instructions.
+//! The `emulate` command as a separate process, with programs of a few instructions.
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -140,7 +140,7 @@ fn serves_clients_until_ctrl_c() {
     assert_eq!(ask(b""), "< hi >");
     assert_eq!(ask(b"< open can0 >"), "< ok >");
     assert_eq!(ask(b"< send 123 1 AB >< rawmode >"), "< ok >");
-    // The program never touches its CAN controller, so nobody acknowledges.
+    // The program does not use its CAN controller, so no node acknowledges.
     let told = lines.by_ref().find(|line| line.contains("123#AB")).unwrap();
     assert!(told.contains("no acknowledge"), "{told}");
     let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
@@ -165,7 +165,7 @@ fn a_reader_that_leaves_is_no_error() {
     assert_eq!(String::from_utf8_lossy(&output.stderr), "");
 }
 
-/// An emulator that runs until it is dropped, and what it says.
+/// An emulator that runs until it is dropped, and its output.
 struct Running {
     child: std::process::Child,
     lines: std::io::Lines<BufReader<std::process::ChildStdout>>,
@@ -183,7 +183,7 @@ impl Running {
         Self { child, lines }
     }
 
-    /// The rest of the first line that begins so.
+    /// Waits for the first line with this beginning; returns the rest of the line.
     fn after(&mut self, prefix: &str) -> String {
         let mut lines = self.lines.by_ref().map_while(Result::ok);
         lines.find_map(|line| line.strip_prefix(prefix).map(str::to_owned)).unwrap()
@@ -276,7 +276,7 @@ fn the_flash_file_keeps_what_was_programmed() {
     assert_eq!(kept.len(), 1 << 20);
     assert_eq!(kept[..4], 0x2000_1000_u32.to_le_bytes());
     assert_eq!(kept[0x1_0000..0x1_0002], [0x00, 0xFF], "the program has programmed a byte");
-    // The file alone is enough now; Ctrl-C and power off write it too.
+    // The file holds the flash now, so no image is named; Ctrl-C and power off write it, too.
     std::fs::write(&file, [&kept[..0x1_0000], &[0xFF; 0xF_0000]].concat()).unwrap();
     let mut board = Running::start(&["--flash", path, "--control", "127.0.0.1:0"]);
     let address = board.after(COMMANDS_AT);
@@ -288,7 +288,7 @@ fn the_flash_file_keeps_what_was_programmed() {
     board.interrupt();
     assert!(std::fs::read(&file).unwrap() == kept, "at the end");
     assert!(!folder.join("flash.bin.new").exists());
-    // What is no flash of this chip stays as it is.
+    // A file that is no flash of this chip is not changed.
     std::fs::write(&file, [0; 1000]).unwrap();
     let output = emulate(&["--flash", path]);
     let text = String::from_utf8(output.stderr).unwrap();
@@ -298,7 +298,7 @@ fn the_flash_file_keeps_what_was_programmed() {
     assert!(String::from_utf8(output.stderr).unwrap().contains("/nowhere/flash.bin cannot be written"));
 }
 
-/// What gdb prints.
+/// The output of gdb.
 #[cfg(feature = "gdb")]
 fn gdb(address: &str, commands: &[&str]) -> String {
     let mut gdb = Command::new("gdb-multiarch");
@@ -309,7 +309,7 @@ fn gdb(address: &str, commands: &[&str]) -> String {
     let output = gdb.stdin(Stdio::null()).output().unwrap_or_else(|error| {
         panic!("gdb-multiarch: {error}. `cargo xtask test` installs it (Debian's package gdb-multiarch).")
     });
-    // What `monitor` answers goes to the standard error.
+    // gdb prints the answer to `monitor` on its standard error.
     [output.stderr, output.stdout].map(|text| String::from_utf8_lossy(&text).into_owned()).concat()
 }
 
@@ -319,7 +319,8 @@ fn gdb(address: &str, commands: &[&str]) -> String {
 const COUNTS: &[u16] =
     &[0x2000, 0x4904, 0x3001, 0x6008, 0xF000, 0xF801, 0xE7FA, 0x3203, 0x4770, 0xBF00, 0x0000, 0x2000];
 
-/// gdb itself: breakpoints, steps, memory, registers, a reset, and time that stands still.
+/// gdb with breakpoints, steps, memory, registers, and a reset; the virtual time stands still while
+/// the machine is halted.
 #[test]
 #[cfg(all(unix, feature = "gdb"))]
 fn gdb_stops_steps_looks_and_changes() {
@@ -387,12 +388,12 @@ fn gdb_stops_steps_looks_and_changes() {
     board.interrupt();
 }
 
-/// What packets of gdb's protocol are made of.
+/// A packet of gdb's protocol.
 #[cfg(feature = "gdb")]
 const NOISE: &[u8] = b"$#+-cmMgGsXZzvqk,;:0123456789abcdef\x03\xFF}*";
 
-/// While it is halted no time goes by; who goes away in the middle of it all lets it go on; rubbish does
-/// no harm.
+/// While the machine is halted no time goes by. When a debugger disconnects at any point, the
+/// machine goes on. Invalid bytes do no harm.
 #[test]
 #[cfg(all(unix, feature = "gdb"))]
 fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
@@ -406,9 +407,9 @@ fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
     let status = control.ask(b"status\n");
     assert!(status.contains("halted by the debugger"), "{status}");
     assert_eq!(control.ask(b"status\n"), status, "time and all stand still");
-    // A second one waits.
+    // A second debugger waits.
     let second = TcpStream::connect(&address).unwrap();
-    // A step, and gone before its answer.
+    // It asks for a step, and disconnects before the answer.
     door.write_all(b"$s#73").unwrap();
     drop(door);
     board.line_with("the board goes on");
@@ -427,7 +428,7 @@ fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
                 NOISE[(random >> 16) as usize % NOISE.len()]
             })
             .collect();
-        // It may hang up on us.
+        // The server may close the connection.
         let _ = door.write_all(packet).and_then(|()| door.write_all(&noise));
         drop(door);
         board.line_with("the board goes on");

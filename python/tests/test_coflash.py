@@ -1,6 +1,7 @@
 """The package against `coboot-node` over TCP (socketcand), as a test bench uses it.
 
-``COBOOT_NODE`` names the program; ``tests/tests/python_package.rs`` builds all of it and runs this.
+``COBOOT_NODE`` names the program; ``tests/tests/python_package.rs`` builds package and program, and
+runs this file.
 """
 
 import ast
@@ -125,7 +126,7 @@ def test_the_file_is_read_before_the_bus_is_opened(tmp_path):
 
 
 def sealed(program=1, cut=0) -> bytes:
-    """A sealed image with a signature of nobody's, by the table of the format (docs/protocol.md)."""
+    """A sealed image with an invalid signature, by the table of the format (docs/protocol.md)."""
     image = bytes([0x5A]) * 600
     manifest = bytearray(176)
     manifest[:8] = b"CBS1" + len(manifest).to_bytes(2, "little") + bytes([1, 0])

@@ -34,7 +34,7 @@ fn built() -> Option<Vec<u8>> {
 fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
     let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);
     fs::create_dir_all(copy.join("src")).expect("the folder can be made");
-    for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/main.rs"] {
+    for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/identity.rs", "src/main.rs"] {
         let text = fs::read_to_string(example().join(file)).expect(file);
         let text = match file {
             // Of another name: cargo takes packages of one name in a folder for the same one.

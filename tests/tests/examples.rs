@@ -68,42 +68,53 @@ fn each_is_installed_and_updates_itself_over_socketcand() {
     if !is_board_of_examples() {
         return;
     }
-    for versions in EXAMPLES {
-        let mut endpoint = Endpoint::new(empty_board());
-        let url = endpoint.url();
-        let mut crcs = Vec::new();
-        for (version, name) in (1..).zip(versions) {
-            assert_eq!(label_of(name), Label::new(0, 0x4007_D151, version), "{name}");
-            let board = ["--verify", "--board", stm32f407g_disc1::LAYOUT.board];
-            let mut command = coflash();
-            command.args(["--bus", &url, "flash"]).arg(firmware::dir().join(name)).args(board);
-            // The second time the running program gets the command to return to the bootloader.
-            let output = endpoint.run(&mut command);
-            assert!(output.status.success(), "{name}: {}", text(&output));
-            let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
-            assert!(output.status.success(), "{name}: {}", text(&output));
-            assert!(text(&output).contains("an application"), "{name}: {}", text(&output));
-            let mut session = endpoint.bench.session();
-            assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "{name} runs");
-            crcs.push(session.read_number(CRC).unwrap());
-        }
-        assert_ne!(crcs[0], crcs[1], "another program");
-        let bench = &mut endpoint.bench;
-        bench.power_off();
-        bench.run_ms(500);
-        bench.power_on();
-        bench.await_program(1000);
-        assert!(!bench.is_bootloader(NODE), "it starts by itself");
-        assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1]);
-        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-        bench.await_boot_up(1000);
-        assert!(bench.is_bootloader(NODE));
-        assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1], "the bootloader says the same");
-        let known: &[u32] = if versions[0] == "example-embassy.elf" { &OF_EMBASSY } else { &[] };
-        let reports = bench.world.machine_mut(bench.device).reports();
-        let others: Vec<_> = reports.iter().filter(|report| !known.contains(&report.address)).collect();
-        assert!(others.is_empty(), "{}: {others:#?}", versions[0]);
+    EXAMPLES.into_iter().for_each(install_and_update);
+}
+
+/// A new project of the template is updated to the example that the template is.
+#[test]
+#[ignore = "needs the image that `cargo xtask examples template` builds"]
+fn a_project_of_the_template_is_installed_and_updates_itself() {
+    if is_board_of_examples() {
+        install_and_update(["example-template.elf", "example-no-stack-v2.elf"]);
     }
+}
+
+fn install_and_update(versions: [&str; 2]) {
+    let mut endpoint = Endpoint::new(empty_board());
+    let url = endpoint.url();
+    let mut crcs = Vec::new();
+    for (version, name) in (1..).zip(versions) {
+        assert_eq!(label_of(name), Label::new(0, 0x4007_D151, version), "{name}");
+        let board = ["--verify", "--board", stm32f407g_disc1::LAYOUT.board];
+        let mut command = coflash();
+        command.args(["--bus", &url, "flash"]).arg(firmware::dir().join(name)).args(board);
+        // The second time the running program gets the command to return to the bootloader.
+        let output = endpoint.run(&mut command);
+        assert!(output.status.success(), "{name}: {}", text(&output));
+        let output = endpoint.run(coflash().args(["--bus", &url, "info"]));
+        assert!(output.status.success(), "{name}: {}", text(&output));
+        assert!(text(&output).contains("an application"), "{name}: {}", text(&output));
+        let mut session = endpoint.bench.session();
+        assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "{name} runs");
+        crcs.push(session.read_number(CRC).unwrap());
+    }
+    assert_ne!(crcs[0], crcs[1], "another program");
+    let bench = &mut endpoint.bench;
+    bench.power_off();
+    bench.run_ms(500);
+    bench.power_on();
+    bench.await_program(1000);
+    assert!(!bench.is_bootloader(NODE), "it starts by itself");
+    assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1]);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    assert!(bench.is_bootloader(NODE));
+    assert_eq!(bench.session().read_number(CRC).unwrap(), crcs[1], "the bootloader says the same");
+    let known: &[u32] = if versions[0] == "example-embassy.elf" { &OF_EMBASSY } else { &[] };
+    let reports = bench.world.machine_mut(bench.device).reports();
+    let others: Vec<_> = reports.iter().filter(|report| !known.contains(&report.address)).collect();
+    assert!(others.is_empty(), "{}: {others:#?}", versions[0]);
 }
 
 /// When they reset, the answer to 80h is complete on the bus, and 10 ms more have passed.

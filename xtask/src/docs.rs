@@ -125,6 +125,11 @@ pub fn check(shown: &Shown) -> Option<String> {
             let there = package.is_none_or(|name| is_package(name));
             (!there).then(|| format!("there is no package {}", package.unwrap_or(&"")))
         }
+        ["cargo", "generate", "--path", folder, ..] => {
+            let template = folder.strip_prefix("coboot/").unwrap_or(folder);
+            let there = workspace::root().join(template).join("cargo-generate.toml").exists();
+            (!there).then(|| format!("there is no template {folder}"))
+        }
         [program, rest @ ..] if program.contains('/') || program.starts_with("python") => {
             // An interpreter or a script, and its script argument.
             let ours = |word: &&&str| word.ends_with(".py") || word.ends_with("/run");

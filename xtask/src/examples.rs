@@ -9,7 +9,7 @@ use shared_abi::layout::{stm32f407g_disc1, Layout};
 
 use crate::args::Args;
 use crate::build::report;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part, Setup};
 use crate::{process, workspace, Outcome};
 
 pub const HELP: &str = "\
@@ -28,6 +28,8 @@ target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all 
   embassy-v2    the same as version 2
   rtic          Rust on RTIC, with a CANopen stack of its own
   rtic-v2       the same as version 2
+  template      a new project, which `cargo generate` makes of no-stack. Only if it is named: the first time
+                cargo-generate is built, which takes some minutes
 
   --yes         installs what is missing with sudo
 ";
@@ -51,6 +53,8 @@ enum Tools {
     Cmake { toolchain: &'static str, version: u32 },
     /// Cargo: the program of this name, with features of its package.
     Cargo { program: &'static str, features: &'static str },
+    /// `cargo generate` with the folder as the template, then Cargo.
+    Template,
 }
 
 const EXAMPLES: &[Example] = &[
@@ -88,7 +92,11 @@ const EXAMPLES: &[Example] = &[
         folder: "rtic",
         tools: Tools::Cargo { program: "rtic-example", features: "version-2" },
     },
+    Example { name: "template", folder: "no-stack", tools: Tools::Template },
 ];
+
+/// What makes a project of a template, and its version.
+const GENERATE: (&str, &str) = ("cargo-generate", "0.23.7");
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
@@ -101,12 +109,12 @@ pub fn run(mut args: Args) -> Outcome {
     chosen.into_iter().try_for_each(build)
 }
 
-/// Builds all examples, and prints their sizes. The tools must be installed.
+/// Builds all examples but the template, and prints their sizes. The tools must be installed.
 ///
 /// # Errors
 /// When an example does not build, or is not an image of its board.
 pub fn all() -> Outcome {
-    EXAMPLES.iter().try_for_each(build)
+    EXAMPLES.iter().filter(|example| example.tools != Tools::Template).try_for_each(build)
 }
 
 fn by_name(name: &str) -> Outcome<&'static Example> {
@@ -122,6 +130,7 @@ fn build(example: &Example) -> Outcome {
     let built = match example.tools {
         Tools::Cmake { toolchain, version } => cmake(&folder, &work.join(example.name), toolchain, version)?,
         Tools::Cargo { program, features } => cargo(&folder, &work.join("rust"), program, features)?,
+        Tools::Template => template(&folder, &work)?,
     };
     let images = workspace::firmware_dir(BOARD);
     let image = images.join(format!("example-{}.elf", example.name));
@@ -159,9 +168,44 @@ fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<P
     Ok(work.join(workspace::TARGET).join("release").join(program))
 }
 
+/// Makes a project of the template in `folder` and builds it; returns the program.
+fn template(folder: &Path, work: &Path) -> Outcome<PathBuf> {
+    const NAME: &str = "from-template";
+    let (tool, version) = GENERATE;
+    let tool = setup::pinned_tool(tool, version, &[])?;
+    let project = work.join(NAME);
+    if project.exists() {
+        fs::remove_dir_all(&project)
+            .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(&project)))?;
+    }
+    fs::create_dir_all(work)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(work)))?;
+    let house = workspace::root().display().to_string().replace('\\', "/");
+    let mut generate = Command::new(tool);
+    // `--no-workspace`: the project is below the repository, but no member of its workspace.
+    generate.args(["generate", "--silent", "--vcs", "none", "--no-workspace", "--name", NAME]);
+    generate.arg("--path").arg(folder).arg("--destination").arg(work);
+    for answer in [
+        format!("board={}", BOARD.board),
+        "vendor_id=0x0".into(),
+        "product_code=0x4007D151".into(),
+        format!("coboot={house}"),
+    ] {
+        generate.args(["--define", &answer]);
+    }
+    process::output(&mut generate)?;
+    // The versions that the example is tested with; cargo writes the project's name into the copy.
+    fs::copy(folder.join("Cargo.lock"), project.join("Cargo.lock"))
+        .map_err(|error| format!("{} cannot be written to: {error}.", workspace::shown(&project)))?;
+    let mut cargo = process::cargo_on(&project, "build");
+    cargo.current_dir(&project).args(["--release", "--target-dir"]).arg(work.join("rust"));
+    process::output(&mut cargo)?;
+    Ok(work.join("rust").join(workspace::TARGET).join("release").join(NAME))
+}
+
 #[cfg(test)]
 mod tests {
-    use shared_abi::layout::Image;
+    use shared_abi::layout::{self, Image};
 
     use super::*;
 
@@ -187,6 +231,44 @@ mod tests {
             let path = workspace::root().join("examples").join(example.folder).join("CMakeLists.txt");
             let line = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
             assert!(fs::read_to_string(&path).unwrap().contains(&line), "{}: {line}", path.display());
+        }
+    }
+
+    /// Each file of the template is the example's, with the answers that fit the example.
+    #[test]
+    fn the_template_is_the_example() {
+        let folder = workspace::root().join("examples/no-stack");
+        let read = |file: &str| fs::read_to_string(folder.join(file)).unwrap();
+        for file in ["Cargo.toml", "src/identity.rs"] {
+            let mut text = read(&format!("{file}.liquid"));
+            // The crates of coboot from a folder, not from a git repository.
+            while let Some((before, condition)) = text.split_once("{% if ") {
+                let (_, otherwise) = condition.split_once("{% else %}").unwrap();
+                let (path, after) = otherwise.split_once("{% endif %}").unwrap();
+                text = format!("{before}{path}{after}");
+            }
+            for (question, answer) in [
+                ("project-name", "no-stack"),
+                ("coboot", "../.."),
+                ("vendor_id", "0x0"),
+                ("product_code", "0x4007D151"),
+            ] {
+                text = text.replace(&format!("{{{{ {question} }}}}"), answer);
+            }
+            assert_eq!(text, read(file), "{file}");
+        }
+    }
+
+    /// The boards that the template offers exist, and have the chip of its program.
+    #[test]
+    fn the_template_offers_boards_that_there_are() {
+        let path = workspace::root().join("examples/no-stack/cargo-generate.toml");
+        let text = fs::read_to_string(path).unwrap();
+        let choices = text.lines().find_map(|line| line.strip_prefix("choices = ")).unwrap();
+        let names: Vec<_> = choices.split('"').skip(1).step_by(2).collect();
+        assert_eq!(names.first(), Some(&BOARD.board));
+        for name in names {
+            assert_eq!(layout::by_name(name).expect(name).chip, BOARD.chip, "{name}");
         }
     }
 

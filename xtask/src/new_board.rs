@@ -12,9 +12,9 @@ use crate::{workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask new-board NAME --chip CHIP
 
-Lays down the files of a port, with numbered steps to go through: the memory map, what is on the board, and
-the header with the same numbers for the application in C. Nothing else has to be changed. They compile as
-they are, with clocks that the chip can do and pins that each of its packages has; docs/porting.md goes on from there.
+Creates the files of a port, with numbered steps to go through: the memory map, the board file, and the
+header with the same numbers for the application in C. Nothing else has to be changed. The files compile as
+they are, with clocks that the chip allows and pins that each of its packages has. docs/porting.md has the next steps.
 
   NAME            of the board, as it will be given to --board: small letters, digits and hyphens
   --chip CHIP     its chip as it is ordered, STM32F407VGT6: any STM32F4 with CAN controllers
@@ -31,7 +31,7 @@ pub fn run(mut args: Args) -> Outcome {
     let files = files(&name, chip)?;
     for (path, _) in &files {
         if root.join(path).exists() {
-            return Err(format!("{path} is there already; remove it, or choose another name."));
+            return Err(format!("{path} exists already; remove it, or choose another name."));
         }
     }
     for (path, text) in &files {
@@ -141,11 +141,11 @@ pub const LAYOUT: Layout = Layout {{
     // Step 1: the bootloader. 32 KiB are two sectors of 16 KiB on every chip of the family.
     bootloader: {},
     callgate_offset: 0x40,
-    // Step 2: the two homes of the parameters, a sector each.
+    // Step 2: the two sectors of the parameters.
     parameters: [{}, {}],
-    // Step 3: the programs, whole sectors each. One has all that is left.
+    // Step 3: the programs, whole sectors each. Here one program has the rest of the flash.
     programs: &[{}],
-    // Step 4: the RAM; the last 64 bytes of the chip's are for handoff and warm-start cell.
+    // Step 4: the RAM; the chip's last 64 bytes of it are for handoff and warm-start cell.
     ram: {},
     handoff: {},
     warm_start: {},
@@ -207,7 +207,7 @@ use crate::clock::ClockTree;
 use crate::{{Identity, Strap}};
 
 // Step 5: vendor-ID, product code and names. The product code tells your product from others.
-/// What the device says of itself.
+/// The identity that the device reports.
 pub const IDENTITY: Identity = Identity {{
     vendor_id: 0,
     product_code: 0,
@@ -217,16 +217,16 @@ pub const IDENTITY: Identity = Identity {{
 }};
 
 // Step 6: the node-ID of a new device.
-/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
-/// setting services.
+/// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
+/// layer setting services (LSS).
 pub const NODE_ID: u8 = 1;
 
 // Step 7: the bit rate of a new device.
-/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it by
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
-// Step 8: the crystal, or the clock at OSC_IN with `hse_bypass`, and what the PLL makes of it.
+// Step 8: the crystal, or the clock at OSC_IN with `hse_bypass`, and the numbers of the PLL.
 /// {mhz} MHz from a crystal of 8 MHz; {} MHz on APB1 make each bit rate of CiA 301.
 pub const CLOCK_TREE: ClockTree = ClockTree {{
     hse: 8_000_000,
@@ -267,10 +267,10 @@ mod pins {{
     use crate::Board;
 
     // Step 11: the LED, its pin here and in `init`.
-    /// The LED that shows life.
+    /// The LED that blinks while the device works.
     pub type Led = Pin<'C', 13, Output>;
 
-    // Step 12: the UART for words while you port, its pins in `init`.
+    // Step 12: the UART for messages while you port, its pins in `init`.
     uart! {{
         /// The UART, on PA2 and PA3. It is set up with the feature `uart` alone.
         USART2
@@ -316,7 +316,7 @@ fn c_header(name: &str, chip: &Geometry) -> String {
 /* Step 17: the crystal of step 8. */
 #define HSE_HZ UINT32_C(8000000)
 #define HSE_BYPASS 0
-/* Step 18: what the device says of itself, as in step 5. */
+/* Step 18: the identity, as in step 5. */
 #define VENDOR_ID UINT32_C(0)
 #define PRODUCT_CODE UINT32_C(0)
 #define REVISION UINT32_C(0x00010000)

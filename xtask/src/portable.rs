@@ -7,8 +7,8 @@ pub const HELP: &str = "\
 usage: cargo xtask portable [--strict]
 
 Checks that coflash and coboot-node compile for Windows and macOS. It compiles and does not link, so it
-needs the Rust libraries of those systems (added by rustup) and nothing else of them. Where they cannot
-be had, a line says so and that system is left out.
+needs the Rust libraries of those systems (added by rustup) and nothing else of them: coflash without
+TLS, which is partly C. Where they cannot be had, a line says so and that system is left out.
 
   --strict        a system that was left out is a failure
 ";
@@ -17,6 +17,8 @@ be had, a line says so and that system is left out.
 const TARGETS: [&str; 2] = ["x86_64-pc-windows-gnu", "aarch64-apple-darwin"];
 /// The packages that must compile there.
 const PACKAGES: [&str; 2] = ["coflash", "coboot-node"];
+/// The default features of coflash without `tls`.
+const FEATURES: &str = "coflash/cli,coflash/ui,coflash/agent,coflash/peak,coflash/kvaser,coflash/gs_usb";
 
 pub fn run(mut args: Args) -> Outcome {
     let strict = args.flag("--strict");
@@ -30,7 +32,7 @@ pub fn run(mut args: Args) -> Outcome {
             continue;
         }
         let mut check = process::cargo("check");
-        check.args(["--target", target]);
+        check.args(["--target", target, "--no-default-features", "--features", FEATURES]);
         for package in PACKAGES {
             check.args(["--package", package]);
         }
@@ -47,5 +49,22 @@ pub fn run(mut args: Args) -> Outcome {
         ([], missing) if strict => Err(format!("left out: {}.", missing.join(", "))),
         ([], _) => Ok(()),
         (broken, _) => Err(format!("does not compile for {}.", broken.join(", "))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_tls_is_left_out() {
+        let manifest = include_str!("../../coflash/Cargo.toml");
+        let default = manifest.lines().find_map(|line| line.strip_prefix("default = ")).unwrap();
+        let named = FEATURES.split(',').map(|feature| feature.trim_start_matches("coflash/"));
+        let mut named: Vec<String> = named.chain(["tls"]).map(|feature| format!("{feature:?}")).collect();
+        let mut all: Vec<&str> = default.trim_matches(['[', ']']).split(", ").collect();
+        named.sort();
+        all.sort_unstable();
+        assert_eq!(named, all);
     }
 }

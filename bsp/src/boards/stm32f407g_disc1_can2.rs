@@ -3,7 +3,7 @@
 use crate::clock::ClockTree;
 use crate::{Identity, Pull, Strap};
 
-/// What the device says of itself.
+/// The identity that the device reports.
 pub const IDENTITY: Identity = Identity {
     vendor_id: 0,
     product_code: 0x4007_D151,
@@ -12,11 +12,11 @@ pub const IDENTITY: Identity = Identity {
     hardware_version: "MB997",
 };
 
-/// Node-ID of a device that was never told another one, 1 to 127; 255 for one that waits for layer
-/// setting services.
+/// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
+/// layer setting services (LSS).
 pub const NODE_ID: u8 = 1;
 
-/// Bit rate of a device that was never told another one, in bit/s; 0 for one that finds it out by
+/// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it by
 /// listening.
 pub const BIT_RATE: u32 = 125_000;
 
@@ -58,7 +58,7 @@ mod pins {
     use crate::uart::Port;
     use crate::{can_controllers, Board};
 
-    /// The LED that shows life: LD4, green, high is on.
+    /// The LED that blinks while the device works: LD4, green, high is on.
     pub type Led = Pin<'D', 12, Output>;
 
     uart! {

@@ -107,7 +107,7 @@ const RARE: [&str; 38] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 34] = [
+const EXAMPLES: [(&str, &str); 35] = [
     (
         "",
         "\
@@ -345,6 +345,13 @@ Examples:
   coflash ui --bus socketcan:can0 --port 8080 --no-open",
     ),
     (
+        "agent",
+        "\
+Examples:
+  coflash agent --hawkbit https://hawkbit.example.com
+  coflash agent --devices line.toml --once",
+    ),
+    (
         "completions",
         "\
 Examples:
@@ -408,7 +415,10 @@ mod tests {
     fn every_example_is_understood() {
         let mut count = 0;
         for (name, text) in EXAMPLES {
-            if name == "ui" && !cfg!(feature = "ui") || name == "conform" && !cfg!(feature = "conform") {
+            if name == "ui" && !cfg!(feature = "ui")
+                || name == "agent" && !cfg!(feature = "agent")
+                || name == "conform" && !cfg!(feature = "conform")
+            {
                 continue;
             }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {

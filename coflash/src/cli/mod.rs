@@ -13,6 +13,8 @@ use self::values::base_id;
 
 mod access;
 mod adapters;
+#[cfg(feature = "agent")]
+mod agent;
 mod catch;
 mod config;
 #[cfg(feature = "conform")]
@@ -147,6 +149,8 @@ enum Command {
     Conform(conform::Conform),
     #[cfg(feature = "ui")]
     Ui(ui::Ui),
+    #[cfg(feature = "agent")]
+    Agent(agent::Agent),
     Completions(generate::Completions),
     Man(generate::Manual),
 }
@@ -207,6 +211,8 @@ impl Command {
             Self::Conform(conform) => conform.run(context),
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
+            #[cfg(feature = "agent")]
+            Self::Agent(agent) => agent.run(context),
             Self::Completions(completions) => completions.run(commands()),
             Self::Man(manual) => manual.run(context, commands()),
         }

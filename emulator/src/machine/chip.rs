@@ -567,16 +567,24 @@ impl Chip {
     }
 
     /// The deadline or the next event, whichever comes first. An event that is due already is not
-    /// counted, because it was processed.
+    /// counted: either it was processed, or the CPU leaves for it.
     #[must_use]
     pub fn next_stop(&self) -> Time {
+        self.stop_before(self.next_event())
+    }
+
+    fn stop_before(&self, event: Option<Time>) -> Time {
         let now = self.now();
-        self.next_event().filter(|&event| event > now).map_or(self.deadline, |event| event.min(self.deadline))
+        event.filter(|&event| event > now).map_or(self.deadline, |event| event.min(self.deadline))
     }
 
     /// Sets the end of the CPU's run to the deadline or the next event, whichever comes first.
     pub fn limit_slice(&mut self) {
-        let until = self.next_stop();
+        self.end_slice_at(self.next_event());
+    }
+
+    fn end_slice_at(&mut self, event: Option<Time>) {
+        let until = self.stop_before(event);
         self.slice_end = self.clock.cycle_at(until);
     }
 
@@ -857,16 +865,14 @@ impl Chip {
         Ok(())
     }
 
-    /// A write may have raised a line, started something, or ended something.
+    /// A write may have raised an interrupt line, or have started or ended something. An event that
+    /// has come due within the block that writes is not processed yet: the CPU leaves for it.
     fn after_write(&mut self) {
         self.update_lines();
-        self.limit_slice();
-        // What came due within the block that writes has not happened yet, and no slice would end
-        // for it any more.
         let now = self.now();
-        let tims = self.tims.iter().filter_map(Peripheral::next_event);
-        let usarts = self.usarts.iter().filter_map(Peripheral::next_event);
-        self.leave |= tims.chain(usarts).any(|event| event <= now);
+        let next = self.next_event();
+        self.leave |= next.is_some_and(|event| event <= now);
+        self.end_slice_at(next);
     }
 
     /// The reset bits of the modelled blocks: each sits 20h before the enable bit.

@@ -475,8 +475,8 @@ mod tests {
         assert_eq!(rcc.read(0x00, Time(u64::MAX)).unwrap() & CR_HSERDY, 0);
     }
 
-    /// What one chip of the family has, another has not: port I of the F407, the clock gates of the
-    /// F446.
+    /// The lines of the family have different enable bits: port I of the F407, the clock gates of
+    /// the F446.
     #[test]
     fn registers_and_bits_are_those_of_the_chip() {
         const CKGATENR: u32 = 0x90;

@@ -552,8 +552,9 @@ mod tests {
         assert_eq!(tim.next_event(), None);
     }
 
-    /// What a driver of an operating system's time does: the range of 16 bits in two halves, and an
-    /// alarm. Section 18.4.5: CCxIF is set when the counter matches.
+    /// The use of a timer as the clock of an operating system: an interrupt in the middle and at
+    /// the end of the 16-bit range, and an alarm. Section 18.4.5: CCxIF is set when the counter
+    /// matches.
     #[test]
     fn two_halves_and_an_alarm() {
         let set_up =

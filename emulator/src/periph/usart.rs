@@ -613,8 +613,8 @@ mod tests {
         assert!(line(&usart).is_empty());
     }
 
-    /// Section 30.3.3: the register keeps what is in it, what comes is lost, and a read of SR and
-    /// one of DR clear ORE.
+    /// Section 30.3.3, overrun: the data register keeps its character, the new character is lost,
+    /// and a read of SR and then of DR clears ORE.
     #[test]
     fn a_character_that_nobody_took_stays_and_the_next_is_lost() {
         let mut usart = on(1 << 5);
@@ -680,8 +680,8 @@ mod tests {
         }
     }
 
-    /// What the outside sends while the chip resets comes whether or not anybody hears it; without
-    /// power the line is dead.
+    /// Characters from outside go on over the line while the chip resets; without power nothing is
+    /// sent.
     #[test]
     fn the_outside_knows_of_no_reset() {
         let mut usart = on(0);

@@ -256,7 +256,7 @@ pub fn frame_element(at: Time, frame: &Frame) -> String {
 mod tests {
     use super::*;
 
-    /// Feeds a whole conversation; the answers and what was sent.
+    /// Feeds a whole conversation; returns the answers and the frames to send.
     fn talk(session: &mut Session, text: &[u8]) -> (Vec<String>, Vec<String>) {
         let mut splitter = Splitter::default();
         let (mut answers, mut sent) = (Vec::new(), Vec::new());

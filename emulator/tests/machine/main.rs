@@ -1,5 +1,5 @@
-//! The machine from outside: hand-assembled programs, and what the architecture and the reference
-//! manual say of them.
+//! Tests of the machine through its public interface. The programs are machine code with listings;
+//! the expected results come from the architecture and the reference manuals.
 
 #[rustfmt::skip]
 mod programs;
@@ -13,7 +13,7 @@ const MS: u64 = 1_000_000_000;
 const STACK: u32 = 0x2001_0000;
 /// The programs log here.
 const OUT: u32 = 0x2000_0000;
-/// What the programs are told.
+/// The programs read their arguments here.
 const ARGUMENT: u32 = 0x2000_0100;
 
 fn ms(n: u64) -> Time {
@@ -24,7 +24,7 @@ fn bytes(code: &[u16]) -> Vec<u8> {
     code.iter().flat_map(|half| half.to_le_bytes()).collect()
 }
 
-/// The vector table, for whatever program.
+/// The vector table of a program.
 fn table(program: &Program) -> Vec<u8> {
     let mut table = [0_u32; 128];
     table[0] = STACK;
@@ -51,7 +51,7 @@ fn machine(program: &Program) -> Machine {
     with_options(program, Options::default())
 }
 
-/// A machine whose program waits in RAM, told `argument`.
+/// A machine that is about to run the program in RAM, with `argument` at [`ARGUMENT`].
 fn machine_in_ram(program: &Program, argument: u32, options: Options) -> Machine {
     let mut machine = with_options(&programs::TO_RAM, options);
     machine.write_ram(program.base, &bytes(program.code)).unwrap();
@@ -110,8 +110,8 @@ fn systick_comes_once_a_millisecond() {
     assert_eq!(words(&machine, 2), [1_000, 1_000]);
 }
 
-/// What a waiting program costs: a tick enters its handler and goes back to WFI. How often the
-/// machine is looked at meanwhile makes no difference.
+/// The cost of a sleeping program: each tick enters translated code for the handler, and for the
+/// way back to WFI. Shorter runs of the machine add no entries.
 #[test]
 fn a_sleeping_program_is_entered_for_its_ticks_alone() {
     let entries = |slice: u64| {
@@ -124,7 +124,7 @@ fn a_sleeping_program_is_entered_for_its_ticks_alone() {
     };
     let (whole, often) = (entries(1_000 * MS), entries(MS / 50));
     assert!(whole <= 2 * 1_000 + 10, "{whole} entries in a second");
-    assert!(often <= whole + 10, "{often} entries where it is looked at 50 000 times");
+    assert!(often <= whole + 10, "{often} entries in 50 000 runs of 20 µs");
 }
 
 #[test]
@@ -188,7 +188,7 @@ fn a_timer_interrupts_at_halves_of_its_range_and_the_cpu_sleeps_between() {
     assert_eq!(machine.reports(), []);
 }
 
-/// A register that is written in the very block in which the period ends does not hide its end.
+/// A write to a register in the block in which the period ends does not put the interrupt off.
 #[test]
 fn no_period_of_a_timer_is_lost_while_the_program_writes_registers() {
     let mut machine = machine(&programs::TIMER_PERIOD);
@@ -200,6 +200,108 @@ fn no_period_of_a_timer_is_lost_while_the_program_writes_registers() {
     machine.reset_pin();
     machine.run_until(Time(202 * MS));
     assert_eq!(word(&machine, OUT), 1, "a reset starts it anew");
+}
+
+/// A condition that the program polls: address, mask, value.
+type Condition = (u32, u32, u32);
+/// Only an interrupt or a reset ends the wait.
+const NO_CONDITION: Condition = (OUT, 0, 1);
+
+/// Runs [`programs::WRITES_AND_WAITS`] for 100 ms: the stores, then the wait.
+fn wait_after(stores: &[(u32, u32)], condition: Condition) -> (Machine, Stop) {
+    const SEEN: u32 = 0x2000_1027;
+    // RCC_AHB1ENR: port D. DEMCR.TRCENA and DWT_CTRL.CYCCNTENA: the counter of cycles.
+    let common = [(0x4002_3830, 1 << 3), (0xE000_EDFC, 1 << 24), (0xE000_1000, 1)];
+    let mut machine = machine_in_ram(&programs::WRITES_AND_WAITS, 0, Options::default());
+    for exception in [15, 16 + 4] {
+        machine.load_bin(0x0800_0000 + 4 * exception, &u32::to_le_bytes(SEEN)).unwrap();
+    }
+    let script = common.iter().chain(stores).flat_map(|&(address, value)| [address, value]);
+    let script = script.chain([0, 0, condition.0, condition.1, condition.2]);
+    for (n, value) in (0..).zip(script) {
+        put(&mut machine, ARGUMENT + 4 * n, value);
+    }
+    put(&mut machine, OUT + 4, 0);
+    let stop = loop {
+        match machine.run_until(ms(100)) {
+            Stop::Attention => {}
+            stop => break stop,
+        }
+    };
+    (machine, stop)
+}
+
+/// Asserts that the wait ends when the event is due, so many cycles of 16 MHz after the last store.
+/// Every block of the waiting program writes a register; an event that comes due within such a
+/// block is not put off to the end of the slice.
+fn assert_no_delay(stores: &[(u32, u32)], condition: Condition, cycles: u32) {
+    let (machine, stop) = wait_after(stores, condition);
+    assert_eq!(stop, Stop::Deadline);
+    let passed = word(&machine, OUT + 4).wrapping_sub(word(&machine, OUT));
+    assert!((cycles - 30..cycles + 60).contains(&passed), "{passed} cycles");
+    assert_eq!(machine.reports(), []);
+}
+
+/// PM0214 section 4.5: a period of the reload value and one.
+#[test]
+fn systick_is_not_late_because_the_program_writes_registers() {
+    let stores = [(0xE000_E014, 999), (0xE000_E018, 0), (0xE000_E010, 7)];
+    assert_no_delay(&stores, NO_CONDITION, 1_000);
+}
+
+/// Datasheet: 16 µs for a word.
+#[test]
+fn the_flash_is_not_late_because_the_program_writes_registers() {
+    // NVIC line 4, the keys, FLASH_CR: PG, x32, EOPIE.
+    let prepare = [(0xE000_E100, 1 << 4), UNLOCK[0], UNLOCK[1], (0x4002_3C10, 1 | 2 << 8 | 1 << 24)];
+    let stores = [&prepare[..], &[(0x0800_4000, 0x1234_5678)]].concat();
+    assert_no_delay(&stores, NO_CONDITION, 256);
+}
+
+/// RM0090 section 32.4: from sleep mode to normal mode after 11 recessive bits; with the reset
+/// value of CAN_BTR a bit has 8 quanta of a cycle.
+#[test]
+fn can_is_not_late_because_the_program_writes_registers() {
+    const CAN1_MCR: u32 = 0x4000_6400;
+    let not_asleep = (CAN1_MCR + 4, 1 << 1, 0);
+    assert_no_delay(&[(0x4002_3840, 1 << 25), (CAN1_MCR, 0)], not_asleep, 88);
+}
+
+/// RM0090 section 30.3.2: TE sends an idle frame first, as long as the character behind it: 10 bits
+/// each, at 1 Mbit/s.
+#[test]
+fn a_usart_is_not_late_because_the_program_writes_registers() {
+    const USART2_SR: u32 = 0x4000_4400;
+    const TC: u32 = 1 << 6;
+    // Port A beside D; PA2 is TX (AF7).
+    let pin = [(0x4002_3830, 1 << 3 | 1), (0x4002_0020, 7 << 8), (0x4002_0000, 0xA800_0020)];
+    // USART2_CR1: UE, TE. TC is set after a reset, and cleared by writing 0.
+    let set_up = [(0x4002_3840, 1 << 17), (USART2_SR + 8, 16), (USART2_SR + 12, 0x2008)];
+    let stores = [&pin[..], &set_up, &[(USART2_SR + 4, 0x55), (USART2_SR, 0)]].concat();
+    assert_no_delay(&stores, (USART2_SR, TC, TC), 320);
+}
+
+/// RM0090 section 21.3: 10 counts of 4 periods of the LSI's 32 kHz are 1.25 ms.
+#[test]
+fn the_watchdog_is_not_late_because_the_program_writes_registers() {
+    const IWDG: u32 = 0x4000_3000;
+    let stores = [(IWDG, 0x5555), (IWDG + 8, 9), (IWDG, 0xAAAA), (IWDG, 0xCCCC)];
+    let (machine, stop) = wait_after(&stores, NO_CONDITION);
+    assert_eq!(stop, Stop::Reset(ResetCause::IndependentWatchdog));
+    let at = machine.now().0;
+    assert!((MS + MS / 4..MS + MS / 4 + MS / 50).contains(&at), "{}", machine.now());
+}
+
+/// The core goes from 16 MHz to the crystal's 8 MHz when the crystal is ready, after 2 ms.
+#[test]
+fn a_change_of_clocks_is_not_late_because_the_program_writes_registers() {
+    // RCC_CR: HSION, HSITRIM, HSEON. RCC_CFGR.SW: the crystal.
+    let stores = [(0x4002_3800, 0x0001_0081), (0x4002_3808, 1)];
+    let (machine, stop) = wait_after(&stores, NO_CONDITION);
+    assert_eq!((stop, machine.core_clock()), (Stop::Deadline, 8_000_000));
+    let cycles = machine.counters().cycles;
+    let expected = 2 * 16_000 + 98 * 8_000;
+    assert!((expected..expected + 1_000).contains(&cycles), "{cycles} cycles");
 }
 
 /// RM0090 sections 9.2.6 and 12.2: SYSCFG_EXTICR4 gives line 13 to port C.
@@ -294,8 +396,8 @@ fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
     assert!(word(&machine, OUT + 16) > 10_000, "ticks: {}", word(&machine, OUT + 16));
 }
 
-/// A load that has to look its page up tells the host where it is; the code behind its IT block is
-/// not conditional for that.
+/// The first load from a page calls a hook in the middle of a block. If the load is within an IT
+/// block, the code behind the IT block stays unconditional.
 #[test]
 fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
     let mut machine = machine(&programs::CONDITIONAL_LOADS);
@@ -303,7 +405,7 @@ fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
     assert_eq!(word(&machine, OUT), 64 * 4);
 }
 
-/// New code in flash is run, also where the old was read before it was run.
+/// New code in flash is executed, also if the program had read the old code before executing it.
 #[test]
 fn code_that_was_read_before_it_was_run_can_be_replaced() {
     let mut machine = machine(&programs::CALLS_WHAT_IT_HAS_READ);
@@ -358,7 +460,8 @@ fn fpu_registers_survive_an_interrupt() {
 // --- faults
 // ----------------------------------------------------------------------------------------------------------
 
-/// What each bad thing leads to: IPSR, CFSR, HFSR, stacked PC.
+/// Runs [`programs::FAULTS`] with this kind of fault. It logs IPSR, CFSR, HFSR, BFAR and the
+/// stacked PC.
 fn fault(kind: u32, enabled: u32, again: u32) -> (Machine, Stop) {
     let mut machine = machine(&programs::FAULTS);
     put(&mut machine, ARGUMENT, kind);
@@ -474,7 +577,7 @@ fn code_in_flash_stands_still_while_the_flash_is_busy() {
     assert_eq!((counters.sectors_erased, counters.units_programmed), (1, 1));
     assert!((1..=2).contains(&word(&machine, OUT)), "polls: {}", word(&machine, OUT));
     assert_eq!(word(&machine, OUT + 8), 0, "no error");
-    // One tick is remembered during the stall, not 250.
+    // During the stall one tick becomes pending; the other 249 are lost.
     assert!((1..=11).contains(&word(&machine, OUT + 4)), "ticks: {}", word(&machine, OUT + 4));
     let stalled = counters.flash_stall_time.0;
     assert!((250 * MS..251 * MS).contains(&stalled), "{stalled}");
@@ -601,7 +704,7 @@ const IGNORE_BUS_FAULTS: (u32, u32) = (0xE000_ED14, 1 << 8 | 1 << 9);
 /// SHCSR.BUSFAULTENA.
 const ENABLE_BUS_FAULT: (u32, u32) = (0xE000_ED24, 1 << 17);
 
-/// What a script of stores leaves behind.
+/// The result of a script of stores.
 #[derive(Debug, PartialEq, Eq)]
 struct Stored {
     faults: u32,
@@ -633,7 +736,7 @@ fn the_right_keys_open_flash_and_option_bytes() {
     assert_eq!(machine.reports(), []);
 }
 
-/// RM0090 sections 3.5.1 and 3.6.2. The right keys are wrong ones then, and each is a bus error.
+/// RM0090 sections 3.5.1 and 3.6.2: after a wrong key each key, right or wrong, is a bus error.
 #[test]
 fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
@@ -645,7 +748,7 @@ fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
     assert_eq!((stored.faults, stored.locks), (0, OPEN));
 }
 
-/// One register's wrong key says nothing of the other.
+/// A wrong key for one register does not affect the other one.
 #[test]
 fn each_key_register_has_a_lock_of_its_own() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
@@ -690,17 +793,18 @@ fn without_the_write_buffer_the_fault_names_its_store() {
     assert_eq!(stored.locks, [LOCKED[0], 0x0FFF_AAED]);
 }
 
-/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on behind the store. The status tells.
+/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on behind the store. The status
+/// registers show the fault.
 #[test]
 fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
     let quiet = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS, CPSID_F];
     let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F]]);
     assert_eq!(stored, Stored { faults: 0, locks: LOCKED, cfsr: 0x8200, hfsr: 0, bfar: OPTKEYR });
-    assert_eq!(machine.reports(), [], "the program means it");
+    assert_eq!(machine.reports(), [], "the program asked to have it ignored");
     machine.reset_pin();
     let stored = store(&mut machine, &[&quiet, &LOCK, &[CPSIE_F], &UNLOCK]);
-    assert_eq!((stored.faults, stored.locks), (2, LOCKED), "what tries the keys later gets its fault");
+    assert_eq!((stored.faults, stored.locks), (2, LOCKED), "each key that is written later is a fault");
     machine.reset_pin();
     let without_mask = [NO_WRITE_BUFFER, IGNORE_BUS_FAULTS];
     let stored = store(&mut machine, &[&without_mask, &LOCK]);
@@ -717,7 +821,8 @@ fn a_precise_fault_under_faultmask_locks_up_otherwise() {
     assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
 }
 
-/// RM0090 section 3.6.2: what is programmed is loaded at the next reset, and protects sectors 0 and 1.
+/// RM0090 section 3.6.2: programmed option bytes are loaded at the next reset; these protect
+/// sectors 0 and 1.
 #[test]
 fn a_program_protects_sectors_by_its_option_bytes() {
     const OPTCR: u32 = 0x4002_3C14;
@@ -869,8 +974,8 @@ fn bad_images_are_refused_and_leave_the_flash_alone() {
     assert!(!machine.pin('Z', 99));
 }
 
-/// A machine must take whatever a program does. The program is noise, its registers point at
-/// peripherals and memories.
+/// No program may make the emulator panic or hang. This program is random code; its registers hold
+/// addresses of peripherals and memories.
 #[test]
 fn noise_as_a_program_does_no_harm() {
     const PLACES: [u32; 16] = [
@@ -920,7 +1025,7 @@ fn noise_as_a_program_does_no_harm() {
 // --- debugging
 // -------------------------------------------------------------------------------------------------------
 
-/// Runs [`programs::BREAKPOINTS`]; gives pairs of the log, and the three results.
+/// Runs [`programs::BREAKPOINTS`]; returns the pairs of its log and its three results.
 fn debugged(machine: &mut Machine, arguments: [u32; 4], events: u32) -> (Vec<[u32; 2]>, Vec<u32>) {
     for (n, argument) in (0..).zip(arguments) {
         put(machine, ARGUMENT + 4 * n, argument);
@@ -970,7 +1075,7 @@ fn a_breakpoint_that_the_monitor_cannot_take_is_a_hard_fault() {
         let (log, results) = debugged(&mut machine, [demcr, 0x4800_022D, primask, 0], 1);
         assert_eq!(log, [[0x0800_022C, 0x8000_0000], [2, 0]], "{what}");
         assert_eq!(results, [0, 0, 0], "{what}");
-        // Without a breakpoint, BKPT is one.
+        // Without a breakpoint in the unit, the program goes on to its BKPT.
         machine.power_off();
         machine.power_on(machine.now());
         let (log, results) = debugged(&mut machine, [demcr, 0, primask, 0], 1);
@@ -979,11 +1084,13 @@ fn a_breakpoint_that_the_monitor_cannot_take_is_a_hard_fault() {
     }
 }
 
-/// Breakpoints are of the debug power domain, the monitor's bits of the core.
+/// Breakpoints are in the debug power domain, which a reset leaves alone; the monitor's bits are in
+/// the core.
 #[test]
 fn breakpoints_outlive_a_reset_and_not_the_power() {
     let mut machine = machine(&programs::BREAKPOINTS);
-    // The monitor turns the unit off at the breakpoint: with PRIMASK it stays on.
+    // The monitor's handler turns the unit off at the breakpoint. With PRIMASK set it does not run,
+    // and the unit stays on.
     debugged(&mut machine, [0x0101_0000, 0x4800_022D, 1, 0], 1);
     machine.reset_pin();
     let (log, _) = debugged(&mut machine, [0x0101_0000, 0, 0, 0], 2);

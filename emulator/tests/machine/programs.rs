@@ -1,5 +1,5 @@
-//! Thumb programs as machine code, with the listing of GNU as beside it. None comes from a compiler
-//! of ours, and the tests need no assembler.
+//! Thumb programs as machine code, with the listing of GNU as beside it, so that the tests need no
+//! assembler.
 
 /// A program: its code, where that lies, and the exception handlers by exception number.
 pub struct Program {
@@ -255,7 +255,7 @@ pub const FPU: Program = Program {
     ],
 };
 
-/// Does the bad thing that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The
+/// Causes the fault that 2000_0100h chooses, with the faults of 2000_0104h (SHCSR) enabled. The
 /// handler logs IPSR, CFSR, HFSR, BFAR, the stacked PC.
 pub const FAULTS: Program = Program {
     base: 0x0800_0200,
@@ -1099,8 +1099,8 @@ pub const CONDITIONAL_LOADS: Program = Program {
     ],
 };
 
-/// Reads the word at 0801_0000h, then calls what is there for ever, and keeps its result at
-/// 2000_0000h.
+/// Reads the word at 0801_0000h, then calls the function there again and again, and keeps its
+/// result at 2000_0000h.
 pub const CALLS_WHAT_IT_HAS_READ: Program = Program {
     base: 0x0800_0200,
     vectors: &[],
@@ -1287,6 +1287,39 @@ pub const TIMER_PERIOD: Program = Program {
         0x0000,              // 252  .short 0x0000
         0x3800, 0x4002,      // 254  .word 0x40023800
         0x0C00, 0x4002,      // 258  .word 0x40020c00
+    ],
+};
+
+/// Runs at 2000_1000h. Carries out the stores at 2000_0100h: pairs of address and value, ended by
+/// an address of 0 with any value. The next three words are an address, a mask and a value. The
+/// program writes to port D all the time, until the word at the address, masked, has the value, or
+/// an interrupt comes (its vector is 2000_1027h). It keeps CYCCNT at 2000_0000h when it starts to
+/// wait and at 2000_0004h when it has seen the event.
+pub const WRITES_AND_WAITS: Program = Program {
+    base: 0x2000_1000,
+    vectors: &[],
+    code: &[
+        0xF04F, 0x5400,      // 000  mov.w r4, #536870912
+        0x4B09,              // 004  ldr r3, [pc, #36]
+        0x4F0A,              // 006  ldr r7, [pc, #40]
+        0xF504, 0x7580,      // 008  add.w r5, r4, #256
+        0xCD03,              // 00C next:  ldmia r5!, {r0, r1}
+        0xB108,              // 00E  cbz r0, 20001014
+        0x6001,              // 010  str r1, [r0, #0]
+        0xE7FB,              // 012  b.n 2000100c
+        0xE895, 0x0007,      // 014 wait:  ldmia.w r5, {r0, r1, r2}
+        0x685E,              // 018  ldr r6, [r3, #4]
+        0x6026,              // 01A  str r6, [r4, #0]
+        0x617E,              // 01C poll:  str r6, [r7, #20]
+        0x6806,              // 01E  ldr r6, [r0, #0]
+        0x400E,              // 020  ands r6, r1
+        0x4296,              // 022  cmp r6, r2
+        0xD1FA,              // 024  bne.n 2000101c
+        0x685E,              // 026 seen:  ldr r6, [r3, #4]
+        0x6066,              // 028  str r6, [r4, #4]
+        0xE7FE,              // 02A  b.n 2000102a
+        0x1000, 0xE000,      // 02C  .word 0xe0001000
+        0x0C00, 0x4002,      // 030  .word 0x40020c00
     ],
 };
 

@@ -20,10 +20,11 @@ use stm32f4xx_hal::pac::{CorePeripherals, Peripherals};
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::Config;
 
-/// 1018h/1 to 3: those of the bootloader.
-const VENDOR_ID: u32 = 0;
-const PRODUCT_CODE: u32 = 0x4007_D151;
-const REVISION: u32 = 0x0001_0000;
+mod identity;
+
+use identity::{PRODUCT_CODE, REVISION, VENDOR_ID};
+
+/// Which version of the program this is: the last number of its label.
 const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
 
 /// Where everything is on this board: `build.rs` names it.

@@ -20,6 +20,12 @@ pub fn program(root: &Path, target_dir: &Path, target: &str) -> Outcome<PathBuf>
     let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     cargo.args(["build", "--package", "coflash", "--profile", PROFILE, "--locked", "--target", target]);
     cargo.arg("--target-dir").arg(target_dir).arg("--manifest-path").arg(root.join("Cargo.toml"));
+    if target == LINUX {
+        // The C code in TLS uses no C library but for functions that musl has, too; so the compiler
+        // of this system will do. What it would add for glibc alone is switched off.
+        let name = LINUX.replace('-', "_");
+        cargo.env(format!("CC_{name}"), "cc").env(format!("CFLAGS_{name}"), "-U_FORTIFY_SOURCE");
+    }
     process::run(reproducible(&mut cargo, root))?;
     let extension = if target.contains("windows") { "exe" } else { "" };
     Ok(target_dir.join(target).join(PROFILE).join("coflash").with_extension(extension))

@@ -67,15 +67,15 @@ export function listen(take, renew) {
     };
     source.onerror = () => {
       say(lost);
-      // A refusal is not tried again by the browser: the server has another token, or too many pages.
+      // The browser does not retry after a refusal: the server has another token, or too many pages.
       if (source.readyState === EventSource.CLOSED) {
-        say("coflash ui was ended, or started anew: open the URL that it prints. The page tries again.");
+        say("coflash ui has ended or was restarted: open the URL that it prints. The page tries again.");
       }
       alive();
     };
     alive();
   };
-  // A browser has few connections for each server: a page that nobody sees leaves its one to others.
+  // A browser has few connections for each server: a hidden page frees its connection for others.
   document.addEventListener("visibilitychange", () => {
     if (document.hidden) {
       clearTimeout(watch);

@@ -1,4 +1,4 @@
-// The page of `coflash ui`. The server holds the state; the page shows it and asks for things.
+// The page of `coflash ui`. The server holds the state; the page shows it and sends requests.
 
 import { ask, listen, sendFile } from "./api.js";
 import * as bus from "./bus.js";
@@ -20,7 +20,7 @@ function show(next) {
   text($("adapter-state"), CONNECTION[adapter.state] + (adapter.url && adapter.state !== "closed" ? `: ${adapter.url}` : ""));
   $("adapter-state").className = `pill ${adapter.state}`;
   $("adapter-words").hidden = adapter.words === null;
-  text($("adapter-words"), adapter.words ? `The adapter is lost: ${adapter.words}. It is tried again every second.` : "");
+  text($("adapter-words"), adapter.words ? `The adapter is lost: ${adapter.words}. coflash tries to open it again every second.` : "");
   $("disconnect").hidden = adapter.state === "closed";
   if (adapter.url && adapter.url !== before?.adapter.url && document.activeElement !== $("adapter-url")) $("adapter-url").value = adapter.url;
   if (adapter.bit_rate && adapter.bit_rate !== before?.adapter.bit_rate) $("bit-rate").value = adapter.bit_rate;
@@ -61,23 +61,23 @@ function file(firmware) {
     ["File", firmware.name],
     ["Program", `${firmware.program_size} bytes`],
     ["CRC", hex(firmware.crc)],
-    ["Version", firmware.version ?? "not told"],
-    ["Made for", firmware.vendor_id === null ? "not told" : `vendor-ID ${hex(firmware.vendor_id)}, product code ${hex(firmware.product_code)}`],
+    ["Version", firmware.version ?? "unknown"],
+    ["Made for", firmware.vendor_id === null ? "unknown" : `vendor-ID ${hex(firmware.vendor_id)}, product code ${hex(firmware.product_code)}`],
     ...(firmware.seal ? seal(firmware.seal) : []),
     ...(firmware.left_out > 0 ? [["Left out", `${firmware.left_out} bytes outside the program's region`]] : []),
   ]);
   text($("inspection"), firmware.inspection);
 }
 
-/** What a sealed image says of itself; whether it is true is for the device to say. */
+/** The statements of a sealed image; only the device can check them. */
 function seal({ program, counter, signed_by, opened_by, flags }) {
   const keys = (ids) => ids.map(hex).join(", ");
   return [
     ["Program number", program],
     ["Security counter", counter],
     ["Signed by", `key ${keys(signed_by)} (the device checks it)`],
-    ["Encrypted for", opened_by.length > 0 ? `key ${keys(opened_by)}` : "nobody: it is not encrypted"],
-    ["Sealed as", flags.length > 0 ? flags.join(", ") : "it is in flash"],
+    ["Encrypted for", opened_by.length > 0 ? `key ${keys(opened_by)}` : "no key: it is not encrypted"],
+    ["Contents", flags.length > 0 ? flags.join(", ") : "as in flash"],
   ];
 }
 
@@ -118,7 +118,7 @@ function dropping() {
   });
   $("file").addEventListener("change", async (event) => {
     const files = [...event.target.files];
-    // The same file may be chosen again, when it was built anew.
+    // The user may choose the same file again after a new build.
     event.target.value = "";
     if (files.length > 0) await take(files);
   });

@@ -1,4 +1,4 @@
-// What goes over the bus: frames in words, and its load over time.
+// The frames on the bus in words, and the bus load over time.
 
 import { $, el, text } from "./dom.js";
 
@@ -19,7 +19,7 @@ export function renew() {
   seconds = new Map();
 }
 
-/** Takes what an event tells about the bus. */
+/** Takes over the bus data of an event. */
 export function take(event) {
   if (event.frames?.length) {
     const last = rows.length ? rows[rows.length - 1].number : 0;

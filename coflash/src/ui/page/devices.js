@@ -25,7 +25,7 @@ export function show(next) {
   $("no-devices").hidden = list.length !== 0;
   text($("no-devices"), state.devices === null
     ? "The bus has not been searched yet."
-    : "Nobody answers, and nobody is heard.");
+    : "No device answers, and no frame of a device was received.");
   buttons();
 }
 
@@ -52,11 +52,11 @@ function row(device) {
   return el("tr", { role: "row", "data-node": device.node, class: device.answers ? "" : "silent" },
     cell("Choose", check),
     cell("Node", el("strong", {}, String(device.node))),
-    cell("Name", device.name ?? "not told"),
+    cell("Name", device.name ?? "unknown"),
     cell("Runs", device.runs, device.heartbeat ? el("span", { class: "faint" }, ` · ${device.heartbeat}`) : null),
-    cell("Version", device.software ?? "not told"),
+    cell("Version", device.software ?? "unknown"),
     cell("CRC", el("code", {}, one?.crc ? hex(one.crc) : "–")),
-    cell("Program", one?.words ?? "not told"),
+    cell("Program", one?.words ?? "unknown"),
     cell("The file", verdict ? el("span", { class: `verdict ${verdict.fits}` }, verdict.words) : "–"),
     el("td", { role: "cell", class: "more" },
       el("button", {
@@ -94,11 +94,11 @@ function open(node) {
   text($("device-head"), `Node ${node}`);
   facts($("device-facts"), [
     ["Runs", device.runs],
-    ["Name", device.name ?? "not told"],
-    ["Hardware", device.hardware ?? "not told"],
-    ["Software", device.software ?? "not told"],
+    ["Name", device.name ?? "unknown"],
+    ["Hardware", device.hardware ?? "unknown"],
+    ["Software", device.software ?? "unknown"],
     ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],
-    ["Dialect", device.dialect ?? "not told"],
+    ["Dialect", device.dialect ?? "unknown"],
     ...device.programs.map((one) => [`Program ${one.number}`, `${one.words}${one.crc ? `, CRC ${hex(one.crc)}` : ""}`]),
   ]);
   const off = state.task !== null || state.adapter.state !== "open";
@@ -137,8 +137,8 @@ export function start() {
 function step(name) {
   $("device").close();
   if (name === "erase") {
-    text($("confirm-words"), `Program ${state.settings.program} of node ${opened} will be gone. The device stays in ` +
-      "its bootloader until it gets another one.");
+    text($("confirm-words"), `Program ${state.settings.program} of node ${opened} will be erased. The device stays in ` +
+      "its bootloader until it gets another program.");
     $("confirm").showModal();
     return;
   }

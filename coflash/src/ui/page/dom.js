@@ -1,4 +1,4 @@
-// Small things that every part of the page needs. Text from outside goes in as text, never as HTML.
+// Functions that every part of the page uses. Text from outside is inserted as text, never as HTML.
 
 export const $ = (id) => document.getElementById(id);
 

@@ -24,15 +24,15 @@ function fill() {
   const good = run.filter((one) => one.ok).length;
   text($("report-head"), `Update of ${date(first.date)}`);
   facts($("report-facts"), [
-    ["File", first.file], ["CRC of the file", hex(first.file_crc)], ["Version of the file", first.file_version ?? "not told"],
+    ["File", first.file], ["CRC of the file", hex(first.file_crc)], ["Version of the file", first.file_version ?? "unknown"],
     ["Result", `${good} of ${run.length} devices updated`], ["Adapter", first.adapter], ["Tool", `coflash ${first.tool}`],
   ]);
   const cell = (label, ...content) => el("td", { "data-label": label }, ...content);
   $("report-rows").replaceChildren(...run.map((one) => el("tr", {},
-    cell("Node", String(one.node)), cell("Device", one.device ?? "not told"),
+    cell("Node", String(one.node)), cell("Device", one.device ?? "unknown"),
     cell("Serial number", el("code", {}, hex(one.serial_number))),
     cell("CRC", el("code", {}, one.crc ? hex(one.crc) : "–")),
-    cell("Version", one.version ?? "not told"),
+    cell("Version", one.version ?? "unknown"),
     cell("Result", `${one.words}, ${one.seconds.toFixed(1)} s`))));
 }
 

@@ -1,0 +1,45 @@
+//! The artifact as a program.
+
+use std::sync::Arc;
+
+use super::config::Device;
+use crate::file::convert::{blocks_of, Options, Region};
+use crate::file::judge::judge;
+use crate::file::sealed::SealedFile;
+use crate::file::{self, AddressRange, Format};
+use crate::update::Program;
+
+/// Reads and judges a firmware file, as `coflash flash` does, without the device.
+///
+/// # Errors
+/// The lines for the server: what is wrong, and what to do.
+pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Program, Vec<String>> {
+    let lines = |what: String, advice: &str| vec![what, format!("what to do: {advice}")];
+    let anew = "deploy the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image";
+    let format = Format::detect(bytes);
+    if format == Some(Format::Sealed) {
+        let file = SealedFile::for_program(bytes.to_vec(), device.program);
+        let file = file.map_err(|refusal| lines(format!("{name}: {refusal}"), refusal.advice()))?;
+        return Ok(Arc::new(file).into());
+    }
+    let region: Option<AddressRange> =
+        device.board.and_then(|board| board.program(device.program)).map(Into::into);
+    // A raw file has no distinctive bytes: its name shows the format, and the board gives its
+    // address.
+    let raw = format.is_none() && name.to_lowercase().ends_with(".bin");
+    let (format, place) = match region {
+        _ if !raw => (format, None),
+        Some(region) => (Some(Format::Raw), Some(region.first)),
+        None => {
+            let advice = "set board in the agent's configuration";
+            return Err(lines(format!("{name}: a raw binary does not contain its address"), advice));
+        }
+    };
+    let firmware =
+        file::read(bytes, format, place).map_err(|error| lines(error.of(name).to_string(), anew))?;
+    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
+    let blocks = blocks_of(firmware, &options).map_err(|error| lines(format!("{name}: {error}"), anew))?.file;
+    judge(&blocks.image(), blocks.program_start())
+        .map_err(|fault| lines(format!("{name}: {fault}"), fault.advice()))?;
+    Ok(Arc::new(blocks).into())
+}
