@@ -3,6 +3,7 @@
 mod bus;
 
 use std::sync::Arc;
+use std::thread;
 use std::time::Duration;
 
 use bus::{Folder, Nodes};
@@ -69,51 +70,96 @@ const fn takes(found_by: &'static [&'static str], request: fn(Frame) -> Option<F
 
 const UPLOAD: [u8; 8] = [0x40, 0, 0x10, 0, 0, 0, 0, 0];
 
+#[rustfmt::skip]
 const FAULTS: &[Fault] = &[
     // Wrong abort codes.
-    answers(&["SDO-001"], |asked, f| general(asked, f, &[0x40, 0xFF, 0x0F])),
+    answers(&["SDO-001", "SDO-027"], |asked, f| general(asked, f, &[0x40, 0xFF, 0x0F])),
     answers(&["SDO-002"], |asked, f| general(asked, f, &[0x40, 0x18, 0x10, 0xC8])),
     answers(&["SDO-003"], |asked, f| general(asked, f, &[0x40, 0x00, 0x10, 1])),
-    answers(&["SDO-004"], |asked, f| general(asked, f, &[0x23, 0x00, 0x10])),
-    answers(&["SDO-005"], |asked, f| general(asked, f, &[0x23, 0x18, 0x10])),
+    answers(&["SDO-004", "SDO-027"], |asked, f| general(asked, f, &[0x23, 0x00, 0x10, 0])),
+    answers(&["SDO-005"], |asked, f| general(asked, f, &[0x23, 0x18, 0x10, 1])),
     answers(&["SDO-006"], |asked, f| general(asked, f, &[0x23, 0xFF, 0x0F])),
     answers(&["SDO-007"], |asked, f| general(asked, f, &[0xE0])),
-    answers(&["SDO-009"], |asked, f| general(asked, f, &[0x01])),
+    answers(&["SDO-022"], |asked, f| general(asked, f, &[0x20, 0x00, 0x10])),
+    answers(&["PRG-009"], |asked, f| general(asked, f, &[0x40, 0x50, 0x1F, 1])),
+    answers(&["PRG-018"], |asked, f| general(asked, f, &[0x2F, 0x51, 0x1F, 1])),
+    answers(&["PRG-020"], |asked, f| general(asked, f, &[0x23, 0x51, 0x1F, 1])),
+    answers(&["PRG-028", "PRG-029"], |asked, f| general(asked, f, &[0xD9])),
+    // A wrong toggle bit is taken for another error.
+    answers(&["SEG-002"], |asked, f| {
+        sdo(f, |data| if asked[0] == 0x70 && data[4..] == [0, 0, 3, 5] { data[4..].copy_from_slice(&[1, 0, 4, 5]) })
+    }),
     // The abort names another object.
     answers(&["SDO-011"], |asked, f| {
-        sdo(f, |data| {
-            if asked.starts_with(&[0x40, 0x18, 0x10, 0xC8]) {
-                data[3] = 0
-            }
-        })
+        sdo(f, |data| if asked.starts_with(&[0x40, 0x18, 0x10, 0xC8]) { data[3] = 0 })
     }),
-    // Objects: a size that is wrong, and a number of entries that is.
+    // The CRC of a block upload.
+    answers(&["BLK-003", "BLK-005"], |asked, f| {
+        sdo(f, |data| if asked[0] == 0xA2 && data[0] & 0xE3 == 0xC1 { data[1] ^= 1 })
+    }),
+    // Segments that were not acknowledged are not sent again: the acknowledgement of one is taken
+    // for more.
+    takes(&["BLK-008"], |f| {
+        if f.has_cob_id(ASK) && f.data()[..] == *[0xA2, 4, 127, 0, 0, 0, 0, 0].as_slice() { None } else { Some(f) }
+    }),
+    // Objects of another size.
     answers(&["OD-002"], |asked, f| altered(asked, f, &[0x40, 0x01, 0x10, 0], |data| data[0] = 0x43)),
-    answers(&["BOOT-001", "BOOT-002"], |_, f| {
+    answers(&["PRG-003"], |asked, f| altered(asked, f, &[0x40, 0x56, 0x1F, 0], |data| data[0] = 0x43)),
+    // The flash status is not cleared.
+    answers(&["PRG-041"], |asked, f| altered(asked, f, &[0x40, 0x57, 0x1F, 1], |data| data[4] |= 4)),
+    // Boot-up messages are missing.
+    answers(&["BOOT-001", "BOOT-002", "BOOT-003", "BOOT-004", "LSS-026"], |_, f| {
         (!f.has_cob_id(CobId::heartbeat(NODE)) || f.data() != [0]).then_some(f)
     }),
+    // The heartbeat tells operational.
+    answers(&["HB-001", "NMT-005"], |_, f| {
+        let beat = f.has_cob_id(CobId::heartbeat(NODE)) && f.data() == [0x7F];
+        Some(if beat { Frame::of(CobId::heartbeat(NODE), &[5]) } else { f })
+    }),
     // Frames that are not requests are taken for some.
-    takes(&["FRM-001"], |f| if f.is_remote_frame() { Some(Frame::full(ASK, UPLOAD)) } else { Some(f) }),
-    takes(&["FRM-002"], |f| if f.is_extended() { Some(Frame::full(ASK, UPLOAD)) } else { Some(f) }),
+    takes(&["FRM-002"], |f| Some(if f.is_extended() && f.data()[0] == 0x40 { Frame::full(ASK, UPLOAD) } else { f })),
     takes(&["FRM-003"], |f| {
         let other = f.has_cob_id(CobId::sdo_request(NodeId::MAX));
-        if other {
-            Some(Frame::full(ASK, UPLOAD))
-        } else {
-            Some(f)
-        }
+        Some(if other { Frame::full(ASK, UPLOAD) } else { f })
     }),
-    takes(&["FRM-004"], |f| {
-        if f.has_cob_id(ASK) && f.data().is_empty() {
-            Some(Frame::full(ASK, UPLOAD))
-        } else {
-            Some(f)
-        }
+    takes(&["FRM-004"], |f| short(f, 0)),
+    takes(&["FRM-007"], |f| short(f, 3)),
+    takes(&["FRM-011"], |f| short(f, 7)),
+    // NMT frames of another form or for nobody are obeyed.
+    takes(&["FRM-013"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().len() == 1)),
+    takes(&["FRM-014"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().len() == 3)),
+    takes(&["FRM-016"], |f| obeys(f, |f| f.is_extended() && f.data().len() == 2)),
+    takes(&["NMT-004"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().get(1) == Some(&0x81))),
+    takes(&["NMT-005"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().first() == Some(&0x83))),
+    // Wrong values of layer setting services are taken for right ones.
+    takes(&["LSS-015"], |f| lss(f, [0x11, 0], [0x11, 1])),
+    takes(&["LSS-014"], |f| lss(f, [0x04, 2], [0x04, 0])),
+    // Answers of layer setting services.
+    answers(&["LSS-008"], |_, f| {
+        let data = f.exactly::<8>().copied().filter(|data| f.has_cob_id(CobId::LSS_RESPONSE) && data[0] == 0x5B);
+        Some(data.map_or(f, |mut data| { data[1] ^= 1; Frame::full(CobId::LSS_RESPONSE, data) }))
     }),
 ];
 
-/// The node stays in pre-operational state whatever it is told: a bootloader has no PDO.
-const KNOWN: [&str; 3] = ["NMT-001", "NMT-002", "NMT-003"];
+/// A request of so many bytes completed.
+fn short(frame: Frame, len: usize) -> Option<Frame> {
+    Some(if frame.has_cob_id(ASK) && frame.data().len() == len { Frame::full(ASK, UPLOAD) } else { frame })
+}
+
+/// Reset communication in the place of a frame.
+fn obeys(frame: Frame, which: fn(&Frame) -> bool) -> Option<Frame> {
+    Some(if which(&frame) { Frame::of(CobId::NMT, &[0x82, NODE.get()]) } else { frame })
+}
+
+/// A request of layer setting services in the place of another one.
+fn lss(frame: Frame, of: [u8; 2], to: [u8; 2]) -> Option<Frame> {
+    let is = frame.has_cob_id(CobId::LSS_REQUEST) && frame.data().starts_with(&of);
+    Some(if is { Frame::full(CobId::LSS_REQUEST, [to[0], to[1], 0, 0, 0, 0, 0, 0]) } else { frame })
+}
+
+/// What the node has not, or need not have: remote frames are not in socketcand's protocol, 1017h
+/// is const, and a bootloader has no operational state.
+const SKIPPED: [&str; 6] = ["HB-004", "NMT-001", "NMT-002", "NMT-003", "NMT-006", "FRM-001"];
 
 /// The bus with the fault in between.
 struct Faulty<'f> {
@@ -151,9 +197,7 @@ fn verdicts(nodes: &Nodes, fault: Option<&Fault>) -> (Vec<String>, Vec<String>) 
     let bus = coflash::bus::open(nodes.url()).unwrap();
     let mut bus = Faulty { bus, fault, asked: Vec::new() };
     let (mut failed, mut skipped) = (Vec::new(), Vec::new());
-    // HB-002 depends on the clock of the host that runs the tests.
-    let checks: Vec<_> = checks().into_iter().filter(|check| check.id != "HB-002").collect();
-    run(&mut bus, NODE, &checks, Duration::from_millis(150), &Arc::default(), &mut |verdict| match &verdict
+    run(&mut bus, NODE, &checks(), Duration::from_secs(1), &Arc::default(), &mut |verdict| match &verdict
         .outcome
     {
         Outcome::Passed => {}
@@ -175,20 +219,30 @@ fn device(test: &str) -> (Folder, Nodes) {
 }
 
 #[test]
-fn a_node_passes_all_but_the_states_of_nmt() {
+fn a_node_passes() {
     let (_folder, nodes) = device("conform");
     let (failed, skipped) = verdicts(&nodes, None);
-    assert_eq!(ids(&failed), KNOWN, "{failed:#?}");
-    // socketcand has no remote frames.
-    assert_eq!(ids(&skipped), ["FRM-001"], "{skipped:#?}");
+    assert!(failed.is_empty(), "{failed:#?}");
+    assert_eq!(ids(&skipped), SKIPPED, "{skipped:#?}");
 }
 
+/// Each fault has its own node, and most of a run is waiting: all run at the same time.
 #[test]
-fn each_fault_is_found_by_its_check_alone() {
-    let (_folder, nodes) = device("conform-faults");
-    for fault in FAULTS {
-        let (failed, _) = verdicts(&nodes, Some(fault));
-        let found: Vec<_> = ids(&failed).into_iter().filter(|id| !KNOWN.contains(id)).collect();
-        assert_eq!(found, fault.found_by, "{failed:#?}");
-    }
+fn each_fault_is_found_by_its_checks_alone() {
+    assert!(FAULTS.len() >= 25, "{}", FAULTS.len());
+    let wrong: Vec<String> = thread::scope(|scope| {
+        let runs: Vec<_> = (0..)
+            .zip(FAULTS)
+            .map(|(number, fault): (u32, _)| {
+                scope.spawn(move || {
+                    let (_folder, nodes) = device(&format!("conform-{number}"));
+                    let (failed, _) = verdicts(&nodes, Some(fault));
+                    let expected = fault.found_by;
+                    (ids(&failed) != expected).then(|| format!("fault {number}, {expected:?}: {failed:#?}"))
+                })
+            })
+            .collect();
+        runs.into_iter().filter_map(|run| run.join().unwrap()).collect()
+    });
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::nmt::NmtCommand;
+use canopen::nmt::{NmtCommand, NmtState};
 use canopen::{CobId, Frame, NodeId};
 
 use crate::bus::{Adapter, AdapterError};
@@ -29,6 +29,10 @@ impl From<AdapterError> for Stop {
 
 /// How long the bus must carry no answer before it counts as quiet.
 const QUIET: Duration = Duration::from_millis(30);
+/// How long a frame that must not be answered is given for an answer.
+const UNANSWERED: Duration = Duration::from_millis(100);
+/// How long the first heartbeat is waited for.
+const HEARTBEAT: Duration = Duration::from_millis(2100);
 /// The most that [`Bench::settle`] reads from a bus that never gets quiet.
 const SETTLE: Duration = Duration::from_secs(2);
 /// How long one wait lasts before the flag of Ctrl-C is looked at.
@@ -90,6 +94,23 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
+    /// The NMT state that the next heartbeat tells, if one comes.
+    pub(super) fn state(&mut self) -> Result<Option<NmtState>, Stop> {
+        let frame = self.hear(CobId::heartbeat(self.node), HEARTBEAT)?;
+        Ok(frame.and_then(|frame| frame.exactly::<1>().and_then(|[byte]| NmtState::from_byte(*byte))))
+    }
+
+    /// Leaves the device without a transfer, and in this state.
+    pub(super) fn leave(&mut self, state: Option<NmtState>) -> Result<(), Error> {
+        self.settle()?;
+        let command = match state {
+            Some(NmtState::Operational) => NmtCommand::Start,
+            Some(NmtState::Stopped) => NmtCommand::Stop,
+            _ => return Ok(()),
+        };
+        Ok(self.adapter.send(&command.emit(Some(self.node)))?)
+    }
+
     pub(super) fn now(&self) -> Duration {
         self.adapter.now()
     }
@@ -131,6 +152,26 @@ impl<'a> Bench<'a> {
         self.heard()
     }
 
+    /// Sends a frame of the SDO client that has no answer.
+    pub(super) fn tell(&mut self, data: [u8; 8]) -> Result<(), Stop> {
+        self.send(&Frame::full(CobId::sdo_request(self.node), data))
+    }
+
+    /// Aborts the transfer of an object.
+    pub(super) fn abort(&mut self, index: u16, sub: u8) -> Result<(), Stop> {
+        self.tell(request(0x80, index, sub, 0x0800_0000_u32.to_le_bytes()))
+    }
+
+    /// Sends an SDO request and expects an answer with this command byte.
+    pub(super) fn takes(&mut self, data: [u8; 8], command: u8) -> Result<[u8; 8], Stop> {
+        let answer = self.ask(data)?;
+        match abort_of(&answer) {
+            _ if answer[0] == command => Ok(answer),
+            Some(code) => failed(format!("abort {code:08X}h in place of {command:02X}h")),
+            None => failed(format!("{:02X}h in place of {command:02X}h", answer[0])),
+        }
+    }
+
     /// Expects that the device refuses a request with this abort code.
     pub(super) fn refuses(&mut self, data: [u8; 8], code: u32) -> Result<(), Stop> {
         let answer = self.ask(data)?;
@@ -144,7 +185,7 @@ impl<'a> Bench<'a> {
     /// Expects that a frame is not answered on `id`, and that the server works afterwards.
     pub(super) fn ignores(&mut self, frame: &Frame, id: CobId) -> Result<(), Stop> {
         self.send(frame)?;
-        match self.hear(id, self.answer)? {
+        match self.hear(id, self.answer.min(UNANSWERED))? {
             Some(answer) => failed(format!("{frame} was answered with {answer}")),
             None => self.works(),
         }

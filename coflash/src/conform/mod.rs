@@ -7,15 +7,23 @@
 //! | module | what it does |
 //! |---|---|
 //! | `bench` | frames to and from the device, with time limits on the adapter's clock |
-//! | `sdo` | checks of the SDO server and of the mandatory objects |
+//! | `objects` | the objects that describe the device, and emergencies |
+//! | `sdo` | the SDO server: refusals, expedited and segmented transfers |
+//! | `block` | SDO block upload |
 //! | `frames` | wrong frames |
-//! | `network` | boot-up, heartbeat, NMT and LSS |
+//! | `network` | boot-up, heartbeat and NMT |
+//! | `lss` | layer setting services |
+//! | `program` | 1F50h to 1F57h, without a change of the program |
 //! | `junit` | the report for a test system |
 
 mod bench;
+mod block;
 mod frames;
 mod junit;
+mod lss;
 mod network;
+mod objects;
+mod program;
 mod sdo;
 
 use std::sync::atomic::AtomicBool;
@@ -41,21 +49,50 @@ pub struct Check {
     pub clause: &'static str,
     /// Whether the device is reset: a bootloader with a program may then start it.
     pub resets: bool,
-    run: fn(&mut Bench<'_>) -> Result<(), Stop>,
+    /// What the device must have or be; otherwise the check is skipped.
+    needs: Option<Step>,
+    run: Run,
+}
+
+/// A part of a check.
+type Step = fn(&mut Bench<'_>) -> Result<(), Stop>;
+
+/// What a check does.
+#[derive(Clone, Copy, Debug)]
+enum Run {
+    By(Step),
+    /// This SDO request is refused with this abort code.
+    Refused([u8; 8], u32),
+    /// An object is read by expedited upload: index, sub-index and number of bytes.
+    Number(u16, u8, u8),
 }
 
 impl Check {
-    const fn new(
-        id: &'static str,
-        title: &'static str,
-        clause: &'static str,
-        run: fn(&mut Bench<'_>) -> Result<(), Stop>,
-    ) -> Self {
-        Self { id, title, clause, resets: false, run }
+    const fn of(id: &'static str, title: &'static str, clause: &'static str, run: Run) -> Self {
+        Self { id, title, clause, resets: false, needs: None, run }
+    }
+
+    const fn new(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Self {
+        Self::of(id, title, clause, Run::By(run))
     }
 
     const fn that_resets(self) -> Self {
         Self { resets: true, ..self }
+    }
+
+    const fn needs(self, needs: Step) -> Self {
+        Self { needs: Some(needs), ..self }
+    }
+
+    fn judge(&self, bench: &mut Bench<'_>) -> Result<(), Stop> {
+        if let Some(needs) = self.needs {
+            needs(bench)?;
+        }
+        match self.run {
+            Run::By(step) => step(bench),
+            Run::Refused(request, code) => bench.refuses(request, code),
+            Run::Number(index, sub, len) => bench.value(index, sub, len).map(drop),
+        }
     }
 
     /// The group of the check, as in `SDO`.
@@ -94,12 +131,23 @@ pub struct Verdict {
 /// All checks, in the order in which they run.
 #[must_use]
 pub fn checks() -> Vec<Check> {
-    [network::CHECKS, sdo::CHECKS, frames::CHECKS].concat()
+    [
+        network::CHECKS,
+        objects::CHECKS,
+        sdo::CHECKS,
+        block::CHECKS,
+        frames::CHECKS,
+        lss::CHECKS,
+        program::CHECKS,
+    ]
+    .concat()
 }
 
 /// Runs checks on a device and passes each verdict to `tell`. `answer` is the longest time for an
 /// answer of the device. Before each check, the device is put into pre-operational state, and a
-/// transfer that is left over is aborted; the device is left like this.
+/// transfer that is left over is aborted. At the end, also after an error, the device gets back the
+/// NMT state that its heartbeat told before the first check; without a heartbeat it stays
+/// pre-operational.
 ///
 /// # Errors
 /// [`Error::Adapter`] if the bus is lost; [`Error::Cancelled`].
@@ -112,24 +160,36 @@ pub fn run(
     tell: &mut dyn FnMut(&Verdict),
 ) -> Result<Vec<Verdict>, Error> {
     let mut bench = Bench::new(adapter, node, answer, cancelled);
+    let found = match bench.state() {
+        Ok(found) => found,
+        Err(Stop::Bus(error)) => return Err(error),
+        Err(_) => None,
+    };
+    let verdicts = run_all(&mut bench, checks, tell);
+    let left = bench.leave(found);
+    // The reason why the checks ended stays the error.
+    let verdicts = verdicts?;
+    left.map(|()| verdicts)
+}
+
+fn run_all(
+    bench: &mut Bench<'_>,
+    checks: &[Check],
+    tell: &mut dyn FnMut(&Verdict),
+) -> Result<Vec<Verdict>, Error> {
     let mut verdicts = Vec::new();
     for check in checks {
         bench.settle()?;
-        let outcome = match (check.run)(&mut bench) {
+        let outcome = match check.judge(bench) {
             Ok(()) => Outcome::Passed,
             Err(Stop::Failed(what)) => Outcome::Failed(what),
             Err(Stop::Skipped(why)) => Outcome::Skipped(why),
-            Err(Stop::Bus(error)) => {
-                // The reason why the checks end stays the error.
-                let _ = bench.settle();
-                return Err(error);
-            }
+            Err(Stop::Bus(error)) => return Err(error),
         };
         let verdict = Verdict { check: *check, outcome };
         tell(&verdict);
         verdicts.push(verdict);
     }
-    bench.settle()?;
     Ok(verdicts)
 }
 
@@ -144,6 +204,10 @@ mod tests {
         ids.sort_unstable();
         ids.dedup();
         assert_eq!(ids.len(), count);
-        assert!(checks().iter().all(|check| check.clause.starts_with("CiA ") && check.id.contains('-')));
+        for check in checks() {
+            let documents = ["CiA 301 4.2, ", "CiA 305, ", "L-1112, ", "coboot, "];
+            assert!(documents.iter().any(|document| check.clause.starts_with(document)), "{check:?}");
+            assert!(check.id.contains('-'), "{check:?}");
+        }
     }
 }
