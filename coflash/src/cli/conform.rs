@@ -15,8 +15,8 @@ use super::values::{milliseconds, node_id};
 
 /// Checks whether a device conforms to CiA 301 and CiA 305, with a verdict for each check.
 ///
-/// No check touches the program. The device is left in pre-operational state. Checks that reset
-/// the device run only with --reset.
+/// No check touches the program. The device is left in the NMT state in which it was found, also
+/// after Ctrl-C. Checks that reset the device run only with --reset.
 #[derive(Debug, Args)]
 pub(super) struct Conform {
     /// The checks or groups to run, for example SDO or SDO-003; by default all.
