@@ -1,6 +1,6 @@
 //! Conformance checks for a device on a real bus (`coflash conform`).
 //!
-//! A check is data (its number, the clause, what is expected) and a function over a [`Bench`]. All
+//! A check is data (its number, the clause, what is expected) and a function over a bench. All
 //! checks here leave the device's program alone. Those that reset the device say so
 //! ([`Check::resets`]) and run only if they are asked for.
 //!
