@@ -6,8 +6,8 @@ use canopen::CobId;
 use crc::{Crc, CRC_16_XMODEM};
 
 use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::check::Check;
 use super::sdo::{text, COMMAND, NO_OBJECT, NO_SUB_INDEX};
-use super::Check;
 
 const BLOCK_SIZE: u32 = 0x0504_0002;
 const SEQUENCE: u32 = 0x0504_0003;

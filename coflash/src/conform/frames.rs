@@ -1,17 +1,21 @@
 //! Wrong frames: none may be taken for a request or a command, and the server works afterwards.
 
+use std::time::Duration;
+
 use canopen::nmt::NmtCommand;
 use canopen::{CobId, Frame, NodeId};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 
 use super::bench::{failed, request, skipped, Bench, Stop};
-use super::Check;
+use super::check::Check;
 use crate::bus::AdapterError;
 use crate::device::Error;
 
 const UPLOAD: [u8; 8] = request(0x40, 0x1000, 0, [0; 4]);
 const FRAME: &str = "CiA 301 4.2, SDO protocols";
 const NMT: &str = "CiA 301 4.2, NMT protocols";
+/// How long a reaction to a command is waited for that must not come.
+pub(super) const REACTION: Duration = Duration::from_millis(200);
 /// Reset communication: a device that takes it sends a boot-up message.
 const RESET: u8 = 0x82;
 
@@ -94,7 +98,7 @@ fn cut(b: &mut Bench<'_>, len: usize) -> Result<(), Stop> {
 pub(super) fn no_boot_up(b: &mut Bench<'_>, frame: &Frame) -> Result<(), Stop> {
     b.send(frame)?;
     let id = CobId::heartbeat(b.node);
-    let end = b.now() + super::network::REACTION;
+    let end = b.now() + REACTION;
     while let Some(heard) = b.hear(id, end.saturating_sub(b.now()))? {
         if heard.data() == [0] {
             return failed(format!("{frame} led to a boot-up message"));

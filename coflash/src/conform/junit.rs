@@ -1,6 +1,6 @@
 //! The report as JUnit XML.
 
-use super::{Outcome, Verdict};
+use super::check::{Outcome, Verdict};
 
 /// The verdicts as a test suite in JUnit XML.
 #[must_use]

@@ -6,8 +6,8 @@ use canopen::nmt::NmtCommand;
 use canopen::{CobId, Frame};
 
 use super::bench::{failed, skipped, Bench, Stop};
+use super::check::Check;
 use super::frames::extended;
-use super::Check;
 
 /// How long an LSS answer may take; CiA 305 leaves the limit to the master.
 const LIMIT: Duration = Duration::from_millis(200);

@@ -8,6 +8,7 @@
 //! |---|---|
 //! | `bench` | frames to and from the device, with time limits on the adapter's clock |
 //! | `objects` | the objects that describe the device, and emergencies |
+//! | `check` | a check, and its verdict |
 //! | `sdo` | the SDO server: refusals, expedited and segmented transfers |
 //! | `block` | SDO block upload |
 //! | `frames` | wrong frames |
@@ -18,6 +19,7 @@
 
 mod bench;
 mod block;
+mod check;
 mod frames;
 mod junit;
 mod lss;
@@ -34,99 +36,10 @@ use canopen::NodeId;
 
 use self::bench::Bench;
 pub use self::bench::Stop;
+pub use self::check::{Check, Outcome, Verdict};
 pub use self::junit::junit;
 use crate::bus::Adapter;
 use crate::device::Error;
-
-/// A check of one property of the device.
-#[derive(Clone, Copy, Debug)]
-pub struct Check {
-    /// The stable number, as in `SDO-012`; the part before the dash is the group.
-    pub id: &'static str,
-    /// What is sent, and what is expected.
-    pub title: &'static str,
-    /// The document and its clause.
-    pub clause: &'static str,
-    /// Whether the device is reset: a bootloader with a program may then start it.
-    pub resets: bool,
-    /// What the device must have or be; otherwise the check is skipped.
-    needs: Option<Step>,
-    run: Run,
-}
-
-/// A part of a check.
-type Step = fn(&mut Bench<'_>) -> Result<(), Stop>;
-
-/// What a check does.
-#[derive(Clone, Copy, Debug)]
-enum Run {
-    By(Step),
-    /// This SDO request is refused with this abort code.
-    Refused([u8; 8], u32),
-    /// An object is read by expedited upload: index, sub-index and number of bytes.
-    Number(u16, u8, u8),
-}
-
-impl Check {
-    const fn of(id: &'static str, title: &'static str, clause: &'static str, run: Run) -> Self {
-        Self { id, title, clause, resets: false, needs: None, run }
-    }
-
-    const fn new(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Self {
-        Self::of(id, title, clause, Run::By(run))
-    }
-
-    const fn that_resets(self) -> Self {
-        Self { resets: true, ..self }
-    }
-
-    const fn needs(self, needs: Step) -> Self {
-        Self { needs: Some(needs), ..self }
-    }
-
-    fn judge(&self, bench: &mut Bench<'_>) -> Result<(), Stop> {
-        if let Some(needs) = self.needs {
-            needs(bench)?;
-        }
-        match self.run {
-            Run::By(step) => step(bench),
-            Run::Refused(request, code) => bench.refuses(request, code),
-            Run::Number(index, sub, len) => bench.value(index, sub, len).map(drop),
-        }
-    }
-
-    /// The group of the check, as in `SDO`.
-    #[must_use]
-    pub fn group(&self) -> &'static str {
-        self.id.split('-').next().unwrap_or(self.id)
-    }
-
-    /// Whether `word` names this check or its group, in upper or lower case.
-    #[must_use]
-    pub fn is_named(&self, word: &str) -> bool {
-        self.id.eq_ignore_ascii_case(word) || self.group().eq_ignore_ascii_case(word)
-    }
-}
-
-/// The outcome of a check.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// The device does what the clause asks for.
-    Passed,
-    /// The device does something else: what.
-    Failed(String),
-    /// The property cannot be judged on this device or this host: why.
-    Skipped(String),
-}
-
-/// A check with its outcome.
-#[derive(Clone, Debug)]
-pub struct Verdict {
-    /// The check.
-    pub check: Check,
-    /// The outcome.
-    pub outcome: Outcome,
-}
 
 /// All checks, in the order in which they run.
 #[must_use]

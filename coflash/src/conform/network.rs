@@ -6,15 +6,13 @@ use canopen::nmt::{NmtCommand, NmtState};
 use canopen::{CobId, Frame};
 
 use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
-use super::frames::no_boot_up;
-use super::Check;
+use super::check::Check;
+use super::frames::{no_boot_up, REACTION};
 
 /// How long a device may take to start. The standard sets no limit.
 const START: Duration = Duration::from_secs(10);
 /// The longest heartbeat time that a check waits for.
 const LONGEST: u32 = 5000;
-/// How long a reaction to a command is waited for that must not come.
-pub(super) const REACTION: Duration = Duration::from_millis(200);
 
 const BOOT_UP: &str = "CiA 301 4.2, boot-up protocol";
 const HEARTBEAT: &str = "CiA 301 4.2, heartbeat protocol";

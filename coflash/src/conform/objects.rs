@@ -3,8 +3,8 @@
 use canopen::CobId;
 
 use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::check::{Check, Run};
 use super::sdo::{text, INVALID, NO_DATA, NO_OBJECT, NO_SUB_INDEX, READ_ONLY};
-use super::{Check, Run};
 
 const IDENTITY: &str = "CiA 301 4.2, object 1018h";
 const ERRORS: &str = "CiA 301 4.2, object 1003h";

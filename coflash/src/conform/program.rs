@@ -7,8 +7,8 @@ use canopen::CobId;
 use crc::{Crc, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 
 use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
+use super::check::{Check, Run};
 use super::sdo::{COMMAND, INVALID, NO_OBJECT, NO_SUB_INDEX, READ_ONLY, TOGGLE, WRITE_ONLY};
-use super::{Check, Run};
 
 /// What 1000h reads in a bootloader (L-1112, "Procedure in principle").
 pub(super) const BOOTLOADER: u32 = 0x1000_0000;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::{CobId, Frame};
 
 use super::bench::{abort_of, failed, request, skipped, Bench, Stop};
-use super::{Check, Run};
+use super::check::{Check, Run};
 
 const UP: u8 = 0x40;
 pub(super) const TOGGLE: u32 = 0x0503_0000;
