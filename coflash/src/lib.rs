@@ -7,6 +7,7 @@
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
 //! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `bus`, `device`, `file`, `update` |
+//! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device` |
 //! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
 //!
 //! The command line (`src/cli`, feature `cli`) is an ordinary user of this library: decisions are
@@ -41,6 +42,8 @@ mod setters;
 #[cfg(feature = "agent")]
 pub mod agent;
 pub mod bus;
+#[cfg(feature = "conform")]
+pub mod conform;
 pub mod device;
 pub mod file;
 #[cfg(feature = "ui")]

@@ -109,7 +109,7 @@ const RARE: [&str; 39] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 34] = [
+const EXAMPLES: [(&str, &str); 35] = [
     (
         "",
         "\
@@ -333,6 +333,13 @@ Examples:
   coflash debug break 0x08010204 --node 5",
     ),
     (
+        "conform",
+        "\
+Examples:
+  coflash conform --list
+  coflash conform SDO LSS --node 5 --junit report.xml",
+    ),
+    (
         "ui",
         "\
 Examples:
@@ -410,7 +417,10 @@ mod tests {
     fn every_example_is_understood() {
         let mut count = 0;
         for (name, text) in EXAMPLES {
-            if name == "ui" && !cfg!(feature = "ui") || name == "agent" && !cfg!(feature = "agent") {
+            if name == "ui" && !cfg!(feature = "ui")
+                || name == "agent" && !cfg!(feature = "agent")
+                || name == "conform" && !cfg!(feature = "conform")
+            {
                 continue;
             }
             for line in text.lines().filter_map(|line| line.strip_prefix("  coflash ")) {

@@ -17,6 +17,8 @@ mod adapters;
 mod agent;
 mod catch;
 mod config;
+#[cfg(feature = "conform")]
+mod conform;
 mod context;
 mod convert;
 mod debug;
@@ -143,6 +145,8 @@ enum Command {
     Debug(debug::Debug),
     Monitor(monitor::Monitor),
     Shell(shell::Shell),
+    #[cfg(feature = "conform")]
+    Conform(conform::Conform),
     #[cfg(feature = "ui")]
     Ui(ui::Ui),
     #[cfg(feature = "agent")]
@@ -203,6 +207,8 @@ impl Command {
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
             Self::Shell(shell) => shell.run(context, shell_line),
+            #[cfg(feature = "conform")]
+            Self::Conform(conform) => conform.run(context),
             #[cfg(feature = "ui")]
             Self::Ui(ui) => ui.run(context),
             #[cfg(feature = "agent")]

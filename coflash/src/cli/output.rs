@@ -328,6 +328,13 @@ impl Failure {
         Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
     }
 
+    /// A device that has failed `count` conformance checks; each one was shown.
+    #[cfg(feature = "conform")]
+    pub(super) fn nonconforming(node: NodeId, count: usize) -> Self {
+        let what = format!("node {node} has failed {count} of the checks");
+        Self { told: true, ..Self::new(Exit::Device, None, what, None) }
+    }
+
     /// The device refused some of several objects; each refusal was shown. The exit code is that of
     /// the first refusal.
     pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
