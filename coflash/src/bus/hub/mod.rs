@@ -8,7 +8,7 @@
 //! Conversations with devices that have a second SDO server can be a `group`: when all of them
 //! bring the same data, the hub writes the data to their devices in one download.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{channel, Receiver, Sender};
@@ -21,9 +21,11 @@ use canopen::sdo::client::SERVERS_MAX;
 use canopen::{Address, Frame, NodeId};
 
 use self::group::Meetings;
+use self::turns::Turns;
 use super::adapter::{Adapter, AdapterError, Group, Met};
 
 mod group;
+mod turns;
 
 /// A conversation with one node. [`run`] collects the results.
 pub struct Conversation<'c, R> {
@@ -205,6 +207,7 @@ pub fn run<'c, R: Send + 'c>(
 ) -> Vec<R> {
     let count = conversations.len();
     let mut meetings = Meetings::new(terms);
+    let mut turns = Turns::default();
     let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
     let (asks, asked) = channel();
     let (done, results) = channel();
@@ -234,12 +237,12 @@ pub fn run<'c, R: Send + 'c>(
             if !lines.iter().any(busy) {
                 break;
             }
-            settle(adapter, &asked, &mut lines, &mut lost);
+            settle(adapter, &asked, &mut lines, &mut turns, &mut lost);
             let is_complete = !waiting.iter().any(|(_, conversation)| conversation.channel.is_some());
             if lost.is_none() {
                 lost = meetings.go_on(adapter, &mut lines, is_complete).err();
             }
-            serve(adapter, &mut lines, &mut meetings, &mut lost);
+            serve(adapter, &mut lines, &mut meetings, &mut turns, &mut lost);
         }
     });
     drop(done);
@@ -254,16 +257,19 @@ fn settle(
     adapter: &mut dyn Adapter,
     asked: &Receiver<Ask>,
     lines: &mut [Option<Line>],
+    turns: &mut Turns,
     lost: &mut Option<AdapterError>,
 ) {
     let running = |line: &Option<Line>| line.as_ref().is_some_and(|line| line.state == State::Running);
-    let mut frames: Vec<(usize, Frame)> = Vec::new();
+    let now = adapter.now();
+    let mut sent: BTreeMap<usize, Vec<Frame>> = BTreeMap::new();
+    let mut waits: BTreeMap<usize, Duration> = BTreeMap::new();
     while lines.iter().any(running) {
         // The caller holds a sender, and each port reports its end: this loop ends.
         let Ok(ask) = asked.recv() else { return };
         let (port, state) = match ask {
             Ask::Send(port, frame) => {
-                frames.push((port, frame));
+                sent.entry(port).or_default().push(frame);
                 continue;
             }
             Ask::Leave(port) => {
@@ -272,16 +278,28 @@ fn settle(
                 }
                 continue;
             }
-            Ask::Receive { port, until } => (port, State::Waiting { until }),
+            Ask::Receive { port, until } => {
+                waits.insert(port, until);
+                (port, State::Waiting { until })
+            }
             Ask::Meet { port, item } => (port, State::Meeting(item)),
-            Ask::Gone(port) => (port, State::Gone),
+            Ask::Gone(port) => {
+                turns.gone(port);
+                (port, State::Gone)
+            }
         };
         if let Some(line) = &mut lines[port] {
             line.state = state;
         }
     }
-    frames.sort_by_key(|(port, _)| *port);
-    for (_, frame) in frames {
+    let mut frames = Vec::new();
+    for (port, until) in &waits {
+        frames.extend(turns.take(*port, sent.remove(port).unwrap_or_default(), *until, now));
+    }
+    // Who does not wait for an answer has ended, or waits for its group.
+    frames.extend(sent.into_values().flatten());
+    frames.extend(turns.pass_on(now));
+    for frame in frames {
         if lost.is_none() {
             *lost = adapter.send(&frame).err();
         }
@@ -293,6 +311,7 @@ fn serve(
     adapter: &mut dyn Adapter,
     lines: &mut [Option<Line>],
     meetings: &mut Meetings,
+    turns: &mut Turns,
     lost: &mut Option<AdapterError>,
 ) {
     let waiting = |line: &Line| match line.state {
@@ -302,7 +321,9 @@ fn serve(
     if lines.iter().flatten().any(|line| line.state == State::Running) {
         return;
     }
-    let deadlines = lines.iter().flatten().filter_map(waiting).chain(meetings.deadline());
+    let in_turn = lines.iter().enumerate().filter(|(port, _)| !turns.hold(*port));
+    let deadlines = in_turn.filter_map(|(_, line)| waiting(line.as_ref()?));
+    let deadlines = deadlines.chain(meetings.deadline()).chain(turns.deadline());
     let received = match (&lost, deadlines.min()) {
         (Some(error), _) => Err(copy(error)),
         (None, None) => return,
@@ -312,7 +333,8 @@ fn serve(
     if let Ok(Some(frame)) = &received {
         meetings.hear(frame, lines, now);
     }
-    for line in lines.iter_mut().flatten() {
+    for (port, line) in lines.iter_mut().enumerate() {
+        let Some(line) = line else { continue };
         let until = match (&line.state, &received) {
             (State::Waiting { until }, _) => *until,
             (State::Meeting(_), Err(error)) => {
@@ -325,9 +347,12 @@ fn serve(
             Ok(Some(frame)) if concerns(frame, line.node) => Ok(Some(*frame)),
             Ok(Some(_)) if until + GRACE > now => continue,
             Ok(None) if until > now => continue,
+            // Its frames are not sent yet, so its time has not begun.
+            Ok(_) if turns.hold(port) => continue,
             Ok(_) => Ok(None),
             Err(error) => Err(copy(error)),
         };
+        turns.woken(port);
         line.wake(frame.map(What::Frame), now);
     }
     if let Err(error) = received {
