@@ -76,7 +76,7 @@ pub(super) struct Labels {
     ver: Option<u32>,
 
     /// The date that belongs to --ver or to the image's label, in seconds since 1970. The default
-    /// is SOURCE_DATE_EPOCH; without it, the current time for --ver and no date for the label.
+    /// is SOURCE_DATE_EPOCH; without it, that of the file for --ver and no date for the label.
     #[arg(long, value_name = "SECONDS", env = "SOURCE_DATE_EPOCH")]
     date: Option<u64>,
 
@@ -174,7 +174,7 @@ impl Convert {
                 ));
             }
         }
-        let done = self.source.convert(firmware, input, self.program, self.labels.label()?)?;
+        let done = self.source.convert(firmware, input, self.program, self.labels.label(input)?)?;
         warn_left_out(context, input, &done);
         if sealing.is_none() {
             write(&output, &done.file.emit())?;
@@ -268,7 +268,8 @@ impl Convert {
 }
 
 impl Labels {
-    pub(super) fn label(&self) -> Result<Label, Failure> {
+    /// The contents of block 0 for the program in this file.
+    pub(super) fn label(&self, file: &Path) -> Result<Label, Failure> {
         if self.no_label {
             return Ok(Label::None);
         }
@@ -278,9 +279,13 @@ impl Labels {
         let Some(version) = self.ver else { return Ok(Label::Device { vendor_id, product_code }) };
         let date = match self.date {
             Some(date) => date,
-            None => SystemTime::now()
-                .duration_since(SystemTime::UNIX_EPOCH)
-                .map_err(|_| Failure::system("the clock is set before 1970: give --date".to_string()))?
+            // The same file always gives the same block 0: otherwise a download that was cut off
+            // could not go on.
+            None => std::fs::metadata(file)
+                .and_then(|about| about.modified())
+                .ok()
+                .and_then(|time| time.duration_since(SystemTime::UNIX_EPOCH).ok())
+                .ok_or_else(|| Failure::system(format!("{}: it has no date: give --date", file.display())))?
                 .as_secs(),
         };
         Ok(Label::Release { vendor_id, product_code, version, date })

@@ -207,7 +207,7 @@ impl Flash {
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
         let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
-        let file = self.program(context, image, self.program, &self.source(), self.labels.label()?)?;
+        let file = self.program(context, image, self.program, &self.source(), self.labels.label(image)?)?;
         let options = self.options(&file, &Settings::default())?;
         match &file {
             Program::Blocks(file) => {

@@ -8,7 +8,7 @@ use canopen::frame::Channel;
 use canopen::sdo::client::{Config, GroupDownload, GroupResult, GroupStep, Servers, SERVERS_MAX};
 use canopen::{AbortCode, Frame, Instant};
 
-use super::{Item, Line, State, Terms, What};
+use super::line::{Item, Line, State, Terms, What};
 use crate::bus::adapter::{Adapter, AdapterError, Met};
 
 /// After this many frames in a row, the bus is read.

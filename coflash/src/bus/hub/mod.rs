@@ -10,9 +10,7 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
-use std::sync::atomic::AtomicBool;
 use std::sync::mpsc::{channel, Receiver, Sender};
-use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
@@ -21,10 +19,13 @@ use canopen::sdo::client::SERVERS_MAX;
 use canopen::{Address, Frame, NodeId};
 
 use self::group::Meetings;
+pub use self::line::Terms;
+use self::line::{Answer, Item, Line, State, What};
 use self::turns::Turns;
 use super::adapter::{Adapter, AdapterError, Group, Met};
 
 mod group;
+mod line;
 mod turns;
 
 /// A conversation with one node. [`run`] collects the results.
@@ -41,17 +42,6 @@ pub struct Conversation<'c, R> {
 /// The work of a conversation.
 pub type Act<'c, R> = Box<dyn FnOnce(&mut Port) -> R + Send + 'c>;
 
-/// How conversations run.
-#[derive(Clone, Debug)]
-pub struct Terms {
-    /// How many are at work at the same time.
-    pub at_once: usize,
-    /// How long the group waits for the answer of a device.
-    pub answer: Duration,
-    /// Ends a download of the group when it is set.
-    pub cancelled: Arc<AtomicBool>,
-}
-
 /// A frame that is still in the adapter may be the one that a conversation waits for. The time of a
 /// conversation is therefore over only when the adapter has no frames left, or after this
 /// additional time.
@@ -64,25 +54,6 @@ enum Ask {
     Meet { port: usize, item: Item },
     Leave(usize),
     Gone(usize),
-}
-
-/// The hub's message to a port.
-struct Answer {
-    what: Result<What, AdapterError>,
-    now: Duration,
-}
-
-enum What {
-    Frame(Option<Frame>),
-    Met(Met),
-}
-
-/// What a conversation brings to a meeting.
-#[derive(Clone, PartialEq, Eq)]
-struct Item {
-    turn: u32,
-    at: Address,
-    data: Vec<u8>,
 }
 
 /// A conversation's access to the bus: it receives only the frames that concern its node.
@@ -163,37 +134,6 @@ impl Drop for Port {
         // If the hub is gone, no receiver is left.
         let _ = self.asks.send(Ask::Gone(self.number));
     }
-}
-
-/// The hub's record of a port.
-struct Line {
-    node: NodeId,
-    /// Its part in the group, until it leaves.
-    channel: Option<Channel>,
-    answers: Sender<Answer>,
-    state: State,
-}
-
-impl Line {
-    /// Lets the conversation continue.
-    fn wake(&mut self, what: Result<What, AdapterError>, now: Duration) {
-        self.state = State::Running;
-        // If the conversation has ended in the meantime, it reports its end itself.
-        let _ = self.answers.send(Answer { what, now });
-    }
-}
-
-#[derive(Clone, PartialEq, Eq)]
-enum State {
-    /// The conversation works, and will send its next request.
-    Running,
-    /// The conversation waits for a frame.
-    Waiting {
-        until: Duration,
-    },
-    /// The conversation waits for the others of its group.
-    Meeting(Item),
-    Gone,
 }
 
 /// Runs the conversations. Returns their results in the order of the conversations.
