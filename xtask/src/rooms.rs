@@ -70,7 +70,7 @@ const COFLASH: &[Rule] = &[
     Rule { room: "device", may_use: &["bus", "canopen", "json", "setters", "shared_abi"] },
     Rule { room: "update", may_use: &["bus", "canopen", "device", "file", "json", "setters", "shared_abi"] },
     Rule { room: "agent", may_use: &["bus", "canopen", "device", "file", "shared_abi", "update"] },
-    Rule { room: "conform", may_use: &["bus", "canopen", "device"] },
+    Rule { room: "conform", may_use: &["bus", "canopen", "device", "update"] },
     Rule {
         room: "cli",
         may_use: &["agent", "bus", "canopen", "conform", "device", "file", "shared_abi", "ui", "update"],

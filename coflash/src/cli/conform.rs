@@ -1,22 +1,27 @@
 //! `coflash conform`: conformance checks on a device.
 
 use std::path::PathBuf;
+use std::process::Command;
+use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::conform::{checks, junit, run, Check, Outcome, Verdict};
+use coflash::conform::{checks, junit, run, Check, Means, Outcome, Power, Verdict};
+use coflash::file::convert::Label;
+use coflash::update::Program;
 use serde_json::json;
 
 use super::context::Context;
 use super::device::cancelled;
+use super::file::{warn_left_out, Source};
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
 /// Checks whether a device conforms to CiA 301 and CiA 305, with a verdict for each check.
 ///
-/// No check touches the program. The device is left in the NMT state in which it was found, also
-/// after Ctrl-C. Checks that reset the device run only with --reset.
+/// No check touches the program, unless --install asks for it. The device is left in the NMT state in
+/// which it was found, also after Ctrl-C. Checks that reset the device run only with --reset.
 #[derive(Debug, Args)]
 pub(super) struct Conform {
     /// The checks or groups to run, for example SDO or SDO-003; by default all.
@@ -34,6 +39,22 @@ pub(super) struct Conform {
     /// Also run the checks that reset the device; a bootloader may then start its program.
     #[arg(long)]
     reset: bool,
+
+    /// Also run the checks that erase the device and install --image, which runs at the end.
+    #[arg(long, requires = "image")]
+    install: bool,
+
+    /// The program for --install.
+    #[arg(long, value_name = "FILE", requires = "install")]
+    image: Option<PathBuf>,
+
+    #[command(flatten)]
+    source: Source,
+
+    /// The command that switches the device's power, for the power cut of --install; {state} becomes
+    /// on or off.
+    #[arg(long, value_name = "COMMAND", requires = "install")]
+    power_command: Option<String>,
 
     /// Write the report as JUnit XML to this file.
     #[arg(long, value_name = "FILE")]
@@ -53,12 +74,16 @@ impl Conform {
             context.out.result(lines.join("\n"), || {
                 let list: Vec<_> = chosen
                     .iter()
-                    .map(|c| json!({ "id": c.id, "title": c.title, "clause": c.clause, "resets": c.resets }))
+                    .map(|c| {
+                        json!({ "id": c.id, "title": c.title, "clause": c.clause, "resets": c.resets,
+                                       "installs": c.installs })
+                    })
                     .collect();
                 json!({ "command": "conform", "checks": list })
             });
             return Ok(());
         }
+        let image = self.image(context)?;
         let _lock = context.lock(context.bus.as_deref(), self.node)?;
         let mut adapter = context.open()?;
         let tell = &mut |verdict: &Verdict| {
@@ -66,8 +91,10 @@ impl Conform {
             let why = if why.is_empty() { String::new() } else { format!(": {why}") };
             context.out.say(format_args!("{:9} {word:7} {}{why}", verdict.check.id, verdict.check.title));
         };
-        let chosen: Vec<_> = chosen.into_iter().filter(|check| self.reset || !check.resets).collect();
-        let verdicts = run(&mut *adapter, self.node, &chosen, self.answer_timeout, &cancelled()?, tell)?;
+        let is_asked = |check: &Check| (self.reset || !check.resets) && (self.install || !check.installs);
+        let chosen: Vec<_> = chosen.into_iter().filter(is_asked).collect();
+        let means = Means { answer: self.answer_timeout, image, power: self.power() };
+        let verdicts = run(&mut *adapter, self.node, &chosen, means, &cancelled()?, tell)?;
         if let Some(path) = &self.junit {
             std::fs::write(path, junit(&verdicts))
                 .map_err(|error| Failure::system(format!("{}: {error}", path.display())))?;
@@ -91,6 +118,28 @@ impl Conform {
         } else {
             Err(Failure::nonconforming(self.node, failed))
         }
+    }
+
+    /// The program of --image, as blocks.
+    fn image(&self, context: &Context) -> Result<Option<Program>, Failure> {
+        let Some(path) = &self.image else { return Ok(None) };
+        let done = self.source.blocks(path, 1, Label::OfImage { date: 0 })?;
+        warn_left_out(context, path, &done);
+        Ok(Some(Arc::new(done.file).into()))
+    }
+
+    /// The power of the device, by the user's command.
+    fn power(&self) -> Option<Power<'_>> {
+        let command = self.power_command.as_ref()?;
+        Some(Box::new(move |on| {
+            let line = command.replace("{state}", if on { "on" } else { "off" });
+            let (shell, flag) = if cfg!(windows) { ("cmd", "/C") } else { ("sh", "-c") };
+            match Command::new(shell).args([flag, &line]).status() {
+                Ok(status) if status.success() => Ok(()),
+                Ok(status) => Err(format!("'{line}' has failed ({status})")),
+                Err(error) => Err(format!("'{line}' cannot be run: {error}")),
+            }
+        }))
     }
 
     fn chosen(&self) -> Result<Vec<Check>, Failure> {

@@ -337,7 +337,8 @@ Examples:
         "\
 Examples:
   coflash conform --list
-  coflash conform SDO LSS --node 5 --junit report.xml",
+  coflash conform SDO LSS --node 5 --junit report.xml
+  coflash conform --install --image app.elf --node 5",
     ),
     (
         "ui",

@@ -8,7 +8,29 @@ use canopen::nmt::{NmtCommand, NmtState};
 use canopen::{CobId, Frame, NodeId};
 
 use crate::bus::{Adapter, AdapterError};
-use crate::device::Error;
+use crate::device::{Error, Session, Timing};
+use crate::update::Program;
+
+/// Switches the power of the device on or off.
+pub type Power<'p> = Box<dyn FnMut(bool) -> Result<(), String> + 'p>;
+
+/// What the checks may use.
+pub struct Means<'p> {
+    /// The longest time for an answer of the device.
+    pub answer: Duration,
+    /// The program for the checks that install one.
+    pub image: Option<Program>,
+    /// The power of the device.
+    pub power: Option<Power<'p>>,
+}
+
+impl Means<'_> {
+    /// Checks that install nothing.
+    #[must_use]
+    pub const fn of(answer: Duration) -> Self {
+        Self { answer, image: None, power: None }
+    }
+}
 
 /// Why a check ends without passing.
 #[derive(Debug)]
@@ -42,7 +64,7 @@ const TURN: Duration = Duration::from_millis(100);
 pub struct Bench<'a> {
     adapter: &'a mut dyn Adapter,
     pub(super) node: NodeId,
-    answer: Duration,
+    means: Means<'a>,
     cancelled: &'a Arc<AtomicBool>,
 }
 
@@ -69,10 +91,41 @@ impl<'a> Bench<'a> {
     pub(super) fn new(
         adapter: &'a mut dyn Adapter,
         node: NodeId,
-        answer: Duration,
+        means: Means<'a>,
         cancelled: &'a Arc<AtomicBool>,
     ) -> Self {
-        Self { adapter, node, answer, cancelled }
+        Self { adapter, node, means, cancelled }
+    }
+
+    /// Does something with the client of updates; its error is the device's failure.
+    pub(super) fn with<R>(
+        &mut self,
+        act: impl FnOnce(&mut Session<'_>) -> Result<R, Error>,
+    ) -> Result<R, Stop> {
+        let timing = Timing::default().sdo(self.means.answer);
+        let mut session = Session::new(&mut *self.adapter, self.node, timing);
+        session.cancel_by(Arc::clone(self.cancelled));
+        act(&mut session).map_err(|error| match error {
+            Error::Adapter(_) | Error::Cancelled => Stop::Bus(error),
+            error => Stop::Failed(error.to_string()),
+        })
+    }
+
+    /// The program to install.
+    pub(super) fn image(&self) -> Result<&Program, Stop> {
+        self.means.image.as_ref().ok_or_else(|| Stop::Skipped("no program is given".to_string()))
+    }
+
+    pub(super) fn has_power(&self) -> bool {
+        self.means.power.is_some()
+    }
+
+    /// Switches the power on or off.
+    pub(super) fn power(&mut self, on: bool) -> Result<(), Stop> {
+        match &mut self.means.power {
+            Some(power) => power(on).map_err(Stop::Skipped),
+            None => skipped("no command for the power is given"),
+        }
     }
 
     /// Brings the device into a known state: pre-operational, no transfer, LSS waiting.
@@ -137,12 +190,12 @@ impl<'a> Bench<'a> {
 
     /// The next SDO answer.
     pub(super) fn heard(&mut self) -> Result<[u8; 8], Stop> {
-        match self.hear(CobId::sdo_response(self.node), self.answer)? {
+        match self.hear(CobId::sdo_response(self.node), self.means.answer)? {
             Some(frame) => match frame.exactly::<8>() {
                 Some(data) => Ok(*data),
                 None => failed(format!("the SDO answer has not 8 bytes: {frame}")),
             },
-            None => failed(format!("no SDO answer within {} ms", self.answer.as_millis())),
+            None => failed(format!("no SDO answer within {} ms", self.means.answer.as_millis())),
         }
     }
 
@@ -185,7 +238,7 @@ impl<'a> Bench<'a> {
     /// Expects that a frame is not answered on `id`, and that the server works afterwards.
     pub(super) fn ignores(&mut self, frame: &Frame, id: CobId) -> Result<(), Stop> {
         self.send(frame)?;
-        match self.hear(id, self.answer.min(UNANSWERED))? {
+        match self.hear(id, self.means.answer.min(UNANSWERED))? {
             Some(answer) => failed(format!("{frame} was answered with {answer}")),
             None => self.works(),
         }

@@ -13,6 +13,8 @@ pub struct Check {
     pub clause: &'static str,
     /// Whether the device is reset: a bootloader with a program may then start it.
     pub resets: bool,
+    /// Whether a program is erased or installed.
+    pub installs: bool,
     /// What the device must have or be; otherwise the check is skipped.
     needs: Option<Step>,
     run: Run,
@@ -33,7 +35,7 @@ pub(super) enum Run {
 
 impl Check {
     pub(super) const fn of(id: &'static str, title: &'static str, clause: &'static str, run: Run) -> Self {
-        Self { id, title, clause, resets: false, needs: None, run }
+        Self { id, title, clause, resets: false, installs: false, needs: None, run }
     }
 
     pub(super) const fn new(id: &'static str, title: &'static str, clause: &'static str, run: Step) -> Self {
@@ -42,6 +44,10 @@ impl Check {
 
     pub(super) const fn that_resets(self) -> Self {
         Self { resets: true, ..self }
+    }
+
+    pub(super) const fn that_installs(self) -> Self {
+        Self { installs: true, ..self }
     }
 
     pub(super) const fn needs(self, needs: Step) -> Self {

@@ -1,8 +1,8 @@
 //! Conformance checks for a device on a real bus (`coflash conform`).
 //!
-//! A check is data (its number, the clause, what is expected) and a function over a bench. All
-//! checks here leave the device's program alone. Those that reset the device say so
-//! ([`Check::resets`]) and run only if they are asked for.
+//! A check is data (its number, the clause, what is expected) and a function over a bench. Those
+//! that reset the device ([`Check::resets`]) or install a program ([`Check::installs`]) say so; the
+//! others leave the program alone.
 //!
 //! | module | what it does |
 //! |---|---|
@@ -15,6 +15,7 @@
 //! | `network` | boot-up, heartbeat and NMT |
 //! | `lss` | layer setting services |
 //! | `program` | 1F50h to 1F57h, without a change of the program |
+//! | `update` | updates, whole and interrupted, with a program that the user gives |
 //! | `junit` | the report for a test system |
 
 mod bench;
@@ -27,15 +28,15 @@ mod network;
 mod objects;
 mod program;
 mod sdo;
+mod update;
 
 use std::sync::atomic::AtomicBool;
 use std::sync::Arc;
-use std::time::Duration;
 
 use canopen::NodeId;
 
 use self::bench::Bench;
-pub use self::bench::Stop;
+pub use self::bench::{Means, Power, Stop};
 pub use self::check::{Check, Outcome, Verdict};
 pub use self::junit::junit;
 use crate::bus::Adapter;
@@ -52,12 +53,12 @@ pub fn checks() -> Vec<Check> {
         frames::CHECKS,
         lss::CHECKS,
         program::CHECKS,
+        update::CHECKS,
     ]
     .concat()
 }
 
-/// Runs checks on a device and passes each verdict to `tell`. `answer` is the longest time for an
-/// answer of the device. Before each check, the device is put into pre-operational state, and a
+/// Runs checks on a device and passes each verdict to `tell`. Before each check, the device is put into pre-operational state, and a
 /// transfer that is left over is aborted. At the end, also after an error, the device gets back the
 /// NMT state that its heartbeat told before the first check; without a heartbeat it stays
 /// pre-operational.
@@ -68,11 +69,11 @@ pub fn run(
     adapter: &mut dyn Adapter,
     node: NodeId,
     checks: &[Check],
-    answer: Duration,
+    means: Means<'_>,
     cancelled: &Arc<AtomicBool>,
     tell: &mut dyn FnMut(&Verdict),
 ) -> Result<Vec<Verdict>, Error> {
-    let mut bench = Bench::new(adapter, node, answer, cancelled);
+    let mut bench = Bench::new(adapter, node, means, cancelled);
     let found = match bench.state() {
         Ok(found) => found,
         Err(Stop::Bus(error)) => return Err(error),

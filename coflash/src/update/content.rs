@@ -56,6 +56,12 @@ pub enum Program {
 }
 
 impl Program {
+    /// The CRC that 1F56h of a device with this program tells.
+    #[must_use]
+    pub fn program_crc(&self) -> u32 {
+        self.content().program_crc()
+    }
+
     /// The target device, if the content names one.
     #[must_use]
     pub fn target(&self) -> Option<Target> {

@@ -292,7 +292,7 @@ fn serve(
             Ok(_) => Ok(None),
             Err(error) => Err(copy(error)),
         };
-        turns.woken(port);
+        turns.woken(port, now);
         line.wake(frame.map(What::Frame), now);
     }
     if let Err(error) = received {

@@ -3,8 +3,8 @@
 //! The segments of several transfers at once would fill the adapter's queue, and the bus without a
 //! pause: nodes could not send what has a lower priority than requests, such as a boot-up, for as
 //! long as that lasts, and the segments of one transfer would have pauses that its device takes for
-//! losses. So one conversation at a time sends a burst, and the next one waits for the answer to
-//! it. Single requests are sent at once.
+//! losses. So one conversation at a time sends a burst. The next one waits for the answer to it, and
+//! for a moment in which the bus is free. Single requests are sent at once.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -14,10 +14,16 @@ use canopen::Frame;
 /// If a burst gets no answer for this time, the next conversation has its turn.
 const UNANSWERED: Duration = Duration::from_millis(250);
 
+/// How long the bus is left alone between two turns. A frame can begin when the bus has been idle
+/// for 3 bits, which are 150 us at 20 kbit/s.
+const PAUSE: Duration = Duration::from_micros(300);
+
 /// Whose turn it is, and the frames of those that wait for theirs.
 #[derive(Default)]
 pub(super) struct Turns {
     turn: Option<Turn>,
+    /// When the last turn ended.
+    ended: Duration,
     held: VecDeque<(usize, Vec<Frame>)>,
 }
 
@@ -48,7 +54,7 @@ impl Turns {
         let is_burst = frames.len() > 1;
         match &mut self.turn {
             Some(turn) if turn.port == port => turn.waits_since = (until > now).then_some(now),
-            Some(_) if is_burst => {
+            turn if is_burst && (turn.is_some() || !self.held.is_empty()) => {
                 self.held.push_back((port, frames));
                 return Vec::new();
             }
@@ -61,9 +67,10 @@ impl Turns {
     }
 
     /// A conversation has got an answer, or waits no longer.
-    pub(super) fn woken(&mut self, port: usize) {
+    pub(super) fn woken(&mut self, port: usize, now: Duration) {
         if self.turn.as_ref().is_some_and(|turn| turn.port == port && turn.waits_since.is_some()) {
             self.turn = None;
+            self.ended = now;
         }
     }
 
@@ -75,18 +82,20 @@ impl Turns {
         }
     }
 
-    /// When the turn ends without an answer, if somebody waits for it.
+    /// When the next conversation has its turn at the latest, if one waits for it.
     pub(super) fn deadline(&self) -> Option<Duration> {
-        let since = self.turn.as_ref()?.waits_since?;
-        (!self.held.is_empty()).then_some(since + UNANSWERED)
+        if self.held.is_empty() {
+            return None;
+        }
+        match &self.turn {
+            Some(turn) => turn.waits_since.map(|since| since + UNANSWERED),
+            None => Some(self.ended + PAUSE),
+        }
     }
 
-    /// Passes the turn on if it is over; returns the frames of the next conversation.
+    /// Passes the turn on if it is time; returns the frames of the next conversation.
     pub(super) fn pass_on(&mut self, now: Duration) -> Vec<Frame> {
-        if self.deadline().is_some_and(|deadline| now >= deadline) {
-            self.turn = None;
-        }
-        if self.turn.is_some() {
+        if !self.deadline().is_some_and(|deadline| now >= deadline) {
             return Vec::new();
         }
         let Some((port, frames)) = self.held.pop_front() else { return Vec::new() };
