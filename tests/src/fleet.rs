@@ -160,19 +160,21 @@ pub struct Measurement {
 /// If an update fails, or the firmware was not built.
 pub fn measure(mut row: impl FnMut(Measurement)) {
     let mut fleet = Fleet::new(8, BitRate::K1000);
-    for block_size in [DEFAULT_BLOCK_SIZE, LARGE] {
+    let of_default: &[_] = &[
+        (1, Way::OneByOne, 0),
+        (2, Way::Together, 0),
+        (4, Way::Together, 0),
+        (8, Way::Together, 0),
+        (8, Way::OneByOne, 0),
+        (8, Way::Together, 100_000),
+        (8, Way::Together, 1000),
+        (1, Way::OneByOne, 1000),
+    ];
+    let of_large: &[_] = &[(1, Way::OneByOne, 0), (8, Way::Together, 0), (8, Way::Together, 1000)];
+    for (block_size, rows) in [(DEFAULT_BLOCK_SIZE, of_default), (LARGE, of_large)] {
         let file = Arc::new(blocks(&program(256), block_size));
         let mut one = None;
-        for (boards, way, lost_one_in) in [
-            (1, Way::OneByOne, 0),
-            (2, Way::Together, 0),
-            (4, Way::Together, 0),
-            (8, Way::Together, 0),
-            (8, Way::OneByOne, 0),
-            (8, Way::Together, 100_000),
-            (8, Way::Together, 1000),
-            (1, Way::OneByOne, 1000),
-        ] {
+        for &(boards, way, lost_one_in) in rows {
             fleet.bench.world.clear_faults();
             if lost_one_in != 0 {
                 fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);

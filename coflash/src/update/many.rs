@@ -39,8 +39,9 @@ impl Job {
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ManyOptions {
-    /// The time limits. Answers wait behind those of other devices, so the SDO time-out is
-    /// multiplied by the number of devices that are updated at the same time.
+    /// The time limits. Requests wait behind those for other devices: with several devices at the
+    /// same time, the SDO time-out of a block is multiplied by their number, and that of other
+    /// requests is doubled outside of a group.
     pub timing: Timing,
     /// The form of downloads.
     pub transfers: Transfers,
@@ -155,12 +156,16 @@ fn flash_each(
     tell: &(dyn Fn(usize, Event) + Sync),
 ) -> Vec<End> {
     let at_once = options.at_once.clamp(1, jobs.len().max(1));
-    let sdo = options.timing.sdo.saturating_mul(at_once as u32);
-    let timing = Timing { sdo, ..options.timing };
+    // Without a group, a request may have to wait for the segments of another transfer.
+    let timing = |plan: &Planned<'_>| match (at_once, plan.channel) {
+        (1, _) | (_, Some(_)) => options.timing,
+        _ => Timing { sdo: options.timing.sdo.saturating_mul(2), ..options.timing },
+    };
     let conversation = |plan: &Planned<'_>| {
-        let (number, job, all) = (plan.number, plan.job.clone(), options.clone());
+        let (number, job, all, timing) = (plan.number, plan.job.clone(), options.clone(), timing(plan));
         let act = move |port: &mut hub::Port| {
             let mut session = Session::new(port, job.node, timing);
+            session.share_with(at_once as u32);
             let one = FlashOptions { follow: false, ..job.options };
             let (mut done, mut was_in_group) = (None, false);
             let result = update(&mut session, &job, &one, &all, &mut |event| match event {
@@ -188,7 +193,8 @@ fn flash_each(
         let act: hub::Act<'_, _> = Box::new(act);
         hub::Conversation { node: plan.job.node, channel: plan.channel, act }
     };
-    let terms = hub::Terms { at_once, answer: options.timing.sdo, cancelled: options.cancelled.clone() };
+    // Devices of a group have nothing else to do than to answer.
+    let terms = hub::Terms { at_once, answer: options.timing.sdo / 2, cancelled: options.cancelled.clone() };
     hub::run(adapter, jobs.iter().map(conversation).collect(), &terms)
 }
 

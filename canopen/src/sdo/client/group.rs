@@ -16,7 +16,7 @@ pub type Servers = u128;
 pub const SERVERS_MAX: usize = Servers::BITS as usize;
 
 /// How long the answers of single servers are awaited when others have answered the initiate or the
-/// end, or have acknowledged a whole sub-block, in milliseconds: longer than a server waits for a
+/// end, or have acknowledged the whole sub-block, in milliseconds: longer than a server waits for a
 /// missing segment.
 const LATE_MS: u32 = 120;
 
@@ -260,8 +260,13 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
             State::Blocks(Sent { sub_block, range: Some((first, _)), .. }) => sub_block.is_whole(first),
             _ => false,
         };
-        let deadline =
-            self.moved + if others_have_all { LATE_MS.min(self.timeout_ms) } else { self.timeout_ms };
+        let others_have_answered = match self.state {
+            State::Begun { blksize, .. } => blksize.is_some(),
+            State::Ended { missing, .. } => missing != self.servers,
+            _ => others_have_all,
+        };
+        let wait = if others_have_answered { LATE_MS.min(self.timeout_ms) } else { self.timeout_ms };
+        let deadline = self.moved + wait;
         if !now.has_reached(deadline) {
             return GroupStep::Wait(deadline);
         }

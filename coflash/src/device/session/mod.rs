@@ -44,6 +44,7 @@ pub struct Session<'a> {
     node: NodeId,
     timing: Timing,
     transfers: Transfers,
+    sharing: u32,
     cancelled: Option<Arc<AtomicBool>>,
     answer: Option<fn(&Frame) -> Option<Frame>>,
     watch: Arc<Mutex<Watch>>,
@@ -84,6 +85,7 @@ impl<'a> Session<'a> {
             node,
             timing,
             transfers: Transfers::default(),
+            sharing: 1,
             cancelled: None,
             answer: None,
             watch: Arc::default(),
@@ -100,8 +102,14 @@ impl<'a> Session<'a> {
             Way::Bus(adapter) => Way::Bus(&mut **adapter),
             Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
         };
-        let (watch, on_silence) = (self.watch.clone(), self.on_silence);
-        Session { way, node, timing, transfers, cancelled, answer, watch, on_silence }
+        let (watch, on_silence, sharing) = (self.watch.clone(), self.on_silence, self.sharing);
+        Session { way, node, timing, transfers, sharing, cancelled, answer, watch, on_silence }
+    }
+
+    /// Says that so many sessions share the bus: a long value may have to wait for those of all
+    /// others, so its SDO time-out is multiplied by this.
+    pub(crate) fn share_with(&mut self, sessions: u32) {
+        self.sharing = sessions.max(1);
     }
 
     /// Continues with another node.

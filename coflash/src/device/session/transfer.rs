@@ -101,9 +101,13 @@ impl Session<'_> {
         if !self.hears_the_bus() {
             return self.write_there(at, data, doing, progress);
         }
+        let mut config = self.config();
+        if data.len() > WORTH_BLOCKS {
+            config.timeout_ms = config.timeout_ms.saturating_mul(self.sharing).min(u32::MAX / 4);
+        }
         if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
             let block = Block { fallback: false, ..Block::default() };
-            let mut download = Download::as_blocks(self.node, at, data, self.config(), block);
+            let mut download = Download::as_blocks(self.node, at, data, config, block);
             match self.run(&mut download, doing, Patience::ForEachStep, progress) {
                 // Later values are not tried by block transfer again.
                 Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
@@ -116,7 +120,7 @@ impl Session<'_> {
                 result => return result,
             }
         }
-        let mut download = Download::new(self.node, at, data, self.config());
+        let mut download = Download::new(self.node, at, data, config);
         self.run(&mut download, doing, Patience::ForEachStep, progress)
     }
 
