@@ -66,8 +66,16 @@ pub fn run(mut args: Args) -> Outcome {
         Suite { summary: Summary::default(), coflash: built("coflash"), node: built("coboot-node"), python };
     if chosen_board {
         suite.run(board, &[build::tests_args(board), chosen].concat())?;
-    } else {
+    } else if !chosen.is_empty() {
         suite.run(board, &chosen)?;
+    } else {
+        // The crate of the emulated tests has sealed images, without which a bootloader has more:
+        // together, all would be tested with them.
+        let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
+        let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
+        suite.run(board, &["--workspace".to_owned()].into_iter().chain(hosts).collect::<Vec<_>>())?;
+        let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+        suite.run(board, &[build::tests_args(board), sealed.to_vec()].concat())?;
         for other in others {
             println!("\n-- {} --", other.board);
             let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));
@@ -89,6 +97,9 @@ pub fn run(mut args: Args) -> Outcome {
         failed => Err(format!("{failed} tests failed; their output stands above.")),
     }
 }
+
+/// The packages that are built for a chip, or by another tool.
+const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coboot-python"];
 
 /// The test programs that run for every board: they show the mistakes that a port can have.
 const MAIN_TESTS: [&str; 11] = [

@@ -37,14 +37,14 @@ pub(super) const CHECKS: &[Check] = &[
     }),
     check("UPD-003", "80h to 1F51h/1 calls the running program back", COMMANDS, |b| {
         running(b)?;
-        b.with(|session| steps::call_back(session)).map(drop)
+        b.with(steps::call_back).map(drop)
     }),
     check("UPD-004", "the call is heard behind other requests", COMMANDS, |b| {
         running(b)?;
         for _ in 0..LOAD {
             b.tell(request(0x40, 0x1000, 0, [0; 4]))?;
         }
-        b.with(|session| steps::call_back(session)).map(drop)
+        b.with(steps::call_back).map(drop)
     }),
     check("UPD-005", "every request is answered while the device erases", RAM, |b| {
         let program = b.image()?.clone();

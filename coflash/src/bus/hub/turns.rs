@@ -95,7 +95,7 @@ impl Turns {
 
     /// Passes the turn on if it is time; returns the frames of the next conversation.
     pub(super) fn pass_on(&mut self, now: Duration) -> Vec<Frame> {
-        if !self.deadline().is_some_and(|deadline| now >= deadline) {
+        if self.deadline().is_none_or(|deadline| now < deadline) {
             return Vec::new();
         }
         let Some((port, frames)) = self.held.pop_front() else { return Vec::new() };
