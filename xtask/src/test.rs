@@ -99,7 +99,7 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The packages that are built for a chip, or by another tool.
-const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coboot-python"];
+const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
 
 /// The test programs that run for every board: they show the mistakes that a port can have.
 const MAIN_TESTS: [&str; 11] = [
