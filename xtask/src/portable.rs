@@ -18,7 +18,8 @@ const TARGETS: [&str; 2] = ["x86_64-pc-windows-gnu", "aarch64-apple-darwin"];
 /// The packages that must compile there.
 const PACKAGES: [&str; 2] = ["coflash", "coboot-node"];
 /// The default features of coflash without `tls`.
-const FEATURES: &str = "coflash/cli,coflash/ui,coflash/agent,coflash/peak,coflash/kvaser,coflash/gs_usb";
+const FEATURES: &str =
+    "coflash/cli,coflash/ui,coflash/agent,coflash/conform,coflash/peak,coflash/kvaser,coflash/gs_usb";
 
 pub fn run(mut args: Args) -> Outcome {
     let strict = args.flag("--strict");
