@@ -265,6 +265,28 @@ fn a_program_for_another_product_is_refused() {
     assert!(folder.read("1.flash")[0x1_0000..] == before[0x1_0000..]);
 }
 
+/// One of three devices that are updated together is another product: it refuses alone.
+#[test]
+fn another_product_among_the_devices_of_a_group_refuses_alone() {
+    let folder = folder("group");
+    let wanted = ["--node", "1", "--count", "2", "--product-code", "98", "--flash", "instant"];
+    let nodes = Nodes::start(&folder, &wanted);
+    let other = ["--node", "3", "--serial", "3", "--product-code", "99", "--flash", "instant"];
+    let other = Nodes::join(&folder, nodes.url(), &other);
+    other.await_line("serial 3, node 3: bootloader (Program(Absent))");
+    let coflash = Coflash::new(&folder, &nodes);
+    let flash = ["-N", "1-3", "--together=always", "--no-start", "--vid", "0", "--pid", "98"];
+    let said = coflash.run(&[FLASH, &flash].concat());
+    assert_eq!(said.exit, 8, "{}{}", said.out, said.err);
+    let refusal = "node 3: error: the program is for product code 00000062h, and node 3 has 00000063h";
+    assert!(said.out.contains(refusal) && said.out.contains("2 of 3 devices are done"), "{}", said.out);
+    assert!(said.out.contains("together"), "{}", said.out);
+    for serial in 1..=2 {
+        assert!(folder.read(&format!("{serial}.flash"))[0x1_0000..] == flashed(), "{serial}");
+    }
+    assert!(folder.read("3.flash")[0x1_0000..].iter().all(|byte| *byte == 0xFF));
+}
+
 #[test]
 fn two_programs_have_their_places() {
     let folder = folder("two");

@@ -1,19 +1,25 @@
 //! Boards that get the same program at the same time, with the real firmware.
 
 use std::sync::atomic::Ordering;
+use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::program::PROGRAM_ID;
+use canopen::program::{FlashError, PROGRAM_ID};
 use canopen::{Address, BitRate};
+use coboot_tests::firmware;
 use coboot_tests::fleet::{file, Fleet, Update};
 use coflash::bus::Adapter as _;
+use coflash::device::Doing;
+use coflash::file::block_file::BlockFile;
 use coflash::update::event::{Note, Warning};
 use coflash::update::many::ManyOptions;
 use coflash::update::Event;
 use coflash::Error;
 use emulator::bus::fault::FaultAction;
 use emulator::frame::Frame;
+use emulator::machine::Machine;
 use emulator::time::Span;
+use shared_abi::layout::stm32f407g_disc1_two;
 
 const KIB: u32 = 40;
 
@@ -207,4 +213,68 @@ fn a_cancelled_group_goes_on_later() {
     assert_eq!(rest.done(), 3, "{:?}", warnings(&rest));
     assert!(rest.took * 10 < usual * 9, "{:?} for the rest, {usual:?} for all", rest.took);
     assert_all_have(&mut fleet, 3, file.program_crc());
+}
+
+/// One of three boards cannot take the program: the error is its own, and the others have theirs.
+fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<BlockFile>) -> Error {
+    let mut fleet = Fleet::new(3, BitRate::K1000);
+    let board = fleet.bench.boards()[1];
+    fleet.bench.world.power_off(board);
+    prepare(fleet.bench.world.machine_mut(board));
+    fleet.bench.world.power_on(board);
+    fleet.bench.run_ms(50);
+    let mut update = fleet.update(3, file, &ManyOptions::default());
+    assert_eq!(update.done(), 2, "{:?}", update.results);
+    assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
+    let crc = file.program_crc();
+    for node in [1, 3] {
+        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
+        assert_eq!(told.unwrap(), crc, "node {node}");
+    }
+    // It runs nothing that was not verified, and is there for the next try.
+    assert!(fleet.bench.is_bootloader(2));
+    let told = fleet.bench.session_with(2).read_number(Address::new(PROGRAM_ID, 1)).unwrap();
+    assert_eq!(told, 0);
+    update.results.swap_remove(1).unwrap_err().error
+}
+
+#[test]
+fn a_device_with_another_checksum_refuses_alone() {
+    let error = assert_refuses_alone(
+        |machine| {
+            machine.load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap();
+        },
+        &file(KIB),
+    );
+    assert!(matches!(error, Error::Failed { doing: Doing::Block(0), error: FlashError::Crc, .. }), "{error}");
+}
+
+#[test]
+fn a_device_with_flash_that_cannot_be_erased_fails_alone() {
+    let error = assert_refuses_alone(
+        |machine| {
+            let board = firmware::board();
+            let first = board.chip.sector_at(board.programs[0].base).unwrap();
+            machine.protect_sector(first.number, true);
+        },
+        &file(KIB),
+    );
+    assert!(
+        matches!(error, Error::Failed { doing: Doing::Block(1), error: FlashError::Secured, .. }),
+        "{error}"
+    );
+}
+
+/// The bootloader of the board with two programs has less room for the first one.
+#[test]
+fn a_device_without_room_refuses_alone() {
+    let size = stm32f407g_disc1_two::LAYOUT.programs[0].size / 1024 + 1;
+    let error = assert_refuses_alone(
+        |machine| {
+            let name = firmware::of_board(stm32f407g_disc1_two::LAYOUT.board, firmware::BOOTLOADER);
+            machine.load(&firmware::elf(&name)).unwrap();
+        },
+        &file(size),
+    );
+    assert!(matches!(error, Error::OtherRegion { program: 1, .. }), "{error}");
 }
