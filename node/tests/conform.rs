@@ -139,7 +139,7 @@ const FAULTS: &[Fault] = &[
     takes(&["FRM-011"], |f| short(f, 7)),
     // NMT frames of another form or for nobody are obeyed.
     takes(&["FRM-013"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().len() == 1)),
-    takes(&["FRM-014"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().len() == 3)),
+    takes(&["FRM-014"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().len() == 6)),
     takes(&["FRM-016"], |f| obeys(f, |f| f.is_extended() && f.data().len() == 2)),
     takes(&["NMT-004"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().get(1) == Some(&0x81))),
     takes(&["NMT-005"], |f| obeys(f, |f| f.has_cob_id(CobId::NMT) && f.data().first() == Some(&0x83))),

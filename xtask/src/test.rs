@@ -102,7 +102,7 @@ pub fn run(mut args: Args) -> Outcome {
 const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
 
 /// The test programs that run for every board: they show the mistakes that a port can have.
-const MAIN_TESTS: [&str; 11] = [
+const MAIN_TESTS: [&str; 12] = [
     "main_job",
     "device",
     "masters",
@@ -114,6 +114,7 @@ const MAIN_TESTS: [&str; 11] = [
     "handover",
     "log",
     "virtual_can",
+    "conform",
 ];
 
 /// The results of the run so far, and the needs of the tests.

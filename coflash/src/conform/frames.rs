@@ -53,9 +53,9 @@ pub(super) const CHECKS: &[Check] = &[
     Check::new("FRM-013", "an NMT frame of 1 byte is ignored", NMT, |b| {
         no_boot_up(b, &Frame::of(CobId::NMT, &[RESET]))
     }),
-    Check::new("FRM-014", "an NMT frame of 3 bytes is ignored", NMT, |b| {
-        let node = b.node.get();
-        no_boot_up(b, &Frame::of(CobId::NMT, &[RESET, node, 0]))
+    Check::new("FRM-014", "NMT frames of 3 to 7 bytes are ignored", NMT, |b| {
+        let bytes = [RESET, b.node.get(), 0, 0, 0, 0, 0];
+        (3..=7).try_for_each(|len| no_boot_up(b, &Frame::of(CobId::NMT, &bytes[..len])))
     }),
     Check::new("FRM-015", "an NMT frame of 8 bytes is ignored", NMT, |b| {
         let node = b.node.get();

@@ -97,9 +97,11 @@ pub(super) const CHECKS: &[Check] = &[
         let frame = extended(CobId::LSS_REQUEST, &padded(&[0x5E]))?;
         b.ignores(&frame, CobId::LSS_RESPONSE)
     }),
-    check("LSS-025", "an inquiry of 1 byte in configuration state is not answered", "CiA 305, LSS protocols", |b| {
+    check("LSS-025", "inquiries of 1 to 7 bytes in configuration state are not answered", "CiA 305, LSS protocols", |b| {
         select(b, None)?;
-        b.ignores(&Frame::of(CobId::LSS_REQUEST, &[0x5E]), CobId::LSS_RESPONSE)
+        (1..=7).try_for_each(|len| {
+            b.ignores(&Frame::of(CobId::LSS_REQUEST, &padded(&[0x5E])[..len]), CobId::LSS_RESPONSE)
+        })
     }),
     check("LSS-026", "after reset communication the device is in waiting state", "CiA 305, LSS state machine", |b| {
         select(b, None)?;
