@@ -15,7 +15,7 @@ use shared_abi::geometry::{Geometry, Region};
 use crate::bxcan::BxCan;
 use crate::cpu::{Cpu, Entry, Exit};
 use crate::periph::flash::Noise;
-pub use crate::periph::flash::{Cut, FlashCut, FlashTimes};
+pub use crate::periph::flash::{Cells, Cut, FlashCut, FlashTimes, Operation};
 pub use crate::periph::usart::Usart;
 use crate::peripheral::Peripheral;
 use crate::time::{Span, Time};
@@ -275,6 +275,36 @@ impl Machine {
     /// A cut ends [`Self::run_until`] with [`Stop::PowerCut`].
     pub fn cut_power_at(&mut self, cut: Option<FlashCut>) {
         self.cpu.chip_mut().flash.cut_power_at(cut);
+    }
+
+    /// Keeps the flash operations that start from now on, for [`Self::take_flash_log`].
+    pub fn keep_flash_log(&mut self) {
+        self.cpu.chip_mut().flash.keep_log();
+    }
+
+    /// Takes the flash operations since [`Self::keep_flash_log`], in order; keeps no more.
+    pub fn take_flash_log(&mut self) -> Vec<Operation> {
+        self.cpu.chip_mut().flash.take_log()
+    }
+
+    /// What the flash holds, with the bits between 0 and 1.
+    #[must_use]
+    pub fn flash_cells(&self) -> Cells {
+        self.cpu.chip().flash.cells()
+    }
+
+    /// Replaces what the flash of a machine without power holds.
+    ///
+    /// # Panics
+    /// If they are the cells of another chip.
+    pub fn set_flash_cells(&mut self, cells: &Cells) {
+        let seed = self.options.seed ^ self.power_cycles;
+        let chip = self.cpu.chip_mut();
+        assert_eq!(cells.bytes.len(), chip.geometry.flash.size as usize, "cells of another chip");
+        chip.flash.preset_cells(cells, seed);
+        let base = chip.geometry.flash.base;
+        let changed = chip.flash.take_changed();
+        chip.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
     }
 
     // --- time

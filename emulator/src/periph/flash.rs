@@ -4,14 +4,19 @@
 //! target is erased. While an operation runs (BSY) the array answers neither fetches nor data
 //! reads; the machine stalls the CPU then.
 
+mod cells;
 mod lock;
 mod options;
+
+use std::collections::BTreeMap;
 
 use shared_abi::geometry::{Geometry, Sector};
 
 use crate::machine::memory::HostMemory;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
+use cells::carry_out;
+pub use cells::{Cells, Cut, Operation};
 use lock::Lock;
 use options::{OptionBytes, Request};
 
@@ -69,42 +74,8 @@ const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000,
 /// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
-/// The effect of an operation on the array when it ends.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Operation {
-    /// These bytes are programmed at this offset of the array.
-    Program {
-        /// Offset from the start of the flash.
-        offset: u32,
-        /// What was written; bits that are 0 in the array stay 0.
-        bytes: Vec<u8>,
-    },
-    /// These sectors are erased; one, or all of them.
-    Erase {
-        /// In address order.
-        sectors: Vec<Sector>,
-    },
-    /// The option bytes are programmed.
-    Options {
-        /// The value of OPTCR without its lock and start bits.
-        optcr: u32,
-    },
-}
-
-/// The point within an operation at which the power fails.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Cut {
-    /// Before it changed anything.
-    Before,
-    /// When it was complete.
-    After,
-    /// In the middle: some bits of a word are programmed, some bytes of a sector erased; which ones
-    /// follows from the seed.
-    Torn {
-        /// Chooses the bits.
-        seed: u64,
-    },
-}
+/// How long a bit between 0 and 1 reads the same, at most.
+const REDRAW: Span = Span::from_millis(20);
 
 /// Cut the power at a flash operation.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -161,6 +132,14 @@ pub struct Flash {
     waited_until: Option<Time>,
     cut: Option<FlashCut>,
     power_failed: bool,
+    /// The bits between 0 and 1, by the offset of their byte.
+    unstable: BTreeMap<u32, u8>,
+    /// How these read now.
+    noise: Noise,
+    /// When they read otherwise.
+    redraw_at: Time,
+    /// The operations that have started since somebody wants to know them.
+    log: Option<Vec<Operation>>,
     /// Usage.
     pub counters: FlashCounters,
 }
@@ -184,6 +163,10 @@ impl Flash {
             waited_until: None,
             cut: None,
             power_failed: false,
+            unstable: BTreeMap::new(),
+            noise: Noise(0),
+            redraw_at: Time(0),
+            log: None,
             counters: FlashCounters::default(),
         }
     }
@@ -227,6 +210,39 @@ impl Flash {
         self.power_failed
     }
 
+    /// Keeps the operations that start from now on.
+    pub fn keep_log(&mut self) {
+        self.log = Some(Vec::new());
+    }
+
+    /// Takes the operations since [`Self::keep_log`], in order, and keeps no more.
+    pub fn take_log(&mut self) -> Vec<Operation> {
+        self.log.take().unwrap_or_default()
+    }
+
+    /// What the array holds.
+    #[must_use]
+    pub fn cells(&self) -> Cells {
+        Cells { bytes: self.array.bytes().to_vec(), unstable: self.unstable.clone() }
+    }
+
+    /// Replaces what the array holds. `seed` chooses how bits between 0 and 1 read.
+    pub fn preset_cells(&mut self, cells: &Cells, seed: u64) {
+        self.preset(0, &cells.bytes);
+        self.unstable.clone_from(&cells.unstable);
+        self.noise = Noise(seed);
+        self.redraw();
+    }
+
+    /// The bits between 0 and 1 read otherwise.
+    fn redraw(&mut self) {
+        for (at, bits) in &self.unstable {
+            let cell = &mut self.array.bytes_mut()[*at as usize];
+            *cell = *cell & !bits | self.noise.byte() & bits;
+            self.changed.push((*at, 1));
+        }
+    }
+
     /// Writes into the array as a debug probe does, whatever the locks say.
     pub fn preset(&mut self, offset: u32, bytes: &[u8]) {
         let start = offset as usize;
@@ -243,7 +259,7 @@ impl Flash {
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
         if let Some(running) = self.running.take() {
-            self.tear(&running.operation, seed);
+            self.tear(&running.operation, Cut::Torn { seed });
         }
         self.cut = None;
         self.power_failed = false;
@@ -340,6 +356,9 @@ impl Flash {
     }
 
     fn start(&mut self, operation: Operation, takes: Span, now: Time) {
+        if let Some(log) = &mut self.log {
+            log.push(operation.clone());
+        }
         if let Some(cut) = &mut self.cut {
             if cut.operation == 0 {
                 let when = cut.when;
@@ -348,7 +367,7 @@ impl Flash {
                 match when {
                     Cut::Before => {}
                     Cut::After => self.complete(&operation),
-                    Cut::Torn { seed } => self.tear(&operation, seed),
+                    Cut::Torn { .. } | Cut::Unstable { .. } => self.tear(&operation, when),
                 }
                 return;
             }
@@ -412,62 +431,32 @@ impl Flash {
         self.geometry.sector(number)
     }
 
-    fn offset_of(&self, sector: &Sector) -> (usize, usize) {
-        ((sector.region.base - self.geometry.flash.base) as usize, sector.region.size as usize)
-    }
-
     fn complete(&mut self, operation: &Operation) {
         match operation {
-            Operation::Program { offset, bytes } => {
-                self.counters.units_programmed += 1;
-                self.and_bytes(*offset, bytes);
-            }
-            Operation::Erase { sectors } => {
-                for sector in sectors {
-                    self.counters.sectors_erased += 1;
-                    let (start, len) = self.offset_of(sector);
-                    self.array.bytes_mut()[start..start + len].fill(0xFF);
-                    self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
-                }
-            }
+            Operation::Program { .. } => self.counters.units_programmed += 1,
+            Operation::Erase { sectors } => self.counters.sectors_erased += sectors.len() as u64,
             Operation::Options { optcr } => {
                 if self.options.program(*optcr) {
                     self.array.bytes_mut().fill(0xFF);
+                    self.unstable.clear();
                     self.changed.push((0, self.geometry.flash.size));
                 }
             }
         }
-    }
-
-    fn and_bytes(&mut self, offset: u32, bytes: &[u8]) {
-        let array = &mut self.array.bytes_mut()[offset as usize..];
-        for (cell, byte) in array.iter_mut().zip(bytes) {
-            *cell &= byte;
-        }
-        self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
+        self.carry_out(operation, Cut::After);
     }
 
     /// Carries an operation out in part.
-    fn tear(&mut self, operation: &Operation, seed: u64) {
-        let mut noise = Noise(seed);
-        match operation {
-            Operation::Program { offset, bytes } => {
-                // Each bit that should become 0 does so or not.
-                let torn: Vec<u8> = bytes.iter().map(|byte| byte | noise.byte()).collect();
-                self.and_bytes(*offset, &torn);
-            }
-            Operation::Erase { sectors } => {
-                // A cell on its way to 1 reads as what it was, as 1, or as either.
-                for sector in sectors {
-                    let (start, len) = self.offset_of(sector);
-                    for cell in &mut self.array.bytes_mut()[start..start + len] {
-                        *cell |= noise.byte();
-                    }
-                    self.changed.push((sector.region.base - self.geometry.flash.base, sector.region.size));
-                }
-            }
-            Operation::Options { .. } => self.options.tear(),
+    fn tear(&mut self, operation: &Operation, how: Cut) {
+        if let Operation::Options { .. } = operation {
+            self.options.tear();
         }
+        self.carry_out(operation, how);
+    }
+
+    fn carry_out(&mut self, operation: &Operation, until: Cut) {
+        let array = self.array.bytes_mut();
+        self.changed.extend(carry_out(operation, self.geometry, until, array, &mut self.unstable));
     }
 
     fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
@@ -579,6 +568,10 @@ impl Peripheral for Flash {
     }
 
     fn advance(&mut self, now: Time) {
+        if now >= self.redraw_at && !self.unstable.is_empty() {
+            self.redraw_at = now + REDRAW;
+            self.redraw();
+        }
         if self.busy_until().is_some_and(|ends| ends <= now) {
             if let Some(Running { operation, .. }) = self.running.take() {
                 self.complete(&operation);
@@ -607,7 +600,7 @@ impl Peripheral for Flash {
         if let Some(running) = self.running.take() {
             // A fixed seed: a reset is no power failure, but leaves the same kind of half-done
             // work.
-            self.tear(&running.operation, 0x5EED);
+            self.tear(&running.operation, Cut::Torn { seed: 0x5EED });
         }
         self.acr = 0;
         self.sr = 0;

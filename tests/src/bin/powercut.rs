@@ -5,11 +5,8 @@ use std::fmt::Display;
 use std::process::ExitCode;
 use std::str::FromStr;
 
-use coboot_tests::powercut::board::{self, Effort, Story};
+use coboot_tests::powercut::board::{self, Effort};
 use coboot_tests::powercut::{reproduce, run, Point, Report, SCENARIOS};
-
-/// The number of points of level 2 between the first and the last ones, without `--full`.
-const SAMPLE: u64 = 24;
 
 /// A point of one of the levels.
 enum AnyPoint {
@@ -29,76 +26,115 @@ impl FromStr for AnyPoint {
     }
 }
 
-fn main() -> ExitCode {
-    let mut arguments = std::env::args().skip(1);
-    let (mut full, mut json, mut point) = (false, false, None);
+/// What to do.
+#[derive(Default)]
+struct Wish {
+    full: bool,
+    json: bool,
+    /// Level 2 alone, with a tenth of the cuts.
+    tenth: bool,
+    point: Option<AnyPoint>,
+}
+
+fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
+    let mut wish = Wish::default();
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
-            "--full" => full = true,
-            "--json" => json = true,
+            "--full" => wish.full = true,
+            "--json" => wish.json = true,
+            "--tenth" => wish.tenth = true,
             "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
-                Some(Ok(given)) => point = Some(given),
-                Some(Err(why)) => return refuse(&why),
-                None => return refuse("--reproduce wants a point, as update:37:torn."),
+                Some(point) => wish.point = Some(point?),
+                None => return Err("--reproduce wants a point, as update:37:torn.".into()),
             },
             other => {
-                return refuse(&format!(
-                    "{other:?} is no option; there are --full, --json and --reproduce POINT."
+                return Err(format!(
+                    "{other:?} is no option; there are --full, --tenth, --json and --reproduce POINT."
                 ))
             }
         }
     }
-    if let Some(point) = point {
-        match point {
-            AnyPoint::Model(point) => print!("{}", reproduce(&point)),
-            AnyPoint::Board(point) => match Story::new() {
-                Ok(story) => print!("{}", story.reproduce(point)),
-                Err(why) => return refuse(&format!("the board fails without any cut: {why}")),
-            },
-        }
-        return ExitCode::SUCCESS;
-    }
+    Ok(wish)
+}
 
-    if !json {
-        println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n");
+/// The counts of all scenarios.
+#[derive(Default)]
+struct Sum {
+    rows: Vec<String>,
+    points: u64,
+    states: u64,
+    violations: u64,
+}
+
+impl Sum {
+    fn add<P: Display>(&mut self, level: u8, name: &str, report: &Report<P>, json: bool) {
+        self.points += report.points;
+        self.states += report.states;
+        self.violations += report.violations;
+        if json {
+            self.rows.push(as_json(level, name, report));
+        } else {
+            println!("{}", as_text(name, report));
+        }
+    }
+}
+
+fn main() -> ExitCode {
+    let wish = match wish(std::env::args().skip(1)) {
+        Ok(wish) => wish,
+        Err(why) => return refuse(&why),
+    };
+    match wish.point {
+        Some(AnyPoint::Model(point)) => {
+            print!("{}", reproduce(&point));
+            return ExitCode::SUCCESS;
+        }
+        Some(AnyPoint::Board(point)) => {
+            print!("{}", board::reproduce(point));
+            return ExitCode::SUCCESS;
+        }
+        None => {}
+    }
+    let mut sum = Sum::default();
+    let head =
+        "scenario           operations    points   states  recoveries   bootloader  old program  new program  violations";
+    if !wish.tenth {
+        if !wish.json {
+            println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
+        }
+        for scenario in SCENARIOS {
+            match run(scenario, wish.full) {
+                Ok(report) => sum.add(1, scenario.name, &report, wish.json),
+                Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
+            }
+        }
+    }
+    if !wish.json {
         println!(
-            "scenario           operations    points   bootloader  old program  new program  violations"
+            "\nLevel 2: the built firmware of {} in the emulator. Points that leave the same flash are one state; the board is looked at in each.\n\n{head}",
+            coboot_tests::firmware::board().board
         );
     }
-    let mut rows = Vec::new();
-    let (mut points, mut violations) = (0, 0);
-    for scenario in SCENARIOS {
-        let report = match run(scenario, full) {
-            Ok(report) => report,
-            Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
+    for scenario in board::SCENARIOS {
+        // Every operation once; the other scenarios share most of them.
+        let effort = match (wish.full && scenario.name == "update", wish.full || wish.tenth) {
+            (true, _) => Effort::FULL,
+            (_, true) => Effort::TENTH,
+            _ => Effort::SAMPLE,
         };
-        points += report.points;
-        violations += report.violations;
-        if json {
-            rows.push(as_json(1, scenario.name, &report));
-        } else {
-            println!("{}", as_text(scenario.name, &report));
+        match board::run(scenario, effort) {
+            Ok(report) => sum.add(2, scenario.name, &report, wish.json),
+            Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
         }
     }
-    let report = match Story::new() {
-        Ok(story) => story.run(if full { Effort::Full } else { Effort::Sample(SAMPLE) }),
-        Err(why) => return refuse(&format!("the board fails without any cut: {why}")),
-    };
-    points += report.points;
-    violations += report.violations;
-    if json {
-        rows.push(as_json(2, board::NAME, &report));
-    } else {
-        println!("\nLevel 2: the built firmware in the emulator; what it did behind each cut.\n");
-        println!("{}", as_text(board::NAME, &report));
-    }
-    if json {
+    let Sum { rows, points, states, violations } = sum;
+    if wish.json {
         println!(
-            "{{\"points\": {points}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
+            "{{\"points\": {points}, \"states\": {states}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
             rows.join(",\n")
         );
     } else {
-        println!("\n{points} points, {violations} violations.");
+        println!("\n{points} points, {states} states of the real firmware's flash, {violations} violations.");
         println!("To see one: cargo xtask powercut --reproduce update:37:torn");
     }
     if violations == 0 {
@@ -120,8 +156,8 @@ fn outcomes<P>(report: &Report<P>) -> [u64; 3] {
 fn as_text<P: Display>(name: &str, report: &Report<P>) -> String {
     let [bootloader, old, new] = outcomes(report);
     let mut text = format!(
-        "{name:<18} {:>10} {:>9} {bootloader:>12} {old:>12} {new:>12} {:>11}",
-        report.operations, report.points, report.violations
+        "{name:<18} {:>10} {:>9} {:>8} {:>11} {bootloader:>12} {old:>12} {new:>12} {:>11}",
+        report.operations, report.points, report.states, report.recoveries, report.violations
     );
     for (point, what) in &report.told {
         text += &format!("\n  {point}: {what}");
@@ -134,9 +170,11 @@ fn as_json<P: Display>(level: u8, name: &str, report: &Report<P>) -> String {
     let told: Vec<_> =
         report.told.iter().map(|(point, what)| format!("{:?}", format!("{point}: {what}"))).collect();
     format!(
-        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}]}}",
+        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"states\": {}, \"recoveries\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}]}}",
         report.operations,
         report.points,
+        report.states,
+        report.recoveries,
         report.violations,
         told.join(", ")
     )

@@ -89,6 +89,10 @@ pub struct Report<P = Point> {
     pub operations: u64,
     /// Cuts, single and double.
     pub points: u64,
+    /// The different states of the flash behind these cuts. Level 1 does not count them.
+    pub states: u64,
+    /// How many times the host did everything again. Level 1 does so after each cut.
+    pub recoveries: u64,
     /// The states of the device after the power returned, with their counts.
     pub outcomes: BTreeMap<String, u64>,
     /// The number of points with a violation.
@@ -100,7 +104,15 @@ pub struct Report<P = Point> {
 // A derived implementation would require a default for points.
 impl<P> Default for Report<P> {
     fn default() -> Self {
-        Self { operations: 0, points: 0, outcomes: BTreeMap::new(), violations: 0, told: Vec::new() }
+        Self {
+            operations: 0,
+            points: 0,
+            states: 0,
+            recoveries: 0,
+            outcomes: BTreeMap::new(),
+            violations: 0,
+            told: Vec::new(),
+        }
     }
 }
 

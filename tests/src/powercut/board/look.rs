@@ -1,0 +1,100 @@
+//! What a board does after the power returns, with its flash in some state.
+
+use canopen::Address;
+use emulator::machine::{Cells, ResetCause, Stop};
+use shared_abi::geometry::Region;
+
+use boot_core::crc32;
+use boot_core::store::{Journal, ProgramRecord};
+
+use super::super::model::ModelFlash;
+use super::story::{Outcome, Seen, Story};
+use super::BOOT_MS;
+use crate::bench::Bench;
+use crate::firmware;
+
+const VERSION: Address = Address::new(0x100A, 0);
+
+/// The flash from the start of the first program on.
+#[must_use]
+pub fn program_flash(flash: &[u8]) -> &[u8] {
+    let board = firmware::board();
+    &flash[(board.programs[0].base - board.chip.flash.base) as usize..]
+}
+
+/// The power returns; returns what the board does then.
+///
+/// # Errors
+/// What it must not do: be silent, run something else than a whole program, or touch what the
+/// emulator does not model.
+pub fn look(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Seen, String> {
+    records_are_true(cells)?;
+    bench.power_off();
+    bench.machine().set_flash_cells(cells);
+    observe(story, bench)
+}
+
+/// The same with the flash that the board has; its power is off.
+///
+/// # Errors
+/// As [`look`].
+pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
+    bench.events();
+    let from = bench.time();
+    bench.power_on();
+    bench.run_ms(BOOT_MS);
+    // A program that was never confirmed starts after a reset, at the end of the rescue window.
+    let resets = bench.events();
+    if !matches!(resets[..], [] | [(_, Stop::Reset(ResetCause::Software))]) {
+        return Err(format!("it starts with {resets:?}"));
+    }
+    let boot_ups = bench.frames_since(from);
+    let boot_up = boot_ups.iter().rev().find(|(_, id, data)| (0x701..=0x77F).contains(id) && *data == [0]);
+    let Some(node) = boot_up.map(|(_, id, _)| (id & 0x7F) as u8) else {
+        return Err(format!("no boot-up within {BOOT_MS} ms"));
+    };
+    let told = bench.session_with(node).device_type().map_err(|error| format!("no answer: {error}"))?;
+    let outcome = match told {
+        None => return Err("it does not tell what it is".into()),
+        Some(kind) if kind.is_bootloader() => Outcome::Bootloader,
+        Some(_) => {
+            let version = bench.session_with(node).read_text(VERSION).map_err(|error| error.to_string())?;
+            let (outcome, whole) = match version.as_str() {
+                "1.0.0" => (Outcome::Old, &story.programs[0]),
+                "2.0.0" => (Outcome::New, &story.programs[1]),
+                _ => return Err(format!("it runs version {version:?}")),
+            };
+            if program_flash(bench.machine().flash()).get(..whole.len()) != Some(whole) {
+                return Err(format!("version {version} runs, and is not whole"));
+            }
+            outcome
+        }
+    };
+    let events = bench.events();
+    if !events.is_empty() {
+        return Err(format!("{} answers after {events:?}", outcome.name()));
+    }
+    let reports = bench.machine().reports();
+    if !reports.is_empty() {
+        return Err(format!("the firmware touched what the emulator does not model: {reports:?}"));
+    }
+    Ok(Seen { outcome, node })
+}
+
+/// No program has a false record, not even one that the CRC at the start would reject.
+fn records_are_true(cells: &Cells) -> Result<(), String> {
+    let board = firmware::board();
+    let mut flash = ModelFlash::new(board.chip);
+    flash.poke(board.chip.flash.base, &cells.bytes);
+    let journal = Journal::open(&flash, board.parameters);
+    for (number, region) in (1..).zip(board.programs) {
+        let Some(record) = ProgramRecord::load(&journal, &flash, number) else { continue };
+        let program = Region::new(region.base, record.size.min(region.size));
+        let from = program.base - board.chip.flash.base;
+        let between = cells.unstable.range(from..from + program.size).next();
+        if crc32(flash.cells(program)) != record.crc || between.is_some() {
+            return Err(format!("program {number} has a record, and is not what it says"));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,368 @@
+//! Level 2: the built firmware on the emulated chip, with the power cut at its flash operations.
+//!
+//! A power cut leaves nothing but the flash. So a scenario runs once, and the emulator keeps the
+//! list of its flash operations: from it follows the flash behind each cut. Cuts that leave the
+//! same flash are one state. With each state the board is switched on and looked at, and with some
+//! of them the host does everything again; this recovery has operations of its own, which are cut
+//! in the same way.
+//!
+//! | module | what it does |
+//! |---|---|
+//! | [`story`] | what the host does, and what may be found |
+//! | [`look`] | what a board does after the power returns |
+
+use std::collections::hash_map::DefaultHasher;
+use std::collections::HashSet;
+use std::fmt;
+use std::hash::{Hash, Hasher};
+use std::panic::{catch_unwind, AssertUnwindSafe};
+use std::str::FromStr;
+use std::sync::Mutex;
+
+use emulator::machine::{Cells, Cut, Operation};
+
+use super::points::{Report, TOLD};
+use crate::bench::{Bench, RESCUE_WINDOW_MS};
+use crate::firmware;
+use look::{look, observe};
+pub use story::{Outcome, Scenario, Seen, Story, SCENARIOS};
+
+mod look;
+pub mod story;
+
+/// A board with a program, confirmed or not, runs it within this time, in ms.
+const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
+/// The prefix of the name of a point.
+pub const NAME: &str = "board";
+/// The first and last operations, which concern the parameters: all of them are cut.
+const EDGE: usize = 10;
+/// The number of looks at a flash with bits between 0 and 1: they read differently each time.
+const LOOKS: usize = 3;
+
+/// The way in which an operation is cut.
+const KINDS: [(&str, Cut); 5] = [
+    ("before", Cut::Before),
+    ("after", Cut::After),
+    ("torn", Cut::Torn { seed: 7 }),
+    ("torn-otherwise", Cut::Torn { seed: 8 }),
+    ("unstable", Cut::Unstable { seed: 9 }),
+];
+
+/// A cut: the flash operation, counted from 0, and the way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct At {
+    operation: usize,
+    kind: usize,
+}
+
+/// A cut in a scenario, and possibly another one in the recovery. Written as
+/// `board:update:37:torn` or `board:update:37:torn:12:after`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Point {
+    scenario: &'static str,
+    first: At,
+    second: Option<At>,
+}
+
+impl fmt::Display for Point {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{NAME}:{}", self.scenario)?;
+        for at in [Some(self.first), self.second].into_iter().flatten() {
+            write!(f, ":{}:{}", at.operation, KINDS[at.kind].0)?;
+        }
+        Ok(())
+    }
+}
+
+impl FromStr for Point {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let words: Vec<&str> = text.split(':').collect();
+        let scenario = |name: &str| {
+            SCENARIOS.iter().map(|scenario| scenario.name).find(|known| *known == name).ok_or_else(|| {
+                let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
+                format!("{name:?} is no scenario of a board; there are {}.", names.join(", "))
+            })
+        };
+        let at = |operation: &str, kind: &str| -> Result<At, String> {
+            let operation =
+                operation.parse().map_err(|_| format!("{operation:?} is no number of an operation."))?;
+            let kind = KINDS.iter().position(|(name, _)| *name == kind).ok_or_else(|| {
+                let names: Vec<_> = KINDS.iter().map(|(name, _)| *name).collect();
+                format!("{kind:?} is no way to cut; there are {}.", names.join(", "))
+            })?;
+            Ok(At { operation, kind })
+        };
+        match words[..] {
+            [NAME, name, operation, kind] => {
+                Ok(Self { scenario: scenario(name)?, first: at(operation, kind)?, second: None })
+            }
+            [NAME, name, operation, kind, later, its_kind] => Ok(Self {
+                scenario: scenario(name)?,
+                first: at(operation, kind)?,
+                second: Some(at(later, its_kind)?),
+            }),
+            _ => Err(format!(
+                "{text:?} is no point: {NAME}:update:37:torn, or {NAME}:update:37:torn:12:after."
+            )),
+        }
+    }
+}
+
+/// The operations that are taken: so many at the beginning and at the end, and one of how many
+/// between.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Effort {
+    /// One of how many is cut, in every way.
+    pub cut: usize,
+    /// How many at each end are followed by a recovery, in one way, and one of how many between.
+    pub recovered: (usize, usize),
+    /// One of how many in the recovery is cut, in one way.
+    pub cut_again: usize,
+}
+
+impl Effort {
+    /// For every run of the tests.
+    pub const SAMPLE: Self = Self { cut: 128, recovered: (2, 1024), cut_again: 1024 };
+    /// A tenth of all.
+    pub const TENTH: Self = Self { cut: 10, recovered: (4, 256), cut_again: 256 };
+    /// Every operation.
+    pub const FULL: Self = Self { cut: 1, recovered: (EDGE, 64), cut_again: 64 };
+
+    fn takes((edge, one_in): (usize, usize), operation: usize, of: usize) -> bool {
+        operation < edge || operation + edge >= of || operation.is_multiple_of(one_in)
+    }
+}
+
+/// A run without a cut: its flash operations, or what went wrong.
+fn record(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Vec<Operation>, String> {
+    bench.power_off();
+    bench.machine().set_flash_cells(cells);
+    bench.machine().keep_flash_log();
+    bench.power_on();
+    bench.run_ms(BOOT_MS);
+    let acted = (story.act)(bench);
+    let operations = bench.machine().take_flash_log();
+    bench.power_off();
+    acted.map(|()| operations)
+}
+
+/// The flash behind a cut, from the flash before and the operations up to this one.
+fn behind(before: &Cells, operations: &[Operation], at: At) -> Option<Cells> {
+    let chip = firmware::board().chip;
+    let mut cells = before.clone();
+    let (last, done) = operations.get(..=at.operation)?.split_last()?;
+    for operation in done {
+        cells.apply(operation, chip, Cut::After);
+    }
+    cells.apply(last, chip, KINDS[at.kind].1);
+    Some(cells)
+}
+
+fn hash(cells: &Cells) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    cells.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// The proof for one scenario.
+struct Proof<'s> {
+    name: &'static str,
+    story: &'s Story,
+    operations: &'s [Operation],
+    effort: Effort,
+    /// The states that were looked at, and the counts.
+    total: Mutex<(HashSet<u64>, Report<Point>)>,
+}
+
+impl Proof<'_> {
+    /// Whether nobody has looked at this state yet.
+    fn is_new(&self, cells: &Cells) -> bool {
+        let hash = hash(cells);
+        let mut total = self.total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        total.1.points += 1;
+        let new = total.0.insert(hash);
+        total.1.states += u64::from(new);
+        new
+    }
+
+    /// Looks at a state, as often as it takes.
+    fn inspect(&self, bench: &mut Bench, cells: &Cells) -> Result<Seen, String> {
+        let looks = if cells.unstable.is_empty() { 1 } else { LOOKS };
+        let mut seen = self.story.from;
+        for _ in 0..looks {
+            seen = look(self.story, bench, cells)?;
+            let Story { from, to, between, .. } = self.story;
+            let outcomes = [&[from.outcome, to.outcome][..], between].concat();
+            if !outcomes.contains(&seen.outcome) || ![from.node, to.node].contains(&seen.node) {
+                return Err(format!("{seen:?}, where {from:?}, {to:?} or {between:?} may be"));
+            }
+        }
+        Ok(seen)
+    }
+
+    fn count(&self, point: Point, found: Result<Seen, String>) {
+        let mut total = self.total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let report = &mut total.1;
+        match found {
+            Ok(seen) => *report.outcomes.entry(seen.outcome.name().into()).or_default() += 1,
+            Err(what) => {
+                report.violations += 1;
+                if report.told.len() < TOLD {
+                    report.told.push((point, what));
+                }
+            }
+        }
+    }
+
+    /// All points whose first cut is at this operation; `before` is the flash before it.
+    fn at_operation(&self, bench: &mut Bench, number: usize, before: &Cells) {
+        let chip = firmware::board().chip;
+        let all = self.operations.len();
+        let recovers = Effort::takes(self.effort.recovered, number, all);
+        for (kind, (_, cut)) in KINDS.iter().enumerate() {
+            // The state before an operation is that after the one before.
+            if *cut == Cut::Before && number > 0 {
+                continue;
+            }
+            let mut cells = before.clone();
+            cells.apply(&self.operations[number], chip, *cut);
+            let point = Point { scenario: self.name, first: At { operation: number, kind }, second: None };
+            if self.is_new(&cells) {
+                let found = self.inspect(bench, &cells);
+                self.count(point, found);
+            }
+            if recovers && (kind == 1 + number % (KINDS.len() - 1) || number + 1 == all) {
+                self.recover(bench, point, &cells);
+            }
+        }
+    }
+
+    /// The host does everything again, and the power is cut in this, too.
+    fn recover(&self, bench: &mut Bench, point: Point, cells: &Cells) {
+        let recovery =
+            record(self.story, bench, cells).and_then(|operations| match observe(self.story, bench)? {
+                seen if seen == self.story.to => Ok(operations),
+                seen => Err(format!("{seen:?}, where {:?} should be", self.story.to)),
+            });
+        {
+            let mut total = self.total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+            total.1.recoveries += 1;
+        }
+        let operations = match recovery {
+            Ok(operations) => operations,
+            Err(what) => return self.count(point, Err(format!("the recovery does not complete: {what}"))),
+        };
+        let chip = firmware::board().chip;
+        let mut before = cells.clone();
+        for (number, operation) in operations.iter().enumerate() {
+            if Effort::takes((EDGE, self.effort.cut_again), number, operations.len()) {
+                let kind = 1 + (point.first.operation + number) % (KINDS.len() - 1);
+                let mut cells = before.clone();
+                cells.apply(operation, chip, KINDS[kind].1);
+                if self.is_new(&cells) {
+                    let point = Point { second: Some(At { operation: number, kind }), ..point };
+                    let found = self.inspect(bench, &cells);
+                    self.count(point, found);
+                }
+            }
+            before.apply(operation, chip, Cut::After);
+        }
+    }
+}
+
+/// Cuts the power in a scenario.
+///
+/// # Errors
+/// If the scenario fails without a cut.
+pub fn run(scenario: &Scenario, effort: Effort) -> Result<Report<Point>, String> {
+    let story = scenario.story()?;
+    let mut bench = story.bench();
+    let operations = record(&story, &mut bench, &story.start)?;
+    match observe(&story, &mut bench)? {
+        seen if seen == story.to => prove(scenario.name, &story, &operations, effort),
+        seen => Err(format!("without a cut: {seen:?}")),
+    }
+}
+
+/// Cuts the power in these operations.
+///
+/// # Errors
+/// None today.
+pub fn prove(
+    name: &'static str,
+    story: &Story,
+    operations: &[Operation],
+    effort: Effort,
+) -> Result<Report<Point>, String> {
+    let report = Report { operations: operations.len() as u64, ..Report::default() };
+    let total = Mutex::new((HashSet::new(), report));
+    let proof = Proof { name, story, operations, effort, total };
+    let threads = std::thread::available_parallelism().map_or(1, usize::from);
+    std::thread::scope(|scope| {
+        for thread in 0..threads {
+            let proof = &proof;
+            scope.spawn(move || {
+                let chip = firmware::board().chip;
+                let mut bench = story.bench();
+                let mut before = story.start.clone();
+                let mut turn = 0;
+                for (number, operation) in operations.iter().enumerate() {
+                    if Effort::takes((EDGE, effort.cut), number, operations.len()) {
+                        turn += 1;
+                        if turn % threads == thread {
+                            let run = AssertUnwindSafe(|| proof.at_operation(&mut bench, number, &before));
+                            if catch_unwind(run).is_err() {
+                                let first = At { operation: number, kind: 0 };
+                                proof.count(
+                                    Point { scenario: name, first, second: None },
+                                    Err("a panic".into()),
+                                );
+                                bench = story.bench();
+                            }
+                        }
+                    }
+                    before.apply(operation, chip, Cut::After);
+                }
+            });
+        }
+    });
+    Ok(proof.total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).1)
+}
+
+/// One point as text.
+#[must_use]
+pub fn reproduce(point: Point) -> String {
+    tell(point).unwrap_or_else(|what| format!("{point}: VIOLATION: {what}\n"))
+}
+
+fn tell(point: Point) -> Result<String, String> {
+    let scenario = SCENARIOS.iter().find(|scenario| scenario.name == point.scenario);
+    let scenario = scenario.ok_or("there is no such scenario")?;
+    let story = scenario.story()?;
+    let mut bench = story.bench();
+    let mut text = format!("{point}: {}\n", scenario.about);
+    let mut cells = story.start.clone();
+    for at in [Some(point.first), point.second].into_iter().flatten() {
+        let operations = record(&story, &mut bench, &cells)?;
+        let Some(behind) = behind(&cells, &operations, at) else {
+            return Err(format!("there is no operation {}, {} are all", at.operation, operations.len()));
+        };
+        cells = behind;
+        let seen = look(&story, &mut bench, &cells)?;
+        text += &format!(
+            "cut at operation {} of {} ({}): {}, node {}\n",
+            at.operation,
+            operations.len(),
+            KINDS[at.kind].0,
+            seen.outcome.name(),
+            seen.node
+        );
+    }
+    let operations = record(&story, &mut bench, &cells)?;
+    let seen = observe(&story, &mut bench)?;
+    text +=
+        &format!("recovery, {} operations: {}, node {}\n", operations.len(), seen.outcome.name(), seen.node);
+    Ok(text)
+}

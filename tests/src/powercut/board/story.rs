@@ -1,0 +1,291 @@
+//! What happens to a board while its power is cut, and what may be found afterwards.
+
+use std::sync::Arc;
+
+use canopen::program::ProgramControl;
+use canopen::BitRate;
+use coflash::device::Dialect;
+use coflash::file::sealed::{SealedFile, Sealer};
+use coflash::update::{flash, FlashOptions, Program};
+use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
+use emulator::machine::{Cells, Machine, Options};
+
+use super::BOOT_MS;
+use crate::bench::{Bench, NODE};
+use crate::{firmware, sealed_board};
+
+/// The highest bit rate. It is stored in the device and differs from the default, so a device that
+/// answers has kept its parameters.
+const RATE: BitRate = BitRate::K1000;
+/// The same in bit/s.
+pub const BIT_RATE: u32 = 1_000_000;
+/// The node-ID that a scenario stores.
+const OTHER_NODE: u8 = 9;
+
+/// The program that answers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// None: the bootloader does.
+    Bootloader,
+    /// Version 1.
+    Old,
+    /// Version 2.
+    New,
+}
+
+impl Outcome {
+    /// Its name in reports.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Bootloader => "bootloader",
+            Self::Old => "old program",
+            Self::New => "new program",
+        }
+    }
+}
+
+/// What answers, and under which node-ID.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Seen {
+    /// What answers.
+    pub outcome: Outcome,
+    /// The node-ID.
+    pub node: u8,
+}
+
+/// What the host does; it does it again after a cut.
+pub type Act = Box<dyn Fn(&mut Bench) -> Result<(), String> + Send + Sync>;
+
+/// The common data of all points of a scenario.
+pub struct Story {
+    /// The bootloader's image.
+    pub bootloader: &'static str,
+    /// The flash of the board before.
+    pub start: Cells,
+    /// What the board does before.
+    pub from: Seen,
+    /// What it does afterwards.
+    pub to: Seen,
+    /// What may answer after a cut besides.
+    pub between: &'static [Outcome],
+    /// Version 1 and version 2 as they lie in the program's flash.
+    pub programs: [Vec<u8>; 2],
+    /// What the host does.
+    pub act: Act,
+}
+
+impl Story {
+    /// A board of this story without power, and a host at its bit rate.
+    #[must_use]
+    pub fn bench(&self) -> Bench {
+        let mut bench = Bench::of_image(self.bootloader);
+        bench.set_host_bit_rate(BIT_RATE);
+        bench
+    }
+}
+
+/// A scenario.
+pub struct Scenario {
+    /// Its name in points.
+    pub name: &'static str,
+    /// What happens, in words.
+    pub about: &'static str,
+    prepare: fn() -> Result<Story, String>,
+}
+
+impl Scenario {
+    /// A board that is ready for it.
+    ///
+    /// # Errors
+    /// If this fails without a cut.
+    pub fn story(&self) -> Result<Story, String> {
+        (self.prepare)()
+    }
+}
+
+/// All of them.
+pub const SCENARIOS: &[Scenario] = &[
+    Scenario {
+        name: "update",
+        about: "version 2 in blocks, while version 1 runs",
+        prepare: || update(|bench| write(bench, &options())),
+    },
+    Scenario {
+        name: "raw",
+        about: "the same in one download of a binary image",
+        prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Raw)))),
+    },
+    Scenario {
+        name: "resume",
+        about: "the same in blocks, after half of them have arrived",
+        prepare: resume,
+    },
+    Scenario {
+        name: "confirm",
+        about: "version 2 runs and was never confirmed; it is called back, and started again",
+        prepare: confirm,
+    },
+    Scenario {
+        name: "store",
+        about: "another node-ID is stored by layer setting services, while version 1 runs",
+        prepare: store,
+    },
+    Scenario {
+        name: "sealed",
+        about: "version 2 as a sealed image with a higher security counter, while version 1 runs",
+        prepare: || sealed(false),
+    },
+    Scenario { name: "compressed", about: "the same, compressed", prepare: || sealed(true) },
+];
+
+fn options() -> FlashOptions {
+    FlashOptions::default().trial_run(false)
+}
+
+fn write(bench: &mut Bench, options: &FlashOptions) -> Result<(), String> {
+    let file = firmware::blocks(firmware::APP_V2);
+    match flash(&mut bench.session(), &file, options, &mut |_| {}) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+/// A board with its node-ID and bit rate stored, and this program in it.
+fn board(bootloader: &'static str, program: &Program) -> Result<Bench, String> {
+    let mut bench = Bench::of_image(bootloader);
+    let board = bench.boards()[0];
+    bench.commission(board, NODE, RATE);
+    bench.set_host_bit_rate(BIT_RATE);
+    if bootloader == firmware::BOOTLOADER_SEALED {
+        sealed_board::provision(&mut bench);
+    }
+    bench.power_on();
+    bench.run_ms(BOOT_MS);
+    let installed =
+        coflash::update::flash_program(&mut bench.session(), program, &FlashOptions::default(), &mut |_| {});
+    installed.map_err(|error| error.to_string())?;
+    Ok(bench)
+}
+
+/// The story of a board that runs version 1.
+fn from_version_1(
+    bootloader: &'static str,
+    program: &Program,
+    act: impl Fn(&mut Bench) -> Result<(), String> + Send + Sync + 'static,
+) -> Result<Story, String> {
+    let mut bench = board(bootloader, program)?;
+    bench.power_off();
+    Ok(Story {
+        bootloader,
+        start: bench.machine().flash_cells(),
+        from: Seen { outcome: Outcome::Old, node: NODE },
+        to: Seen { outcome: Outcome::New, node: NODE },
+        between: &[Outcome::Bootloader],
+        programs: [program_of(firmware::APP_V1)?, program_of(firmware::APP_V2)?],
+        act: Box::new(act),
+    })
+}
+
+fn update(act: impl Fn(&mut Bench) -> Result<(), String> + Send + Sync + 'static) -> Result<Story, String> {
+    let version_1 = Arc::new(firmware::blocks(firmware::APP_V1));
+    from_version_1(firmware::BOOTLOADER, &version_1.into(), act)
+}
+
+/// The board of a story, which runs.
+fn running(story: &Story) -> Bench {
+    let mut bench = story.bench();
+    bench.machine().set_flash_cells(&story.start);
+    bench.power_on();
+    bench.run_ms(BOOT_MS);
+    bench
+}
+
+fn resume() -> Result<Story, String> {
+    let mut story = update(|bench| write(bench, &options()))?;
+    let mut bench = running(&story);
+    let before = bench.records().len();
+    write(&mut bench, &options())?;
+    let half = (bench.records().len() - before) as u64 / 2;
+
+    let mut bench = running(&story);
+    let (frames, when) = (FrameMatch::default(), When::FromNth(half));
+    bench.world.inject(Fault { frames, when, action: FaultAction::Drop });
+    if write(&mut bench, &options()).is_ok() {
+        return Err("an update whose frames are lost is done".into());
+    }
+    bench.power_off();
+    story.start = bench.machine().flash_cells();
+    story.from.outcome = Outcome::Bootloader;
+    Ok(story)
+}
+
+fn confirm() -> Result<Story, String> {
+    let mut story = update(|bench| {
+        let running = bench.session().find().map_err(|error| error.to_string())?;
+        if !running.is_bootloader() {
+            control(bench, ProgramControl::StartBootloader)?;
+        }
+        control(bench, ProgramControl::Start)
+    })?;
+    let mut bench = running(&story);
+    write(&mut bench, &options())?;
+    bench.power_off();
+    story.start = bench.machine().flash_cells();
+    story.from.outcome = Outcome::New;
+    story.between = &[];
+    Ok(story)
+}
+
+/// Sends a command after which the device boots.
+fn control(bench: &mut Bench, command: ProgramControl) -> Result<(), String> {
+    bench.session().command(1, command).map_err(|error| error.to_string())?;
+    bench.run_ms(BOOT_MS);
+    Ok(())
+}
+
+fn store() -> Result<Story, String> {
+    let mut story = update(|_| Ok(()))?;
+    story.to = Seen { outcome: Outcome::Old, node: OTHER_NODE };
+    story.between = &[];
+    story.act = Box::new(|bench| {
+        // Switch state global: configuration. Configure node-ID. Store (CiA 305). Then a reset.
+        bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+        for [command, a] in [[0x11, OTHER_NODE], [0x17, 0]] {
+            let answer = bench.ask(0x7E5, &[command, a, 0, 0, 0, 0, 0, 0], 0x7E4);
+            if answer.as_deref() != Some(&[command, 0, 0, 0, 0, 0, 0, 0][..]) {
+                return Err(format!("layer setting services answer {answer:02X?} to {command:02X}h"));
+            }
+        }
+        Ok(())
+    });
+    Ok(story)
+}
+
+fn sealed(compress: bool) -> Result<Story, String> {
+    let seal = |image: &str, counter| -> Result<Program, String> {
+        let sealer = Sealer { compress, ..sealed_board::sealer(counter) };
+        let bytes = sealer
+            .seal(&firmware::raw(image), &sealed_board::release())
+            .map_err(|error| error.to_string())?;
+        let file = SealedFile::parse(bytes).map_err(|error| error.to_string())?;
+        Ok(Program::Sealed(Arc::new(file)))
+    };
+    let version_2 = seal(firmware::APP_V2, sealed_board::COUNTER + 1)?;
+    let version_1 = seal(firmware::APP_V1, sealed_board::COUNTER)?;
+    from_version_1(firmware::BOOTLOADER_SEALED, &version_1, move |bench| {
+        coflash::update::flash_program(&mut bench.session(), &version_2, &options(), &mut |_| {})
+            .map(drop)
+            .map_err(|error| error.to_string())
+    })
+}
+
+/// The first bytes of the program's flash with this image, from the emulator's own ELF loader.
+fn program_of(image: &str) -> Result<Vec<u8>, String> {
+    let chip = firmware::board().chip;
+    let mut machine = Machine::new(chip, Options::default()).map_err(|error| error.to_string())?;
+    machine.load(&firmware::elf(image)).map_err(|error| error.to_string())?;
+    let bytes = super::look::program_flash(machine.flash());
+    let used = bytes.iter().rposition(|byte| *byte != 0xFF).map_or(0, |last| last + 1);
+    Ok(bytes[..used].to_vec())
+}
