@@ -8,7 +8,7 @@ use coflash::bus::{Adapter, AdapterError};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::DEFAULT_BLOCK_SIZE;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::update::{Event, FlashOptions, Report};
+use coflash::update::{Event, FlashOptions, Report, GROUP_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;
@@ -104,10 +104,21 @@ impl Fleet {
         options: &ManyOptions,
         happens: Happens<'_>,
     ) -> Update {
+        self.update_as(devices, file, &FlashOptions::default(), options, happens)
+    }
+
+    fn update_as(
+        &mut self,
+        devices: u8,
+        file: &Arc<BlockFile>,
+        each: &FlashOptions,
+        options: &ManyOptions,
+        happens: Happens<'_>,
+    ) -> Update {
         let began = self.bench.time();
         let job = |node| {
             let node = NodeId::new(node).expect("1 to 127");
-            Job::new(node, file.clone(), FlashOptions::default())
+            Job::new(node, file.clone(), each.clone())
         };
         let jobs: Vec<Job> = (1..=devices).map(job).collect();
         let events = Mutex::new(Vec::new());
@@ -124,9 +135,6 @@ impl Fleet {
 pub fn file(kib: u32) -> Arc<BlockFile> {
     Arc::new(blocks(&program(kib), DEFAULT_BLOCK_SIZE))
 }
-
-/// Large blocks, which need fewer answers.
-const LARGE: usize = 4096;
 
 /// How a program gets to several boards.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -150,7 +158,7 @@ pub struct Measurement {
     pub lost_one_in: u32,
     /// From the first request until the last board runs its program.
     pub took: Duration,
-    /// The duration for one board with the same blocks and no lost frames.
+    /// The duration for one board and no lost frames.
     pub one: Duration,
 }
 
@@ -160,30 +168,31 @@ pub struct Measurement {
 /// If an update fails, or the firmware was not built.
 pub fn measure(mut row: impl FnMut(Measurement)) {
     let mut fleet = Fleet::new(8, BitRate::K1000);
-    let of_default: &[_] = &[
-        (1, Way::OneByOne, 0),
-        (2, Way::Together, 0),
-        (4, Way::Together, 0),
-        (8, Way::Together, 0),
-        (8, Way::OneByOne, 0),
-        (8, Way::Together, 100_000),
-        (8, Way::Together, 1000),
-        (1, Way::OneByOne, 1000),
+    let file = file(256);
+    let own = DEFAULT_BLOCK_SIZE;
+    let rows = [
+        (1, Way::OneByOne, own, 0),
+        (2, Way::Together, GROUP_BLOCKS, 0),
+        (4, Way::Together, GROUP_BLOCKS, 0),
+        (8, Way::Together, GROUP_BLOCKS, 0),
+        (8, Way::OneByOne, own, 0),
+        (8, Way::Together, GROUP_BLOCKS, 100_000),
+        (8, Way::Together, GROUP_BLOCKS, 1000),
+        (1, Way::OneByOne, own, 1000),
+        (8, Way::Together, own, 0),
+        (8, Way::Together, own, 1000),
     ];
-    let of_large: &[_] = &[(1, Way::OneByOne, 0), (8, Way::Together, 0), (8, Way::Together, 1000)];
-    for (block_size, rows) in [(DEFAULT_BLOCK_SIZE, of_default), (LARGE, of_large)] {
-        let file = Arc::new(blocks(&program(256), block_size));
-        let mut one = None;
-        for &(boards, way, lost_one_in) in rows {
-            fleet.bench.world.clear_faults();
-            if lost_one_in != 0 {
-                fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
-            }
-            let options = ManyOptions::default().together(way == Way::Together);
-            let update = fleet.update(boards, &file, &options);
-            assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
-            let (took, one) = (update.took, *one.get_or_insert(update.took));
-            row(Measurement { boards, way, block_size, lost_one_in, took, one });
+    let mut one = None;
+    for (boards, way, block_size, lost_one_in) in rows {
+        fleet.bench.world.clear_faults();
+        if lost_one_in != 0 {
+            fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
         }
+        let options = ManyOptions::default().together(way == Way::Together);
+        let each = FlashOptions::default().group_blocks(Some(block_size));
+        let update = fleet.update_as(boards, &file, &each, &options, &mut |_| {});
+        assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
+        let (took, one) = (update.took, *one.get_or_insert(update.took));
+        row(Measurement { boards, way, block_size, lost_one_in, took, one });
     }
 }

@@ -8,6 +8,7 @@ use coflash::file::block_file::{Checksum, LastBlock};
 use coflash::file::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::file::read::{self, Firmware, Format};
 use coflash::file::{self, limit, AddressRange};
+use coflash::update::GROUP_BLOCKS;
 use shared_abi::layout;
 
 use super::context::Context;
@@ -79,9 +80,9 @@ pub(super) struct Source {
     place: Place,
 
     /// The size of a block in bytes, including its 16 bytes of framing: at most the bootloader's
-    /// buffer.
-    #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number, default_value = "0x400")]
-    block_size: u32,
+    /// buffer. The default is 0x400; devices that are updated together get 0x1000.
+    #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number)]
+    block_size: Option<u32>,
 
     /// The value that fills gaps inside a block: a byte, or a 32-bit pattern.
     #[arg(long, alias = "gap_fill", value_name = "VALUE", value_parser = number, default_value = "0xFFFFFFFF")]
@@ -103,7 +104,7 @@ pub(super) struct Source {
     last_block_2008: bool,
 }
 
-const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400, "the help text says so");
+const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400 && GROUP_BLOCKS == 0x1000, "the help text says so");
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum FormatName {
@@ -190,7 +191,12 @@ impl Source {
 
     /// The size of a block in bytes, including framing.
     pub(super) fn block_size(&self) -> usize {
-        self.block_size as usize
+        self.block_size.map_or(DEFAULT_BLOCK_SIZE, |size| size as usize)
+    }
+
+    /// The size of a block for devices that are updated together; `None` for the file's blocks.
+    pub(super) fn group_blocks(&self) -> Option<usize> {
+        self.block_size.is_none().then_some(GROUP_BLOCKS)
     }
 
     /// Whether the user asked for another CRC than the file's CRC `kept`.

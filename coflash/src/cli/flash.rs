@@ -328,6 +328,7 @@ impl Flash {
             .alone(!self.not_alone)
             .mastership(!self.no_mastership)
             .blocks(self.in_blocks.then(|| self.source.block_size()))
+            .group_blocks(self.source.group_blocks())
             .from_start(self.from_start)
             .force(self.force))
     }

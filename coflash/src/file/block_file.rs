@@ -154,6 +154,32 @@ impl BlockFile {
         Self { blocks: all, control, last, checksum }
     }
 
+    /// The same program in blocks of up to `size` bytes, framing included: blocks without a gap
+    /// between them are joined. Block 0 and the last block stay as they are.
+    #[must_use]
+    pub(crate) fn joined(&self, size: usize) -> Self {
+        let most = size.min(MAX_BLOCK_SIZE).saturating_sub(FRAMING);
+        let mut blocks: Vec<Block> = Vec::new();
+        for block in &self.blocks {
+            let is_program = |block: &Block| !matches!(block.number, NUMBER_CONTROL | NUMBER_LAST);
+            let follows = |last: &&mut Block| {
+                let end = last.flash_address.checked_add(last.data.len() as u32);
+                let fits = last.data.len() + block.data.len() <= most;
+                is_program(last) && is_program(block) && fits && end == Some(block.flash_address)
+            };
+            if let Some(last) = blocks.last_mut().filter(follows) {
+                last.data.extend_from_slice(&block.data);
+            } else {
+                let number = match block.number {
+                    NUMBER_LAST => NUMBER_LAST,
+                    _ => blocks.len() as u32,
+                };
+                blocks.push(Block { number, ..block.clone() });
+            }
+        }
+        Self { blocks, ..self.clone() }
+    }
+
     /// Whether bytes begin like a block file: block 0 at address 0 with one of the valid lengths.
     #[must_use]
     pub fn looks_like(bytes: &[u8]) -> bool {
@@ -418,4 +444,41 @@ fn program_crc<'a>(
         let full = std::iter::repeat_n(ERASED.as_slice(), gap / ERASED.len());
         full.chain([&ERASED[..gap % ERASED.len()], data])
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::file::convert::{blocks_of, Options};
+    use crate::file::read::Firmware;
+
+    /// 300 bytes, a gap, and 100 more.
+    fn file() -> BlockFile {
+        let mut pieces = Pieces::default();
+        pieces.add(0x1000, (0..300_u32).map(|i| i as u8).collect(), Place::File);
+        pieces.add(0x2000, vec![7; 100], Place::File);
+        let image = Firmware::Image(pieces.in_order());
+        blocks_of(image, &Options::default().block_size(64).max_gap(Some(0))).expect("it fits").file
+    }
+
+    #[test]
+    fn joined_blocks_are_the_same_program() {
+        let file = file();
+        for (size, sizes) in [
+            (0, vec![48; 6].into_iter().chain([12, 48, 48, 4]).collect::<Vec<_>>()),
+            (128, vec![96, 96, 108, 100]),
+            (usize::MAX, vec![300, 100]),
+        ] {
+            let joined = file.joined(size);
+            let found: Vec<usize> = joined.program_blocks().iter().map(|block| block.data.len()).collect();
+            assert_eq!(found, sizes, "{size}");
+            // The numbers and CRCs are right, by the reader's judgement.
+            assert_eq!(BlockFile::parse(&joined.emit()).expect("a block file"), joined);
+            assert_eq!(joined.flash_image(), file.flash_image());
+            assert_eq!(
+                (joined.blocks.first(), joined.blocks.last()),
+                (file.blocks.first(), file.blocks.last())
+            );
+        }
+    }
 }

@@ -32,5 +32,5 @@ pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::held::{held, Difference, Held, Part};
 pub use self::left::{DeviceState, Left, Look, Seen};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
-pub use self::options::{FlashOptions, Target};
+pub use self::options::{FlashOptions, Target, GROUP_BLOCKS};
 pub use self::password::Password;

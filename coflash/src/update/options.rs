@@ -45,6 +45,9 @@ pub struct FlashOptions {
     /// Take the NMT mastership during the update of a lift device, and give it back (CiA 814-1
     /// clause 6.3).
     pub mastership: bool,
+    /// To the devices of a group, join blocks of the file up to this size, including framing: fewer
+    /// blocks need fewer answers of each device. `None` sends the file's own blocks.
+    pub group_blocks: Option<usize>,
     /// Send a sealed image in blocks of at most this size, including framing, instead of in one
     /// download.
     pub blocks: Option<usize>,
@@ -56,6 +59,10 @@ pub struct FlashOptions {
     /// be a program, or that is for another device or another region, before it changes the device.
     pub force: bool,
 }
+
+/// A block of a group, framing included. Every device with a second SDO server takes it; a device
+/// that refuses it is updated by itself, with the file's blocks.
+pub const GROUP_BLOCKS: usize = 0x1000;
 
 impl FlashOptions {
     setters! {
@@ -72,6 +79,7 @@ impl FlashOptions {
         alone: bool,
         mastership: bool,
         blocks: Option<usize>,
+        group_blocks: Option<usize>,
         together: bool,
         from_start: bool,
         force: bool,
@@ -134,6 +142,7 @@ impl Default for FlashOptions {
             alone: true,
             mastership: true,
             blocks: None,
+            group_blocks: Some(GROUP_BLOCKS),
             together: false,
             from_start: false,
             force: false,

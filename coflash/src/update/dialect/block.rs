@@ -73,6 +73,8 @@ impl Procedure for Block {
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
         }
+        let larger = options.group_blocks.filter(|_| in_group).map(|size| file.joined(size));
+        let file = larger.as_ref().unwrap_or(file);
         let sent = send_verified(session, file, &mut in_group, options, course);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);

@@ -34,8 +34,6 @@ pub mod story;
 const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
 /// The prefix of the name of a point.
 pub const NAME: &str = "board";
-/// The first and last operations, which concern the parameters: all of them are cut.
-const EDGE: usize = 10;
 /// The number of looks at a flash with bits between 0 and 1: they read differently each time.
 const LOOKS: usize = 3;
 
@@ -114,21 +112,28 @@ impl FromStr for Point {
 /// between.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Effort {
-    /// One of how many is cut, in every way.
-    pub cut: usize,
+    /// How many at each end are cut, in every way, and one of how many between. The first and last
+    /// ones concern the parameters.
+    pub cut: (usize, usize),
     /// How many at each end are followed by a recovery, in one way, and one of how many between.
     pub recovered: (usize, usize),
-    /// One of how many in the recovery is cut, in one way.
-    pub cut_again: usize,
+    /// How many at each end of the recovery are cut, in one way, and one of how many between.
+    pub cut_again: (usize, usize),
 }
 
 impl Effort {
     /// For every run of the tests.
-    pub const SAMPLE: Self = Self { cut: 128, recovered: (2, 1024), cut_again: 1024 };
+    pub const SAMPLE: Self = Self { cut: (10, 128), recovered: (2, 1024), cut_again: (10, 1024) };
     /// A tenth of all.
-    pub const TENTH: Self = Self { cut: 10, recovered: (4, 256), cut_again: 256 };
+    pub const TENTH: Self = Self { cut: (10, 10), recovered: (4, 256), cut_again: (10, 256) };
     /// Every operation.
-    pub const FULL: Self = Self { cut: 1, recovered: (EDGE, 64), cut_again: 64 };
+    pub const FULL: Self = Self { cut: (10, 1), recovered: (10, 64), cut_again: (10, 64) };
+
+    /// The same for a scenario in which a look takes ten times as long.
+    fn slow(self) -> Self {
+        let rarer = |(edge, one_in): (usize, usize)| (edge.div_ceil(3), one_in * 8);
+        Self { cut: rarer(self.cut), recovered: rarer(self.recovered), cut_again: rarer(self.cut_again) }
+    }
 
     fn takes((edge, one_in): (usize, usize), operation: usize, of: usize) -> bool {
         operation < edge || operation + edge >= of || operation.is_multiple_of(one_in)
@@ -257,7 +262,7 @@ impl Proof<'_> {
         let chip = firmware::board().chip;
         let mut before = cells.clone();
         for (number, operation) in operations.iter().enumerate() {
-            if Effort::takes((EDGE, self.effort.cut_again), number, operations.len()) {
+            if Effort::takes(self.effort.cut_again, number, operations.len()) {
                 let kind = 1 + (point.first.operation + number) % (KINDS.len() - 1);
                 let mut cells = before.clone();
                 cells.apply(operation, chip, KINDS[kind].1);
@@ -277,6 +282,7 @@ impl Proof<'_> {
 /// # Errors
 /// If the scenario fails without a cut.
 pub fn run(scenario: &Scenario, effort: Effort) -> Result<Report<Point>, String> {
+    let effort = if scenario.is_slow { effort.slow() } else { effort };
     let story = scenario.story()?;
     let mut bench = story.bench();
     let operations = record(&story, &mut bench, &story.start)?;
@@ -309,7 +315,7 @@ pub fn prove(
                 let mut before = story.start.clone();
                 let mut turn = 0;
                 for (number, operation) in operations.iter().enumerate() {
-                    if Effort::takes((EDGE, effort.cut), number, operations.len()) {
+                    if Effort::takes(effort.cut, number, operations.len()) {
                         turn += 1;
                         if turn % threads == thread {
                             let run = AssertUnwindSafe(|| proof.at_operation(&mut bench, number, &before));

@@ -91,6 +91,8 @@ pub struct Scenario {
     pub name: &'static str,
     /// What happens, in words.
     pub about: &'static str,
+    /// Whether the device checks signatures at each start: a look takes ten times as long.
+    pub is_slow: bool,
     prepare: fn() -> Result<Story, String>,
 }
 
@@ -109,31 +111,37 @@ pub const SCENARIOS: &[Scenario] = &[
     Scenario {
         name: "update",
         about: "version 2 in blocks, while version 1 runs",
+        is_slow: false,
         prepare: || update(|bench| write(bench, &options())),
     },
     Scenario {
         name: "raw",
         about: "the same in one download of a binary image",
+        is_slow: false,
         prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Raw)))),
     },
     Scenario {
         name: "resume",
         about: "the same in blocks, after half of them have arrived",
+        is_slow: false,
         prepare: resume,
     },
     Scenario {
         name: "confirm",
         about: "version 2 runs and was never confirmed; it is called back, and started again",
+        is_slow: false,
         prepare: confirm,
     },
     Scenario {
         name: "store",
         about: "another node-ID is stored by layer setting services, while version 1 runs",
+        is_slow: false,
         prepare: store,
     },
     Scenario {
         name: "sealed",
         about: "version 2 as a sealed image with a higher security counter, while version 1 runs",
+        is_slow: true,
         prepare: || sealed(false),
     },
     Scenario { name: "compressed", about: "the same, compressed", prepare: || sealed(true) },
