@@ -144,7 +144,7 @@ pub const SCENARIOS: &[Scenario] = &[
         is_slow: true,
         prepare: || sealed(false),
     },
-    Scenario { name: "compressed", about: "the same, compressed", prepare: || sealed(true) },
+    Scenario { name: "compressed", about: "the same, compressed", is_slow: true, prepare: || sealed(true) },
 ];
 
 fn options() -> FlashOptions {
