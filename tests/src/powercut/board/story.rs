@@ -91,7 +91,7 @@ pub struct Scenario {
     pub name: &'static str,
     /// What happens, in words.
     pub about: &'static str,
-    /// Whether the device checks signatures at each start: a look takes ten times as long.
+    /// Whether a look takes ten times as long: a sealed device computes with its keys at each start.
     pub is_slow: bool,
     prepare: fn() -> Result<Story, String>,
 }
