@@ -1,6 +1,8 @@
 //! Proof by power cut, level 2: the built firmware on the emulated chip.
 
-use coboot_tests::powercut::board::{run, Effort, Point, SCENARIOS};
+use coboot_tests::firmware;
+use coboot_tests::powercut::board::{operations, prove, run, Effort, Point, SCENARIOS};
+use emulator::machine::Operation;
 
 #[test]
 fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
@@ -18,6 +20,41 @@ fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
         states += report.states;
     }
     assert!(states > 1000, "{states}");
+}
+
+/// The operations of an update in another order, as a bootloader with a bug would have them.
+#[test]
+fn a_cut_shows_an_order_of_operations_that_is_wrong() {
+    let scenario = SCENARIOS.iter().find(|scenario| scenario.name == "update").unwrap();
+    let story = scenario.story().unwrap();
+    let sound = operations(&story).unwrap();
+    let parameters = firmware::board().parameters;
+    let base = firmware::board().chip.flash.base;
+    let is_parameter = |operation: &Operation| match operation {
+        Operation::Program { offset, .. } => parameters.iter().any(|region| region.contains(base + offset, 4)),
+        _ => false,
+    };
+    // The ends and nothing else.
+    let effort = Effort { cut: (20, usize::MAX), recovered: (0, usize::MAX), cut_again: (0, usize::MAX) };
+    let told = |operations: &[Operation]| {
+        let report = prove("update", &story, operations, effort);
+        report.told.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
+    };
+    assert_eq!(told(&sound), Vec::<String>::new());
+
+    // The record of the new program before its last words.
+    let last_data = sound.iter().rposition(|operation| !is_parameter(operation)).unwrap();
+    let mut early = sound.clone();
+    early[last_data - 3..].rotate_left(4);
+    // The sectors are erased before the record of the old program is withdrawn.
+    let erase = sound.iter().position(|operation| matches!(operation, Operation::Erase { .. })).unwrap();
+    assert!(erase > 0 && sound[..erase].iter().all(is_parameter));
+    let mut late = sound.clone();
+    late[..=erase].rotate_right(1);
+    for wrong in [early, late] {
+        let told = told(&wrong);
+        assert!(told.iter().any(|what| what.contains("is not what it says")), "{told:?}");
+    }
 }
 
 #[test]

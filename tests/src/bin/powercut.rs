@@ -29,7 +29,10 @@ impl FromStr for AnyPoint {
 /// What to do.
 #[derive(Default)]
 struct Wish {
+    /// Every operation of the real firmware.
     full: bool,
+    /// Every way for the second cut on the model, too.
+    every_way: bool,
     json: bool,
     /// Level 2 alone, with a tenth of the cuts.
     tenth: bool,
@@ -41,6 +44,7 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
     while let Some(argument) = arguments.next() {
         match argument.as_str() {
             "--full" => wish.full = true,
+            "--every-way" => wish.every_way = true,
             "--json" => wish.json = true,
             "--tenth" => wish.tenth = true,
             "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
@@ -49,7 +53,7 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             },
             other => {
                 return Err(format!(
-                    "{other:?} is no option; there are --full, --tenth, --json and --reproduce POINT."
+                    "{other:?} is no option; there are --full, --every-way, --tenth, --json and --reproduce POINT."
                 ))
             }
         }
@@ -103,7 +107,7 @@ fn main() -> ExitCode {
             println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
         }
         for scenario in SCENARIOS {
-            match run(scenario, wish.full) {
+            match run(scenario, wish.every_way) {
                 Ok(report) => sum.add(1, scenario.name, &report, wish.json),
                 Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
             }

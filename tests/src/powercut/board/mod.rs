@@ -284,24 +284,25 @@ impl Proof<'_> {
 pub fn run(scenario: &Scenario, effort: Effort) -> Result<Report<Point>, String> {
     let effort = if scenario.is_slow { effort.slow() } else { effort };
     let story = scenario.story()?;
+    Ok(prove(scenario.name, &story, &operations(&story)?, effort))
+}
+
+/// The flash operations of a story without a cut.
+///
+/// # Errors
+/// If it fails.
+pub fn operations(story: &Story) -> Result<Vec<Operation>, String> {
     let mut bench = story.bench();
-    let operations = record(&story, &mut bench, &story.start)?;
-    match observe(&story, &mut bench)? {
-        seen if seen == story.to => prove(scenario.name, &story, &operations, effort),
+    let operations = record(story, &mut bench, &story.start)?;
+    match observe(story, &mut bench)? {
+        seen if seen == story.to => Ok(operations),
         seen => Err(format!("without a cut: {seen:?}")),
     }
 }
 
 /// Cuts the power in these operations.
-///
-/// # Errors
-/// None today.
-pub fn prove(
-    name: &'static str,
-    story: &Story,
-    operations: &[Operation],
-    effort: Effort,
-) -> Result<Report<Point>, String> {
+#[must_use]
+pub fn prove(name: &'static str, story: &Story, operations: &[Operation], effort: Effort) -> Report<Point> {
     let report = Report { operations: operations.len() as u64, ..Report::default() };
     let total = Mutex::new((HashSet::new(), report));
     let proof = Proof { name, story, operations, effort, total };
@@ -334,7 +335,7 @@ pub fn prove(
             });
         }
     });
-    Ok(proof.total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).1)
+    proof.total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).1
 }
 
 /// One point as text.
