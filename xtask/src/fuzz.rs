@@ -1,11 +1,13 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, one after the other.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::{env, fs};
+use std::{env, fmt, fs};
 
 use crate::args::Args;
-use crate::{process, setup, workspace, Outcome};
+use crate::json::Value;
+use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N] [--target NAME]
@@ -14,6 +16,7 @@ Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, L
 program download by blocks and in one piece,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
 configuration files, sealed images with their signatures and their compression. What they find in this run is built upon in the next one.
+The counts of all runs go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
   --target NAME   this one alone
@@ -26,6 +29,66 @@ where it is missing.
 const CARGO_FUZZ: &str = "0.13.2";
 /// The longest time for one input of a target, in seconds. They need microseconds.
 const TOO_LONG: u32 = 10;
+/// The file of the counts.
+const EVIDENCE: &str = "fuzz";
+
+/// The counts of all runs without a fault.
+struct Counts(BTreeMap<String, Row>);
+
+/// The counts of one target.
+struct Row {
+    /// The commit of the first run that is counted.
+    since: String,
+    /// Inputs and seconds, of all runs together.
+    sums: [u64; 2],
+    /// The edges that the last run covered, and the files in its corpus.
+    last: [u64; 2],
+}
+
+impl Counts {
+    fn read(recorded: &Value) -> Self {
+        let Value::Object(targets) = recorded.get("targets") else { return Self(BTreeMap::new()) };
+        let row = |counts: &Value| {
+            let number = |key| match counts.get(key) {
+                Value::Number(text) => text.parse::<u64>().ok(),
+                _ => None,
+            };
+            Some(Row {
+                since: counts.get("since").text()?.to_owned(),
+                sums: [number("inputs")?, number("seconds")?],
+                last: [number("edges")?, number("corpus")?],
+            })
+        };
+        Self(targets.iter().filter_map(|(name, counts)| Some((name.clone(), row(counts)?))).collect())
+    }
+
+    fn add(&mut self, target: &str, more: [u64; 2], last: [u64; 2]) {
+        let row = self.0.entry(target.to_owned()).or_insert_with(|| Row {
+            since: evidence::commit(),
+            sums: [0; 2],
+            last,
+        });
+        row.sums = [row.sums[0].saturating_add(more[0]), row.sums[1].saturating_add(more[1])];
+        row.last = last;
+    }
+}
+
+impl fmt::Display for Counts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{{\"targets\": {{")?;
+        for (n, (target, Row { since, sums: [inputs, seconds], last: [edges, corpus] })) in
+            self.0.iter().enumerate()
+        {
+            let comma = if n == 0 { "" } else { "," };
+            write!(
+                f,
+                "{comma}\n  \"{target}\": {{\"inputs\": {inputs}, \"seconds\": {seconds}, \"edges\": {edges}, \
+                 \"corpus\": {corpus}, \"since\": \"{since}\"}}"
+            )?;
+        }
+        write!(f, "\n}}}}")
+    }
+}
 
 pub fn run(mut args: Args) -> Outcome {
     let seconds = seconds(args.value("--seconds")?)?;
@@ -51,6 +114,7 @@ pub fn run(mut args: Args) -> Outcome {
     println!("Building the fuzz targets ...");
     process::run(&mut fuzz(&["build"]))?;
     let mut failed = Vec::new();
+    let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
     for target in &targets {
         let corpus = folder.join("corpus").join(target);
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
@@ -69,7 +133,12 @@ pub fn run(mut args: Args) -> Outcome {
         let said = fs::read(&log).unwrap_or_default();
         let said = String::from_utf8_lossy(&said);
         match (status.success(), runs(&said)) {
-            (true, Some(runs @ 1..)) => println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault"),
+            (true, Some(runs @ 1..)) => {
+                println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+                let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
+                counts.add(target, [runs, seconds.into()], [edges(&said).unwrap_or(0), files]);
+                evidence::record(EVIDENCE, &counts.to_string())?;
+            }
             (good, _) => {
                 let words = if good { "ran no input" } else { "FAILED" };
                 println!("  {target:<16} {words}; all of it is in {}", workspace::shown(&log));
@@ -143,6 +212,11 @@ fn runs(said: &str) -> Option<u64> {
     said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
 }
 
+/// The covered edges in the fuzzer's last line about them.
+fn edges(said: &str) -> Option<u64> {
+    said.lines().rev().find_map(|line| line.split_once("cov: ")?.1.split(' ').next()?.parse().ok())
+}
+
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
 /// the input.
 fn excerpt(said: &str) -> String {
@@ -190,10 +264,25 @@ mod tests {
     fn the_fuzzers_words_are_understood() {
         let said = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
         assert_eq!((runs(said), excerpt(said)), (Some(918_484), String::new()));
+        assert_eq!((edges(said), edges("#2 INITED exec/s: 0")), (Some(741), None));
         let said = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
                     Test unit written to crash-1\n";
         assert_eq!(runs(said), None);
         let excerpt = excerpt(said);
         assert!(excerpt.contains("no room") && excerpt.contains("crash-1") && !excerpt.contains("seed"));
+    }
+
+    #[test]
+    fn counts_add_up_over_runs() {
+        let mut counts = Counts::read(&Value::Null);
+        counts.add("lss", [10, 2], [700, 30]);
+        let mut counts = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        counts.add("lss", [u64::MAX, 3], [701, 29]);
+        counts.add("lzma", [5, 1], [60, 7]);
+        let Counts(rows) = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        let lss = &rows["lss"];
+        assert_eq!((lss.sums, lss.last), ([u64::MAX, 5], [701, 29]));
+        assert_eq!((rows["lzma"].sums, rows.len()), ([5, 1], 2));
+        assert!(!lss.since.is_empty());
     }
 }

@@ -20,6 +20,7 @@ mod docs;
 mod eds;
 mod elf;
 mod emulate;
+mod evidence;
 mod examples;
 mod fleet;
 mod fuzz;

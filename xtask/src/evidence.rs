@@ -1,0 +1,134 @@
+//! The files in `target/evidence`: what a job has measured, and from which sources.
+//!
+//! Each file is one JSON object. It begins with `commit` (with `-dirty` behind it if the sources
+//! were changed since), `toolchain` (the line of `rustc --version`) and `date` (UTC, ISO 8601);
+//! the rest is the job's own.
+
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+use std::time::{SystemTime, UNIX_EPOCH};
+use std::{env, fs};
+
+use crate::json::Value;
+use crate::{process, workspace, Outcome};
+
+/// Writes `target/evidence/NAME.json` and returns its path. `facts` is a JSON object as text.
+///
+/// # Errors
+/// When `facts` is no object or has one of the three members above, or when the file cannot be
+/// written.
+pub fn record(name: &str, facts: &str) -> Outcome<PathBuf> {
+    let seconds = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+    let text = with_origin(facts, &commit(), &toolchain(), &date(seconds))?;
+    let file = path(name);
+    let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
+    fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
+    // A reader never sees half a file.
+    let draft = file.with_extension("draft");
+    fs::write(&draft, text).map_err(unwritable)?;
+    fs::rename(&draft, &file).map_err(unwritable)?;
+    Ok(file)
+}
+
+/// What was recorded last under this name, if it can be read.
+pub fn recorded(name: &str) -> Option<Value> {
+    Value::parse(&fs::read_to_string(path(name)).ok()?).ok()
+}
+
+fn path(name: &str) -> PathBuf {
+    workspace::target_dir().join("evidence").join(name).with_extension("json")
+}
+
+/// The facts with where they come from in front of them.
+fn with_origin(facts: &str, commit: &str, toolchain: &str, date: &str) -> Outcome<String> {
+    let Value::Object(members) = Value::parse(facts)? else {
+        return Err("what is recorded is no JSON object.".into());
+    };
+    let own = [("commit", commit), ("toolchain", toolchain), ("date", date)];
+    if let Some((name, _)) = own.iter().find(|(name, _)| members.contains_key(*name)) {
+        return Err(format!("what is recorded has a \"{name}\" of its own."));
+    }
+    let own = own.map(|(name, value)| format!("\"{name}\": \"{}\"", value.replace(['"', '\\'], "'")));
+    let inner = facts.trim().trim_start_matches('{').trim_start();
+    let comma = if members.is_empty() { "" } else { ",\n" };
+    Ok(format!("{{{}{comma}{inner}\n", own.join(",\n")))
+}
+
+/// The commit of the sources; `unknown` outside a clone.
+pub fn commit() -> String {
+    let git =
+        |words: &[&str]| process::output(Command::new("git").current_dir(workspace::root()).args(words));
+    let Ok(commit) = git(&["rev-parse", "HEAD"]) else { return "unknown".to_owned() };
+    let changed = git(&["status", "--porcelain", "--untracked-files=no"]).is_ok_and(|said| !said.is_empty());
+    format!("{}{}", commit.trim(), if changed { "-dirty" } else { "" })
+}
+
+/// The compiler that cargo uses here.
+fn toolchain() -> String {
+    let mut rustc = Command::new(env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+    let said = process::output(rustc.arg("--version").current_dir(workspace::root()).stdin(Stdio::null()));
+    said.map_or_else(|_| "unknown".to_owned(), |said| said.trim().to_owned())
+}
+
+/// A time in seconds since 1970, as `2026-01-31T12:00:00Z`.
+fn date(seconds: u64) -> String {
+    let (mut days, rest) = (seconds / 86400, seconds % 86400);
+    let is_leap =
+        |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
+    let mut year = 1970;
+    while days >= 365 + u64::from(is_leap(year)) {
+        days -= 365 + u64::from(is_leap(year));
+        year += 1;
+    }
+    let mut month = 1;
+    for length in [31, 28 + u64::from(is_leap(year)), 31, 30, 31, 30, 31, 31, 30, 31, 30] {
+        if days < length {
+            break;
+        }
+        days -= length;
+        month += 1;
+    }
+    let (hour, minute, second) = (rest / 3600, rest / 60 % 60, rest % 60);
+    format!("{year}-{month:02}-{:02}T{hour:02}:{minute:02}:{second:02}Z", days + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn facts_get_their_origin_in_front_and_stay_what_they_are() {
+        for (facts, count) in [("{}", None), (" { \"count\": 3, \"more\": {} } ", Some("3"))] {
+            let text = with_origin(facts, "abc", "rustc 1 \"x\"", "2026-01-31T12:00:00Z").unwrap();
+            let value = Value::parse(&text).unwrap();
+            assert_eq!(value.get("commit").text(), Some("abc"));
+            assert_eq!(value.get("toolchain").text(), Some("rustc 1 'x'"));
+            assert_eq!(value.get("date").text(), Some("2026-01-31T12:00:00Z"));
+            assert_eq!(*value.get("count"), count.map_or(Value::Null, |count| Value::Number(count.into())));
+        }
+    }
+
+    #[test]
+    fn what_is_no_object_or_hides_the_origin_is_refused() {
+        for facts in ["", "[]", "{", "3", "{\"commit\": 1}", "{\"a\": 1, \"date\": 2}"] {
+            assert!(with_origin(facts, "", "", "").is_err(), "{facts}");
+        }
+    }
+
+    /// Second column: the output of GNU `date -u -d @… +%FT%TZ`.
+    #[test]
+    fn dates_are_those_of_the_calendar() {
+        for (seconds, text) in [
+            (0, "1970-01-01T00:00:00Z"),
+            (951782400, "2000-02-29T00:00:00Z"),
+            (951868799, "2000-02-29T23:59:59Z"),
+            (1709251199, "2024-02-29T23:59:59Z"),
+            (1798761599, "2026-12-31T23:59:59Z"),
+            (1798761600, "2027-01-01T00:00:00Z"),
+            (4107542400, "2100-03-01T00:00:00Z"),
+            (4102444799, "2099-12-31T23:59:59Z"),
+        ] {
+            assert_eq!(date(seconds), text);
+        }
+    }
+}
