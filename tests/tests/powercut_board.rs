@@ -31,7 +31,9 @@ fn a_cut_shows_an_order_of_operations_that_is_wrong() {
     let parameters = firmware::board().parameters;
     let base = firmware::board().chip.flash.base;
     let is_parameter = |operation: &Operation| match operation {
-        Operation::Program { offset, .. } => parameters.iter().any(|region| region.contains(base + offset, 4)),
+        Operation::Program { offset, .. } => {
+            parameters.iter().any(|region| region.contains(base + offset, 4))
+        }
         _ => false,
     };
     // The ends and nothing else.

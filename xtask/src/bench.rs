@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask bench [--json] [--board BOARD] [--yes]
@@ -14,7 +14,8 @@ how long several boards on one bus take.
 Then, in real time: what a frame costs the host, in an update over socketcand into a node whose flash
 is a file.
 
-  --json          prints the tables as JSON: downloads, bus, forms, fleets, host
+  --json          prints the tables as JSON: downloads, bus, forms, fleets, host; and keeps them in
+                  target/evidence/bench.json
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
 ";
@@ -42,8 +43,9 @@ pub fn run(mut args: Args) -> Outcome {
         // The first result is an object; the second one is added to it.
         let emulated =
             emulated.trim_end().strip_suffix('}').ok_or("the bench printed something unexpected.")?;
-        println!("{emulated},\n\"host\": {}}}", host.trim_end());
-        return Ok(());
+        let rows = format!("{emulated},\n\"host\": {}}}", host.trim_end());
+        println!("{rows}");
+        return evidence::record("bench", &rows).map(drop);
     }
     process::run(&mut bench)?;
     println!();

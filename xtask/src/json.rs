@@ -13,7 +13,7 @@ pub enum Value {
     Null,
     /// `true`, `false`
     Bool(bool),
-    /// A number, as text: nothing here calculates with one.
+    /// A number, as text.
     Number(String),
     /// A string without escapes.
     String(String),
@@ -54,6 +54,23 @@ impl Value {
         match self {
             Self::Array(items) => items,
             _ => &[],
+        }
+    }
+
+    /// The members of an object, in the order of their names; none for any other value.
+    pub fn members(&self) -> impl Iterator<Item = (&str, &Self)> {
+        let members = match self {
+            Self::Object(members) => Some(members),
+            _ => None,
+        };
+        members.into_iter().flatten().map(|(name, value)| (name.as_str(), value))
+    }
+
+    /// The value of a number.
+    pub fn number(&self) -> Option<f64> {
+        match self {
+            Self::Number(text) => text.parse().ok(),
+            _ => None,
         }
     }
 

@@ -158,6 +158,12 @@ const JOBS: &[Job] = &[
         run: powercut::run,
     },
     Job {
+        name: "evidence",
+        about: "one page of what the last runs have measured",
+        help: evidence::HELP,
+        run: evidence::run,
+    },
+    Job {
         name: "size",
         about: "the bootloader's flash against its budget",
         help: size::HELP,

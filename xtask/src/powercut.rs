@@ -1,10 +1,12 @@
 //! `cargo xtask powercut`: tests that no power cut bricks a device.
 
+use std::fs;
+
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask powercut [--full] [--every-way] [--json] [--reproduce POINT] [--board BOARD] [--yes]
@@ -39,13 +41,18 @@ pub fn run(mut args: Args) -> Outcome {
         .flatten()
         .chain(point.iter().flatten().cloned())
         .collect();
-    cut(board, &only, json)?;
-    if full && !chosen_board && point.is_none() {
+    if point.is_some() {
+        return cut(board, &only, json, None).map(drop);
+    }
+    evidence::begin("powercut")?;
+    let mut boards = vec![cut(board, &only, json, Some("powercut-board"))?];
+    if full && !chosen_board {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
-            cut(other, &["--tenth".to_owned()], json)?;
+            boards.push(cut(other, &["--tenth".to_owned()], json, Some("powercut-board"))?);
         }
     }
+    evidence::record("powercut", &format!("{{\"full\": {full}, \"boards\": [{}]}}", boards.join(",\n")))?;
     Ok(())
 }
 
@@ -56,13 +63,20 @@ fn is_of_its_own(board: &Layout) -> bool {
     BOARDS.iter().find(alike).is_some_and(|first| first.board == board.board)
 }
 
-fn cut(board: &Layout, arguments: &[String], json: bool) -> Outcome {
+/// Cuts the power on a board; returns the counts as JSON, if they are to be kept.
+fn cut(board: &Layout, arguments: &[String], json: bool, keep: Option<&str>) -> Outcome<String> {
     let images = build::all(board)?;
+    let kept = keep.map(|name| workspace::target_dir().join(name).with_extension("json"));
     let mut powercut = process::cargo("run");
     powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]).args(arguments);
     powercut.args(json.then_some("--json"));
+    if let Some(file) = &kept {
+        powercut.arg("--evidence").arg(file);
+    }
     powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
-    process::run(&mut powercut)
+    process::run(&mut powercut)?;
+    let Some(file) = kept else { return Ok(String::new()) };
+    fs::read_to_string(&file).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&file)))
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use shared_abi::layout::{Layout, BOARDS};
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::setup::{Part, Setup};
-use crate::{build, pack, parts, workspace, Outcome};
+use crate::{build, evidence, pack, parts, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--image IMAGE] [--yes]
@@ -50,10 +50,18 @@ pub fn run(mut args: Args) -> Outcome {
 
     println!("\nboard                            bytes  of {BUDGET}");
     let mut within = Ok(());
+    let mut images = Vec::new();
+    let mut keep = |image: &str, board: &Layout, bytes: u32, budget: u32| {
+        images.push(format!(
+            "{{\"image\": \"{image}\", \"board\": \"{}\", \"bytes\": {bytes}, \"budget\": {budget}}}",
+            board.board
+        ));
+    };
     for board in BOARDS {
         let path = build::images(board, &["bootloader"])?.join("bootloader.elf");
         let flash = Flash::of(&read(&path)?, board.bootloader)?;
         println!("{:<31} {:>6}", board.board, flash.used);
+        keep("bootloader", board, flash.used, BUDGET);
         within = within.and(flash.within(BUDGET).map_err(|problem| format!("{}: {problem}", board.board)));
     }
     println!("\nwith sealed images               bytes     of");
@@ -62,8 +70,10 @@ pub fn run(mut args: Args) -> Outcome {
         let path = build::images(board, &["bootloader-sealed"])?.join("bootloader-sealed.elf");
         let flash = Flash::of(&read(&path)?, room)?;
         println!("{:<31} {:>6}  {}", board.board, flash.used, room.size);
+        keep("bootloader-sealed", board, flash.used, room.size);
         within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
+    evidence::record("size", &format!("{{\"images\": [{}]}}", images.join(",\n")))?;
     within
 }
 

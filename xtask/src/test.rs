@@ -9,7 +9,7 @@ use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
-use crate::{build, examples, process, workspace, Outcome};
+use crate::{build, evidence, examples, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
@@ -60,6 +60,10 @@ pub fn run(mut args: Args) -> Outcome {
         path.with_extension(std::env::consts::EXE_EXTENSION).into_os_string()
     };
 
+    let is_whole = !chosen_board && chosen.is_empty();
+    if is_whole {
+        evidence::begin("tests")?;
+    }
     let started = Instant::now();
     let python = setup::python().into_os_string();
     let mut suite =
@@ -84,6 +88,14 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let summary = suite.summary;
 
+    if is_whole {
+        let Summary { passed, failed, ignored, programs, .. } = &summary;
+        let seconds = started.elapsed().as_secs();
+        evidence::record(
+            "tests",
+            &format!("{{\"passed\": {passed}, \"failed\": {failed}, \"skipped\": {ignored}, \"programs\": {programs}, \"seconds\": {seconds}}}"),
+        )?;
+    }
     println!();
     for name in &summary.names_of_failed {
         println!("FAILED: {name}");

@@ -34,6 +34,8 @@ struct Wish {
     /// Every way for the second cut on the model, too.
     every_way: bool,
     json: bool,
+    /// Writes the counts as JSON to this file, too.
+    evidence: Option<String>,
     /// Level 2 alone, with a tenth of the cuts.
     tenth: bool,
     point: Option<AnyPoint>,
@@ -46,6 +48,7 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             "--full" => wish.full = true,
             "--every-way" => wish.every_way = true,
             "--json" => wish.json = true,
+            "--evidence" => wish.evidence = Some(arguments.next().ok_or("--evidence wants a file.")?),
             "--tenth" => wish.tenth = true,
             "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
                 Some(point) => wish.point = Some(point?),
@@ -53,7 +56,7 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             },
             other => {
                 return Err(format!(
-                    "{other:?} is no option; there are --full, --every-way, --tenth, --json and --reproduce POINT."
+                    "{other:?} is no option; there are --full, --every-way, --tenth, --json, --evidence FILE and --reproduce POINT."
                 ))
             }
         }
@@ -75,9 +78,8 @@ impl Sum {
         self.points += report.points;
         self.states += report.states;
         self.violations += report.violations;
-        if json {
-            self.rows.push(as_json(level, name, report));
-        } else {
+        self.rows.push(as_json(level, name, report));
+        if !json {
             println!("{}", as_text(name, report));
         }
     }
@@ -132,11 +134,18 @@ fn main() -> ExitCode {
         }
     }
     let Sum { rows, points, states, violations } = sum;
+    let object = format!(
+        "{{\"board\": \"{}\", \"points\": {points}, \"states\": {states}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
+        coboot_tests::firmware::board().board,
+        rows.join(",\n")
+    );
+    if let Some(file) = &wish.evidence {
+        if let Err(error) = std::fs::write(file, &object) {
+            return refuse(&format!("{file} cannot be written: {error}"));
+        }
+    }
     if wish.json {
-        println!(
-            "{{\"points\": {points}, \"states\": {states}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
-            rows.join(",\n")
-        );
+        println!("{object}");
     } else {
         println!("\n{points} points, {states} states of the real firmware's flash, {violations} violations.");
         println!("To see one: cargo xtask powercut --reproduce update:37:torn");
@@ -173,13 +182,17 @@ fn as_json<P: Display>(level: u8, name: &str, report: &Report<P>) -> String {
     let [bootloader, old, new] = outcomes(report);
     let told: Vec<_> =
         report.told.iter().map(|(point, what)| format!("{:?}", format!("{point}: {what}"))).collect();
+    let row =
+        |(way, letters): (&&str, &Vec<u8>)| format!("\"{way}\": \"{}\"", String::from_utf8_lossy(letters));
+    let map: Vec<_> = report.map.iter().map(row).collect();
     format!(
-        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"states\": {}, \"recoveries\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}]}}",
+        "  {{\"level\": {level}, \"scenario\": \"{name}\", \"operations\": {}, \"points\": {}, \"states\": {}, \"recoveries\": {}, \"bootloader\": {bootloader}, \"old_program\": {old}, \"new_program\": {new}, \"violations\": {}, \"told\": [{}], \"map\": {{{}}}}}",
         report.operations,
         report.points,
         report.states,
         report.recoveries,
         report.violations,
-        told.join(", ")
+        told.join(", "),
+        map.join(", ")
     )
 }

@@ -95,6 +95,10 @@ pub struct Report<P = Point> {
     pub recoveries: u64,
     /// The states of the device after the power returned, with their counts.
     pub outcomes: BTreeMap<String, u64>,
+    /// For each way, a letter for each operation: what was found behind a cut there. `B` bootloader,
+    /// `O` old program, `N` new program, `!` a violation, `=` a flash that was looked at already, `.`
+    /// not cut. Level 1 has none.
+    pub map: BTreeMap<&'static str, Vec<u8>>,
     /// The number of points with a violation.
     pub violations: u64,
     /// The first of them: the point and the violation.
@@ -110,6 +114,7 @@ impl<P> Default for Report<P> {
             states: 0,
             recoveries: 0,
             outcomes: BTreeMap::new(),
+            map: BTreeMap::new(),
             violations: 0,
             told: Vec::new(),
         }

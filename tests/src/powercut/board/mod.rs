@@ -171,6 +171,13 @@ fn hash(cells: &Cells) -> u64 {
     hasher.finish()
 }
 
+/// Puts a letter into the map of a report.
+fn mark(report: &mut Report<Point>, at: At, letter: u8) {
+    let operations = report.operations as usize;
+    let row = report.map.entry(KINDS[at.kind].0).or_insert_with(|| vec![b'.'; operations]);
+    row[at.operation] = letter;
+}
+
 /// The proof for one scenario.
 struct Proof<'s> {
     name: &'static str,
@@ -210,6 +217,15 @@ impl Proof<'_> {
     fn count(&self, point: Point, found: Result<Seen, String>) {
         let mut total = self.total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
         let report = &mut total.1;
+        let letter = match &found {
+            Ok(Seen { outcome: Outcome::Bootloader, .. }) => b'B',
+            Ok(Seen { outcome: Outcome::Old, .. }) => b'O',
+            Ok(Seen { outcome: Outcome::New, .. }) => b'N',
+            Err(_) => b'!',
+        };
+        if point.second.is_none() || letter == b'!' {
+            mark(report, point.first, letter);
+        }
         match found {
             Ok(seen) => *report.outcomes.entry(seen.outcome.name().into()).or_default() += 1,
             Err(what) => {
@@ -237,6 +253,9 @@ impl Proof<'_> {
             if self.is_new(&cells) {
                 let found = self.inspect(bench, &cells);
                 self.count(point, found);
+            } else {
+                let mut total = self.total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                mark(&mut total.1, point.first, b'=');
             }
             if recovers && (kind == 1 + number % (KINDS.len() - 1) || number + 1 == all) {
                 self.recover(bench, point, &cells);

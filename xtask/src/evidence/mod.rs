@@ -1,16 +1,38 @@
-//! The files in `target/evidence`: what a job has measured, and from which sources.
+//! `cargo xtask evidence`: the page of what the jobs have measured, and the files in
+//! `target/evidence` from which it is made.
 //!
 //! Each file is one JSON object. It begins with `commit` (with `-dirty` behind it if the sources
 //! were changed since), `toolchain` (the line of `rustc --version`) and `date` (UTC, ISO 8601);
-//! the rest is the job's own.
+//! the rest is the job's own. A job that has begun and not ended leaves `unfinished`.
+
+mod page;
 
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 use std::time::{SystemTime, UNIX_EPOCH};
 use std::{env, fs};
 
+use crate::args::Args;
 use crate::json::Value;
 use crate::{process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask evidence
+
+Writes target/evidence/index.html: one page, without any other file, of what the last runs have
+measured. It runs nothing itself: a part of which there is no result, or one of other sources, says so
+and names the command.
+";
+
+pub fn run(args: Args) -> Outcome {
+    args.none_left()?;
+    let file = workspace::target_dir().join("evidence").join("index.html");
+    let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
+    fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
+    fs::write(&file, page::page(&commit(), recorded)).map_err(unwritable)?;
+    println!("The page is {}.", workspace::shown(&file));
+    Ok(())
+}
 
 /// Writes `target/evidence/NAME.json` and returns its path. `facts` is a JSON object as text.
 ///
@@ -28,6 +50,14 @@ pub fn record(name: &str, facts: &str) -> Outcome<PathBuf> {
     fs::write(&draft, text).map_err(unwritable)?;
     fs::rename(&draft, &file).map_err(unwritable)?;
     Ok(file)
+}
+
+/// Notes that this job has begun: if it breaks off, the page says so.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn begin(name: &str) -> Outcome {
+    record(name, "{\"unfinished\": true}").map(drop)
 }
 
 /// What was recorded last under this name, if it can be read.

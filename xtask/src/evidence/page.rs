@@ -1,0 +1,498 @@
+//! The page: what the jobs have recorded, with its origin, and what is missing.
+
+use std::fmt::Write;
+
+use crate::json::Value;
+
+/// A part of the page, from one record.
+struct Part {
+    /// The name of the record.
+    name: &'static str,
+    title: &'static str,
+    /// The command that makes the record.
+    command: &'static str,
+    /// What it shows, in a sentence.
+    about: &'static str,
+    /// The verdict in a few words, `Err` if it is bad; then the details as HTML.
+    show: fn(&Value) -> (Result<String, String>, String),
+}
+
+const PARTS: &[Part] = &[
+    Part {
+        name: "tests",
+        title: "Tests",
+        command: "cargo xtask test",
+        about: "All host crates, and the built firmware in the emulator on a board of each chip.",
+        show: tests,
+    },
+    Part {
+        name: "powercut",
+        title: "Power cuts",
+        command: "cargo xtask powercut --full",
+        about: "The power fails in a flash operation; then the device answers or runs a whole program.",
+        show: powercut,
+    },
+    Part {
+        name: "attacker",
+        title: "Hostile bus",
+        command: "cargo xtask attack",
+        about: "A seeded attacker and a legal master on one bus; what nobody may change stays.",
+        show: plain,
+    },
+    Part {
+        name: "fuzz",
+        title: "Fuzzing",
+        command: "cargo xtask fuzz",
+        about: "Random inputs for each parser and state machine that meets the bus or a foreign file.",
+        show: fuzz,
+    },
+    Part {
+        name: "cpu",
+        title: "Second opinion on the CPU",
+        command: "cargo xtask second-opinion",
+        about: "The same programs on QEMU's Cortex-M4 and on the emulator, compared word for word.",
+        show: plain,
+    },
+    Part {
+        name: "mutants",
+        title: "Mutants",
+        command: "cargo xtask mutants",
+        about: "Changes of the code that the tests must notice.",
+        show: plain,
+    },
+    Part {
+        name: "bench",
+        title: "Speed",
+        command: "cargo xtask bench --json",
+        about: "A download in virtual time, beside the limits of wire and flash.",
+        show: bench,
+    },
+    Part {
+        name: "size",
+        title: "Size",
+        command: "cargo xtask size",
+        about: "The bootloader's flash on each board, against its budget.",
+        show: size,
+    },
+];
+
+/// What no run here can show.
+const NOT_VERIFIED: &str = "Nothing here ran on silicon. The emulated chip follows the reference manual, and \
+    the emulator's authors read it: an error of theirs would be in both. Transceivers, termination, clock \
+    tolerance, brown-out levels, the wear of the flash and the erase times of a real device are not verified. \
+    <code>cargo xtask hil</code> runs the same tests on a board.";
+
+/// The page for sources of this commit, with the records that `read` finds.
+pub fn page(commit: &str, read: impl Fn(&str) -> Option<Value>) -> String {
+    let (mut cards, mut sections) = (String::new(), String::new());
+    for part in PARTS {
+        let record = read(part.name);
+        let (class, verdict, details) = judge(part, commit, record.as_ref());
+        let _ = write!(
+            cards,
+            "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>\n",
+            part.name, part.title
+        );
+        let _ = write!(
+            sections,
+            "<section id=\"{}\"><h2>{}</h2><p>{} <code>{}</code></p>\n<p class=\"verdict {class}\">{verdict}</p>\n{}{details}</section>\n",
+            part.name,
+            part.title,
+            part.about,
+            part.command,
+            record.as_ref().map_or(String::new(), origin),
+        );
+    }
+    format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <title>coboot: evidence</title>\n<style>{STYLE}</style></head><body>\n\
+         <h1>coboot: evidence</h1>\n<p>Sources: commit <code>{}</code>. Every number comes from a run.</p>\n\
+         <nav>{cards}</nav>\n{sections}\
+         <section id=\"not-verified\"><h2>Not verified</h2><p>{NOT_VERIFIED}</p></section>\n</body></html>\n",
+        text(commit)
+    )
+}
+
+/// The class, the verdict and the details of a part.
+fn judge(part: &Part, commit: &str, record: Option<&Value>) -> (&'static str, String, String) {
+    let Some(record) = record else {
+        return ("none", format!("not run: <code>{}</code>", part.command), String::new());
+    };
+    if *record.get("unfinished") == Value::Bool(true) {
+        return ("bad", "the last run was broken off".into(), String::new());
+    }
+    let (verdict, details) = (part.show)(record);
+    let of = record.get("commit").text().unwrap_or("unknown");
+    match verdict {
+        Err(what) => ("bad", what, details),
+        Ok(what) if of != commit => {
+            let of = if of.ends_with("-dirty") { "of changed sources" } else { "of another commit" };
+            ("old", format!("{what}; {of}"), details)
+        }
+        // Changed sources are not those of a commit.
+        Ok(what) if commit.ends_with("-dirty") => {
+            ("old", format!("{what}; the sources were changed"), details)
+        }
+        Ok(what) => ("good", what, details),
+    }
+}
+
+fn origin(record: &Value) -> String {
+    let of = |name| text(record.get(name).text().unwrap_or("unknown"));
+    format!("<p class=\"origin\">{}, commit {}, {}</p>\n", of("date"), of("commit"), of("toolchain"))
+}
+
+/// Text as HTML.
+fn text(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// A number with spaces between thousands, or text.
+fn shown(value: &Value) -> String {
+    match value {
+        Value::Number(number) if number.bytes().all(|digit| digit.is_ascii_digit()) => {
+            let digits: Vec<char> = number.chars().rev().collect();
+            let groups: Vec<String> = digits.chunks(3).map(|group| group.iter().collect()).collect();
+            groups.join("\u{202f}").chars().rev().collect()
+        }
+        Value::Number(number) => number.clone(),
+        Value::String(string) => text(string),
+        Value::Bool(true) => "yes".into(),
+        Value::Bool(false) => "no".into(),
+        Value::Null => "–".into(),
+        Value::Array(items) => items.iter().map(shown).collect::<Vec<_>>().join(", "),
+        Value::Object(_) => value
+            .members()
+            .map(|(name, value)| format!("{}: {}", text(name), shown(value)))
+            .collect::<Vec<_>>()
+            .join(", "),
+    }
+}
+
+fn number(value: &Value, name: &str) -> f64 {
+    value.get(name).number().unwrap_or(f64::NAN)
+}
+
+/// A table of these members of objects.
+fn table(head: &[&str], names: &[&str], rows: &[Value]) -> String {
+    let mut table = String::from("<div class=\"wide\"><table><tr>");
+    for title in head {
+        let _ = write!(table, "<th>{title}</th>");
+    }
+    for row in rows {
+        table += "</tr>\n<tr>";
+        for name in names {
+            let _ = write!(table, "<td>{}</td>", shown(row.get(name)));
+        }
+    }
+    table + "</tr></table></div>\n"
+}
+
+/// `Ok` if this member is 0.
+fn none(record: &Value, name: &str, good: String) -> Result<String, String> {
+    match record.get(name).number() {
+        Some(0.0) => Ok(good),
+        _ => Err(format!("{good}, {} {name}", shown(record.get(name)))),
+    }
+}
+
+fn tests(record: &Value) -> (Result<String, String>, String) {
+    let passed = format!("{} passed", shown(record.get("passed")));
+    let rows = [record.clone()];
+    let head = ["passed", "failed", "skipped", "programs", "seconds"];
+    (none(record, "failed", passed), table(&head, &head, &rows))
+}
+
+fn powercut(record: &Value) -> (Result<String, String>, String) {
+    let boards = record.get("boards").items();
+    let sum = |name| boards.iter().map(|board| number(board, name)).sum::<f64>();
+    let (states, violations) = (sum("states"), sum("violations"));
+    let shown_states = shown(&Value::Number(format!("{states}")));
+    let verdict = format!("{shown_states} states of the real firmware's flash on {} boards", boards.len());
+    let mut details = String::new();
+    for board in boards {
+        let _ = write!(details, "<h3>{}</h3>\n", shown(board.get("board")));
+        let scenarios = board.get("scenarios").items();
+        details += &table(
+            &[
+                "level",
+                "scenario",
+                "operations",
+                "points",
+                "states",
+                "recoveries",
+                "bootloader",
+                "old program",
+                "new program",
+                "violations",
+            ],
+            &[
+                "level",
+                "scenario",
+                "operations",
+                "points",
+                "states",
+                "recoveries",
+                "bootloader",
+                "old_program",
+                "new_program",
+                "violations",
+            ],
+            scenarios,
+        );
+        for scenario in scenarios.iter().filter(|scenario| scenario.get("scenario").text() == Some("update"))
+        {
+            details += &map(scenario.get("map"));
+        }
+    }
+    (
+        if violations == 0.0 { Ok(verdict) } else { Err(format!("{verdict}, {violations} violations")) },
+        details,
+    )
+}
+
+/// What was found behind a cut, by operation and way. A column is as many operations as it takes;
+/// it shows the worst of them.
+fn map(map: &Value) -> String {
+    const COLUMNS: usize = 720;
+    const WORST: &[u8] = b".=NOB!";
+    let rows: Vec<(&str, &str)> =
+        map.members().filter_map(|(way, letters)| Some((way, letters.text()?))).collect();
+    let Some(operations) = rows.iter().map(|(_, letters)| letters.len()).max().filter(|len| *len > 0) else {
+        return String::new();
+    };
+    let mut svg = format!(
+        "<div class=\"wide\"><svg class=\"map\" viewBox=\"0 0 {} {}\" role=\"img\" aria-label=\"what was found behind each cut\">",
+        COLUMNS + 110,
+        rows.len() * 22 + 20
+    );
+    let columns = operations.min(COLUMNS);
+    let width = COLUMNS as f64 / columns as f64;
+    for (y, (way, letters)) in rows.iter().enumerate() {
+        let _ = write!(svg, "<text x=\"0\" y=\"{}\">{}</text>", y * 22 + 14, text(way));
+        let worst = |column: usize| {
+            let cells =
+                &letters.as_bytes()[column * letters.len() / columns..(column + 1) * letters.len() / columns];
+            cells.iter().max_by_key(|letter| WORST.iter().position(|known| known == *letter)).copied()
+        };
+        let mut column = 0;
+        while column < columns {
+            let letter = worst(column);
+            let run = (column..columns).take_while(|next| worst(*next) == letter).count();
+            let class = match letter {
+                Some(b'N') => "new",
+                Some(b'O') => "was",
+                Some(b'B') => "boot",
+                Some(b'=') => "same",
+                Some(b'!') => "wrong",
+                _ => "uncut",
+            };
+            let _ = write!(
+                svg,
+                "<rect class=\"{class}\" x=\"{:.1}\" y=\"{}\" width=\"{:.1}\" height=\"18\"/>",
+                110.0 + column as f64 * width,
+                y * 22,
+                run as f64 * width
+            );
+            column += run;
+        }
+    }
+    let _ = write!(
+        svg,
+        "<text x=\"110\" y=\"{}\">operation 0 to {}</text></svg></div>\n<p class=\"key\">",
+        rows.len() * 22 + 14,
+        operations - 1
+    );
+    for (class, words) in [
+        ("was", "old program"),
+        ("boot", "bootloader"),
+        ("new", "new program"),
+        ("same", "a flash that was looked at already"),
+        ("wrong", "violation"),
+        ("uncut", "not cut"),
+    ] {
+        let _ = write!(svg, "<i class=\"{class}\"></i> {words} ");
+    }
+    svg + "</p>\n"
+}
+
+fn fuzz(record: &Value) -> (Result<String, String>, String) {
+    let targets = record.get("targets");
+    let inputs: f64 = targets.members().map(|(_, target)| number(target, "inputs")).sum();
+    let fewest = targets.members().map(|(_, target)| number(target, "inputs")).fold(f64::INFINITY, f64::min);
+    let of = |count: f64| shown(&Value::Number(format!("{count}")));
+    let rows: Vec<Value> = targets
+        .members()
+        .map(|(name, target)| {
+            let mut row: std::collections::BTreeMap<String, Value> =
+                target.members().map(|(name, value)| (name.to_owned(), value.clone())).collect();
+            row.insert("target".into(), Value::String(name.into()));
+            Value::Object(row)
+        })
+        .collect();
+    let head = ["target", "inputs", "seconds", "edges", "corpus"];
+    let verdict = format!("{} inputs without a fault, at least {} a target", of(inputs), of(fewest));
+    (if rows.is_empty() { Err("no target ran".into()) } else { Ok(verdict) }, table(&head, &head, &rows))
+}
+
+fn bench(record: &Value) -> (Result<String, String>, String) {
+    let downloads = record.get("downloads").items();
+    let longest = downloads.iter().map(|row| number(row, "measured_us")).fold(1.0, f64::max);
+    let mut svg = format!(
+        "<div class=\"wide\"><svg class=\"bars\" viewBox=\"0 0 760 {}\" role=\"img\" aria-label=\"duration and limits\">",
+        downloads.len() * 20 + 4
+    );
+    for (n, row) in downloads.iter().enumerate() {
+        let length = |name| number(row, name) / longest * 480.0;
+        let y = n * 20;
+        let _ = write!(
+            svg,
+            "<text x=\"0\" y=\"{}\">{} kbit/s, {} KiB</text>\
+             <rect class=\"took\" x=\"150\" y=\"{}\" width=\"{:.1}\" height=\"13\"/>\
+             <rect class=\"limit\" x=\"{:.1}\" y=\"{}\" width=\"2\" height=\"19\"/>\
+             <text x=\"{:.1}\" y=\"{}\">{:.2} s</text>",
+            y + 13,
+            number(row, "bit_rate") / 1000.0,
+            shown(row.get("kib")),
+            y + 2,
+            length("measured_us"),
+            150.0 + length("wire_us").max(length("flash_us")),
+            y,
+            156.0 + length("measured_us"),
+            y + 13,
+            number(row, "measured_us") / 1e6
+        );
+    }
+    svg += "</svg></div>\n<p class=\"key\"><i class=\"took\"></i> measured <i class=\"limit\"></i> limit of wire or flash, whichever is later</p>\n";
+    let slowest = downloads
+        .iter()
+        .map(|row| number(row, "measured_us") / number(row, "wire_us").max(number(row, "flash_us")))
+        .fold(0.0, f64::max);
+    let verdict = format!("at most {slowest:.2} times what wire or flash takes");
+    let fleets = record.get("fleets").items();
+    let head = ["boards", "way", "block size", "one lost in", "us"];
+    let names = ["boards", "way", "block_size", "lost_one_in", "measured_us"];
+    if downloads.is_empty() {
+        return (Err("no row".into()), String::new());
+    }
+    (Ok(verdict), svg + "<h3>Several boards</h3>\n" + &table(&head, &names, fleets))
+}
+
+fn size(record: &Value) -> (Result<String, String>, String) {
+    let rows = record.get("images").items();
+    let over = rows.iter().filter(|row| !(number(row, "bytes") <= number(row, "budget"))).count();
+    let fullest = rows.iter().map(|row| number(row, "bytes") / number(row, "budget")).fold(0.0, f64::max);
+    let names = ["image", "board", "bytes", "budget"];
+    let verdict = match over {
+        0 if !rows.is_empty() => Ok(format!("at most {:.1} % of the budget", fullest * 100.0)),
+        _ => Err(format!("{over} images are over their budget")),
+    };
+    (verdict, table(&names, &names, rows))
+}
+
+/// A record that says `failed` itself.
+fn plain(record: &Value) -> (Result<String, String>, String) {
+    let own = ["commit", "toolchain", "date"];
+    let members: Vec<(&str, &Value)> = record.members().filter(|(name, _)| !own.contains(name)).collect();
+    let mut details = String::from("<div class=\"wide\"><table>");
+    for (name, value) in &members {
+        let _ =
+            write!(details, "<tr><th>{}</th><td>{}</td></tr>\n", text(&name.replace('_', " ")), shown(value));
+    }
+    details += "</table></div>\n";
+    let first = members.iter().find(|(_, value)| matches!(value, Value::Number(_)));
+    let words = first.map_or_else(String::new, |(name, value)| format!("{} {}", shown(value), text(name)));
+    let verdict = match record.get("failed") {
+        Value::Null | Value::Bool(false) => Ok(words),
+        Value::Number(count) if count == "0" => Ok(words),
+        failed => Err(format!("{words}, {} failed", shown(failed))),
+    };
+    (verdict, details)
+}
+
+const STYLE: &str = "
+:root{color-scheme:light dark;--fg:#1f2937;--bg:#fff;--line:#d1d5db;--good:#15803d;--bad:#b91c1c;--old:#b45309;--none:#6b7280}
+@media(prefers-color-scheme:dark){:root{--fg:#e5e7eb;--bg:#111827;--line:#374151;--good:#4ade80;--bad:#f87171;--old:#fbbf24;--none:#9ca3af}}
+body{font:16px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:60rem;margin:0 auto;padding:1rem}
+code{font-family:ui-monospace,monospace;font-size:.9em;overflow-wrap:anywhere}
+nav{display:grid;grid-template-columns:repeat(auto-fill,minmax(13rem,1fr));gap:.75rem;margin:1.5rem 0}
+.card{display:flex;flex-direction:column;border:1px solid var(--line);border-left:.35rem solid var(--mark);border-radius:.4rem;padding:.6rem .8rem;color:inherit;text-decoration:none}
+.card span{font-size:.9rem}
+.good{--mark:var(--good)}.bad{--mark:var(--bad)}.old{--mark:var(--old)}.none{--mark:var(--none)}
+.verdict{border-left:.35rem solid var(--mark);padding-left:.6rem;font-weight:600}
+.origin,.key{color:var(--none);font-size:.85rem;overflow-wrap:anywhere}
+.wide{overflow-x:auto}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums}
+th,td{border-bottom:1px solid var(--line);padding:.2rem .6rem;text-align:left;white-space:nowrap}
+svg{width:100%;min-width:34rem;font-size:12px}
+svg text{fill:var(--fg)}
+.key i{display:inline-block;width:.8rem;height:.8rem;margin:0 .2rem 0 .8rem}
+.new{fill:#15803d;background:#15803d}.was{fill:#2563eb;background:#2563eb}.boot{fill:#d97706;background:#d97706}
+.same{fill:#c4b5fd;background:#c4b5fd}.wrong{fill:#dc2626;background:#dc2626}.uncut{fill:#9ca3af55;background:#9ca3af55}
+.took{fill:#2563eb;background:#2563eb}.limit{fill:#dc2626;background:#dc2626}
+section{border-top:1px solid var(--line);margin-top:1.5rem}
+";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COMMIT: &str = "0123abcd";
+
+    /// The page with one record, the tests'.
+    fn with(record: Option<&str>) -> String {
+        page(COMMIT, |name| record.filter(|_| name == "tests").map(|text| Value::parse(text).unwrap()))
+    }
+
+    fn class(page: &str) -> &str {
+        let card = page.split("href=\"#tests\"").next().unwrap().rsplit("class=\"card ").next().unwrap();
+        card.split('"').next().unwrap()
+    }
+
+    #[test]
+    fn only_a_good_result_of_these_sources_is_green() {
+        for (record, expected) in [
+            (None, "none"),
+            (Some(r#"{"unfinished": true, "commit": "0123abcd"}"#), "bad"),
+            (Some(r#"{"passed": 3, "failed": 0, "commit": "0123abcd"}"#), "good"),
+            (Some(r#"{"passed": 3, "failed": 1, "commit": "0123abcd"}"#), "bad"),
+            (Some(r#"{"passed": 3, "commit": "0123abcd"}"#), "bad"),
+            (Some(r#"{"passed": 3, "failed": 0, "commit": "4567"}"#), "old"),
+            (Some(r#"{"passed": 3, "failed": 0, "commit": "0123abcd-dirty"}"#), "old"),
+            (Some(r#"{"passed": 3, "failed": 0}"#), "old"),
+        ] {
+            assert_eq!(class(&with(record)), expected, "{record:?}");
+        }
+        // Sources that are no commit's give no green mark, whatever was measured of them.
+        let dirty = page("1-dirty", |_| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap()));
+        assert!(!dirty.contains("class=\"card good\""));
+    }
+
+    #[test]
+    fn records_of_any_contents_make_a_page() {
+        for record in [
+            "{}",
+            "[]",
+            "3",
+            r#"{"boards": [{"scenarios": [{"scenario": "update", "map": {"after": "", "torn": "B!"}}]}]}"#,
+            r#"{"targets": {"a": 3}}"#,
+            r#"{"downloads": [{}], "images": [{}]}"#,
+            r#"{"a": "<b>", "commit": "<i>"}"#,
+        ] {
+            let record = Value::parse(record).unwrap();
+            let page = page(COMMIT, |_| Some(record.clone()));
+            assert!(page.ends_with("</html>\n") && !page.contains("<b>\"") && !page.contains("<i>,"));
+            assert!(!page.contains("class=\"card good\""), "{record:?}");
+        }
+    }
+
+    #[test]
+    fn the_map_shows_the_worst_of_a_column() {
+        let wide = "N".repeat(1439) + "!";
+        let record = Value::parse(&format!(r#"{{"torn": "{wide}"}}"#)).unwrap();
+        let map = map(&record);
+        assert_eq!(map.matches("<rect class=\"wrong\"").count(), 1, "{map}");
+        assert!(map.contains("<rect class=\"new\" x=\"110.0\" y=\"0\" width=\"719.0\""), "{map}");
+    }
+}
