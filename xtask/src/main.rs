@@ -9,6 +9,7 @@ use std::process::ExitCode;
 
 mod args;
 mod arrows;
+mod attack;
 mod bench;
 mod book;
 mod build;
@@ -155,6 +156,12 @@ const JOBS: &[Job] = &[
         about: "cut the power at every flash operation, and look what is there",
         help: powercut::HELP,
         run: powercut::run,
+    },
+    Job {
+        name: "attack",
+        about: "the standing attacker of the bus, for millions of frames",
+        help: attack::HELP,
+        run: attack::run,
     },
     Job {
         name: "size",
