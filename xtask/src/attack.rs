@@ -22,16 +22,19 @@ attack. The counts go to target/evidence/attacker.json.
 ";
 
 /// The images of the attack, on the board with two programs.
-const IMAGES: [&str; 9] = [
+const IMAGES: [&str; 12] = [
     "bootloader",
     "bootloader-esacademy",
     "bootloader-lift",
     "bootloader-sealed",
+    "bootloader-virtual-can",
     "app-v1",
     "app-v2",
     "app-program-2",
     "app-lift",
     "app-lift-v2",
+    "app-virtual-can",
+    "app-virtual-can-v2",
 ];
 
 pub fn run(mut args: Args) -> Outcome {

@@ -13,7 +13,8 @@ use crate::bench::{convert, Bench, BIT_RATE};
 
 /// A board on a bus with two masters.
 pub struct Board {
-    bench: Bench,
+    /// The bench of the board.
+    pub bench: Bench,
     layout: &'static Layout,
     masters: [PortId; 2],
     /// Events of the machine that belong between frames.

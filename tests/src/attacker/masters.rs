@@ -5,8 +5,8 @@ use canopen::{Address, CobId, Frame, Instant};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
 
 use super::model::{NO_NODE, RATES};
-use super::target::{PowerCut, Target};
-use super::{is_node_id, Attack, Broken, ANSWER_US};
+use super::target::PowerCut;
+use super::{is_node_id, Attack, Broken};
 
 /// Objects that noise asks for.
 const OBJECTS: [(u16, u8); 16] = [
@@ -28,7 +28,7 @@ const OBJECTS: [(u16, u8); 16] = [
     (0x7F50, 1),
 ];
 /// Values of 1F51h.
-const CONTROLS: [u8; 9] = [0x00, 0x01, 0x02, 0x03, 0x80, 0x83, 0x84, 0x7F, 0xFF];
+const CONTROLS: [u8; 10] = [0x00, 0x01, 0x02, 0x03, 0x03, 0x80, 0x83, 0x84, 0x7F, 0xFF];
 /// The longest time that a client waits in an attack, in ms: an erase takes 2 s.
 const CLIENT_MS: u32 = 3000;
 /// The longest delay of an activated bit rate, in ms.
@@ -45,7 +45,7 @@ struct Manner {
 
 const WHOLE: Manner = Manner { noise: 0, stops_after: u32::MAX };
 
-impl<T: Target> Attack<T> {
+impl Attack {
     /// Some steps and noise.
     pub(super) fn attack(&mut self) -> Result<(), Broken> {
         if self.random.chance(6) {
@@ -148,7 +148,7 @@ impl<T: Target> Attack<T> {
     /// Waits until 1F57h is not busy.
     fn await_idle(&mut self, program: u8) -> Result<(), Broken> {
         for _ in 0..200 {
-            let answer = self.ask([0x40, 0x57, 0x1F, program, 0, 0, 0, 0], ANSWER_US)?;
+            let answer = self.ask([0x40, 0x57, 0x1F, program, 0, 0, 0, 0], self.target.answer_us())?;
             match answer {
                 Some([0x43, _, _, _, status, ..]) if status & 1 == 1 => self.pass(20_000)?,
                 _ => break,
@@ -242,7 +242,12 @@ impl<T: Target> Attack<T> {
     fn control(&mut self) -> Result<(), Broken> {
         let program = self.program();
         let value = self.random.pick(&CONTROLS);
-        self.leave(program, value)
+        self.leave(program, value)?;
+        // The second CLEAR in a row erases at once.
+        if value == 0x03 && self.random.chance(70) {
+            return self.leave(program, value);
+        }
+        Ok(())
     }
 
     /// LSS: node-ID and bit rate, stored or not.
@@ -261,10 +266,10 @@ impl<T: Target> Attack<T> {
             1 => self.random.below(256) as u8,
             _ => 1 + self.random.below(127) as u8,
         };
-        self.lss([0x11, id, 0, 0, 0, 0, 0, 0], ANSWER_US)?;
+        self.lss([0x11, id, 0, 0, 0, 0, 0, 0], self.target.answer_us())?;
         if self.random.chance(30) {
             let (rate, _) = self.random.pick(&RATES);
-            self.lss([0x13, 0, rate, 0, 0, 0, 0, 0], ANSWER_US)?;
+            self.lss([0x13, 0, rate, 0, 0, 0, 0, 0], self.target.answer_us())?;
         }
         if self.random.chance(50) {
             self.lss([0x17, 0, 0, 0, 0, 0, 0, 0], 200_000)?;
@@ -332,7 +337,7 @@ impl<T: Target> Attack<T> {
         let (index, sub) = self.random.pick(&OBJECTS);
         let [low, high] = index.to_le_bytes();
         let command = self.random.pick(&[0x40, 0xA0, 0xA4]);
-        self.ask([command, low, high, sub, 127, 0, 0, 0], ANSWER_US)?;
+        self.ask([command, low, high, sub, 127, 0, 0, 0], self.target.answer_us())?;
         for _ in 0..self.random.below(8) {
             let next = self.random.pick(&[0x60, 0x70, 0xA3, 0xA2, 0xA1]);
             let size = self.random.below(128) as u8;
@@ -476,6 +481,9 @@ impl<T: Target> Attack<T> {
     }
 
     fn noise(&mut self) -> Result<(), Broken> {
+        if self.random.chance(10) {
+            self.target.scramble(&mut self.random);
+        }
         let frame = match self.random.below(8) {
             0..=2 => self.random_frame(),
             3..=5 => self.flawed(),

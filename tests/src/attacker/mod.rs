@@ -2,7 +2,7 @@
 //! frames that are nearly right, bus errors and power cuts; in virtual time, by seeds. It goes on
 //! where it has brought the device, and checks after each burst:
 //!
-//! - the device answers: a read of 1000h behind an SDO abort, within [`ANSWER_US`];
+//! - the device answers: a read of 1000h behind an SDO abort, within [`Target::answer_us`];
 //! - the programs and the node parameters are as they were, unless a master asked for a change;
 //! - no reset that nobody asked for;
 //! - the record of a program is true: its CRC is that of the flash and of an image that was sent;
@@ -12,6 +12,7 @@
 //! |---|---|
 //! | [`target`] | what the attacker needs of a device |
 //! | [`board`] | the built firmware in the emulator |
+//! | [`line`] | the same with CAN over its UART |
 //! | [`model`] | what the masters asked for, read from the bus |
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
@@ -21,6 +22,7 @@
 //! have `tests/tests/sealed_attacker.rs`.
 
 pub mod board;
+pub mod line;
 mod masters;
 pub mod model;
 pub mod setup;
@@ -157,7 +159,7 @@ impl fmt::Display for Found {
 /// The first broken rule.
 pub fn run(setup: &Setup, seed: u64, frames: u64) -> Result<Summary, Box<Found>> {
     let found = |burst, broken, story| Box::new(Found { setup: setup.name, seed, burst, broken, story });
-    let attack = Attack::new(setup.board(), setup.clone(), seed);
+    let attack = Attack::new(setup.target(), setup.clone(), seed);
     let mut attack = attack.map_err(|broken| found(0, broken, String::new()))?;
     while attack.summary.frames < frames {
         attack.burst().map_err(|broken| found(attack.summary.bursts, broken, attack.story()))?;
@@ -166,8 +168,8 @@ pub fn run(setup: &Setup, seed: u64, frames: u64) -> Result<Summary, Box<Found>>
 }
 
 /// An attack on a device.
-pub struct Attack<T> {
-    target: T,
+pub struct Attack {
+    target: Box<dyn Target>,
     setup: Setup,
     model: Model,
     random: Random,
@@ -197,12 +199,12 @@ pub struct Attack<T> {
 /// So many lines are kept for a report.
 const TOLD: usize = 120;
 
-impl<T: Target> Attack<T> {
+impl Attack {
     /// An attack on a new device.
     ///
     /// # Errors
     /// If the device does not answer.
-    pub fn new(mut target: T, setup: Setup, seed: u64) -> Result<Self, Broken> {
+    pub fn new(mut target: Box<dyn Target>, setup: Setup, seed: u64) -> Result<Self, Broken> {
         let programs = setup.layout.programs.len() as u8;
         let address = LssAddress { vendor_id: 0, product_code: 0, revision: 0, serial_number: 0 };
         let flash = target.flash().to_vec();
@@ -228,7 +230,7 @@ impl<T: Target> Attack<T> {
         attack.pass(100_000)?;
         let mut address = [0; 4];
         for (sub, part) in (1..).zip(&mut address) {
-            let answer = attack.ask([0x40, 0x18, 0x10, sub, 0, 0, 0, 0], ANSWER_US)?;
+            let answer = attack.ask([0x40, 0x18, 0x10, sub, 0, 0, 0, 0], attack.target.answer_us())?;
             let Some([0x43, _, _, _, a, b, c, d]) = answer else {
                 return Err(Broken::Answer(format!("1018h/{sub}: {answer:02X?}")));
             };
@@ -384,12 +386,17 @@ impl<T: Target> Attack<T> {
             return Ok(());
         }
         self.was_disturbed = true;
-        let until = self.target.now_us() + BUS_OFF_US;
+        let from = self.target.now_us();
+        let until = from + BUS_OFF_US;
         while self.target.now_us() < until {
             self.in_doubt = false;
             let is_named = self.model.id().is_some();
-            if is_named && self.ask([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], ANSWER_US)?.is_some() && !self.in_doubt
+            if is_named
+                && self.ask([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], self.target.answer_us())?.is_some()
+                && !self.in_doubt
             {
+                let took = self.target.now_us() - from;
+                self.summary.slowest_off_us = self.summary.slowest_off_us.max(took);
                 return Ok(());
             }
             self.pass(20_000)?;
@@ -450,8 +457,8 @@ impl<T: Target> Attack<T> {
             Ask::AnyControl => true,
             // The application leaves for each of them; the bootloader starts a program that it has.
             Ask::Control(value) if self.is_app => matches!(value, 0 | 1 | 2 | 3 | 0x80),
-            Ask::Control(1) => self.may_have(program),
-            Ask::Control(2) => self.setup.reset_starts && self.may_have(program),
+            // 2 starts a program that was sent in one transfer, and any program in some dialects.
+            Ask::Control(1 | 2) => self.may_have(program),
             Ask::Control(_) => false,
             Ask::Download => self.setup.starts_by_itself,
             Ask::Password => false,
@@ -533,7 +540,7 @@ impl<T: Target> Attack<T> {
             self.send(0, &abort);
             self.drain()?;
             let from = self.target.now_us();
-            let answer = self.ask([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], ANSWER_US)?;
+            let answer = self.ask([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], self.target.answer_us())?;
             let now = self.target.now_us();
             match answer {
                 Some([0x43, 0x00, 0x10, 0, a, b, c, d]) => {
@@ -549,7 +556,7 @@ impl<T: Target> Attack<T> {
                 }
                 _ if now < begun + patience => self.pass(50_000)?,
                 answer => {
-                    let ms = patience.max(ANSWER_US) / 1000;
+                    let ms = patience.max(self.target.answer_us()) / 1000;
                     return Err(Broken::Answer(format!("a read of 1000h: {answer:02X?} within {ms} ms")));
                 }
             }
@@ -560,7 +567,7 @@ impl<T: Target> Attack<T> {
     fn name_it(&mut self) -> Result<bool, Broken> {
         let (id, _) = self.setup.default;
         self.lss([0x04, 1, 0, 0, 0, 0, 0, 0], 0)?;
-        let answer = self.lss([0x11, id, 0, 0, 0, 0, 0, 0], ANSWER_US)?;
+        let answer = self.lss([0x11, id, 0, 0, 0, 0, 0, 0], self.target.answer_us())?;
         self.lss([0x04, 0, 0, 0, 0, 0, 0, 0], 0)?;
         self.pass(20_000)?;
         Ok(answer == Some([0x11, 0, 0, 0, 0, 0, 0, 0]))

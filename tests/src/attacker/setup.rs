@@ -8,7 +8,9 @@ use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 use shared_abi::layout::Layout;
 
 use super::board::Board;
+use super::line::SerialBoard;
 use super::model::Node;
+use super::target::Target;
 use crate::firmware;
 
 /// A program to send.
@@ -43,8 +45,6 @@ pub struct Setup {
     pub password: Option<(u16, &'static [u8])>,
     /// The program that is data.
     pub data: Option<u8>,
-    /// 1F51h = 2 starts the program.
-    pub reset_starts: bool,
     /// A downloaded program starts by itself.
     pub starts_by_itself: bool,
     /// The programs.
@@ -88,6 +88,12 @@ impl Setup {
                 &[(1, firmware::APP_LIFT[0]), (1, firmware::APP_LIFT[1])],
             ),
             Self::of("sealed", firmware::BOOTLOADER_SEALED, &Profile::STANDARD, &applications),
+            Self::of(
+                "serial",
+                firmware::BOOTLOADER_VIRTUAL_CAN,
+                &Profile::STANDARD,
+                &[(1, firmware::APP_VIRTUAL_CAN), (1, "app-virtual-can-v2.elf")],
+            ),
         ]
     }
 
@@ -112,7 +118,6 @@ impl Setup {
                 PasswordObject::Unlock => Some((0x6005, profile.password)),
             },
             data: profile.download.data,
-            reset_starts: profile.download.reset_starts,
             starts_by_itself: profile.download.starts_by_itself,
             images: images.iter().map(|(program, name)| Image::new(*program, name)).collect(),
         }
@@ -120,7 +125,12 @@ impl Setup {
 
     /// A board with this firmware, switched on.
     #[must_use]
-    pub fn board(&self) -> Board {
-        Board::new(self.layout, &firmware::of_board(self.layout.board, self.bootloader))
+    pub fn target(&self) -> Box<dyn Target> {
+        let bootloader = firmware::of_board(self.layout.board, self.bootloader);
+        if self.bootloader == firmware::BOOTLOADER_VIRTUAL_CAN {
+            Box::new(SerialBoard::new(self.layout, &bootloader))
+        } else {
+            Box::new(Board::new(self.layout, &bootloader))
+        }
     }
 }

@@ -6,6 +6,8 @@ use shared_abi::geometry::Sector;
 use shared_abi::layout::Layout;
 use std::task::Poll;
 
+use crate::random::Random;
+
 /// Something that happened on the device or on its bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Happened {
@@ -42,6 +44,16 @@ pub enum PowerCut {
 pub trait Target {
     /// The memory layout of the device.
     fn layout(&self) -> &'static Layout;
+
+    /// The longest time from a request to its answer, in us.
+    fn answer_us(&self) -> u64 {
+        super::ANSWER_US
+    }
+
+    /// Noise below the level of frames, where there is one.
+    fn scramble(&mut self, random: &mut Random) {
+        let _ = random;
+    }
 
     /// Virtual time in us.
     fn now_us(&self) -> u64;
