@@ -32,6 +32,8 @@ pub struct SerialBoard {
     /// The begun line of the device, and when its last byte came.
     line: String,
     said_at: u64,
+    /// The time of the last exchange.
+    exchanged_at: u64,
     events: Vec<Event>,
 }
 
@@ -47,6 +49,7 @@ impl SerialBoard {
             given: 0,
             line: String::new(),
             said_at: 0,
+            exchanged_at: 0,
             events: Vec::new(),
         }
     }
@@ -78,8 +81,10 @@ impl SerialBoard {
         let said: Vec<u8> = usart.take_sent().iter().map(|character| character.byte).collect();
         self.to_send = bytes;
         self.given += taken as u64;
+        // They came since the last exchange, and before what the device made of them.
+        let came_at = std::mem::replace(&mut self.exchanged_at, at);
         while let Some((_, frame)) = self.frames.front().filter(|(end, _)| *end <= self.given - waiting) {
-            self.events.push((at, Happened::Frame { by_device: false, frame: *frame }));
+            self.events.push((came_at, Happened::Frame { by_device: false, frame: *frame }));
             self.frames.pop_front();
         }
         for byte in said {
