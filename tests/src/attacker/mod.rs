@@ -12,7 +12,7 @@
 //! |---|---|
 //! | [`target`] | what the attacker needs of a device |
 //! | [`board`] | the built firmware in the emulator |
-//! | [`line`] | the same with CAN over its UART |
+//! | [`line`](mod@line) | the same with CAN over its UART |
 //! | [`model`] | what the masters asked for, read from the bus |
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
