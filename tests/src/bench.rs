@@ -320,6 +320,16 @@ impl Bench {
         self.heard.borrow().clone()
     }
 
+    /// The same since the last call, for attacks that last long: the bench forgets them.
+    pub fn take_records(&mut self) -> Vec<Record> {
+        std::mem::take(&mut *self.heard.borrow_mut())
+    }
+
+    /// Throws away the frames that the host has received and not fetched.
+    pub fn forget_received(&mut self) {
+        while self.world.receive(self.port).is_some() {}
+    }
+
     /// The resets and other events of the board that were not read yet.
     pub fn events(&mut self) -> Vec<(Time, Stop)> {
         std::iter::from_fn(|| self.world.news()).map(|news| (news.at, news.stop)).collect()
@@ -425,7 +435,8 @@ impl Default for Bench {
     }
 }
 
-fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Option<G> {
+/// A frame in the type of another crate; `None` for one that is invalid there.
+pub fn convert<F: embedded_can::Frame, G: embedded_can::Frame>(frame: &F) -> Option<G> {
     if frame.is_remote_frame() {
         G::new_remote(frame.id(), frame.dlc())
     } else {

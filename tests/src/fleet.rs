@@ -118,7 +118,7 @@ impl Fleet {
         let began = self.bench.time();
         let job = |node| {
             let node = NodeId::new(node).expect("1 to 127");
-            Job::new(node, file.clone(), each.clone())
+            Job::new(node, file.clone(), *each)
         };
         let jobs: Vec<Job> = (1..=devices).map(job).collect();
         let events = Mutex::new(Vec::new());

@@ -1,5 +1,6 @@
 //! Common code of the tests and the demonstration: the built firmware, and its bench.
 
+pub mod attacker;
 pub mod bench;
 pub mod call_back;
 pub mod eds;

@@ -9,6 +9,7 @@ use std::process::ExitCode;
 
 mod args;
 mod arrows;
+mod attack;
 mod bench;
 mod book;
 mod build;
@@ -162,6 +163,12 @@ const JOBS: &[Job] = &[
         about: "one page of what the last runs have measured",
         help: evidence::HELP,
         run: evidence::run,
+    },
+    Job {
+        name: "attack",
+        about: "the standing attacker of the bus, for millions of frames",
+        help: attack::HELP,
+        run: attack::run,
     },
     Job {
         name: "size",

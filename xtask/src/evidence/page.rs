@@ -1,5 +1,6 @@
 //! The page: what the jobs have recorded, with its origin, and what is missing.
 
+use std::cmp::Ordering;
 use std::fmt::Write;
 
 use crate::json::Value;
@@ -88,9 +89,9 @@ pub fn page(commit: &str, read: impl Fn(&str) -> Option<Value>) -> String {
     for part in PARTS {
         let record = read(part.name);
         let (class, verdict, details) = judge(part, commit, record.as_ref());
-        let _ = write!(
+        let _ = writeln!(
             cards,
-            "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>\n",
+            "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>",
             part.name, part.title
         );
         let _ = write!(
@@ -212,7 +213,7 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
     let verdict = format!("{shown_states} states of the real firmware's flash on {} boards", boards.len());
     let mut details = String::new();
     for board in boards {
-        let _ = write!(details, "<h3>{}</h3>\n", shown(board.get("board")));
+        let _ = writeln!(details, "<h3>{}</h3>", shown(board.get("board")));
         let scenarios = board.get("scenarios").items();
         details += &table(
             &[
@@ -381,7 +382,10 @@ fn bench(record: &Value) -> (Result<String, String>, String) {
 
 fn size(record: &Value) -> (Result<String, String>, String) {
     let rows = record.get("images").items();
-    let over = rows.iter().filter(|row| !(number(row, "bytes") <= number(row, "budget"))).count();
+    let over = rows
+        .iter()
+        .filter(|row| number(row, "bytes").partial_cmp(&number(row, "budget")).is_none_or(Ordering::is_gt))
+        .count();
     let fullest = rows.iter().map(|row| number(row, "bytes") / number(row, "budget")).fold(0.0, f64::max);
     let names = ["image", "board", "bytes", "budget"];
     let verdict = match over {
@@ -398,7 +402,7 @@ fn plain(record: &Value) -> (Result<String, String>, String) {
     let mut details = String::from("<div class=\"wide\"><table>");
     for (name, value) in &members {
         let _ =
-            write!(details, "<tr><th>{}</th><td>{}</td></tr>\n", text(&name.replace('_', " ")), shown(value));
+            writeln!(details, "<tr><th>{}</th><td>{}</td></tr>", text(&name.replace('_', " ")), shown(value));
     }
     details += "</table></div>\n";
     let first = members.iter().find(|(_, value)| matches!(value, Value::Number(_)));

@@ -1,0 +1,151 @@
+//! The built firmware in the emulator.
+
+use canopen::Frame;
+use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
+use emulator::bus::Outcome;
+use emulator::machine::{Cut, FlashCut, ResetCause, Stop};
+use emulator::time::{Span, Time};
+use emulator::world::PortId;
+use shared_abi::layout::Layout;
+
+use super::target::{Event, Happened, PowerCut, Target};
+use crate::bench::{convert, Bench, BIT_RATE};
+
+/// A board on a bus with two masters.
+pub struct Board {
+    /// The bench of the board.
+    pub bench: Bench,
+    layout: &'static Layout,
+    masters: [PortId; 2],
+    /// Events of the machine that belong between frames.
+    cuts: u64,
+}
+
+/// One us.
+const US: u64 = Span::from_micros(1).0;
+
+impl Board {
+    /// A board with this bootloader, switched on.
+    #[must_use]
+    pub fn new(layout: &'static Layout, bootloader: &str) -> Self {
+        let mut bench = Bench::of_image(bootloader);
+        let masters = [0; 2].map(|_| bench.world.add_host_port(BIT_RATE));
+        bench.power_on();
+        Self { bench, layout, masters, cuts: 0 }
+    }
+}
+
+fn micros(at: Time) -> u64 {
+    at.0 / US
+}
+
+impl Target for Board {
+    fn layout(&self) -> &'static Layout {
+        self.layout
+    }
+
+    fn now_us(&self) -> u64 {
+        micros(self.bench.time())
+    }
+
+    fn send(&mut self, master: usize, frame: &Frame) {
+        if let Some(frame) = convert(frame) {
+            self.bench.world.send(self.masters[master], frame);
+        }
+    }
+
+    fn is_drained(&mut self) -> bool {
+        self.masters.into_iter().all(|port| self.bench.world.port_mut(port).waiting() == 0)
+    }
+
+    fn pass_us(&mut self, us: u64) {
+        self.bench.world.run_for(Span(us * US));
+    }
+
+    fn events(&mut self) -> Vec<Event> {
+        let device = self.bench.device.node();
+        // Nobody reads what the masters receive: the records have all of it.
+        for port in self.masters {
+            while self.bench.world.receive(port).is_some() {}
+            while self.bench.world.port_mut(port).sent().is_some() {}
+        }
+        self.bench.forget_received();
+        let frames = self.bench.take_records().into_iter().map(|record| {
+            let happened = match record.outcome {
+                Outcome::Good => match convert(&record.frame) {
+                    Some(frame) => Happened::Frame { by_device: record.from == Some(device), frame },
+                    None => Happened::Error,
+                },
+                Outcome::KeptBack | Outcome::Bad(_) => Happened::Error,
+            };
+            (micros(record.end), happened)
+        });
+        let mut events: Vec<Event> = frames.collect();
+        for (at, stop) in self.bench.events() {
+            let happened = match stop {
+                Stop::Reset(ResetCause::Software) => Happened::Reset,
+                Stop::PowerCut => Happened::PowerCut,
+                // The power came on.
+                Stop::Reset(ResetCause::PowerOn) => continue,
+                Stop::Reset(ResetCause::IndependentWatchdog | ResetCause::Pin) | Stop::Lockup => {
+                    Happened::Trouble
+                }
+                Stop::Deadline | Stop::Attention | Stop::Halted => continue,
+            };
+            events.push((micros(at), happened));
+        }
+        events.sort_by_key(|(at, _)| *at);
+        events
+    }
+
+    fn flash(&mut self) -> &[u8] {
+        self.bench.machine().flash()
+    }
+
+    fn flash_activity(&mut self) -> (u64, bool) {
+        // FLASH_SR.BSY (RM0090 section 3.9.5).
+        const SR: u32 = 0x4002_3C0C;
+        let machine = self.bench.machine();
+        let busy = machine.register(SR).is_some_and(|status| status >> 16 & 1 == 1);
+        let counters = machine.counters();
+        (counters.sectors_erased + counters.units_programmed, busy)
+    }
+
+    fn disturb(&mut self, frames: u64) {
+        self.bench.world.clear_faults();
+        let mine = FrameMatch { from: Some(self.bench.device.node()), ..FrameMatch::default() };
+        for n in 1..=frames {
+            let fault = Fault { frames: mine.clone(), when: When::Nth(n), action: FaultAction::Disturb };
+            self.bench.world.inject(fault);
+        }
+    }
+
+    fn cut_power(&mut self, cut: PowerCut) {
+        match cut {
+            PowerCut::Now => self.bench.power_off(),
+            PowerCut::Operation(operation) => {
+                self.cuts += 1;
+                let when = Cut::Torn { seed: self.cuts };
+                self.bench.machine().cut_power_at(Some(FlashCut { operation, when }));
+            }
+        }
+    }
+
+    fn power_on(&mut self) {
+        self.bench.machine().cut_power_at(None);
+        self.bench.power_on();
+    }
+
+    fn set_bit_rate(&mut self, bit_rate: u32) {
+        self.bench.set_host_bit_rate(bit_rate);
+        for port in self.masters {
+            self.bench.world.port_mut(port).set_bit_rate(bit_rate);
+        }
+    }
+
+    fn complaint(&mut self) -> Option<String> {
+        let device = self.bench.device;
+        let reports = self.bench.world.machine_mut(device).reports();
+        (!reports.is_empty()).then(|| format!("it touched what the emulator does not model: {reports:?}"))
+    }
+}

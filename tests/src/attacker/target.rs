@@ -1,0 +1,122 @@
+//! What an attacker sees of a device: its bus, its power and its flash.
+
+use boot_core::flash::{Flash, FlashFault, Operation};
+use canopen::Frame;
+use shared_abi::geometry::Sector;
+use shared_abi::layout::Layout;
+use std::task::Poll;
+
+use crate::random::Random;
+
+/// Something that happened on the device or on its bus.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Happened {
+    /// A good frame was on the bus.
+    Frame {
+        /// The device sent it.
+        by_device: bool,
+        /// The frame.
+        frame: Frame,
+    },
+    /// A frame was destroyed.
+    Error,
+    /// The device made a reset by itself.
+    Reset,
+    /// A reset that nothing may cause: by the watchdog, or a CPU in lock-up.
+    Trouble,
+    /// The power failed during an operation of the flash.
+    PowerCut,
+}
+
+/// A point of time of the device's virtual time, in us, and what happened then.
+pub type Event = (u64, Happened);
+
+/// A power cut.
+#[derive(Clone, Copy, Debug)]
+pub enum PowerCut {
+    /// Now.
+    Now,
+    /// In the middle of the flash operation with this number from now on, counted from 0.
+    Operation(u64),
+}
+
+/// A device in virtual time, on a bus with two masters.
+pub trait Target {
+    /// The memory layout of the device.
+    fn layout(&self) -> &'static Layout;
+
+    /// The longest time from a request to its answer, in us.
+    fn answer_us(&self) -> u64 {
+        super::ANSWER_US
+    }
+
+    /// Noise below the level of frames, where there is one.
+    fn scramble(&mut self, random: &mut Random) {
+        let _ = random;
+    }
+
+    /// Virtual time in us.
+    fn now_us(&self) -> u64;
+
+    /// Master 0 or 1 sends a frame as soon as the bus lets it; this does not wait.
+    fn send(&mut self, master: usize, frame: &Frame);
+
+    /// Whether all frames of the masters were on the bus.
+    fn is_drained(&mut self) -> bool;
+
+    /// Time passes.
+    fn pass_us(&mut self, us: u64);
+
+    /// What has happened since the last call.
+    fn events(&mut self) -> Vec<Event>;
+
+    /// The contents of the flash, as a debug probe reads them.
+    fn flash(&mut self) -> &[u8];
+
+    /// A number that grows with each flash operation, and whether one runs.
+    fn flash_activity(&mut self) -> (u64, bool);
+
+    /// Destroys this many frames of the device from now on, 0 for none.
+    fn disturb(&mut self, frames: u64);
+
+    /// Orders a power cut.
+    fn cut_power(&mut self, cut: PowerCut);
+
+    /// Switches the power on again, and takes back a cut that has not happened.
+    fn power_on(&mut self);
+
+    /// The masters change to this bit rate, in bit/s.
+    fn set_bit_rate(&mut self, bit_rate: u32);
+
+    /// What the device did that it must not do and no rule names; `None` for nothing.
+    fn complaint(&mut self) -> Option<String>;
+}
+
+/// Flash contents to read the journal from.
+pub struct View<'f> {
+    /// The bytes, from the start of the chip's flash.
+    pub bytes: &'f [u8],
+    /// The layout of the device.
+    pub layout: &'static Layout,
+}
+
+impl Flash for View<'_> {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        for (n, byte) in (0..).zip(buffer) {
+            let at = address.wrapping_add(n).wrapping_sub(self.layout.chip.flash.base);
+            *byte = self.bytes.get(at as usize).copied().unwrap_or(0xFF);
+        }
+    }
+
+    fn start(&mut self, _operation: Operation) -> Result<(), FlashFault> {
+        Err(FlashFault::Protected)
+    }
+
+    fn poll(&mut self) -> Poll<Result<(), FlashFault>> {
+        Poll::Ready(Ok(()))
+    }
+
+    fn sector_at(&self, address: u32) -> Option<Sector> {
+        self.layout.chip.sector_at(address)
+    }
+}

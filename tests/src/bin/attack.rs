@@ -1,0 +1,168 @@
+//! `cargo xtask attack`: the standing attacker of the bus, for as many frames as you like.
+
+use std::process::ExitCode;
+use std::sync::Mutex;
+use std::thread;
+
+use coboot_tests::attacker::setup::Setup;
+use coboot_tests::attacker::{run, Found, Summary};
+
+/// The frames of an attack on one board; then a new board is attacked with the next seed.
+const EACH: u64 = 50_000;
+
+struct Options {
+    frames: u64,
+    seed: u64,
+    evidence: Option<String>,
+}
+
+fn options() -> Result<Options, String> {
+    let mut options = Options { frames: 200_000, seed: 1, evidence: None };
+    let mut words = std::env::args().skip(1);
+    while let Some(word) = words.next() {
+        let mut value = || words.next().ok_or_else(|| format!("{word} wants a value."));
+        let number = |text: String| text.parse().map_err(|_| format!("{text:?} is no number."));
+        match word.as_str() {
+            "--frames" => options.frames = number(value()?)?,
+            "--seed" => options.seed = number(value()?)?,
+            "--evidence" => options.evidence = Some(value()?),
+            other => return Err(format!("{other:?} is no option; there are --frames, --seed, --evidence.")),
+        }
+    }
+    Ok(options)
+}
+
+/// What is left to attack, and what came of it.
+struct Work {
+    /// The number of the next attack.
+    next: u64,
+    rows: Vec<Row>,
+    found: Vec<Found>,
+}
+
+/// All attacks on a setup.
+struct Row {
+    name: &'static str,
+    seeds: Vec<u64>,
+    summary: Summary,
+}
+
+fn main() -> ExitCode {
+    let options = match options() {
+        Ok(options) => options,
+        Err(why) => return refuse(&why),
+    };
+    let setups = Setup::all();
+    if setups.is_empty() {
+        return refuse("there is nothing to attack: choose the board stm32f407g-disc1.");
+    }
+    let attacks = options.frames.div_ceil(EACH).max(1);
+    let frames = options.frames.div_ceil(attacks).max(1);
+    let rows =
+        setups.iter().map(|setup| Row { name: setup.name, seeds: Vec::new(), summary: Summary::default() });
+    let work = Mutex::new(Work { next: 0, rows: rows.collect(), found: Vec::new() });
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| loop {
+                let n = {
+                    let mut work = work.lock().expect("no attack panics");
+                    let n = work.next;
+                    if n >= attacks {
+                        return;
+                    }
+                    work.next += 1;
+                    n
+                };
+                // Each setup gets each seed in turn.
+                let (at, seed) = (n as usize % setups.len(), options.seed + n / setups.len() as u64);
+                let result = run(&setups[at], seed, frames);
+                let mut work = work.lock().expect("no attack panics");
+                match result {
+                    Ok(summary) => {
+                        work.rows[at].seeds.push(seed);
+                        work.rows[at].summary.add(&summary);
+                    }
+                    Err(found) => {
+                        println!("{found}");
+                        work.found.push(*found);
+                    }
+                }
+            });
+        }
+    });
+    let work = work.into_inner().expect("no attack panics");
+    println!("setup          frames   bursts  resets  cuts  updates  slowest answer  behind bus-off");
+    for Row { name, summary, .. } in &work.rows {
+        let Summary { frames, bursts, resets, cuts, updates, slowest_us, slowest_off_us, .. } = summary;
+        println!(
+            "{name:<12} {frames:>8} {bursts:>8} {resets:>7} {cuts:>5} {updates:>8} {:>12.1} ms {:>12.1} ms",
+            *slowest_us as f64 / 1e3,
+            *slowest_off_us as f64 / 1e3
+        );
+    }
+    let all = work.rows.iter().fold(Summary::default(), |mut all, row| {
+        all.add(&row.summary);
+        all
+    });
+    println!("\n{} frames, {} bursts, {} rules broken.", all.frames, all.bursts, work.found.len());
+    if let Some(path) = &options.evidence {
+        if let Err(error) = std::fs::write(path, as_json(&work, &all)) {
+            return refuse(&format!("{path}: {error}"));
+        }
+    }
+    if work.found.is_empty() {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
+}
+
+fn refuse(why: &str) -> ExitCode {
+    eprintln!("attack: {why}");
+    ExitCode::FAILURE
+}
+
+fn counts(summary: &Summary) -> String {
+    format!(
+        "\"frames\": {}, \"bursts\": {}, \"answers\": {}, \"errors\": {}, \"resets\": {}, \"power_cuts\": {}, \"updates\": {}, \"stores\": {}, \"slowest_answer_ms\": {:.1}, \"slowest_answer_behind_bus_off_ms\": {:.1}",
+        summary.frames,
+        summary.bursts,
+        summary.answers,
+        summary.errors,
+        summary.resets,
+        summary.cuts,
+        summary.updates,
+        summary.stores,
+        summary.slowest_us as f64 / 1e3,
+        summary.slowest_off_us as f64 / 1e3
+    )
+}
+
+fn as_json(work: &Work, all: &Summary) -> String {
+    let rows: Vec<String> = work
+        .rows
+        .iter()
+        .map(|row| {
+            format!("  {{\"setup\": {:?}, \"seeds\": {:?}, {}}}", row.name, row.seeds, counts(&row.summary))
+        })
+        .collect();
+    let found: Vec<String> = work
+        .found
+        .iter()
+        .map(|found| {
+            let what = found.broken.to_string();
+            format!(
+                "  {{\"setup\": {:?}, \"seed\": {}, \"burst\": {}, \"what\": {what:?}}}",
+                found.setup, found.seed, found.burst
+            )
+        })
+        .collect();
+    format!(
+        "{{{}, \"failed\": {}, \"setups\": [\n{}\n], \"found\": [\n{}\n]}}\n",
+        counts(all),
+        found.len(),
+        rows.join(",\n"),
+        found.join(",\n")
+    )
+}

@@ -1,0 +1,47 @@
+//! A sample of the standing attacker (`tests/src/attacker`) on the built firmware in the emulator.
+//! The same seed gives the same attack. The long run:
+//!
+//! ```sh
+//! cargo xtask attack --frames 5000000 --seed 1
+//! ```
+
+use coboot_tests::attacker::run;
+use coboot_tests::attacker::setup::Setup;
+
+/// The frames of the masters in one attack, some seconds.
+const FRAMES: u64 = 30_000;
+
+fn attack(name: &str, seed: u64) {
+    let Some(setup) = Setup::all().into_iter().find(|setup| setup.name == name) else { return };
+    let summary = run(&setup, seed, FRAMES).unwrap_or_else(|found| panic!("{found}"));
+    println!("{name}: {summary:?}");
+    // The attack reaches what it is made for. A serial line has no error frames.
+    assert!(summary.bursts > 20 && summary.resets > 10, "{summary:?}");
+    assert!(summary.errors > 0 || name == "serial", "{summary:?}");
+    assert!(summary.updates > 0 && summary.running > 0 && summary.stores > 0, "{summary:?}");
+}
+
+#[test]
+fn the_bootloader_and_its_application_stand() {
+    attack("standard", 1);
+}
+
+#[test]
+fn a_bootloader_with_a_password_for_each_program_stands() {
+    attack("esacademy", 1);
+}
+
+#[test]
+fn the_bootloader_of_a_lift_stands() {
+    attack("lift", 2);
+}
+
+#[test]
+fn a_sealed_bootloader_without_keys_stands() {
+    attack("sealed", 1);
+}
+
+#[test]
+fn a_bootloader_with_can_over_its_uart_stands() {
+    attack("serial", 1);
+}

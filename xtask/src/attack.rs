@@ -1,0 +1,62 @@
+//! `cargo xtask attack`: the standing attacker of the bus.
+
+use std::fs;
+
+use shared_abi::layout::stm32f407g_disc1_two::LAYOUT as TWO;
+use shared_abi::layout::DEFAULT;
+
+use crate::args::Args;
+use crate::setup::{Part, Setup};
+use crate::{build, evidence, process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask attack [--frames N] [--seed S] [--yes]
+
+Attacks emulated boards with the built firmware, in virtual time: two masters that do what masters
+do, mixed with noise, floods, frames that are nearly right, errors on the bus and power cuts. After
+each burst it checks that the device answers in time, and that only what was asked for has changed.
+Fails if a rule is broken, and prints the seed and the last frames. The same seed gives the same
+attack. The counts go to target/evidence/attacker.json.
+
+  --frames N      the frames of the masters (default: 200000, about a minute)
+  --seed S        the first seed (default: 1)
+  --yes           installs what is missing with sudo
+";
+
+/// The images of the attack, on the board with two programs.
+const IMAGES: [&str; 12] = [
+    "bootloader",
+    "bootloader-esacademy",
+    "bootloader-lift",
+    "bootloader-sealed",
+    "bootloader-virtual-can",
+    "app-v1",
+    "app-v2",
+    "app-program-2",
+    "app-lift",
+    "app-lift-v2",
+    "app-virtual-can",
+    "app-virtual-can-v2",
+];
+
+pub fn run(mut args: Args) -> Outcome {
+    let setup = Setup::from(&mut args);
+    let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
+    args.none_left()?;
+    setup.prepare(&[Part::Firmware, Part::Emulator])?;
+    build::images(&TWO, &IMAGES)?;
+    evidence::begin("attacker")?;
+    let counts = workspace::target_dir().join("attack.json");
+    let mut attack = process::cargo("run");
+    attack.args(build::tests_args(DEFAULT)).args(["--bin", "attack", "--"]);
+    for (option, value) in [("--frames", frames), ("--seed", seed)] {
+        attack.args(value.map(|value| [option.to_owned(), value]).into_iter().flatten());
+    }
+    attack.arg("--evidence").arg(&counts);
+    attack.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(DEFAULT));
+    // A rule that was broken is a result, too.
+    let ended = process::run(&mut attack);
+    let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
+    evidence::record("attacker", &fs::read_to_string(&counts).map_err(unread)?)?;
+    ended
+}
