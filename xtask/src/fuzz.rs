@@ -60,7 +60,10 @@ fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
     let mut build = process::cargo_on(folder, "build");
     build.args(["--quiet", "--release", "--bins"]).env("CARGO_TARGET_DIR", &programs);
     process::run(&mut build)?;
-    process::run(build.args(["--features", SEALED]))?;
+    // Only those: the others would be replaced by what they are with the feature.
+    let mut build = process::cargo_on(folder, "build");
+    build.args(["--quiet", "--release", "--features", SEALED]).env("CARGO_TARGET_DIR", &programs);
+    process::run(build.args(SEALED_TARGETS.iter().flat_map(|target| ["--bin", target])))?;
     for target in targets {
         let mut program = Command::new(programs.join("release").join(target));
         for kept in ["seeds", "corpus"] {
@@ -195,7 +198,9 @@ pub fn run(mut args: Args) -> Outcome {
     };
     println!("Building the fuzz targets ...");
     process::run(&mut fuzz(&["build"]))?;
-    process::run(&mut fuzz(&["build", "--features", SEALED]))?;
+    for target in SEALED_TARGETS {
+        process::run(&mut fuzz(&["build", "--features", SEALED, target]))?;
+    }
     let mut failed = Vec::new();
     let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
     for target in &targets {
