@@ -2,13 +2,12 @@
 //!
 //! Must hold: any text gives a frame, nothing, or an error that can be shown; a parsed frame is
 //! written in a form that parses to the same frame, with the same description in words.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use coflash::bus::candump::Line;
 use coflash::bus::decode::Decoder;
-use libfuzzer_sys::fuzz_target;
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let text = String::from_utf8_lossy(bytes);
     let mut decoder = Decoder::new();
     for line in text.lines() {

@@ -3,7 +3,7 @@
 //!
 //! Must hold: memory is only accessed with permission, and never while the device is secured (the
 //! memory of the tests asserts it); and afterwards a correct write and read work.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use canopen::debugger::{Command, Kind, COMMAND, DATA};
 use canopen::sdo::client::{Block, Config, Download, Step, Transfer, Upload};
@@ -11,7 +11,6 @@ use canopen::sdo::SdoError;
 use canopen::{AbortCode, Address};
 use coboot_fuzz::memory::{at, node, request, Target, RAM, SIZE};
 use coboot_fuzz::{Input, ENDLESS};
-use libfuzzer_sys::fuzz_target;
 
 const REFUSALS: [Option<AbortCode>; 3] =
     [None, Some(AbortCode::LOCAL_CONTROL), Some(AbortCode::INVALID_VALUE)];
@@ -43,7 +42,7 @@ fn write(target: &mut Target, address: Address, data: &[u8], now: u32) {
     assert_eq!(run(target, &mut Download::new(node(), address, data, Config::default()), now), Ok(()));
 }
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let mut target = Target::new();
     let mut now = 0;

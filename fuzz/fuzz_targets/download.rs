@@ -4,7 +4,7 @@
 //! Must hold: nothing outside the program's region and the parameters is ever written (the flash
 //! model refuses more than the chip would); and afterwards CLEAR and a correct sequence of blocks
 //! install a program.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use boot_core::control::{Downloader, Policy, Step};
 use boot_core::store::Journal;
@@ -13,7 +13,6 @@ use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
 use coflash::file::block_file::{Block, CRC};
-use libfuzzer_sys::fuzz_target;
 use shared_abi::layout::Layout;
 
 static LAYOUT: Layout = ONE_PROGRAM;
@@ -22,7 +21,7 @@ static LAYOUT: Layout = ONE_PROGRAM;
 const BUFFER: usize = 256;
 const LAST: u32 = u32::MAX;
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
     let journal = Journal::open(&flash, LAYOUT.parameters);

@@ -4,12 +4,11 @@
 //! Must hold: any bytes give an image or an error that can be shown; an image that can be converted
 //! gives a block file that reads back equal, with every byte of the image in it; a block file is
 //! written as it was read.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options};
 use coflash::file::read::{read, Firmware, Format};
-use libfuzzer_sys::fuzz_target;
 
 const FORMATS: [Option<Format>; 6] = [
     None,
@@ -20,7 +19,7 @@ const FORMATS: [Option<Format>; 6] = [
     Some(Format::Raw),
 ];
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let Some((first, bytes)) = bytes.split_first() else { return };
     let format = FORMATS[usize::from(*first) % FORMATS.len()];
     match read(bytes, format, Some(0x0801_0000)) {

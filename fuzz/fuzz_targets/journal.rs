@@ -2,13 +2,12 @@
 //!
 //! Must hold: opening and reading survive any contents; a successfully stored value reads back, now
 //! and after the next start, and the other value does not change.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters};
 use coboot_fuzz::model::ModelFlash;
 use coboot_fuzz::Input;
-use libfuzzer_sys::fuzz_target;
 use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
 
 static CHIP: Geometry = Geometry {
@@ -20,7 +19,7 @@ static CHIP: Geometry = Geometry {
 const REGIONS: [Region; 2] = [Region::new(0x0800_0000, 0x200), Region::new(0x0800_0200, 0x200)];
 const KEYS: [Key; 3] = [Key::Program(1), Key::Program(2), Key::CrashCount];
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let mut flash = ModelFlash::new(&CHIP);
     let Some([fills, stores]) = input.array() else { return };

@@ -3,14 +3,13 @@
 //! Must hold: it answers with 8 bytes under the slave's identifier; it is silent while a bit rate
 //! is being activated; it stores what was configured; and afterwards a correct master finds,
 //! configures and stores it.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use core::task::Poll;
 
 use canopen::lss::{BitRate, Config, Lss, LssAddress, LssDevice, Output, StoreError};
 use canopen::{CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{Input, ENDLESS};
-use libfuzzer_sys::fuzz_target;
 
 const ADDRESS: LssAddress = LssAddress {
     vendor_id: 0x0000_0123,
@@ -41,7 +40,7 @@ impl LssDevice for Device {
     }
 }
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let Some([id, flags]) = input.array() else { return };
     let config = Config { start_in_configuration: flags & 1 != 0, announce: flags & 2 != 0 };

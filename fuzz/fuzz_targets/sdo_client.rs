@@ -2,13 +2,12 @@
 //!
 //! Must hold: it only sends requests of 8 bytes; a successful upload has delivered the announced
 //! data; without answers it ends; and its result does not change.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame};
 use coboot_fuzz::device::{at, node, response};
 use coboot_fuzz::{Input, ENDLESS};
-use libfuzzer_sys::fuzz_target;
 
 const AT: Address = Address::new(0x2000, 0);
 
@@ -32,7 +31,7 @@ impl Sink for &mut Delivered {
     }
 }
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let Some([kind, len, blksize, pst]) = input.array() else { return };
     let data = vec![0xA5; usize::from(len)];

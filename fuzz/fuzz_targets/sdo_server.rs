@@ -5,7 +5,7 @@
 //! asserts it); an answer has the server's identifier and 8 bytes; and afterwards the next correct
 //! transfers work, without and with blocks, at once after an abort by the client or after the
 //! time-out.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Upload};
@@ -13,13 +13,12 @@ use canopen::sdo::server::Config as SdoConfig;
 use canopen::{Address, CobId, Frame};
 use coboot_fuzz::device::{at, node, request, Device};
 use coboot_fuzz::{drain, run, Input};
-use libfuzzer_sys::fuzz_target;
 
 /// Existing objects of every type and access, for frames that pass the first checks.
 const INDICES: [u16; 10] = [0x1000, 0x1008, 0x1017, 0x1018, 0x1F50, 0x1F51, 0x2000, 0x2001, 0x2002, 0x2003];
 const DOMAIN: Address = Address::new(0x2000, 0);
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let Some([blksize, space, flags]) = input.array() else { return };
     let sdo = SdoConfig { blksize, ..SdoConfig::default() };

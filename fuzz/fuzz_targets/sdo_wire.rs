@@ -3,7 +3,7 @@
 //!
 //! Must hold: a successful transfer has moved the data unchanged; every transfer ends; and the
 //! server becomes idle.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use std::collections::VecDeque;
 
@@ -14,11 +14,10 @@ use canopen::sdo::SdoError;
 use canopen::{Address, Frame};
 use coboot_fuzz::device::{at, node, Device};
 use coboot_fuzz::Input;
-use libfuzzer_sys::fuzz_target;
 
 const AT: Address = Address::new(0x2000, 0);
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let Some([kind, low, high, blksize, client_blksize, pst]) = input.array() else { return };
     let len = usize::from(u16::from_le_bytes([low, high]) % 2048);

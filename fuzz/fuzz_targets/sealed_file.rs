@@ -3,11 +3,10 @@
 //! Must hold: no bytes cause a panic of the parser or of the judge; a complete head is not longer
 //! than the bytes; each record lies inside the manifest; an image that passes the judge is for this
 //! device and needs keys that the device has.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
-use libfuzzer_sys::fuzz_target;
 use seal::judge::{judge, Device};
-use seal::key_block::{KEK_COUNT, KEKS, KEY, ROOTS, SIZE};
+use seal::key_block::{KEKS, KEK_COUNT, KEY, ROOTS, SIZE};
 use seal::wire::{head_size, word, Head, RECIPIENT};
 
 const DEVICE: Device<'_> = Device {
@@ -23,7 +22,7 @@ const DEVICE: Device<'_> = Device {
     keys: &[0; SIZE],
 };
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     // The first byte is the id of the root, so that the fuzzer can find it.
     let Some((id, bytes)) = bytes.split_first() else { return };
     let mut keys = [0; SIZE];

@@ -3,13 +3,12 @@
 //! Must hold: any text gives a job, settings, or a fault with a place inside the text; each device
 //! of a job has an image and a name, and no two are equal; each setting exists and has a value of
 //! its kind.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use std::path::Path;
 
 use coflash::update::config::{self, Setting};
 use coflash::update::job;
-use libfuzzer_sys::fuzz_target;
 
 /// The options of a tool, and whether each is a switch.
 const KEYS: [(&str, bool); 7] = [
@@ -22,7 +21,7 @@ const KEYS: [(&str, bool); 7] = [
     ("json", true),
 ];
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     let lines = text.matches('\n').count() + 1;
     match job::parse(text, Path::new("folder")) {

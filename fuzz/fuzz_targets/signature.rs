@@ -2,14 +2,13 @@
 //!
 //! Must hold: for a key, a signature and a message from the fuzzer, and for valid ones that it has
 //! changed, both give the same result; and our verification ends.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use ed25519_dalek::{Signature, Signer, SigningKey, VerifyingKey};
-use libfuzzer_sys::fuzz_target;
 use seal::ed25519::Verification;
 use seal::sha512::Sha512;
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let Some((seed, rest)) = bytes.split_first_chunk::<32>() else { return };
     let Some((changes, message)) = rest.split_first_chunk::<96>() else { return };
     let signer = SigningKey::from_bytes(seed);
@@ -25,6 +24,7 @@ fuzz_target!(|bytes: &[u8]| {
     let mut ours = Verification::new(&key, &signature, &hash.finish());
     let verdict = (0..10_000).find_map(|_| ours.step()).expect("a verdict");
     let theirs = VerifyingKey::from_bytes(&key);
-    let theirs = theirs.is_ok_and(|key| key.verify_strict(message, &Signature::from_bytes(&signature)).is_ok());
+    let theirs =
+        theirs.is_ok_and(|key| key.verify_strict(message, &Signature::from_bytes(&signature)).is_ok());
     assert_eq!(verdict, theirs);
 });

@@ -5,13 +5,13 @@
 //! Must hold: nothing outside the programs and the parameters is ever written; the device never
 //! accepts more than the room that it has reported; and afterwards CLEAR and a valid image install
 //! a program. A wrong password never unlocks anything.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
 use boot_core::control::{Policy, Step};
-use boot_core::store::NodeParameters;
-use boot_core::store::Journal;
 use boot_core::profile::Profile;
+use boot_core::store::Journal;
+use boot_core::store::NodeParameters;
 use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
@@ -19,7 +19,6 @@ use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLO
 use canopen::{AbortCode, Address, BitRate, Instant, NodeId};
 use coboot_fuzz::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 use coboot_fuzz::Input;
-use libfuzzer_sys::fuzz_target;
 use shared_abi::layout::Layout;
 
 static LAYOUT: Layout = TWO_PROGRAMS;
@@ -51,7 +50,7 @@ macro_rules! config {
             supports: |_| true,
             boot_up_emergency: false,
             lss_store: true,
-        second_server: true,
+            second_server: true,
             download: Policy { identity: Some((1, 2)), ..PROFILE.download },
             password: PROFILE.password,
         };
@@ -59,7 +58,7 @@ macro_rules! config {
     }};
 }
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let config = match input.byte().unwrap_or(0) % 3 {
         0 => config!(Profile::STANDARD),

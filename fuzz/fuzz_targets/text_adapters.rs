@@ -2,7 +2,7 @@
 //!
 //! Must hold: any bytes, in any pieces, give frames, nothing, or an error, and never an endless
 //! wait; a frame survives writing and parsing unchanged.
-#![no_main]
+#![cfg_attr(fuzzing, no_main)]
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
@@ -13,7 +13,6 @@ use coboot_fuzz::Input;
 use coflash::bus::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
 use coflash::bus::{Adapter, Line, Slcan};
 use embedded_can::Frame as _;
-use libfuzzer_sys::fuzz_target;
 
 /// A line that gives this text in pieces and then ends; with `echo`, it returns the written text.
 #[derive(Default)]
@@ -56,7 +55,7 @@ impl Line for Script {
 /// A time-out that never passes: the code under test must end by itself.
 const FOR_EVER: Duration = Duration::from_secs(3600);
 
-fuzz_target!(|bytes: &[u8]| {
+coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);
     let mut pieces = VecDeque::new();
     while let Some(length) = input.byte() {

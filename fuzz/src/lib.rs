@@ -1,6 +1,63 @@
 //! Common code of the fuzz targets. `cargo xtask fuzz` runs them; the first lines of each target
 //! say what must hold.
 
+use std::path::{Path, PathBuf};
+
+#[cfg(fuzzing)]
+pub use libfuzzer_sys;
+
+/// The body of a target: the program of libFuzzer under `cargo fuzz`. Under plain cargo it is a
+/// program that runs each file once that is named, and each file of a folder that is named.
+#[macro_export]
+macro_rules! target {
+    (|$bytes:ident: &[u8]| $body:block) => {
+        #[cfg(fuzzing)]
+        $crate::libfuzzer_sys::fuzz_target!(|$bytes: &[u8]| $body);
+
+        #[cfg(not(fuzzing))]
+        fn main() -> std::process::ExitCode {
+            $crate::replay(|$bytes: &[u8]| $body)
+        }
+    };
+}
+
+/// Runs a target with each file that the arguments name, in the order of their names, and prints
+/// how many there were. The name of a file stands on standard error before a panic ends the run.
+pub fn replay(target: impl Fn(&[u8])) -> std::process::ExitCode {
+    let mut count = 0;
+    for argument in std::env::args_os().skip(1) {
+        for file in files(Path::new(&argument)) {
+            let Ok(bytes) = std::fs::read(&file) else {
+                eprintln!("{} cannot be read.", file.display());
+                return std::process::ExitCode::FAILURE;
+            };
+            let told = Told(&file);
+            target(&bytes);
+            std::mem::forget(told);
+            count += 1;
+        }
+    }
+    println!("{count}");
+    std::process::ExitCode::SUCCESS
+}
+
+/// The file itself, or those in the folder.
+fn files(path: &Path) -> Vec<PathBuf> {
+    let Ok(folder) = std::fs::read_dir(path) else { return vec![path.to_owned()] };
+    let mut files: Vec<_> = folder.flatten().map(|entry| entry.path()).collect();
+    files.sort();
+    files
+}
+
+/// Tells its file when a panic drops it.
+struct Told<'p>(&'p Path);
+
+impl Drop for Told<'_> {
+    fn drop(&mut self) {
+        eprintln!("with the input {}", self.0.display());
+    }
+}
+
 /// The devices and the wire of the tests in `canopen`.
 #[path = "../../canopen/tests/common/mod.rs"]
 pub mod device;

@@ -10,18 +10,23 @@ use crate::json::Value;
 use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask fuzz [--seconds N] [--target NAME]
+usage: cargo xtask fuzz [--seconds N] [--target NAME] [--keep | --replay]
 
 Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
 program download by blocks and in one piece,
+downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
-configuration files, sealed images with their signatures and their compression. What they find in this run is built upon in the next one.
+configuration files, sealed images, as files and as they arrive, with their signatures and their compression. What they find in this run is built upon in the next one.
 The counts of all runs go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
   --target NAME   this one alone
+  --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
+                  fuzz/seeds for the replay
+  --replay        runs no fuzzer: every input of fuzz/seeds and fuzz/corpus once, with the Rust that
+                  builds the rest; it needs no nightly toolchain, and about a minute
 
-It needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
+Without --replay, it needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
 where it is missing.
 ";
 
@@ -31,6 +36,79 @@ const CARGO_FUZZ: &str = "0.13.2";
 const TOO_LONG: u32 = 10;
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
+
+/// The feature for sealed images.
+const SEALED: &str = "sealed";
+/// The targets that need it.
+const SEALED_TARGETS: [&str; 1] = ["sealed_stream"];
+/// The most bytes that are kept for a target in fuzz/seeds, and of one input there.
+const KEPT: u64 = 96 * 1024;
+const LONGEST: u64 = 4 * 1024;
+
+/// The features of a target.
+fn features(target: &str) -> &'static str {
+    if SEALED_TARGETS.contains(&target) {
+        SEALED
+    } else {
+        ""
+    }
+}
+
+/// Runs every kept input once, without the fuzzer.
+fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
+    let programs = target_dir().join("replay");
+    let mut build = process::cargo_on(folder, "build");
+    build.args(["--quiet", "--release", "--bins"]).env("CARGO_TARGET_DIR", &programs);
+    process::run(&mut build)?;
+    // Only those: the others would be replaced by what they are with the feature.
+    let mut build = process::cargo_on(folder, "build");
+    build.args(["--quiet", "--release", "--features", SEALED]).env("CARGO_TARGET_DIR", &programs);
+    process::run(build.args(SEALED_TARGETS.iter().flat_map(|target| ["--bin", target])))?;
+    for target in targets {
+        let mut program = Command::new(programs.join("release").join(target));
+        for kept in ["seeds", "corpus"] {
+            let inputs = folder.join(kept).join(target);
+            if inputs.is_dir() {
+                program.arg(inputs);
+            }
+        }
+        let said = process::output(&mut program)?;
+        println!("  {target:<16} {:>10} inputs, no fault", said.trim());
+    }
+    Ok(())
+}
+
+/// Puts the inputs of a corpus into a folder of the repository, the shortest first, as many as
+/// [`KEPT`] allows. Inputs with other names stay there: a person has written them.
+fn put_by(corpus: &Path, seeds: &Path) -> Outcome {
+    let failed = |error: std::io::Error| format!("{}: {error}.", workspace::shown(seeds));
+    let is_found = |path: &Path| {
+        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+        name.len() == 40 && name.bytes().all(|byte| byte.is_ascii_hexdigit())
+    };
+    fs::create_dir_all(seeds).map_err(failed)?;
+    for old in fs::read_dir(seeds).map_err(failed)?.flatten().map(|entry| entry.path()) {
+        if is_found(&old) {
+            fs::remove_file(old).map_err(failed)?;
+        }
+    }
+    let mut inputs: Vec<(u64, PathBuf)> = fs::read_dir(corpus)
+        .map_err(failed)?
+        .flatten()
+        .filter_map(|entry| Some((entry.metadata().ok()?.len(), entry.path())))
+        .filter(|(len, path)| *len <= LONGEST && is_found(path))
+        .collect();
+    inputs.sort();
+    let mut kept = 0;
+    for (len, path) in inputs {
+        kept += len;
+        if kept > KEPT {
+            break;
+        }
+        fs::copy(&path, seeds.join(path.file_name().unwrap_or_default())).map_err(failed)?;
+    }
+    Ok(())
+}
 
 /// The counts of all runs without a fault.
 struct Counts(BTreeMap<String, Row>);
@@ -93,7 +171,11 @@ impl fmt::Display for Counts {
 pub fn run(mut args: Args) -> Outcome {
     let seconds = seconds(args.value("--seconds")?)?;
     let only = args.value("--target")?;
+    let (keep, replay) = (args.flag("--keep"), args.flag("--replay"));
     args.none_left()?;
+    if keep && replay {
+        return Err("--keep and --replay do not go together.".into());
+    }
     let folder = workspace::root().join("fuzz");
     let mut targets = targets(&folder)?;
     if let Some(name) = only {
@@ -101,6 +183,9 @@ pub fn run(mut args: Args) -> Outcome {
             return Err(format!("there is no target \"{name}\"; there is: {}.", targets.join(", ")));
         }
         targets = vec![name];
+    }
+    if replay {
+        return replay_all(&folder, &targets);
     }
     toolchain()?;
     let path = setup::tool("cargo-fuzz", CARGO_FUZZ)?;
@@ -113,6 +198,9 @@ pub fn run(mut args: Args) -> Outcome {
     };
     println!("Building the fuzz targets ...");
     process::run(&mut fuzz(&["build"]))?;
+    for target in SEALED_TARGETS {
+        process::run(&mut fuzz(&["build", "--features", SEALED, target]))?;
+    }
     let mut failed = Vec::new();
     let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
     for target in &targets {
@@ -120,7 +208,7 @@ pub fn run(mut args: Args) -> Outcome {
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
         let log = target_dir().join(target).with_extension("log");
         let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
-        let mut command = fuzz(&["run", target]);
+        let mut command = fuzz(&["run", "--features", features(target), target]);
         command.arg(&corpus);
         let seeds = folder.join("seeds").join(target);
         if seeds.is_dir() {
@@ -138,6 +226,11 @@ pub fn run(mut args: Args) -> Outcome {
                 let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
                 counts.add(target, [runs, seconds.into()], [edges(&said).unwrap_or(0), files]);
                 evidence::record(EVIDENCE, &counts.to_string())?;
+                if keep {
+                    let mut least = fuzz(&["cmin", "--features", features(target), target]);
+                    process::output(least.arg(&corpus))?;
+                    put_by(&corpus, &folder.join("seeds").join(target))?;
+                }
             }
             (good, _) => {
                 let words = if good { "ran no input" } else { "FAILED" };
@@ -246,7 +339,10 @@ mod tests {
         let targets = targets(&folder).unwrap();
         assert!(targets.iter().any(|target| target == "lss"), "{targets:?}");
         for target in targets {
-            assert!(manifest.contains(&format!("path = \"fuzz_targets/{target}.rs\"")), "{target}");
+            let lines = format!("path = \"fuzz_targets/{target}.rs\"");
+            let declared = manifest.split("[[bin]]").find(|bin| bin.contains(&lines));
+            let declared = declared.unwrap_or_else(|| panic!("{target} is not in Cargo.toml"));
+            assert_eq!(declared.contains("required-features"), !features(&target).is_empty(), "{target}");
         }
     }
 
@@ -284,5 +380,29 @@ mod tests {
         assert_eq!((lss.sums, lss.last), ([u64::MAX, 5], [701, 29]));
         assert_eq!((rows["lzma"].sums, rows.len()), ([5, 1], 2));
         assert!(!lss.since.is_empty());
+    }
+
+    #[test]
+    fn what_is_kept_is_short_and_a_persons_seeds_stay() {
+        let folder = std::env::temp_dir().join(format!("coboot-fuzz-kept-{}", std::process::id()));
+        let (corpus, seeds) = (folder.join("corpus"), folder.join("seeds"));
+        let name = |letter: &str| letter.repeat(40);
+        for place in [&corpus, &seeds] {
+            fs::create_dir_all(place).unwrap();
+        }
+        fs::write(seeds.join("by-hand"), "x").unwrap();
+        fs::write(seeds.join(name("0")), "an earlier one").unwrap();
+        fs::write(corpus.join(name("a")), vec![0; 100]).unwrap();
+        fs::write(corpus.join(name("b")), vec![0; LONGEST as usize + 1]).unwrap();
+        for number in 0..30 {
+            fs::write(corpus.join(format!("{number:040x}")), vec![1; LONGEST as usize]).unwrap();
+        }
+        put_by(&corpus, &seeds).unwrap();
+        let files: Vec<_> = fs::read_dir(&seeds).unwrap().flatten().collect();
+        let bytes: u64 = files.iter().map(|file| file.metadata().unwrap().len()).sum();
+        assert!((KEPT - LONGEST..=KEPT + 1).contains(&bytes), "{bytes}");
+        assert!(seeds.join("by-hand").exists() && seeds.join(name("a")).exists());
+        assert!(!seeds.join(name("b")).exists());
+        fs::remove_dir_all(folder).unwrap();
     }
 }

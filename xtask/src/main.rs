@@ -15,6 +15,7 @@ mod book;
 mod build;
 mod chips;
 mod demo;
+mod deny;
 mod diagrams;
 #[cfg(test)]
 mod docs;
@@ -145,6 +146,12 @@ const JOBS: &[Job] = &[
         about: "the fuzz targets, each for a while (nightly toolchain)",
         help: fuzz::HELP,
         run: fuzz::run,
+    },
+    Job {
+        name: "deny",
+        about: "licences and origins of the crates of others",
+        help: deny::HELP,
+        run: deny::run,
     },
     Job {
         name: "bench",

@@ -9,7 +9,7 @@
 //! | module | what it does |
 //! |---|---|
 //! | [`story`] | what the host does, and what may be found |
-//! | [`look`] | what a board does after the power returns |
+//! | `look` | what a board does after the power returns |
 
 use std::collections::hash_map::DefaultHasher;
 use std::collections::HashSet;
