@@ -31,6 +31,7 @@ mod links;
 mod lint;
 mod modules;
 mod new_board;
+mod opinion;
 mod pack;
 mod package;
 #[cfg(test)]
@@ -155,6 +156,12 @@ const JOBS: &[Job] = &[
         about: "cut the power at every flash operation, and look what is there",
         help: powercut::HELP,
         run: powercut::run,
+    },
+    Job {
+        name: "opinion",
+        about: "the emulated CPU against QEMU's, word for word",
+        help: opinion::HELP,
+        run: opinion::run,
     },
     Job {
         name: "size",
