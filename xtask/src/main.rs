@@ -34,6 +34,7 @@ mod links;
 mod lint;
 mod modules;
 mod new_board;
+mod opinion;
 mod pack;
 mod package;
 #[cfg(test)]
@@ -176,6 +177,12 @@ const JOBS: &[Job] = &[
         about: "the standing attacker of the bus, for millions of frames",
         help: attack::HELP,
         run: attack::run,
+    },
+    Job {
+        name: "opinion",
+        about: "the emulated CPU against QEMU's, word for word",
+        help: opinion::HELP,
+        run: opinion::run,
     },
     Job {
         name: "size",

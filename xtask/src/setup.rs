@@ -43,6 +43,8 @@ pub enum Part {
     Gdb,
     /// The browser that the tests of `coflash ui` drive.
     Browser,
+    /// Another emulated CPU to compare ours with.
+    Qemu,
     /// Formatter and linter.
     Lint,
     /// The package for Debian.
@@ -173,6 +175,7 @@ enum Tool {
     Chromium,
     Dpkg,
     Mingw,
+    Qemu,
 }
 
 impl Tool {
@@ -192,6 +195,7 @@ impl Tool {
             Self::Chromium => "chromium",
             Self::Dpkg => "dpkg",
             Self::Mingw => "gcc-mingw-w64-x86-64",
+            Self::Qemu => "qemu-system-arm",
         }
     }
 
@@ -224,6 +228,7 @@ impl Tool {
             Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
             Self::Dpkg => process::succeeds("dpkg-deb", &["--version"]),
             Self::Mingw => process::succeeds("x86_64-w64-mingw32-gcc", &["--version"]),
+            Self::Qemu => process::succeeds("qemu-system-arm", &["--version"]),
             // The tests look for it in the same places.
             Self::Chromium => match env::var_os("COBOOT_CHROMIUM") {
                 Some(chromium) => process::succeeds(chromium, &["--version"]),
@@ -247,6 +252,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
             Part::Browser => &[Tool::Chromium],
             Part::Deb => &[Tool::Dpkg],
             Part::Windows => &[Tool::Mingw],
+            Part::Qemu => &[Tool::Qemu],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
             Part::Python | Part::Firmware | Part::Lint => &[],
         });

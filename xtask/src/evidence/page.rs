@@ -50,7 +50,7 @@ const PARTS: &[Part] = &[
     Part {
         name: "cpu",
         title: "Second opinion on the CPU",
-        command: "cargo xtask second-opinion",
+        command: "cargo xtask opinion --json",
         about: "The same programs on QEMU's Cortex-M4 and on the emulator, compared word for word.",
         show: plain,
     },

@@ -1,0 +1,330 @@
+//! Small programs for the CPU (programs.rs) on our machine, against the Armv7-M Architecture
+//! Reference Manual (DDI 0403E), and on a machine that others wrote: QEMU's mps2-an386.
+//!
+//! `cargo xtask opinion` runs the second half. Nothing else depends on this folder.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use std::{env, fs, thread};
+
+use emulator::machine::{Machine, Options};
+use emulator::time::Time;
+use object::{Object, ObjectSection, ObjectSymbol};
+use shared_abi::geometry::STM32F407VG;
+
+const STACK: u32 = 0x2001_0000;
+/// Where the programs write.
+const RESULTS: u32 = 0x2000_0000;
+/// Where they jump at the end.
+const END: u32 = 0x2000_3000;
+/// Where they are.
+const CODE: u32 = 0x2000_4000;
+/// Words that are compared; those behind the last one of a program are 0.
+const WORDS: usize = 64;
+/// The last word of every program.
+const LAST: u32 = 0x0E0E_0E0E;
+
+/// What is known about a program.
+struct Program {
+    name: &'static str,
+    shows: &'static str,
+    /// The words that it writes, by the manual; the last one is left out.
+    words: Vec<u32>,
+    /// Words that differ on QEMU: which, what they are there, and why.
+    differs: &'static [(usize, u32, &'static str)],
+    /// Words in which our machine does not do what the manual says: which, what they are, and why.
+    gaps: &'static [(usize, u32, &'static str)],
+}
+
+const SFPA: &str = "ours is wrong: bit 3 of CONTROL is reserved in Armv7-M (B1.4.4)";
+const EAGER: &str = "ours saves the FPU's registers at once: LSPACT stays 0 (B1.5.7)";
+const NO_TRAPS: &str = "ours ignores CCR.DIV_0_TRP and CCR.UNALIGN_TRP (B3.2.8)";
+
+fn programs(image: &Image) -> Vec<Program> {
+    let frame = |sp, pc, xpsr| {
+        let saved = [0xA0A0_A0A0, 0xA1A1_A1A1, 0xA2A2_A2A2, 0xA3A3_A3A3, 0xACAC_ACAC, 0xAEAE_AEAE];
+        [&[0xFFFF_FFF9, sp][..], &saved, &[pc, xpsr]].concat()
+    };
+    let program =
+        |name, shows, words: &[u32]| Program { name, shows, words: words.to_vec(), differs: &[], gaps: &[] };
+    vec![
+        program(
+            "order",
+            "SysTick, PendSV, SVCall by priority, one after another (B1.5.4)",
+            &[1, 15, 14, 2, 11, 3],
+        ),
+        program(
+            "preemption",
+            "a higher group priority preempts; the subpriority orders (B1.5.4)",
+            &[0x10, 0x11, 0x12, 1, 0x10, 0x12, 0x11, 2, 0x10, 0x12, 0x11, 3, 0x11, 0x10, 0x12, 0x11, 4],
+        ),
+        program(
+            "basepri",
+            "BASEPRI masks its priority and below; BASEPRI_MAX only raises (B1.4.3, B5.2.3)",
+            &[1, 1, 0x10, 2, 0x40, 0x20, 0x20, 0x10, 3],
+        ),
+        program(
+            "masks",
+            "PRIMASK and FAULTMASK; a return clears FAULTMASK (B1.4.3)",
+            &[1, 0x10, 1, 1, 0x10, 2, 1, 0],
+        ),
+        program(
+            "frame",
+            "the basic frame, also from a stack at 4 bytes (B1.5.6, B1.5.7)",
+            &[
+                frame(0x2000_FFE0, image.symbol("after_first"), 0x6100_0000),
+                frame(0x2000_FFD8, image.symbol("after_second"), 0x6100_0200),
+                vec![0x2000_FFFC],
+            ]
+            .concat(),
+        ),
+        Program {
+            gaps: &[(1, 0xC, SFPA), (3, 0, EAGER), (9, 0xC, SFPA)],
+            ..program(
+                "float_frame",
+                "the extended frame; LSPACT until the handler uses the FPU (B1.5.7)",
+                &[0, 4, 0xFFFF_FFE9, 1, 0, 0, 0x2000_FF98, 0x3F80_0000, 0x3F80_0000, 4],
+            )
+        },
+        program(
+            "process_stack",
+            "PSP, MSP and CONTROL; without privilege CPS and MSR are ignored (B1.4.4, B5.2)",
+            &[2, 0x2000_8000, 0xFFFF_FFFD, 0x2000_7FE0, STACK, 0, 0, 0xFFFF_FFFD, 0x2000_7FE0, STACK, 1, 0],
+        ),
+        program("usage_fault", "an undefined instruction (B3.2.15)", &[0, 6, 1 << 16, 0]),
+        Program {
+            // Without the faults, the word 1 and the last one come first.
+            gaps: &[
+                (0, 1, NO_TRAPS),
+                (1, LAST, NO_TRAPS),
+                (2, 0, NO_TRAPS),
+                (5, 0, NO_TRAPS),
+                (6, 0, NO_TRAPS),
+                (8, 0, NO_TRAPS),
+                (9, 0, NO_TRAPS),
+            ],
+            ..program(
+                "traps",
+                "division by zero and an unaligned access, trapped (B3.2.8, B3.2.15)",
+                &[0, 6, 1 << 25, 0, 0, 6, 1 << 24, 0, 1],
+            )
+        },
+        program(
+            "bus_fault",
+            "a precise error: BFAR, BFARVALID, PRECISERR (B3.2.15, B3.2.18)",
+            &[0xA000_0000, 0, 5, 0x8200, 0],
+        ),
+        program(
+            "escalation",
+            "a fault or SVCall that cannot be taken is a HardFault (B1.5.4, B3.2.16)",
+            &[0, 3, 1 << 16, 1 << 30, 3, 0, 1 << 30, 0x40],
+        ),
+        program(
+            "bit_band",
+            "the alias of SRAM: bit 0 of the value counts (B3.1)",
+            &[8, 1, 0, 0x8000_0008, 0x8000_0000],
+        ),
+        program(
+            "systick",
+            "a write clears the counter, a read COUNTFLAG (B3.3.3 to B3.3.5)",
+            &[0, 0x1_0005, 5, 9999],
+        ),
+        program("wait", "WFI ends for an exception that PRIMASK masks (B1.5.19)", &[1, 14, 2]),
+        Program {
+            differs: &[(
+                0,
+                0xFFFF_FFFF,
+                "DDI 0403E B1.5.4 leaves 3 to 8 bits; STM32F4 has 4 (PM0214), QEMU 8",
+            )],
+            ..program("priority_bits", "the bits of a priority that exist", &[0xF0F0_F0F0])
+        },
+    ]
+}
+
+// --- the programs, assembled
+// -------------------------------------------------------------------------------------------------
+
+struct Image {
+    code: Vec<u8>,
+    symbols: BTreeMap<String, u32>,
+}
+
+impl Image {
+    fn build(test: &str) -> Self {
+        let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+        let elf = folder.join(format!("second_opinion_{test}.elf"));
+        let mut rustc = Command::new(env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
+        rustc.args(["--edition", "2021", "--target", "thumbv7em-none-eabihf", "-C", "panic=abort"]);
+        rustc.arg(format!("-Clink-args=-Ttext={CODE:#x} --no-gc-sections -eorder"));
+        rustc.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/second_opinion/programs.rs"));
+        assert!(rustc.arg("-o").arg(&elf).status().unwrap().success(), "cargo xtask setup adds the target");
+        let bytes = fs::read(&elf).unwrap();
+        let elf = object::File::parse(&bytes[..]).unwrap();
+        let text = elf.section_by_name(".text").unwrap();
+        assert_eq!(text.address(), u64::from(CODE));
+        let address = |symbol: &object::Symbol| u32::try_from(symbol.address()).unwrap();
+        Self {
+            code: text.data().unwrap().to_vec(),
+            symbols: elf.symbols().map(|it| (it.name().unwrap().to_owned(), address(&it))).collect(),
+        }
+    }
+
+    fn symbol(&self, name: &str) -> u32 {
+        self.symbols[name]
+    }
+}
+
+fn bytes(words: &[u32]) -> Vec<u8> {
+    words.iter().flat_map(|word| word.to_le_bytes()).collect()
+}
+
+fn words(bytes: &[u8]) -> Vec<u32> {
+    bytes.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
+}
+
+// --- the machines
+// -------------------------------------------------------------------------------------------------
+
+fn ours(image: &Image, name: &str) -> Vec<u32> {
+    let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
+    machine.load_bin(0x0800_0000, &bytes(&[STACK, image.symbol(name) | 1])).unwrap();
+    machine.power_on(Time(0));
+    machine.write_ram(CODE, &image.code).unwrap();
+    machine.write_ram(END, &bytes(&[0xE7FD_BF30])).unwrap(); // wfi, for ever
+    machine.run_until(Time(100_000_000_000));
+    let mut result = [0; 4 * WORDS];
+    machine.read_memory(RESULTS, &mut result).unwrap();
+    words(&result)
+}
+
+fn qemu(image: &Image, name: &str) -> Result<Vec<u32>, String> {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+    let place = |part: &str, address: u32, bytes: &[u8]| {
+        let file: PathBuf = folder.join(format!("second_opinion_{part}.bin"));
+        fs::write(&file, bytes).unwrap();
+        format!("loader,file={},addr={address:#x},force-raw=on", file.display())
+    };
+    // ldr pc, [pc]
+    let end = bytes(&[0xF000_F8DF, image.symbol("semihosted_end") | 1]);
+    let mut qemu = Command::new("qemu-system-arm");
+    qemu.args(["-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "none"]);
+    // Virtual time advances with the instructions, not with the host's clock.
+    qemu.args(["-icount", "shift=5", "-semihosting-config", "enable=on,target=native"]);
+    qemu.args(["-device", &place("start", 0, &bytes(&[STACK, image.symbol(name) | 1]))]);
+    qemu.args(["-device", &place("code", CODE, &image.code)]);
+    qemu.args(["-device", &place("end", END, &end)]);
+    qemu.stdin(Stdio::null()).stdout(Stdio::piped());
+    let mut child = qemu.spawn().map_err(|error| format!("qemu-system-arm: {error}"))?;
+    // It ends in a fraction of a second; the limit is for a program that does not.
+    let limit = Instant::now() + Duration::from_secs(60);
+    while child.try_wait().map_err(|error| error.to_string())?.is_none() {
+        if Instant::now() > limit {
+            let _ = child.kill();
+            let _ = child.wait();
+            return Err("did not end within a minute".into());
+        }
+        thread::sleep(Duration::from_millis(5));
+    }
+    let output = child.wait_with_output().map_err(|error| error.to_string())?.stdout;
+    match output.len() {
+        len if len == 4 * WORDS => Ok(words(&output)),
+        len => Err(format!("{len} bytes of results, not {}", 4 * WORDS)),
+    }
+}
+
+// --- the comparisons
+// -------------------------------------------------------------------------------------------------
+
+/// The whole block of results.
+fn expected(program: &Program) -> Vec<u32> {
+    let mut words = program.words.clone();
+    words.push(LAST);
+    words.resize(WORDS, 0);
+    words
+}
+
+/// The words that differ: number, left, right.
+fn differences(left: &[u32], right: &[u32]) -> Vec<(usize, u32, u32)> {
+    let pairs = left.iter().zip(right).enumerate();
+    pairs.filter(|(_, (a, b))| a != b).map(|(n, (&a, &b))| (n, a, b)).collect()
+}
+
+#[test]
+fn our_machine_does_what_the_manual_says() {
+    let image = Image::build("ours");
+    let mut wrong = String::new();
+    for program in programs(&image) {
+        let mut expected = expected(&program);
+        for &(n, value, _) in program.gaps {
+            expected[n] = value;
+        }
+        for (n, is, should) in differences(&ours(&image, program.name), &expected) {
+            wrong += &format!("{}, word {n}: {is:08X}h, by the manual {should:08X}h\n", program.name);
+        }
+    }
+    assert!(wrong.is_empty(), "\n{wrong}");
+}
+
+/// `COBOOT_CPU_EVIDENCE` names a file for the result, `COBOOT_COMMIT` the commit in it.
+#[test]
+#[ignore = "needs QEMU: cargo xtask opinion"]
+fn qemu_does_the_same() {
+    let image = Image::build("qemu");
+    let (mut compared, mut explained, mut wrong) = (0, Vec::new(), Vec::new());
+    let programs = programs(&image);
+    for program in &programs {
+        let name = program.name;
+        compared += program.words.len() + 1;
+        let theirs = match qemu(&image, name) {
+            Ok(theirs) => theirs,
+            Err(problem) => {
+                println!("{name:<14} FAILED on QEMU: {problem}");
+                wrong.push(format!("{{\"program\": \"{name}\", \"problem\": {problem:?}}}"));
+                continue;
+            }
+        };
+        let found = differences(&ours(&image, name), &theirs);
+        let same = if found.is_empty() { "the same" } else { "DIFFERS" };
+        println!("{name:<14} {:>2} words  {same:<8}  {}", program.words.len() + 1, program.shows);
+        // An explanation that is no longer needed is a difference, too.
+        for &(n, value, why) in program.differs {
+            if !found.iter().any(|&(m, _, theirs)| (m, theirs) == (n, value)) {
+                println!("    word {n} should be {value:08X}h on QEMU: {why}");
+                wrong.push(format!("{{\"program\": \"{name}\", \"word\": {n}, \"problem\": \"not seen\"}}"));
+            }
+        }
+        for (n, ours, theirs) in found {
+            let by_manual = expected(program)[n];
+            let differs =
+                program.differs.iter().filter(|it| (it.0, it.1) == (n, theirs) && ours == by_manual);
+            let gaps = program.gaps.iter().filter(|it| (it.0, it.1) == (n, ours) && theirs == by_manual);
+            let why = differs.chain(gaps).next().map(|it| it.2);
+            println!("    word {n}: {ours:08X}h, QEMU {theirs:08X}h: {}", why.unwrap_or("NOT EXPLAINED"));
+            let line = format!(
+                "{{\"program\": \"{name}\", \"word\": {n}, \"ours\": {ours}, \"qemu\": {theirs}, \"why\": {:?}}}",
+                why.unwrap_or_default()
+            );
+            if why.is_some() { &mut explained } else { &mut wrong }.push(line);
+        }
+    }
+    println!(
+        "{} programs, {compared} words; {} differences explained, {} not",
+        programs.len(),
+        explained.len(),
+        wrong.len()
+    );
+    if let Some(file) = env::var_os("COBOOT_CPU_EVIDENCE") {
+        let commit = env::var("COBOOT_COMMIT").unwrap_or_default();
+        let json = format!(
+            "{{\n\"commit\": {commit:?},\n\"machine\": \"mps2-an386\",\n\"programs\": {},\n\"words\": {compared},\n\
+             \"explained\": [{}],\n\"unexplained\": [{}]\n}}\n",
+            programs.len(),
+            explained.join(", "),
+            wrong.join(", ")
+        );
+        fs::write(file, json).unwrap();
+    }
+    assert!(wrong.is_empty(), "{} differences without an explanation", wrong.len());
+}

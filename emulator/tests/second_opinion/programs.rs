@@ -1,0 +1,488 @@
+//! The programs, for a Cortex-M4 with RAM at 2000_0000h. They run in RAM, so that every address in
+//! a result is the same on all machines. Each starts at a symbol of its own with the stack at
+//! 2001_0000h, writes words from 2000_0000h on, and ends with a jump to 2000_3000h, where the
+//! machine has its own code.
+//!
+//! r7 is where the next word goes; handlers move it too. r5 and r6 are scratch of the macros.
+
+#![no_std]
+#![no_main]
+
+core::arch::global_asm!(
+    r#"
+    .syntax unified
+    .thumb
+
+    .macro put value            // a constant becomes the next word
+    ldr r6, =\value
+    str r6, [r7], #4
+    .endm
+
+    .macro log register         // a register becomes the next word
+    str \register, [r7], #4
+    .endm
+
+    .macro log_special name     // a special register becomes the next word
+    mrs r6, \name
+    str r6, [r7], #4
+    .endm
+
+    .macro log_word address     // the word at an address becomes the next word
+    ldr r6, =\address
+    ldr r6, [r6]
+    str r6, [r7], #4
+    .endm
+
+    .macro store address, value
+    ldr r6, =\address
+    ldr r5, =\value
+    str r5, [r6]
+    dsb
+    isb
+    .endm
+
+    .macro store_byte address, value
+    ldr r6, =\address
+    movs r5, #\value
+    strb r5, [r6]
+    dsb
+    .endm
+
+    .macro vector number, handler
+    store 0x20002000 + 4 * \number, \handler
+    .endm
+
+    .macro end                  // the last word of every program
+    put 0x0E0E0E0E
+    ldr r6, =0x20003001
+    bx r6
+    .ltorg
+    .endm
+
+    .macro program name
+    .globl \name
+    .type \name, %function
+    .thumb_func
+    \name:
+    bl prepare
+    .endm
+
+    .macro handler name
+    .type \name, %function
+    .thumb_func
+    \name:
+    .endm
+
+    .equ ICSR,  0xE000ED04
+    .equ VTOR,  0xE000ED08
+    .equ AIRCR, 0xE000ED0C
+    .equ CCR,   0xE000ED14
+    .equ SHPR2, 0xE000ED1C
+    .equ SHPR3, 0xE000ED20
+    .equ SHCSR, 0xE000ED24
+    .equ CFSR,  0xE000ED28
+    .equ HFSR,  0xE000ED2C
+    .equ BFAR,  0xE000ED38
+    .equ CPACR, 0xE000ED88
+    .equ FPCCR, 0xE000EF34
+    .equ ISER0, 0xE000E100
+    .equ ISPR0, 0xE000E200
+    .equ IPR0,  0xE000E400
+
+    .section .text
+    // Clears the results, points every vector at a handler that says so, and moves VTOR there.
+    handler prepare
+    ldr r7, =0x20000000
+    movs r0, #0
+    mov r1, r7
+    add r2, r7, #0x800
+1:  str r0, [r1], #4
+    cmp r1, r2
+    bne 1b
+    ldr r1, =0x20002000
+    add r2, r1, #0x200
+    ldr r0, =unexpected
+2:  str r0, [r1], #4
+    cmp r1, r2
+    bne 2b
+    store VTOR, 0x20002000
+    bx lr
+    .ltorg
+
+    handler unexpected
+    mrs r0, ipsr
+    movt r0, #0xBAD0
+    log r0
+    log_word CFSR
+    end
+
+    handler log_exception
+    log_special ipsr
+    bx lr
+
+    // --- order
+
+    program order
+    vector 11, log_exception
+    vector 14, log_exception
+    vector 15, log_exception
+    store SHPR2, 0x80000000     // SVCall
+    store SHPR3, 0x40C00000     // SysTick before PendSV
+    cpsid i
+    store ICSR, 0x14000000      // pends both
+    put 1
+    cpsie i
+    isb
+    put 2
+    svc 0
+    put 3
+    end
+
+    // --- preemption
+
+    handler first_line
+    put 0x10
+    store ISPR0, 2
+    put 0x12
+    bx lr
+    .ltorg
+
+    handler second_line
+    put 0x11
+    bx lr
+    .ltorg
+
+    program preemption
+    vector 16, first_line
+    vector 17, second_line
+    store ISER0, 3
+    store_byte IPR0, 0x80
+    store_byte IPR0 + 1, 0x40
+    store ISPR0, 1              // a more urgent line interrupts the handler
+    put 1
+    store_byte IPR0 + 1, 0x80
+    store ISPR0, 1              // the same priority waits
+    put 2
+    store AIRCR, 0x05FA0600     // group = bit 7
+    store_byte IPR0, 0xC0
+    store_byte IPR0 + 1, 0x80
+    store ISPR0, 1              // the same group waits
+    put 3
+    cpsid i
+    store ISPR0, 3              // and the subpriority says who comes first
+    cpsie i
+    isb
+    put 4
+    end
+
+    // --- masks
+
+    handler line
+    put 0x10
+    bx lr
+    .ltorg
+
+    program basepri
+    vector 16, line
+    store ISER0, 1
+    store_byte IPR0, 0x80
+    movs r0, #0x80
+    msr basepri, r0
+    store ISPR0, 1              // masked: the same priority
+    put 1
+    log_word ISPR0
+    movs r0, #0x90
+    msr basepri, r0             // lowered: taken
+    isb
+    put 2
+    movs r0, #0x40
+    msr basepri, r0
+    store ISPR0, 1
+    movs r0, #0x80
+    msr basepri_max, r0         // would lower: ignored
+    isb
+    log_special basepri
+    movs r0, #0x20
+    msr basepri_max, r0         // raises
+    isb
+    log_special basepri
+    movs r0, #0
+    msr basepri_max, r0         // zero is ignored
+    isb
+    log_special basepri
+    msr basepri, r0             // zero masks nothing: taken
+    isb
+    put 3
+    end
+
+    handler sets_faultmask
+    cpsid f
+    log_special faultmask
+    bx lr
+    .ltorg
+
+    program masks
+    vector 16, line
+    store ISER0, 1
+    cpsid i
+    store ISPR0, 1
+    log_special primask
+    cpsie i
+    isb
+    put 1
+    cpsid f
+    store ISPR0, 1
+    log_special faultmask
+    cpsie f
+    isb
+    put 2
+    vector 16, sets_faultmask   // the return from the handler clears it
+    store ISPR0, 1
+    log_special faultmask
+    end
+
+    // --- stack frames
+
+    handler log_frame
+    log lr
+    mov r4, sp
+    log r4
+    mov r8, #8
+1:  ldr r6, [r4], #4
+    log r6
+    subs r8, #1
+    bne 1b
+    bx lr
+    .ltorg
+
+    program frame
+    vector 11, log_frame
+    ldr r0, =0xA0A0A0A0
+    ldr r1, =0xA1A1A1A1
+    ldr r2, =0xA2A2A2A2
+    ldr r3, =0xA3A3A3A3
+    ldr r12, =0xACACACAC
+    ldr lr, =0xAEAEAEAE
+    cmp r0, r0                  // Z and C
+    svc 0
+after_first:
+    sub sp, #4                  // the frame is aligned to 8 bytes
+    cmp r0, r0
+    svc 0
+after_second:
+    mov r6, sp
+    log r6
+    end
+
+    handler log_float_frame
+    log lr
+    ldr r4, =FPCCR
+    ldr r6, [r4]
+    and r6, #1                  // LSPACT: the room is there, the registers are not saved yet
+    log r6
+    log_special control
+    vmov.f32 s0, #2.0           // saves them first
+    ldr r6, [r4]
+    and r6, #1
+    log r6
+    mov r6, sp
+    log r6
+    ldr r6, [sp, #32]           // s0
+    log r6
+    bx lr
+    .ltorg
+
+    program float_frame
+    vector 11, log_float_frame
+    store CPACR, 0x00F00000
+    log_special control
+    vmov.f32 s0, #1.0
+    log_special control         // FPCA
+    svc 0
+    vmov r6, s0
+    log r6
+    log_special control
+    end
+
+    program process_stack
+    vector 11, log_exception_return
+    ldr r0, =0x20008000
+    msr psp, r0
+    movs r0, #2
+    msr control, r0
+    isb
+    log_special control
+    mov r6, sp
+    log r6
+    svc 0
+    movs r0, #3
+    msr control, r0             // and without privilege
+    isb
+    cpsid i                     // ignored
+    movs r0, #0
+    msr control, r0             // ignored
+    isb
+    svc 0
+    end
+
+    handler log_exception_return
+    log lr
+    log_special psp
+    log_special msp
+    log_special control
+    log_special primask
+    movs r6, #0                 // privileged again
+    msr control, r6
+    bx lr
+    .ltorg
+
+    // --- faults: r8 is where to go on, r9 the instruction at fault
+
+    handler log_bus_fault
+    log_word BFAR
+    b log_fault
+    .ltorg
+
+    handler log_fault
+    ldr r6, [sp, #24]
+    sub r6, r6, r9
+    log r6
+
+    handler log_status
+    log_special ipsr
+    ldr r4, =CFSR
+    ldr r6, [r4]
+    log r6
+    str r6, [r4]
+    ldr r4, =HFSR
+    ldr r6, [r4]
+    log r6
+    str r6, [r4]
+    str r8, [sp, #24]
+    bx lr
+    .ltorg
+
+    .macro fails instruction:vararg
+    adr.w r9, 3f
+    adr.w r8, 4f
+    .balign 4
+3:  \instruction
+    .balign 4
+4:
+    .endm
+
+    program usage_fault
+    vector 6, log_fault
+    store SHCSR, 0x00040000
+    fails udf #0
+    end
+
+    program traps
+    vector 6, log_fault
+    store SHCSR, 0x00040000
+    store CCR, 0x00000218       // STKALIGN, DIV_0_TRP, UNALIGN_TRP
+    movs r0, #1
+    movs r1, #0
+    fails udiv r2, r0, r1
+    ldr r0, =0x20000402
+    fails ldr r1, [r0]
+    store CCR, 0x00000200
+    movs r0, #1
+    udiv r2, r0, r1
+    put 1
+    end
+
+    program bus_fault
+    vector 5, log_bus_fault
+    store SHCSR, 0x00020000
+    ldr r0, =0xA0000000
+    fails ldr r1, [r0]
+    end
+
+    program escalation
+    vector 3, log_fault
+    vector 6, log_exception
+    vector 11, log_exception
+    fails udf #0                // UsageFault is not enabled
+    vector 3, log_status        // where SVC goes on is not compared
+    store SHPR2, 0x80000000
+    movs r0, #0x40
+    msr basepri, r0
+    isb
+    fails svc 0                 // SVCall is masked
+    log_special basepri
+    end
+
+    // --- the rest
+
+    program bit_band
+    store 0x22000000 + 0x400 * 32 + 3 * 4, 1
+    log_word 0x20000400
+    log_word 0x22000000 + 0x400 * 32 + 3 * 4
+    log_word 0x22000000 + 0x400 * 32 + 2 * 4
+    store 0x22000000 + 0x400 * 32 + 31 * 4, 0xFF
+    log_word 0x20000400
+    store 0x22000000 + 0x400 * 32 + 3 * 4, 0xFE
+    log_word 0x20000400
+    end
+
+    program systick
+    store 0xE000E014, 9999
+    store 0xE000E018, 0x1234    // any value clears the counter
+    log_word 0xE000E018
+    store 0xE000E010, 5
+    ldr r4, =0xE000E010
+1:  ldr r0, [r4]
+    tst r0, #0x10000
+    beq 1b
+    ldr r1, [r4]                // the read has cleared COUNTFLAG
+    log r0
+    log r1
+    log_word 0xE000E014
+    end
+
+    program wait
+    vector 14, log_exception
+    cpsid i
+    store ICSR, 0x10000000
+    wfi                         // a pending exception wakes, even masked by PRIMASK
+    put 1
+    cpsie i
+    isb
+    put 2
+    end
+
+    program priority_bits
+    store IPR0, 0xFFFFFFFF
+    log_word IPR0
+    end
+    // The end on a machine with semihosting: the first 64 words go to standard output.
+    handler semihosted_end
+    movs r0, #1                 // SYS_OPEN ":tt", mode "wb"
+    adr.w r1, open_block
+    bkpt 0xAB
+    ldr r1, =0x20003100
+    str r0, [r1]
+    ldr r0, =0x20000000
+    str r0, [r1, #4]
+    mov r0, #256
+    str r0, [r1, #8]
+    movs r0, #5                 // SYS_WRITE
+    bkpt 0xAB
+    movs r0, #0x18              // SYS_EXIT, ADP_Stopped_ApplicationExit
+    ldr r1, =0x20026
+    bkpt 0xAB
+    b .
+    .ltorg
+    .balign 4
+open_block:
+    .word terminal, 5, 3
+terminal:
+    .asciz ":tt"
+"#
+);
+
+#[panic_handler]
+fn panic(_: &core::panic::PanicInfo) -> ! {
+    loop {}
+}
