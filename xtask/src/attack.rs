@@ -46,7 +46,7 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     build::images(&TWO, &IMAGES)?;
     evidence::begin("attacker")?;
-    let counts = workspace::target_dir().join("attack.json");
+    let counts = evidence::file_for("attacker");
     let mut attack = process::cargo("run");
     attack.args(build::tests_args(DEFAULT)).args(["--bin", "attack", "--"]);
     for (option, value) in [("--frames", frames), ("--seed", seed)] {

@@ -1,10 +1,10 @@
 //! `cargo xtask opinion`: the emulated CPU beside one that others wrote.
 
-use std::process::Command;
+use std::fs;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{process, workspace, Outcome};
+use crate::{evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json] [--yes]
@@ -25,12 +25,14 @@ pub fn run(mut args: Args) -> Outcome {
     let mut test = process::cargo("test");
     test.args(["--quiet", "--package", "coboot-emulator", "--test", "second_opinion"]);
     test.args(["--", "--include-ignored", "--nocapture", "--test-threads=1"]);
-    if json {
-        let folder = workspace::target_dir().join("evidence");
-        std::fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}.", folder.display()))?;
-        let mut git = Command::new("git");
-        let commit = process::output(git.args(["rev-parse", "HEAD"]).current_dir(workspace::root()))?;
-        test.env("COBOOT_CPU_EVIDENCE", folder.join("cpu.json")).env("COBOOT_COMMIT", commit.trim());
+    if !json {
+        return process::run(&mut test);
     }
-    process::run(&mut test)
+    evidence::begin("cpu")?;
+    let result = evidence::file_for("cpu");
+    // A difference is a result, too.
+    let ended = process::run(test.env("COBOOT_CPU_EVIDENCE", &result));
+    let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&result));
+    evidence::record("cpu", &fs::read_to_string(&result).map_err(unread)?)?;
+    ended
 }

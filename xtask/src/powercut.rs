@@ -45,11 +45,11 @@ pub fn run(mut args: Args) -> Outcome {
         return cut(board, &only, json, None).map(drop);
     }
     evidence::begin("powercut")?;
-    let mut boards = vec![cut(board, &only, json, Some("powercut-board"))?];
+    let mut boards = vec![cut(board, &only, json, Some("powercut"))?];
     if full && !chosen_board {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
-            boards.push(cut(other, &["--tenth".to_owned()], json, Some("powercut-board"))?);
+            boards.push(cut(other, &["--tenth".to_owned()], json, Some("powercut"))?);
         }
     }
     evidence::record("powercut", &format!("{{\"full\": {full}, \"boards\": [{}]}}", boards.join(",\n")))?;
@@ -66,7 +66,7 @@ fn is_of_its_own(board: &Layout) -> bool {
 /// Cuts the power on a board; returns the counts as JSON, if they are to be kept.
 fn cut(board: &Layout, arguments: &[String], json: bool, keep: Option<&str>) -> Outcome<String> {
     let images = build::all(board)?;
-    let kept = keep.map(|name| workspace::target_dir().join(name).with_extension("json"));
+    let kept = keep.map(evidence::file_for);
     let mut powercut = process::cargo("run");
     powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]).args(arguments);
     powercut.args(json.then_some("--json"));

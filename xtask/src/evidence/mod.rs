@@ -60,6 +60,13 @@ pub fn begin(name: &str) -> Outcome {
     record(name, "{\"unfinished\": true}").map(drop)
 }
 
+/// A file that another program writes its facts to, for [`record`]; it is not there yet.
+pub fn file_for(name: &str) -> PathBuf {
+    let file = path(name).with_extension("facts");
+    let _ = fs::remove_file(&file);
+    file
+}
+
 /// What was recorded last under this name, if it can be read.
 pub fn recorded(name: &str) -> Option<Value> {
     Value::parse(&fs::read_to_string(path(name)).ok()?).ok()
