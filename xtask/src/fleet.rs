@@ -29,6 +29,16 @@ pub enum Way {
     Together,
 }
 
+impl Way {
+    /// Bytes of a block without framing, by default.
+    fn block(self) -> f64 {
+        match self {
+            Self::InTurn | Self::OneByOne => 1008.0,
+            Self::Together => 4080.0,
+        }
+    }
+}
+
 /// What the model is asked.
 #[derive(Clone, Copy, Debug)]
 pub struct Case {
@@ -150,7 +160,7 @@ pub fn picture() -> Outcome<String> {
     }
     for (way, name, colour) in WAYS {
         for (lost, dashes) in [(0.0, "none"), (1e-3, "5 4")] {
-            let case = |devices| Case { way, devices, bit_rate: 1e6, kib: 256.0, block: 1008.0, lost };
+            let case = |devices| Case { way, devices, bit_rate: 1e6, kib: 256.0, block: way.block(), lost };
             let points: Vec<String> = (0..=40)
                 .map(|step| {
                     let devices = 94.0_f64.powf(f64::from(step) / 40.0);
@@ -170,7 +180,8 @@ pub fn picture() -> Outcome<String> {
             }
         }
     }
-    for Measured { case, seconds } in measured()?.iter().filter(|row| row.case.block < 1024.0) {
+    for Measured { case, seconds } in measured()?.iter().filter(|row| row.case.block == row.case.way.block())
+    {
         let colour = WAYS.iter().find(|(way, ..)| *way == case.way).map_or("black", |(.., colour)| colour);
         let fill = if case.lost == 0.0 { colour } else { "white" };
         let (x, y) = place(case.devices, *seconds);
@@ -211,7 +222,7 @@ mod tests {
                 let _ = write!(table, "| {} | {devices} |", bit_rate / 1e3);
                 for (way, ..) in WAYS {
                     let of = |lost| {
-                        clock(Case { way, devices, bit_rate, kib: 256.0, block: 1008.0, lost }.seconds())
+                        clock(Case { way, devices, bit_rate, kib: 256.0, block: way.block(), lost }.seconds())
                     };
                     let _ = write!(table, " {} |", LOST.map(of).join(" / "));
                 }
