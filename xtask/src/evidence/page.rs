@@ -38,7 +38,7 @@ const PARTS: &[Part] = &[
         title: "Hostile bus",
         command: "cargo xtask attack",
         about: "A seeded attacker and a legal master on one bus; what nobody may change stays.",
-        show: plain,
+        show: |record| plain(record, "frames"),
     },
     Part {
         name: "fuzz",
@@ -52,14 +52,14 @@ const PARTS: &[Part] = &[
         title: "Second opinion on the CPU",
         command: "cargo xtask opinion --json",
         about: "The same programs on QEMU's Cortex-M4 and on the emulator, compared word for word.",
-        show: plain,
+        show: |record| plain(record, "words"),
     },
     Part {
         name: "mutants",
         title: "Mutants",
         command: "cargo xtask mutants",
         about: "Changes of the code that the tests must notice.",
-        show: plain,
+        show: |record| plain(record, "viable"),
     },
     Part {
         name: "bench",
@@ -210,7 +210,9 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
     let sum = |name| boards.iter().map(|board| number(board, name)).sum::<f64>();
     let (states, violations) = (sum("states"), sum("violations"));
     let shown_states = shown(&Value::Number(format!("{states}")));
-    let verdict = format!("{shown_states} states of the real firmware's flash on {} boards", boards.len());
+    let boards_are = if boards.len() == 1 { "board" } else { "boards" };
+    let verdict =
+        format!("{shown_states} states of the real firmware's flash on {} {boards_are}", boards.len());
     let mut details = String::new();
     for board in boards {
         let _ = writeln!(details, "<h3>{}</h3>", shown(board.get("board")));
@@ -395,22 +397,29 @@ fn size(record: &Value) -> (Result<String, String>, String) {
     (verdict, table(&names, &names, rows))
 }
 
-/// A record that says `failed` itself.
-fn plain(record: &Value) -> (Result<String, String>, String) {
+/// A record that says `failed` itself, and what it has counted.
+fn plain(record: &Value, counted: &str) -> (Result<String, String>, String) {
     let own = ["commit", "toolchain", "date"];
     let members: Vec<(&str, &Value)> = record.members().filter(|(name, _)| !own.contains(name)).collect();
     let mut details = String::from("<div class=\"wide\"><table>");
+    let mut lists = String::new();
     for (name, value) in &members {
-        let _ =
-            writeln!(details, "<tr><th>{}</th><td>{}</td></tr>", text(&name.replace('_', " ")), shown(value));
+        let title = text(&name.replace('_', " "));
+        match value.items() {
+            [first @ Value::Object(_), ..] => {
+                let names: Vec<&str> = first.members().map(|(name, _)| name).collect();
+                let _ = writeln!(lists, "<h3>{title}</h3>");
+                lists += &table(&names, &names, value.items());
+            }
+            _ => drop(writeln!(details, "<tr><th>{title}</th><td>{}</td></tr>", shown(value))),
+        }
     }
     details += "</table></div>\n";
-    let first = members.iter().find(|(_, value)| matches!(value, Value::Number(_)));
-    let words = first.map_or_else(String::new, |(name, value)| format!("{} {}", shown(value), text(name)));
-    let verdict = match record.get("failed") {
-        Value::Null | Value::Bool(false) => Ok(words),
-        Value::Number(count) if count == "0" => Ok(words),
-        failed => Err(format!("{words}, {} failed", shown(failed))),
+    details += &lists;
+    let words = format!("{} {}", shown(record.get(counted)), text(counted));
+    let verdict = match record.get(counted) {
+        Value::Number(_) => none(record, "failed", words),
+        _ => Err("the record counts nothing".into()),
     };
     (verdict, details)
 }
@@ -427,8 +436,8 @@ nav{display:grid;grid-template-columns:repeat(auto-fill,minmax(13rem,1fr));gap:.
 .verdict{border-left:.35rem solid var(--mark);padding-left:.6rem;font-weight:600}
 .origin,.key{color:var(--none);font-size:.85rem;overflow-wrap:anywhere}
 .wide{overflow-x:auto}
-table{border-collapse:collapse;font-variant-numeric:tabular-nums}
-th,td{border-bottom:1px solid var(--line);padding:.2rem .6rem;text-align:left;white-space:nowrap}
+table{border-collapse:collapse;margin-bottom:.8rem;font-variant-numeric:tabular-nums}
+th,td{border-bottom:1px solid var(--line);padding:.2rem .6rem;text-align:left;vertical-align:top}th{white-space:nowrap}
 svg{width:100%;min-width:34rem;font-size:12px}
 svg text{fill:var(--fg)}
 .key i{display:inline-block;width:.8rem;height:.8rem;margin:0 .2rem 0 .8rem}
