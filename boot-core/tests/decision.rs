@@ -8,6 +8,7 @@ use boot_core::flash::run;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use model::ModelFlash;
+use shared_abi::handoff::ResetCause;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
 use shared_abi::warm_start::{BootRequest, Owed};
@@ -27,6 +28,14 @@ fn policy() -> Policy {
 
 /// A program of 64 bytes as a download leaves it, and its check.
 fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedProgram, Invalid> {
+    check_record(signed, false, damage)
+}
+
+fn check_record(
+    signed: bool,
+    confirmed: bool,
+    damage: impl FnOnce(&mut ModelFlash),
+) -> Result<VerifiedProgram, Invalid> {
     let mut flash = ModelFlash::new(LAYOUT.chip);
     let mut bytes = vec![0xA5; 64];
     bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
@@ -39,7 +48,7 @@ fn check(signed: bool, damage: impl FnOnce(&mut ModelFlash)) -> Result<VerifiedP
         size: 64,
         crc: boot_core::crc32(&bytes),
         signed,
-        confirmed: false,
+        confirmed,
         version: 0,
         half_erased: false,
     };
@@ -134,4 +143,80 @@ fn any_damage_to_a_program_keeps_it_from_starting() {
         check(true, |flash| flash.poke(0x0801_0040, &[0])).is_ok(),
         "what lies behind its size is not its own"
     );
+}
+
+/// docs/architecture.md: resets without a request count, a power-on and the reset pin begin anew
+/// below the limit, and a request begins anew.
+#[test]
+fn resets_in_a_row_are_counted_until_somebody_asks() {
+    use ResetCause::{
+        BrownOut, IndependentWatchdog, LowPower, Pin, PowerOn, Software, Unknown, WindowWatchdog,
+    };
+    let policy = policy();
+    for cause in [Software, IndependentWatchdog, WindowWatchdog, LowPower] {
+        for (before, after) in [(0, 1), (2, 3), (3, 4), (u32::MAX, u32::MAX)] {
+            assert_eq!(policy.crash_resets(before, cause, None), after, "{cause:?}");
+        }
+    }
+    for cause in [PowerOn, Pin, BrownOut, Unknown] {
+        for (before, after) in [(0, 0), (2, 0), (3, 3), (4, 4)] {
+            assert_eq!(policy.crash_resets(before, cause, None), after, "{cause:?}");
+        }
+    }
+    for (request, after) in [
+        (BootRequest::Stay, 0),
+        (BootRequest::Start(1), 0),
+        (BootRequest::Trial(1), 0),
+        (BootRequest::PowerOn, 0),
+        (BootRequest::Fault, 2),
+        (BootRequest::Resume(1), 2),
+    ] {
+        assert_eq!(policy.crash_resets(2, Software, Some(request)), after, "{request:?}");
+    }
+}
+
+/// A program that starts by itself is held back, as long as its confirmation says; one that was
+/// asked for is not.
+#[test]
+fn the_rescue_window_is_for_a_start_that_nobody_asked_for() {
+    let policy = Policy { rescue_window_ms: 300, rescue_window_confirmed_ms: 20, ..policy() };
+    assert_eq!(decide(&QUIET, &policy, |_| signed()), BootDecision::Hold { program: 1, window_ms: 300 });
+    for request in
+        [BootRequest::Start(1), BootRequest::Resume(1), BootRequest::Confirm(1), BootRequest::PowerOn]
+    {
+        let asked = Circumstances { request: Some(request), ..QUIET };
+        let start = BootDecision::Start { program: signed().unwrap(), trial: false };
+        assert_eq!(decide(&asked, &policy, |_| signed()), start, "{request:?}");
+    }
+    let confirmed = || check_record(true, true, |_| {});
+    assert_eq!(decide(&QUIET, &policy, |_| confirmed()), BootDecision::Hold { program: 1, window_ms: 20 });
+    let policy = Policy { rescue_window_confirmed_ms: 0, ..policy };
+    let start = BootDecision::Start { program: confirmed().unwrap(), trial: false };
+    assert_eq!(decide(&QUIET, &policy, |_| confirmed()), start);
+}
+
+#[test]
+fn a_fault_of_the_bootloader_and_the_product_s_own_check_keep_it_there() {
+    let fault = Circumstances { request: Some(BootRequest::Fault), ..QUIET };
+    assert_eq!(decide(&fault, &policy(), |_| signed()), BootDecision::Stay(StayReason::Fault));
+    let forbids = Policy { start_allowed: |number| number != 1, ..policy() };
+    for request in [None, Some(BootRequest::Start(1)), Some(BootRequest::Trial(1))] {
+        let asked = Circumstances { request, ..QUIET };
+        assert_eq!(decide(&asked, &forbids, |_| signed()), BootDecision::Stay(StayReason::Unsigned));
+    }
+    // Just below the limit.
+    let crashes = Circumstances { crash_resets: 2, ..QUIET };
+    assert!(matches!(decide(&crashes, &policy(), |_| signed()), BootDecision::Start { .. }));
+}
+
+/// The numbers of docs/protocol.md; the host tool has names for them.
+#[test]
+fn reasons_have_their_numbers() {
+    use StayReason::{CrashLoop, Fault, NoAutostart, NodeId, Program, Requested, Rescue, Strap, Unsigned};
+    let all =
+        [Requested, Strap, CrashLoop, NoAutostart, NodeId, Unsigned, Program(Invalid::Absent), Fault, Rescue];
+    for (number, reason) in (0..).zip(all) {
+        assert_eq!(reason.code(), number, "{reason:?}");
+        assert_eq!(StayReason::is_trouble(number), matches!(reason, CrashLoop | Fault), "{reason:?}");
+    }
 }

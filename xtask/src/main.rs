@@ -33,6 +33,7 @@ mod layout;
 mod links;
 mod lint;
 mod modules;
+mod mutants;
 mod new_board;
 mod opinion;
 mod pack;
@@ -165,6 +166,12 @@ const JOBS: &[Job] = &[
         about: "cut the power at every flash operation, and look what is there",
         help: powercut::HELP,
         run: powercut::run,
+    },
+    Job {
+        name: "mutants",
+        about: "changes of the code that a test must notice",
+        help: mutants::HELP,
+        run: mutants::run,
     },
     Job {
         name: "evidence",
