@@ -3,7 +3,6 @@
 //!
 //! Where they agree, or where the bootloader can tell them apart, one binary serves all of them:
 //! [`STANDARD`](Profile::STANDARD).
-//! [`STANDARD`](Profile::STANDARD).
 
 use canopen::program::{
     BOOTLOADER_DEVICE_TYPE, ESACADEMY_DEVICE_TYPE, ESACADEMY_NODE_ID, LIFT_DEVICE_TYPE, LIFT_NODE_ID,

@@ -146,7 +146,6 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     ///
     /// # Errors
     /// The file cannot be written.
-    /// The file cannot be written.
     pub fn work(
         &mut self,
         now: Instant,

@@ -106,7 +106,6 @@ impl Bench {
     ///
     /// # Panics
     /// As [`with`](Self::with), and for zero boards.
-    /// As [`with`](Self::with), and for no board at all.
     #[must_use]
     pub fn of_boards(count: u32) -> Self {
         let options = |n| {
@@ -157,7 +156,6 @@ impl Bench {
     ///
     /// # Panics
     /// If the firmware uses none.
-    /// If it uses none.
     pub fn usart(&mut self) -> &mut Usart {
         let mut usarts = self.machine().usarts_mut().iter_mut();
         usarts.find(|usart| usart.accesses() > 0).expect("firmware that uses a USART")
@@ -222,7 +220,6 @@ impl Bench {
     /// as a debug probe could: each sector must then be erased before anything can be written.
     ///
     /// # Panics
-    /// Never: the layout's programs are in flash.
     /// Never: the layout's programs are in flash.
     pub fn soil_programs(&mut self) {
         let board = firmware::board();

@@ -104,7 +104,7 @@ fn as_json(counts: &BTreeMap<String, [u32; 4]>) -> String {
         );
     }
     format!(
-        "{{\"viable\": {}, \"caught\": {noticed}, \"missed\": {missed}, \"unviable\": {}, \"failed\": 0, \"files\": [{rows}]}}",
+        "{{\"viable\": {}, \"caught\": {noticed}, \"missed\": {missed}, \"unviable\": {}, \"files\": [{rows}]}}",
         noticed + missed,
         sum(3)
     )

@@ -115,7 +115,6 @@ impl Held {
 /// nothing in the device.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] and others; a missing object is not an error.
 /// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
 pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error> {
     const RUNNING: u32 = ProgramState::Running as u32;

@@ -59,7 +59,7 @@ const PARTS: &[Part] = &[
         title: "Mutants",
         command: "cargo xtask mutants",
         about: "Changes of the code that the tests must notice.",
-        show: |record| plain(record, "viable"),
+        show: mutants,
     },
     Part {
         name: "bench",
@@ -395,6 +395,13 @@ fn size(record: &Value) -> (Result<String, String>, String) {
         _ => Err(format!("{over} images are over their budget")),
     };
     (verdict, table(&names, &names, rows))
+}
+
+fn mutants(record: &Value) -> (Result<String, String>, String) {
+    let (_, details) = plain(record, "viable");
+    let share = number(record, "caught") / number(record, "viable") * 100.0;
+    let words = format!("{share:.1} % of {} noticed", shown(record.get("viable")));
+    (if share >= 90.0 { Ok(words) } else { Err(words) }, details)
 }
 
 /// A record that says `failed` itself, and what it has counted.
