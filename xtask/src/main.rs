@@ -46,6 +46,7 @@ mod portable;
 mod powercut;
 mod process;
 mod record;
+mod reproduce;
 mod rooms;
 mod sbom;
 mod setup;
@@ -166,6 +167,12 @@ const JOBS: &[Job] = &[
         about: "cut the power at every flash operation, and look what is there",
         help: powercut::HELP,
         run: powercut::run,
+    },
+    Job {
+        name: "reproduce",
+        about: "two clones in two folders give the same firmware",
+        help: reproduce::HELP,
+        run: reproduce::run,
     },
     Job {
         name: "mutants",

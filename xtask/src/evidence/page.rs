@@ -69,6 +69,13 @@ const PARTS: &[Part] = &[
         show: bench,
     },
     Part {
+        name: "reproduce",
+        title: "Reproducible builds",
+        command: "cargo xtask reproduce",
+        about: "Two clones in two folders give the same firmware.",
+        show: |record| plain(record, "compared"),
+    },
+    Part {
         name: "size",
         title: "Size",
         command: "cargo xtask size",
