@@ -34,6 +34,41 @@ fn a_program_goes_in_block_by_block_and_survives_a_restart() {
     assert_eq!((bench.word(IDENTIFICATION), bench.status()), (block_crc(&image), 0));
 }
 
+#[test]
+fn a_program_may_fill_its_region_and_not_a_byte_more() {
+    let size = PROGRAM.size as usize;
+    let image = program(size, 0x12);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&image);
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    assert_eq!(flash.cells(PROGRAM), image);
+    assert_eq!(autostart(&flash), Ok(0x12));
+    // In one download.
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.stream(&image, Some(PROGRAM.size), 7), (Ok(()), 0));
+    assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
+
+    // The last block is behind the end by a byte, or by all of it; and so is a program size.
+    for behind in [1, 16] {
+        assert_eq!(bench.command(CLEAR), 0);
+        let file = block_file(&image, 96);
+        for block in &file[..file.len() - 2] {
+            bench.good(block);
+        }
+        let number = file.len() as u32 - 2;
+        let wrong = block(number, PROGRAM.end() - 16 + behind, &[0; 16]);
+        let (outcome, status) = bench.block(&wrong);
+        assert!(outcome.is_err() && status != 0, "{behind}: {outcome:?}, {status:#x}");
+    }
+    let longer = program(size + 4, 0x13);
+    assert_eq!(bench.command(CLEAR), 0);
+    let (outcome, status) = bench.stream(&longer, None, 7);
+    assert!(outcome.is_err() && status != 0, "{outcome:?}, {status:#x}");
+    assert_eq!(autostart(&flash), Err(Invalid::Absent));
+}
+
 /// CRC-32 of the digits 1 to 9, from the CRC catalogue (CRC-32/ISO-HDLC, "check").
 #[test]
 fn the_crc_is_the_one_of_the_catalogue() {
