@@ -183,10 +183,10 @@ fn number(value: &Value, name: &str) -> f64 {
 }
 
 /// A table of these members of objects.
-fn table(head: &[&str], names: &[&str], rows: &[Value]) -> String {
+fn table(names: &[&str], rows: &[Value]) -> String {
     let mut table = String::from("<div class=\"wide\"><table><tr>");
-    for title in head {
-        let _ = write!(table, "<th>{title}</th>");
+    for name in names {
+        let _ = write!(table, "<th>{}</th>", text(&name.replace('_', " ")));
     }
     for row in rows {
         table += "</tr>\n<tr>";
@@ -209,7 +209,7 @@ fn tests(record: &Value) -> (Result<String, String>, String) {
     let passed = format!("{} passed", shown(record.get("passed")));
     let rows = [record.clone()];
     let head = ["passed", "failed", "skipped", "programs", "seconds"];
-    (none(record, "failed", passed), table(&head, &head, &rows))
+    (none(record, "failed", passed), table(&head, &rows))
 }
 
 fn powercut(record: &Value) -> (Result<String, String>, String) {
@@ -224,33 +224,19 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
     for board in boards {
         let _ = writeln!(details, "<h3>{}</h3>", shown(board.get("board")));
         let scenarios = board.get("scenarios").items();
-        details += &table(
-            &[
-                "level",
-                "scenario",
-                "operations",
-                "points",
-                "states",
-                "recoveries",
-                "bootloader",
-                "old program",
-                "new program",
-                "violations",
-            ],
-            &[
-                "level",
-                "scenario",
-                "operations",
-                "points",
-                "states",
-                "recoveries",
-                "bootloader",
-                "old_program",
-                "new_program",
-                "violations",
-            ],
-            scenarios,
-        );
+        let names = [
+            "level",
+            "scenario",
+            "operations",
+            "points",
+            "states",
+            "recoveries",
+            "bootloader",
+            "old_program",
+            "new_program",
+            "violations",
+        ];
+        details += &table(&names, scenarios);
         for scenario in scenarios.iter().filter(|scenario| scenario.get("scenario").text() == Some("update"))
         {
             details += &map(scenario.get("map"));
@@ -343,7 +329,7 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
         .collect();
     let head = ["target", "inputs", "seconds", "edges", "corpus"];
     let verdict = format!("{} inputs without a fault, at least {} a target", of(inputs), of(fewest));
-    (if rows.is_empty() { Err("no target ran".into()) } else { Ok(verdict) }, table(&head, &head, &rows))
+    (if rows.is_empty() { Err("no target ran".into()) } else { Ok(verdict) }, table(&head, &rows))
 }
 
 fn bench(record: &Value) -> (Result<String, String>, String) {
@@ -381,12 +367,11 @@ fn bench(record: &Value) -> (Result<String, String>, String) {
         .fold(0.0, f64::max);
     let verdict = format!("at most {slowest:.2} times what wire or flash takes");
     let fleets = record.get("fleets").items();
-    let head = ["boards", "way", "block size", "one lost in", "us"];
     let names = ["boards", "way", "block_size", "lost_one_in", "measured_us"];
     if downloads.is_empty() {
         return (Err("no row".into()), String::new());
     }
-    (Ok(verdict), svg + "<h3>Several boards</h3>\n" + &table(&head, &names, fleets))
+    (Ok(verdict), svg + "<h3>Several boards</h3>\n" + &table(&names, fleets))
 }
 
 fn size(record: &Value) -> (Result<String, String>, String) {
@@ -401,7 +386,7 @@ fn size(record: &Value) -> (Result<String, String>, String) {
         0 if !rows.is_empty() => Ok(format!("at most {:.1} % of the budget", fullest * 100.0)),
         _ => Err(format!("{over} images are over their budget")),
     };
-    (verdict, table(&names, &names, rows))
+    (verdict, table(&names, rows))
 }
 
 fn mutants(record: &Value) -> (Result<String, String>, String) {
@@ -423,7 +408,7 @@ fn plain(record: &Value, counted: &str) -> (Result<String, String>, String) {
             [first @ Value::Object(_), ..] => {
                 let names: Vec<&str> = first.members().map(|(name, _)| name).collect();
                 let _ = writeln!(lists, "<h3>{title}</h3>");
-                lists += &table(&names, &names, value.items());
+                lists += &table(&names, value.items());
             }
             _ => drop(writeln!(details, "<tr><th>{title}</th><td>{}</td></tr>", shown(value))),
         }
