@@ -5,6 +5,7 @@
 //! |---|---|
 //! | `device` | level 1: `boot-core` on the flash model, as the bootloader runs it |
 //! | `scenario` | the actions on the device, and the permitted states after a cut |
+//! | `point` | the names of points |
 //! | `points` | cuts, checks and counts |
 //! | [`board`] | level 2: the built firmware in the emulator |
 //!
@@ -15,6 +16,7 @@ mod device;
 #[path = "../../boot-core/tests/model/mod.rs"]
 #[allow(missing_docs, reason = "it is the tests' own")]
 pub mod model;
+mod point;
 mod points;
 mod scenario;
 

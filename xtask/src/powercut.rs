@@ -1,6 +1,7 @@
 //! `cargo xtask powercut`: tests that no power cut bricks a device.
 
 use std::fs;
+use std::process::Command;
 
 use shared_abi::layout::{Layout, BOARDS};
 
@@ -42,18 +43,30 @@ pub fn run(mut args: Args) -> Outcome {
         .chain(point.iter().flatten().cloned())
         .collect();
     if point.is_some() {
-        return cut(board, &only, json, None).map(drop);
+        return process::run(&mut command(board, &only)?);
     }
     evidence::begin("powercut")?;
-    let mut boards = vec![cut(board, &only, json, Some("powercut"))?];
+    let (mut boards, mut problems) = (Vec::new(), Vec::new());
+    let mut cut = |board, only: &[String]| -> Outcome {
+        let counts = evidence::file_for("powercut");
+        let mut powercut = command(board, only)?;
+        // A violation is a result, too.
+        problems.extend(
+            process::run(powercut.args(json.then_some("--json")).arg("--evidence").arg(&counts)).err(),
+        );
+        let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
+        boards.push(fs::read_to_string(&counts).map_err(unread)?);
+        Ok(())
+    };
+    cut(board, &only)?;
     if full && !chosen_board {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
-            boards.push(cut(other, &["--tenth".to_owned()], json, Some("powercut"))?);
+            cut(other, &["--tenth".to_owned()])?;
         }
     }
     evidence::record("powercut", &format!("{{\"full\": {full}, \"boards\": [{}]}}", boards.join(",\n")))?;
-    Ok(())
+    problems.into_iter().next().map_or(Ok(()), Err)
 }
 
 /// Whether a board has a chip or a number of programs that no board before it has.
@@ -63,20 +76,13 @@ fn is_of_its_own(board: &Layout) -> bool {
     BOARDS.iter().find(alike).is_some_and(|first| first.board == board.board)
 }
 
-/// Cuts the power on a board; returns the counts as JSON, if they are to be kept.
-fn cut(board: &Layout, arguments: &[String], json: bool, keep: Option<&str>) -> Outcome<String> {
+/// The program that cuts the power on a board, after its images were built.
+fn command(board: &Layout, arguments: &[String]) -> Outcome<Command> {
     let images = build::all(board)?;
-    let kept = keep.map(evidence::file_for);
     let mut powercut = process::cargo("run");
     powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]).args(arguments);
-    powercut.args(json.then_some("--json"));
-    if let Some(file) = &kept {
-        powercut.arg("--evidence").arg(file);
-    }
     powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
-    process::run(&mut powercut)?;
-    let Some(file) = kept else { return Ok(String::new()) };
-    fs::read_to_string(&file).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&file)))
+    Ok(powercut)
 }
 
 #[cfg(test)]

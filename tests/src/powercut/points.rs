@@ -9,6 +9,7 @@ use std::sync::Mutex;
 
 use super::device::{Bug, Device, Outcome};
 use super::model::{quiet_power_cuts, until_power_cut, Cut};
+use super::point::{self, At};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
 
 /// The number of violations that a report describes.
@@ -26,15 +27,8 @@ const KINDS: [(&str, Cut); 6] = [
     ("all-but-one-bit", Cut::Unstable(9)),
 ];
 
-/// One cut: the number of the flash operation, counted from the power-on, and the way.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct At {
-    operation: u32,
-    kind: usize,
-}
-
 /// A point of the proof: a scenario, a cut, and possibly another one in the recovery. Written as
-/// `update:37:torn` or `update:37:torn:12:after`.
+/// `update:37:torn` or `update:37:torn:12:after`; operations are counted from the power-on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Point {
     scenario: &'static str,
@@ -44,11 +38,7 @@ pub struct Point {
 
 impl fmt::Display for Point {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}", self.scenario)?;
-        for at in [Some(self.first), self.second].into_iter().flatten() {
-            write!(f, ":{}:{}", at.operation, KINDS[at.kind].0)?;
-        }
-        Ok(())
+        point::write(f, self.scenario, [Some(self.first), self.second], |kind| KINDS[kind].0)
     }
 }
 
@@ -56,29 +46,9 @@ impl FromStr for Point {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let mut words = text.split(':');
-        let name = words.next().unwrap_or_default();
-        let scenario = SCENARIOS.iter().find(|scenario| scenario.name == name).ok_or_else(|| {
-            let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
-            format!("{name:?} is no scenario; there are {}.", names.join(", "))
-        })?;
-        let mut at = || -> Result<Option<At>, String> {
-            let Some(operation) = words.next() else { return Ok(None) };
-            let operation =
-                operation.parse().map_err(|_| format!("{operation:?} is no number of an operation."))?;
-            let kind = words.next().unwrap_or_default();
-            let kind = KINDS.iter().position(|(name, _)| *name == kind).ok_or_else(|| {
-                let names: Vec<_> = KINDS.iter().map(|(name, _)| *name).collect();
-                format!("{kind:?} is no way to cut; there are {}.", names.join(", "))
-            })?;
-            Ok(Some(At { operation, kind }))
-        };
-        let first = at()?.ok_or("a point names an operation: update:37:torn.")?;
-        let point = Self { scenario: scenario.name, first, second: at()? };
-        match words.next() {
-            None => Ok(point),
-            Some(more) => Err(format!("{more:?}: a point has two cuts at most.")),
-        }
+        let scenarios: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
+        let (scenario, first, second) = point::read(text.split(':'), &scenarios, &KINDS.map(|(way, _)| way))?;
+        Ok(Self { scenario, first, second })
     }
 }
 

@@ -21,6 +21,7 @@ use std::sync::Mutex;
 
 use emulator::machine::{Cells, Cut, Operation};
 
+use super::point::{self, At};
 use super::points::{Report, TOLD};
 use crate::bench::{Bench, RESCUE_WINDOW_MS};
 use crate::firmware;
@@ -46,15 +47,8 @@ const KINDS: [(&str, Cut); 5] = [
     ("unstable", Cut::Unstable { seed: 9 }),
 ];
 
-/// A cut: the flash operation, counted from 0, and the way.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct At {
-    operation: usize,
-    kind: usize,
-}
-
 /// A cut in a scenario, and possibly another one in the recovery. Written as
-/// `board:update:37:torn` or `board:update:37:torn:12:after`.
+/// `board:update:37:torn` or `board:update:37:torn:12:after`; operations are counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
     scenario: &'static str,
@@ -64,11 +58,8 @@ pub struct Point {
 
 impl fmt::Display for Point {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{NAME}:{}", self.scenario)?;
-        for at in [Some(self.first), self.second].into_iter().flatten() {
-            write!(f, ":{}:{}", at.operation, KINDS[at.kind].0)?;
-        }
-        Ok(())
+        write!(f, "{NAME}:")?;
+        point::write(f, self.scenario, [Some(self.first), self.second], |kind| KINDS[kind].0)
     }
 }
 
@@ -76,35 +67,13 @@ impl FromStr for Point {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let words: Vec<&str> = text.split(':').collect();
-        let scenario = |name: &str| {
-            SCENARIOS.iter().map(|scenario| scenario.name).find(|known| *known == name).ok_or_else(|| {
-                let names: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
-                format!("{name:?} is no scenario of a board; there are {}.", names.join(", "))
-            })
-        };
-        let at = |operation: &str, kind: &str| -> Result<At, String> {
-            let operation =
-                operation.parse().map_err(|_| format!("{operation:?} is no number of an operation."))?;
-            let kind = KINDS.iter().position(|(name, _)| *name == kind).ok_or_else(|| {
-                let names: Vec<_> = KINDS.iter().map(|(name, _)| *name).collect();
-                format!("{kind:?} is no way to cut; there are {}.", names.join(", "))
-            })?;
-            Ok(At { operation, kind })
-        };
-        match words[..] {
-            [NAME, name, operation, kind] => {
-                Ok(Self { scenario: scenario(name)?, first: at(operation, kind)?, second: None })
-            }
-            [NAME, name, operation, kind, later, its_kind] => Ok(Self {
-                scenario: scenario(name)?,
-                first: at(operation, kind)?,
-                second: Some(at(later, its_kind)?),
-            }),
-            _ => Err(format!(
-                "{text:?} is no point: {NAME}:update:37:torn, or {NAME}:update:37:torn:12:after."
-            )),
-        }
+        let words = text.strip_prefix(NAME).and_then(|rest| rest.strip_prefix(':'));
+        let words =
+            words.ok_or_else(|| format!("{text:?} is no point of a board: {NAME}:update:37:torn."))?;
+        let scenarios: Vec<_> = SCENARIOS.iter().map(|scenario| scenario.name).collect();
+        let (scenario, first, second) =
+            point::read(words.split(':'), &scenarios, &KINDS.map(|(way, _)| way))?;
+        Ok(Self { scenario, first, second })
     }
 }
 
@@ -157,7 +126,7 @@ fn record(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Vec<Operati
 fn behind(before: &Cells, operations: &[Operation], at: At) -> Option<Cells> {
     let chip = firmware::board().chip;
     let mut cells = before.clone();
-    let (last, done) = operations.get(..=at.operation)?.split_last()?;
+    let (last, done) = operations.get(..=at.operation as usize)?.split_last()?;
     for operation in done {
         cells.apply(operation, chip, Cut::After);
     }
@@ -175,7 +144,7 @@ fn hash(cells: &Cells) -> u64 {
 fn mark(report: &mut Report<Point>, at: At, letter: u8) {
     let operations = report.operations as usize;
     let row = report.map.entry(KINDS[at.kind].0).or_insert_with(|| vec![b'.'; operations]);
-    row[at.operation] = letter;
+    row[at.operation as usize] = letter;
 }
 
 /// The proof for one scenario.
@@ -249,7 +218,8 @@ impl Proof<'_> {
             }
             let mut cells = before.clone();
             cells.apply(&self.operations[number], chip, *cut);
-            let point = Point { scenario: self.name, first: At { operation: number, kind }, second: None };
+            let point =
+                Point { scenario: self.name, first: At { operation: number as u32, kind }, second: None };
             if self.is_new(&cells) {
                 let found = self.inspect(bench, &cells);
                 self.count(point, found);
@@ -282,11 +252,11 @@ impl Proof<'_> {
         let mut before = cells.clone();
         for (number, operation) in operations.iter().enumerate() {
             if Effort::takes(self.effort.cut_again, number, operations.len()) {
-                let kind = 1 + (point.first.operation + number) % (KINDS.len() - 1);
+                let kind = 1 + (point.first.operation as usize + number) % (KINDS.len() - 1);
                 let mut cells = before.clone();
                 cells.apply(operation, chip, KINDS[kind].1);
                 if self.is_new(&cells) {
-                    let point = Point { second: Some(At { operation: number, kind }), ..point };
+                    let point = Point { second: Some(At { operation: number as u32, kind }), ..point };
                     let found = self.inspect(bench, &cells);
                     self.count(point, found);
                 }
@@ -340,7 +310,7 @@ pub fn prove(name: &'static str, story: &Story, operations: &[Operation], effort
                         if turn % threads == thread {
                             let run = AssertUnwindSafe(|| proof.at_operation(&mut bench, number, &before));
                             if catch_unwind(run).is_err() {
-                                let first = At { operation: number, kind: 0 };
+                                let first = At { operation: number as u32, kind: 0 };
                                 proof.count(
                                     Point { scenario: name, first, second: None },
                                     Err("a panic".into()),
