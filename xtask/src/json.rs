@@ -23,6 +23,19 @@ pub enum Value {
     Object(BTreeMap<String, Value>),
 }
 
+/// Text as a JSON string.
+pub fn quoted(text: &str) -> String {
+    let mut string = String::from("\"");
+    for letter in text.chars() {
+        match letter {
+            '"' | '\\' => string.extend(['\\', letter]),
+            letter if letter.is_control() => string += &format!("\\u{:04x}", u32::from(letter)),
+            letter => string.push(letter),
+        }
+    }
+    string + "\""
+}
+
 /// The greatest permitted depth of nesting. It is deeper than in any file of cargo's, and keeps
 /// hostile text from exhausting the stack.
 const MAX_DEPTH: usize = 64;
@@ -212,6 +225,13 @@ mod tests {
         assert_eq!(value.get("d"), &Value::Null);
         assert_eq!(value.get("e"), &Value::Bool(true));
         assert_eq!(value.get("nothing").get("at").get("all").text(), None);
+    }
+
+    #[test]
+    fn text_is_quoted_so_that_it_is_read_again() {
+        for text in ["", "a \"b\" \\ é", "\n\t\u{1}"] {
+            assert_eq!(Value::parse(&quoted(text)).unwrap().text(), Some(text));
+        }
     }
 
     #[test]

@@ -1,32 +1,91 @@
 //! `cargo xtask mutants`: would the tests notice a mistake?
 
+mod reasons;
+
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::fs;
-use std::path::Path;
 use std::process::Command;
 
 use crate::args::Args;
+use crate::json::{quoted, Value};
 use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N]
 
 Changes the code of the crates that the device is made of, in one place at a time (cargo-mutants), and
-runs the crate's own tests: each change must make one fail. Prints what no test noticed, and counts;
-they go to target/evidence/mutants.json.
+runs the tests of that crate: each change must make one fail. Prints what no test noticed, and counts;
+they go to target/evidence/mutants.json. It fails if a group of files has too few of its changes
+noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
 
-  --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal
-  --file GLOB     the changes in these files alone, as '**/store/*.rs'
-  --shard K/N     every N-th change, beginning with the K-th from 0: a sample
+  --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal;
+                  what was measured of the others of this commit is kept
+  --file GLOB     the changes in these files alone, as '**/store/*.rs'; nothing is recorded
+  --shard K/N     every N-th change, beginning with the K-th from 0: a sample; nothing is recorded
 
-All of it takes many hours. cargo-mutants is installed into target/tools where it is missing.
+All of it takes hours. cargo-mutants is installed into target/tools where it is missing.
 ";
 
 /// The version to install if there is none.
 const VERSION: &str = "27.1.0";
+
+/// One run of cargo-mutants.
+struct Run {
+    package: &'static str,
+    /// The files to change, as globs; all if it is empty.
+    files: &'static [&'static str],
+    /// The files that another run changes.
+    but: &'static [&'static str],
+    features: &'static str,
+    /// The package with the tests, if it is not the one that is changed, and its test programs.
+    tests: Option<(&'static str, &'static [&'static str])>,
+}
+
+impl Run {
+    const fn of(package: &'static str) -> Self {
+        Self { package, files: &[], but: &[], features: "", tests: None }
+    }
+}
+
+/// Code that stands only in a bootloader for sealed images. Its tests need images with signatures,
+/// which the crate of the emulated tests makes.
+const SEALED: &[&str] = &["boot-core/src/unseal/*.rs", "boot-core/src/intake/sealed.rs"];
+/// Code in place of that and of resume, in which there is nothing to do.
+const ABSENT: &str = "boot-core/src/*/absent.rs";
+
 /// The crates without an operating system below them.
-const PACKAGES: [&str; 5] = ["coboot-abi", "coboot-canopen", "coboot-core", "coboot-app", "coboot-seal"];
+const RUNS: &[Run] = &[
+    Run::of("coboot-abi"),
+    Run::of("coboot-canopen"),
+    Run { but: &[SEALED[0], SEALED[1], ABSENT], ..Run::of("coboot-core") },
+    Run {
+        files: SEALED,
+        but: &[ABSENT],
+        features: "sealed",
+        tests: Some(("coboot-tests", &["sealed_model"])),
+        ..Run::of("coboot-core")
+    },
+    Run::of("coboot-app"),
+    Run::of("coboot-seal"),
+];
+
+/// Where a mistake costs a device: what decides, what is stored, and what checks a signature.
+const STRICT: [&str; 6] = [
+    "boot-core/src/store/",
+    "boot-core/src/decision.rs",
+    "boot-core/src/programmer/",
+    "boot-core/src/control/",
+    "shared-abi/src/callgate.rs",
+    "seal/src/",
+];
+/// The least share of the changes that the tests notice there, and elsewhere, in percent.
+const LIMITS: [(&str, f64); 2] = [("strict", 95.0), ("other", 90.0)];
+
+/// The group of a file: an index into [`LIMITS`].
+fn group(file: &str) -> usize {
+    usize::from(!STRICT.iter().any(|part| file.starts_with(part)))
+}
 
 /// What became of a change, with the file in which cargo-mutants lists it.
 const ENDS: [(&str, &str); 4] = [
@@ -37,97 +96,242 @@ const ENDS: [(&str, &str); 4] = [
     ("unviable", "unviable.txt"),
 ];
 
+/// The counts of one file.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+struct Row {
+    package: String,
+    caught: u32,
+    /// Unnoticed, with a reason.
+    named: u32,
+    /// Unnoticed, without one.
+    missed: u32,
+    unviable: u32,
+}
+
+type Rows = BTreeMap<String, Row>;
+
 pub fn run(mut args: Args) -> Outcome {
     let (package, file, shard) = (args.value("--package")?, args.value("--file")?, args.value("--shard")?);
+    // The jobs of the night have it in common; nothing is installed by a package manager.
+    let _ = args.flag("--yes");
     args.none_left()?;
-    let packages: Vec<&str> = match &package {
-        None => PACKAGES.to_vec(),
-        Some(name) => match PACKAGES.iter().find(|known| *known == name) {
-            Some(known) => vec![known],
-            None => return Err(format!("there is no crate \"{name}\"; there is: {}.", PACKAGES.join(", "))),
-        },
-    };
+    let is_chosen = |run: &&Run| package.as_deref().is_none_or(|name| name == run.package);
+    let runs: Vec<&Run> = RUNS.iter().filter(is_chosen).collect();
+    if let (Some(name), []) = (&package, &runs[..]) {
+        let mut known: Vec<&str> = RUNS.iter().map(|run| run.package).collect();
+        known.dedup();
+        return Err(format!("there is no crate \"{name}\"; there is: {}.", known.join(", ")));
+    }
     let path = setup::tool("cargo-mutants", VERSION)?;
-    evidence::begin("mutants")?;
-    let mut counts: BTreeMap<String, [u32; 4]> = BTreeMap::new();
-    for package in packages {
-        let out = workspace::target_dir().join("mutants").join(package);
+    let is_sample = file.is_some() || shard.is_some();
+    let mut rows = match package {
+        Some(package) => kept(evidence::recorded("mutants").as_ref(), &evidence::commit(), &package),
+        None => Rows::new(),
+    };
+    if !is_sample {
+        evidence::record("mutants", &as_json(&rows, true))?;
+    }
+    let mut unnamed = Vec::new();
+    for (number, run) in runs.iter().enumerate() {
+        let out = workspace::target_dir().join("mutants").join(format!("{}-{number}", run.package));
         let _ = fs::remove_dir_all(&out);
         fs::create_dir_all(&out)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&out)))?;
         let mut mutants = Command::new("cargo-mutants");
         mutants.env("PATH", &path).current_dir(workspace::root());
-        mutants.args(["mutants", "--package", package, "--output"]).arg(&out);
-        mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2"]);
-        mutants.args(file.iter().flat_map(|glob| ["--file", glob]));
+        // One crate is built again for each change: what was built before counts, and nobody
+        // debugs it.
+        mutants.envs([("CARGO_INCREMENTAL", "1"), ("CARGO_PROFILE_DEV_DEBUG", "0")]);
+        mutants.args(["mutants", "--package", run.package, "--output"]).arg(&out);
+        mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2", "--timeout-multiplier", "3"]);
+        // The compiler computes the constants: a change can make it compute for ever.
+        mutants.arg("--build-timeout=180");
+        let files = file.as_deref().map_or(run.files.to_vec(), |glob| vec![glob]);
+        mutants.args(files.iter().flat_map(|glob| ["--file", glob]));
+        mutants.args(run.but.iter().flat_map(|glob| ["--exclude", glob]));
         mutants.args(shard.iter().flat_map(|part| ["--shard", part]));
-        // It fails if a change was missed, which is a result.
+        if !run.features.is_empty() {
+            mutants.args(["--features", run.features]);
+        }
+        if let Some((package, programs)) = run.tests {
+            mutants.args(["--test-package", package, "--"]);
+            mutants.args(programs.iter().flat_map(|program| ["--test", program]));
+        }
+        // It fails if a change was missed, or a build took too long, which are results.
         let status = mutants.status().map_err(|error| process::not_started(&mutants, &error))?;
         let known = [0, 2, 3];
         if !status.code().is_some_and(|code| known.contains(&code)) {
             return Err(format!("cargo-mutants failed ({status}); what it printed above says why."));
         }
-        for (end, (_, list)) in ENDS.iter().enumerate() {
+        for (end, list) in ENDS {
             let list = fs::read_to_string(out.join("mutants.out").join(list)).unwrap_or_default();
-            for file in list.lines().filter_map(file_of) {
-                counts.entry(file).or_default()[end] += 1;
+            for (line, (file, change)) in list.lines().filter_map(|line| Some((line, parts(line)?))) {
+                let row = rows.entry(file.clone()).or_default();
+                run.package.clone_into(&mut row.package);
+                match end {
+                    "unviable" => row.unviable += 1,
+                    "missed" if reason(&file, change).is_some() => row.named += 1,
+                    "missed" => {
+                        row.missed += 1;
+                        unnamed.push(line.to_owned());
+                    }
+                    _ => row.caught += 1,
+                }
             }
         }
-        print_missed(&out.join("mutants.out/missed.txt"));
     }
-    evidence::record("mutants", &as_json(&counts)).map(drop)
+    if !unnamed.is_empty() {
+        println!("\nNo test noticed, and no reason is given for:\n{}\n", unnamed.join("\n"));
+    }
+    let mut low = Vec::new();
+    for (group_index, (name, limit)) in LIMITS.iter().enumerate() {
+        let (caught, viable) = sums(&rows, group_index);
+        println!("{name}: {caught} of {viable} noticed, {:.1} %; at least {limit} %", share(caught, viable));
+        if share(caught, viable) < *limit {
+            low.push(*name);
+        }
+    }
+    if is_sample {
+        return Ok(());
+    }
+    evidence::record("mutants", &as_json(&rows, false))?;
+    match (&low[..], unnamed.len()) {
+        ([], 0) => Ok(()),
+        ([], count) => Err(format!("no test noticed {count} changes that have no reason; they stand above.")),
+        (low, _) => Err(format!("too few changes were noticed in: {}.", low.join(", "))),
+    }
 }
 
-/// The file of a line of a list: `boot-core/src/flash.rs:12:5: replace ...`.
-fn file_of(line: &str) -> Option<String> {
-    let (file, _) = line.split_once(".rs:")?;
-    Some(format!("{}.rs", file.replace('\\', "/")))
+/// The file and the change of a line of a list: `boot-core/src/flash.rs:12:5: replace ...`.
+fn parts(line: &str) -> Option<(String, &str)> {
+    let (file, rest) = line.split_once(".rs:")?;
+    let change = rest.splitn(3, ':').nth(2)?.trim();
+    Some((format!("{}.rs", file.replace('\\', "/")), change))
 }
 
-fn print_missed(list: &Path) {
-    let missed = fs::read_to_string(list).unwrap_or_default();
-    if !missed.is_empty() {
-        println!("\nNo test noticed:\n{missed}");
+/// Why no test can notice a change, or need not.
+fn reason(file: &str, change: &str) -> Option<&'static str> {
+    let is_it = |named: &&(&str, &str, &'static str)| named.0 == file && named.1 == change;
+    reasons::REASONS.iter().find(is_it).map(|(_, _, why)| *why)
+}
+
+fn sums(rows: &Rows, of: usize) -> (u32, u32) {
+    let chosen = rows.iter().filter(|(file, _)| group(file) == of).map(|(_, row)| row);
+    chosen.fold((0, 0), |(caught, viable), row| {
+        (caught + row.caught, viable + row.caught + row.named + row.missed)
+    })
+}
+
+fn share(caught: u32, viable: u32) -> f64 {
+    if viable == 0 {
+        100.0
+    } else {
+        f64::from(caught) / f64::from(viable) * 100.0
     }
 }
 
-fn as_json(counts: &BTreeMap<String, [u32; 4]>) -> String {
-    let sum = |end: usize| counts.values().map(|ends| ends[end]).sum::<u32>();
-    let (noticed, missed) = (sum(0) + sum(2), sum(1));
-    let mut rows = String::new();
-    for (n, (file, [caught, missed, timeout, unviable])) in counts.iter().enumerate() {
-        let comma = if n == 0 { "" } else { "," };
-        let _ = write!(
-            rows,
-            "{comma}\n{{\"file\": \"{file}\", \"caught\": {}, \"missed\": {missed}, \"unviable\": {unviable}}}",
-            caught + timeout
-        );
+/// What was recorded of the other packages of this commit.
+fn kept(record: Option<&Value>, commit: &str, package: &str) -> Rows {
+    let Some(record) = record.filter(|record| record.get("commit").text() == Some(commit)) else {
+        return Rows::new();
+    };
+    let count = |row: &Value, name| row.get(name).number().map(|count| count as u32);
+    let row = |row: &Value| {
+        let package = row.get("package").text()?.to_owned();
+        let [caught, named, missed, unviable] =
+            ["caught", "named", "missed", "unviable"].map(|name| count(row, name));
+        let counts = Row { package, caught: caught?, named: named?, missed: missed?, unviable: unviable? };
+        Some((row.get("file").text()?.to_owned(), counts))
+    };
+    let rows = record.get("files").items().iter().filter_map(row);
+    rows.filter(|(_, row)| row.package != package).collect()
+}
+
+fn as_json(rows: &Rows, is_unfinished: bool) -> String {
+    let mut text = String::from("{");
+    if is_unfinished {
+        text += "\"unfinished\": true, ";
     }
-    format!(
-        "{{\"viable\": {}, \"caught\": {noticed}, \"missed\": {missed}, \"unviable\": {}, \"files\": [{rows}]}}",
-        noticed + missed,
-        sum(3)
-    )
+    let groups = LIMITS.iter().enumerate().map(|(index, (name, limit))| {
+        let (caught, viable) = sums(rows, index);
+        let share = share(caught, viable);
+        format!(
+            "{{\"group\": {}, \"viable\": {viable}, \"caught\": {caught}, \"percent\": {share:.1}, \"least\": {limit}}}",
+            quoted(name)
+        )
+    });
+    let _ = write!(text, "\"groups\": [{}]", groups.collect::<Vec<_>>().join(", "));
+    let files = rows.iter().map(|(file, Row { package, caught, named, missed, unviable })| {
+        format!(
+            "\n{{\"file\": {}, \"package\": {}, \"caught\": {caught}, \"named\": {named}, \"missed\": {missed}, \"unviable\": {unviable}}}",
+            quoted(file),
+            quoted(package)
+        )
+    });
+    let _ = write!(text, ", \"files\": [{}]", files.collect::<Vec<_>>().join(","));
+    let sum = |of: fn(&Row) -> u32| rows.values().map(of).sum::<u32>();
+    let _ = write!(
+        text,
+        ", \"viable\": {}, \"caught\": {}, \"named\": {}, \"missed\": {}}}",
+        sum(|row| row.caught + row.named + row.missed),
+        sum(|row| row.caught),
+        sum(|row| row.named),
+        sum(|row| row.missed)
+    );
+    text
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::json::Value;
 
     #[test]
-    fn a_line_names_its_file() {
+    fn a_line_names_its_file_and_its_change() {
         let line = "boot-core/src/store/mod.rs:12:5: replace Journal::open -> Self with Default::default()";
-        assert_eq!(file_of(line).as_deref(), Some("boot-core/src/store/mod.rs"));
-        assert_eq!(file_of("nothing"), None);
+        let (file, change) = parts(line).unwrap();
+        assert_eq!(file, "boot-core/src/store/mod.rs");
+        assert_eq!(change, "replace Journal::open -> Self with Default::default()");
+        assert_eq!(parts("nothing"), None);
     }
 
     #[test]
-    fn what_never_ends_is_noticed() {
-        let counts = BTreeMap::from([("a.rs".to_owned(), [5, 1, 2, 3]), ("b.rs".to_owned(), [1, 0, 0, 0])]);
-        let value = Value::parse(&as_json(&counts)).unwrap();
-        let number = |name| value.get(name).number();
-        assert_eq!(["viable", "caught", "missed", "unviable"].map(number), [9.0, 8.0, 1.0, 3.0].map(Some));
-        assert_eq!(value.get("files").items()[0].get("caught").number(), Some(7.0));
+    fn the_files_of_a_group_are_those_that_the_device_stands_on() {
+        let groups = ["boot-core/src/store/node.rs", "boot-core/src/decision.rs", "boot-core/src/queue.rs"];
+        assert_eq!(groups.map(group), [0, 0, 1]);
+        for part in STRICT {
+            assert!(workspace::root().join(part).exists(), "{part}");
+        }
+    }
+
+    #[test]
+    fn every_reason_is_of_a_file_that_is_there() {
+        for (file, change, why) in reasons::REASONS {
+            assert!(workspace::root().join(file).is_file(), "{file}");
+            assert!(!change.is_empty() && why.ends_with('.'), "{file}: {change}");
+        }
+    }
+
+    #[test]
+    fn what_is_recorded_is_kept_for_the_same_commit_and_another_package() {
+        let row = |package: &str, caught, missed| Row {
+            package: package.into(),
+            caught,
+            named: 1,
+            missed,
+            unviable: 3,
+        };
+        let rows = Rows::from([
+            ("seal/src/lib.rs".to_owned(), row("a", 17, 2)),
+            ("canopen/src/lib.rs".to_owned(), row("b", 9, 0)),
+        ]);
+        let text = as_json(&rows, false).replacen('{', "{\"commit\": \"12\", ", 1);
+        let record = Value::parse(&text).unwrap();
+        assert_eq!(record.get("viable").number(), Some(30.0));
+        assert_eq!(record.get("groups").items()[0].get("percent").number(), Some(85.0));
+        assert_eq!(record.get("groups").items()[1].get("percent").number(), Some(90.0));
+        let files = |rows: Rows| rows.into_keys().collect::<Vec<_>>();
+        assert_eq!(kept(Some(&record), "12", "c"), rows);
+        assert_eq!(files(kept(Some(&record), "12", "a")), ["canopen/src/lib.rs"]);
+        assert!(kept(Some(&record), "13", "c").is_empty() && kept(None, "12", "c").is_empty());
     }
 }

@@ -390,10 +390,24 @@ fn size(record: &Value) -> (Result<String, String>, String) {
 }
 
 fn mutants(record: &Value) -> (Result<String, String>, String) {
-    let (_, details) = plain(record, "viable");
-    let share = number(record, "caught") / number(record, "viable") * 100.0;
-    let words = format!("{share:.1} % of {} noticed", shown(record.get("viable")));
-    (if share >= 90.0 { Ok(words) } else { Err(words) }, details)
+    let groups = record.get("groups").items();
+    let words = groups.iter().map(|group| {
+        format!(
+            "{} % of {} ({})",
+            shown(group.get("percent")),
+            shown(group.get("viable")),
+            shown(group.get("group"))
+        )
+    });
+    let words = format!("noticed: {}", words.collect::<Vec<_>>().join(", "));
+    let is_low = |group: &Value| {
+        number(group, "percent").partial_cmp(&number(group, "least")).is_none_or(Ordering::is_lt)
+    };
+    let is_good = !groups.is_empty() && !groups.iter().any(is_low) && number(record, "missed") == 0.0;
+    let names = ["group", "viable", "caught", "percent", "least"];
+    let of_files = ["file", "caught", "named", "missed", "unviable"];
+    let details = table(&names, groups) + &table(&of_files, record.get("files").items());
+    (if is_good { Ok(words) } else { Err(words) }, details)
 }
 
 /// A record that says `failed` itself, and what it has counted.

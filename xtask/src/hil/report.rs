@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use crate::json::quoted;
 use crate::Outcome;
 
 /// The outcome of a step.
@@ -114,22 +115,6 @@ impl Report {
             self.conform.as_deref().unwrap_or("null").trim()
         )
     }
-}
-
-/// A JSON string.
-fn quoted(text: &str) -> String {
-    let mut quoted = String::from("\"");
-    for character in text.chars() {
-        match character {
-            '"' | '\\' => quoted.extend(['\\', character]),
-            '\n' => quoted += "\\n",
-            control if u32::from(control) < 0x20 => {
-                let _ = write!(quoted, "\\u{:04x}", u32::from(control));
-            }
-            _ => quoted.push(character),
-        }
-    }
-    quoted + "\""
 }
 
 #[cfg(test)]
