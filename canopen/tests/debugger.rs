@@ -3,9 +3,10 @@
 mod memory;
 
 use canopen::debugger::{Command, Kind, Stop, COMMAND, DATA, PIECE};
+use canopen::frame::Channel;
 use canopen::sdo::client::{Block, Config, Download, Step, Transfer, Upload};
 use canopen::sdo::SdoError;
-use canopen::{AbortCode, Address};
+use canopen::{AbortCode, Address, CobId, Frame};
 use embedded_can::Frame as _;
 use memory::{at, node, request, Target, RAM, ROM, SIZE};
 use proptest::collection::vec;
@@ -204,6 +205,22 @@ fn a_stop_is_told_by_an_emergency() {
     // The device's own emergencies are passed on.
     assert_eq!(target.poll(0).unwrap().data(), [0, 0xFF, 0, 1, 2, 3, 4, 5]);
     assert_eq!(target.poll(0), None);
+}
+
+/// The second server of a device (1201h) serves the interface, too: without the forwarding, a
+/// device with both would not answer a group download.
+#[test]
+fn the_second_server_of_the_device_answers() {
+    let mut target = Target::new();
+    let (ask, answer) = (CobId::new(0x6DF).unwrap(), CobId::new(0x681).unwrap());
+    let question = Frame::of(ask, &[0x40, 0x25, 0x10, 0x02, 0, 0, 0, 0]);
+    target.handle(&question, 0);
+    assert_eq!(target.poll(0), None);
+    target.device.second = Some(Channel { request: ask, response: answer });
+    target.handle(&question, 0);
+    assert_eq!(target.poll(0), Some(Frame::of(answer, &[0x4F, 0x25, 0x10, 0x02, 0, 0, 0, 0])));
+    // The first server still answers with its own COB-ID.
+    assert_eq!(status(&mut target), 0);
 }
 
 proptest! {

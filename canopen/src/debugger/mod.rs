@@ -33,7 +33,7 @@ use core::task::Poll;
 
 use crate::abort::AbortCode;
 use crate::bit_rate::BitRate;
-use crate::frame::NodeId;
+use crate::frame::{Channel, NodeId};
 use crate::line::LineEvent;
 use crate::lss::{LssDevice, StoreError};
 use crate::od::{put, Access, Address, DataType, Entry, Objects};
@@ -291,6 +291,10 @@ pub struct Debugged<'a, D, M> {
 }
 
 impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
+    fn has_second_server() -> bool {
+        D::has_second_server()
+    }
+
     /// The device's entries, which include [`ENTRIES`].
     fn entries(&self) -> &'static [Entry] {
         self.device.entries()
@@ -350,6 +354,10 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
         } else {
             self.device.download_cancel(at);
         }
+    }
+
+    fn second_server(&self) -> Channel {
+        self.device.second_server()
     }
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {

@@ -5,6 +5,7 @@
 use core::task::Poll;
 
 use canopen::debugger::{Command, Debugger, Kind, Memory, ENTRIES, PIECE};
+use canopen::frame::Channel;
 use canopen::lss::{LssDevice, StoreError};
 use canopen::node::{Config, Node};
 use canopen::od::{put, Entry};
@@ -104,9 +105,15 @@ impl Memory for Model {
 pub struct Plain {
     pub register: u8,
     pub emergency: Option<[u8; 8]>,
+    /// The COB-IDs of its second SDO server, if it has one.
+    pub second: Option<Channel>,
 }
 
 impl Objects for Plain {
+    fn has_second_server() -> bool {
+        true
+    }
+
     fn entries(&self) -> &'static [Entry] {
         &ENTRIES
     }
@@ -116,6 +123,10 @@ impl Objects for Plain {
             0x1001 => put(buf, &[self.register]),
             _ => panic!("{at} is none of its objects"),
         }
+    }
+
+    fn second_server(&self) -> Channel {
+        self.second.unwrap_or(Channel::NONE)
     }
 
     fn next_emergency(&mut self) -> Option<[u8; 8]> {
