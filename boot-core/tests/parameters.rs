@@ -3,7 +3,8 @@
 mod model;
 
 use boot_core::flash::{run, Flash, FlashFault, Operation};
-use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
+use canopen::{BitRate, NodeId};
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -201,4 +202,349 @@ fn a_store_that_is_asked_while_the_flash_works_is_caught() {
     store(&mut flash, &mut journal, Key::CrashCount, [1; 4]).unwrap();
     flash.start(Operation::Program { address: 0x0800_0300, word: 0 }).unwrap();
     let _ = journal.get(&flash, Key::CrashCount);
+}
+
+// --- the bytes
+
+const MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
+const SLOT: u32 = 24;
+
+fn header(sequence: u32) -> Vec<u8> {
+    slot([MAGIC, sequence, !sequence, 1, u32::MAX])
+}
+
+fn record(key: Key, [a, b, c, d]: Value) -> Vec<u8> {
+    slot([key.tag(), a, b, c, d])
+}
+
+/// The used slots of a region, one after another; everything behind them is blank.
+fn used(flash: &ModelFlash, region: Region, slots: usize) -> &[u8] {
+    let (used, rest) = flash.cells(region).split_at(slots * SLOT as usize);
+    assert!(rest.iter().all(|byte| *byte == 0xFF), "there is more than {slots} slots");
+    used
+}
+
+/// docs/adr/0004: a device in the field is read by every later bootloader.
+#[test]
+fn the_first_values_stand_behind_a_header_in_the_first_region() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+    store(&mut flash, &mut journal, Key::CrashCount, [2, 0, 0, 0]).unwrap();
+    let expected = [header(1), record(Key::Node, [5, 1, 0, 0]), record(Key::CrashCount, [2, 0, 0, 0])];
+    assert_eq!(used(&flash, REGIONS[0], 3), expected.concat());
+    used(&flash, REGIONS[1], 0);
+    assert!(flash.touched.iter().all(|touched| touched.size == 4), "a new device needs no erase");
+}
+
+#[test]
+fn the_tags_are_those_of_devices_in_the_field() {
+    let tags = [Key::Program(1), Key::Program(254), Key::CrashCount, Key::Node].map(Key::tag);
+    assert_eq!(tags, [0x0001_0001, 0x0001_00FE, 0x0002_0000, 0x0003_0000]);
+}
+
+/// 256 bytes are ten slots: a header and nine records. The tenth record needs the other region.
+#[test]
+fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    let stores = [
+        (Key::Node, [5, 1, 0, 0]),
+        (Key::Program(1), [1; 4]),
+        (Key::CrashCount, [1, 0, 0, 0]),
+        (Key::Program(1), [2; 4]),
+        (Key::Program(2), [3; 4]),
+        (Key::CrashCount, [2, 0, 0, 0]),
+        (Key::Program(1), [4; 4]),
+        (Key::CrashCount, [3, 0, 0, 0]),
+        (Key::Program(2), [5; 4]),
+    ];
+    for (key, value) in stores {
+        store(&mut flash, &mut journal, key, value).unwrap();
+    }
+    used(&flash, REGIONS[1], 0);
+    flash.touched.clear();
+    store(&mut flash, &mut journal, Key::Node, [6, 2, 0, 0]).unwrap();
+    let expected = [
+        header(2),
+        record(Key::Node, [5, 1, 0, 0]),
+        record(Key::Program(1), [4; 4]),
+        record(Key::CrashCount, [3, 0, 0, 0]),
+        record(Key::Program(2), [5; 4]),
+        record(Key::Node, [6, 2, 0, 0]),
+    ];
+    assert_eq!(used(&flash, REGIONS[1], 6), expected.concat());
+    // The header comes behind the copies, and the new record behind the header.
+    let sectors: Vec<u32> = flash.touched.iter().filter(|at| at.size > 4).map(|at| at.base).collect();
+    assert_eq!(sectors, [REGIONS[1].base]);
+    let slots: Vec<u32> =
+        flash.touched[1..].chunks(6).map(|words| (words[0].base - REGIONS[1].base) / SLOT).collect();
+    assert_eq!(slots, [1, 2, 3, 4, 0, 5]);
+    // The next ones follow, and the next compaction goes back to the first region.
+    for count in 4..9 {
+        store(&mut flash, &mut journal, Key::CrashCount, [count, 0, 0, 0]).unwrap();
+    }
+    assert_eq!(flash.cells(REGIONS[0])[..24], header(3));
+    let journal = Journal::open(&flash, REGIONS);
+    assert_eq!(journal.get(&flash, Key::Node), Some([6, 2, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::CrashCount), Some([8, 0, 0, 0]));
+}
+
+/// What stands in a region without a header is not a value: neither at once, nor when the region
+/// gets a header.
+#[test]
+fn what_was_left_in_a_region_never_becomes_a_value() {
+    let leftover = record(Key::Program(1), [9; 4]);
+    for slots_before in 1..10 {
+        let mut flash = ModelFlash::new(&SMALL);
+        flash.poke(REGIONS[0].base + slots_before * SLOT, &leftover);
+        let mut journal = Journal::open(&flash, REGIONS);
+        assert_eq!(journal.get(&flash, Key::Program(1)), None);
+        store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+        for journal in [journal, Journal::open(&flash, REGIONS)] {
+            assert_eq!(journal.get(&flash, Key::Program(1)), None, "slot {slots_before}");
+            assert_eq!(journal.get(&flash, Key::Node), Some([5, 1, 0, 0]), "slot {slots_before}");
+        }
+    }
+    // The same in the region that a compaction goes to: power failed before its header was written.
+    let mut flash = ModelFlash::new(&SMALL);
+    flash.poke(REGIONS[0].base, &header(7));
+    for n in 1..10 {
+        flash.poke(REGIONS[0].base + n * SLOT, &record(Key::CrashCount, [n, 0, 0, 0]));
+    }
+    flash.poke(REGIONS[1].base + 4 * SLOT, &leftover);
+    let mut journal = Journal::open(&flash, REGIONS);
+    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+    let journal = Journal::open(&flash, REGIONS);
+    assert_eq!(journal.get(&flash, Key::Program(1)), None);
+    assert_eq!(journal.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::Node), Some([5, 1, 0, 0]));
+}
+
+#[test]
+fn the_region_with_the_later_sequence_number_counts_also_across_its_wrap() {
+    for (first, second, latest) in [
+        (7, 8, 1),
+        (8, 7, 0),
+        (u32::MAX, 0, 1),
+        (0, u32::MAX, 0),
+        (0x7FFF_FFFF, 0x8000_0000, 1),
+        (1, 1, 0),
+        (0, 0, 0),
+    ] {
+        let mut flash = ModelFlash::new(&SMALL);
+        for (n, (region, sequence)) in (0..).zip(REGIONS.into_iter().zip([first, second])) {
+            flash.poke(region.base, &header(sequence));
+            flash.poke(region.base + SLOT, &record(Key::Node, [10 + n, 0, 0, 0]));
+        }
+        let journal = Journal::open(&flash, REGIONS);
+        let what = format!("{first:#x}, {second:#x}");
+        assert_eq!(journal.get(&flash, Key::Node), Some([10 + latest, 0, 0, 0]), "{what}");
+        // The next region to be valid gets the next number.
+        let mut journal = journal;
+        for n in 0..10 {
+            store(&mut flash, &mut journal, Key::CrashCount, [n, 0, 0, 0]).unwrap();
+        }
+        let next = if latest == 0 { first } else { second }.wrapping_add(1);
+        assert_eq!(flash.cells(REGIONS[1 - latest as usize])[..24], header(next), "{what}");
+    }
+}
+
+/// A header counts if its CRC and its inverted sequence number are right; a record if its CRC is.
+#[test]
+fn a_header_or_a_record_with_any_wrong_bit_does_not_count() {
+    let mut good = header(7);
+    good.extend(record(Key::Node, [5, 1, 0, 0]));
+    let read = |bytes: &[u8]| {
+        let mut flash = ModelFlash::new(&SMALL);
+        flash.poke(REGIONS[1].base, bytes);
+        Journal::open(&flash, REGIONS).get(&flash, Key::Node)
+    };
+    assert_eq!(read(&good), Some([5, 1, 0, 0]));
+    for bit in 0..good.len() * 8 {
+        let mut bad = good.clone();
+        bad[bit / 8] ^= 1 << (bit % 8);
+        assert_eq!(read(&bad), None, "bit {bit}");
+    }
+    let sound_but_wrong = slot([MAGIC, 7, !8, 1, u32::MAX]);
+    assert_eq!(read(&[&sound_but_wrong[..], &good[24..]].concat()), None);
+}
+
+/// A power cut may have left bits of the header between 0 and 1: the first store after a start
+/// writes it again, and only that one.
+#[test]
+fn the_first_store_after_a_start_writes_the_header_again() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+    let mut journal = Journal::open(&flash, REGIONS);
+    let mut written = |key| {
+        flash.touched.clear();
+        store(&mut flash, &mut journal, key, [1, 0, 0, 0]).unwrap();
+        let slots = flash.touched.chunks(6).map(|words| (words[0].base - REGIONS[0].base) / SLOT);
+        slots.collect::<Vec<_>>()
+    };
+    assert_eq!(written(Key::CrashCount), [0, 2]);
+    assert_eq!(written(Key::CrashCount), [3]);
+}
+
+// --- flash that does not take everything
+
+/// A flash of which some places lose a bit of each word that is programmed.
+struct Worn {
+    flash: ModelFlash,
+    places: Vec<Region>,
+}
+
+impl Flash for Worn {
+    fn read(&self, address: u32, buffer: &mut [u8]) {
+        self.flash.read(address, buffer);
+    }
+
+    fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        self.flash.start(match operation {
+            Operation::Program { address, word } if self.places.iter().any(|at| at.contains(address, 4)) => {
+                // The lowest 1 becomes 0; a word without one is programmed as it is.
+                Operation::Program { address, word: word & word.wrapping_sub(1) }
+            }
+            other => other,
+        })
+    }
+
+    fn poll(&mut self) -> std::task::Poll<Result<(), FlashFault>> {
+        self.flash.poll()
+    }
+
+    fn sector_at(&self, address: u32) -> Option<shared_abi::geometry::Sector> {
+        self.flash.sector_at(address)
+    }
+}
+
+fn store_worn(flash: &mut Worn, journal: &mut Journal, value: Value) -> Result<(), StoreError> {
+    journal.store(Key::Node, value);
+    run(flash, |flash, outcome| journal.next(flash, outcome))
+}
+
+/// A place that does not hold a record is passed over. (Where the header and the copies of a
+/// compaction belong, there is no other place: then the store fails, and the value before it stays.)
+#[test]
+fn a_worn_out_slot_costs_a_slot_and_no_value() {
+    for slot in 0..10 {
+        let flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        let mut worn = Worn { flash, places: vec![Region::new(REGIONS[1].base + slot * SLOT, SLOT)] };
+        let mut stored = None;
+        for n in 1..40 {
+            let outcome = store_worn(&mut worn, &mut journal, [n; 4]);
+            if slot > 1 {
+                assert_eq!(outcome, Ok(()), "slot {slot}, value {n}");
+            }
+            match outcome {
+                Ok(()) => stored = Some([n; 4]),
+                Err(error) => assert_eq!(error, StoreError::WornOut),
+            }
+            for journal in [&journal, &Journal::open(&worn, REGIONS)] {
+                assert_eq!(journal.get(&worn, Key::Node), stored, "slot {slot}, value {n}");
+            }
+        }
+    }
+}
+
+/// A store ends, whatever the flash does, and the value before it stays.
+#[test]
+fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    store(&mut flash, &mut journal, Key::Node, [1; 4]).unwrap();
+    let before = flash.operations;
+    // Behind the header and the first record, and all of the other region.
+    let rest = Region::new(REGIONS[0].base + 2 * SLOT, 256 - 2 * SLOT);
+    let mut worn = Worn { flash, places: vec![rest, REGIONS[1]] };
+    for attempt in 1..4 {
+        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut), "{attempt}");
+        for journal in [&journal, &Journal::open(&worn, REGIONS)] {
+            assert_eq!(journal.get(&worn, Key::Node), Some([1; 4]), "{attempt}");
+        }
+        // Eight attempts, each with a word that does not read back, and an erase for those that
+        // change the region; the ninth gives up.
+        assert!(worn.flash.operations - before <= attempt * 9 * 2, "{}", worn.flash.operations - before);
+    }
+}
+
+/// The first region is worn out from the start: what is refused is told, and nothing is believed.
+#[test]
+fn a_device_whose_regions_are_worn_out_stores_nothing_and_says_so() {
+    for places in [vec![REGIONS[0]], REGIONS.to_vec()] {
+        let flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        let mut worn = Worn { flash, places };
+        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut));
+        assert_eq!(Journal::open(&worn, REGIONS).get(&worn, Key::Node), None);
+    }
+}
+
+// --- the stored forms
+
+#[test]
+fn node_id_and_bit_rate_are_read_if_the_firmware_knows_them() {
+    let board = NodeParameters { id: NodeId::new(42), bit_rate: BitRate::K500 };
+    let load = |value: Option<Value>, supports: fn(BitRate) -> bool| {
+        let mut flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        if let Some(value) = value {
+            store(&mut flash, &mut journal, Key::Node, value).unwrap();
+        }
+        NodeParameters::load(&journal, &flash, board, supports)
+    };
+    let node = |id, bit_rate| NodeParameters { id, bit_rate };
+    assert_eq!(load(None, |_| true), board);
+    for id in [1, 2, 126, 127] {
+        // CiA 305: index 4 is 125 kbit/s.
+        assert_eq!(load(Some([id, 4, 0, 0]), |_| true), node(NodeId::new(id as u8), BitRate::K125), "{id}");
+    }
+    assert_eq!(load(Some([0xFF, 0, 0, 0]), |_| true), node(None, BitRate::K1000));
+    for id in [0, 128, 254, 256, 257, u32::MAX] {
+        assert_eq!(load(Some([id, 4, 0, 0]), |_| true), board, "{id}");
+    }
+    for rate in [10, 255, 256, 260, u32::MAX] {
+        assert_eq!(load(Some([5, rate, 0, 0]), |_| true), board, "{rate}");
+    }
+    assert_eq!(load(Some([5, 4, 0, 0]), |rate| rate != BitRate::K125), board, "not supported");
+    let values = [node(None, BitRate::K1000), node(NodeId::new(127), BitRate::K125)].map(|node| node.value());
+    assert_eq!(values, [[0xFF, 0, 0, 0], [127, 4, 0, 0]]);
+}
+
+/// A record's words: size with the flag of a half erased program above it, CRC, flags, version.
+#[test]
+fn the_record_of_a_program_has_its_words() {
+    let flags = |word: &[u8; 4]| u32::from_le_bytes(*word);
+    for (signed, confirmed, word) in [
+        (false, false, 0),
+        (true, false, flags(b"APP1")),
+        (false, true, flags(b"RUN0")),
+        (true, true, flags(b"RUN1")),
+    ] {
+        for (half_erased, first) in [(false, 0x0000_1234), (true, 0x8000_1234)] {
+            let record = ProgramRecord {
+                size: 0x1234,
+                crc: 0xCAFE_F00D,
+                signed,
+                confirmed,
+                version: 77,
+                half_erased,
+                #[cfg(feature = "sealed")]
+                seal: None,
+            };
+            assert_eq!(record.value(), [first, 0xCAFE_F00D, word, 77]);
+            assert_eq!(ProgramRecord::from_value(record.value()), Some(record));
+        }
+    }
+    // Nearly a flag is no flag; no size is no program.
+    for word in [1, flags(b"APP0"), flags(b"RUN2"), u32::MAX] {
+        let record = ProgramRecord::from_value([64, 0, word, 0]).unwrap();
+        assert!(!record.signed && !record.confirmed, "{word:#x}");
+    }
+    for first in [0, 0x8000_0000] {
+        assert_eq!(ProgramRecord::from_value([first, 1, flags(b"APP1"), 1]), None);
+    }
 }
