@@ -140,12 +140,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.programmer.unsealer_mut()
     }
 
-    /// Whether sub-index `program` of 1F50h, 1F51h, 1F56h and 1F57h exists.
-    #[must_use]
-    pub fn has(&self, program: u8) -> bool {
-        self.program(program).is_some()
-    }
-
     /// 1F57h. It is busy while a command of this program is carried out, or while no further block
     /// can be accepted.
     #[must_use]

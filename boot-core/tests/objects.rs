@@ -1,0 +1,472 @@
+//! What the objects say, and what the device does beside a download: each object of each program,
+//! emergencies, layer setting services, the second server, and commands in each other's way.
+
+mod bench;
+#[path = "../../tests/src/ihex.rs"]
+#[allow(dead_code, reason = "the rig needs its records")]
+mod ihex;
+mod model;
+mod rig;
+
+use std::task::Poll;
+
+use bench::{Bench, CONFIG, CONTROL};
+use boot_core::bootloader::Config;
+use boot_core::control::{Policy, Step};
+use boot_core::flash::FlashFault;
+use boot_core::store::{Journal, Key, NodeParameters, Parameters};
+use canopen::lss::{LssDevice, StoreError};
+use canopen::od::{Address, Objects};
+use canopen::slave::SlaveDevice;
+use canopen::{AbortCode, BitRate, NodeId};
+use model::{ModelFlash, CHIP};
+use rig::{crc32, program, Rig, Setup, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID};
+use shared_abi::label;
+use shared_abi::warm_start::BootRequest;
+
+const START: u8 = 0x01;
+const CLEAR: u8 = 0x03;
+const SET_SIGNATURE: u8 = 0x83;
+const CLR_SIGNATURE: u8 = 0x84;
+/// 1F57h: busy; NO_ACCESS with it would be another word.
+const BUSY: u32 = 1;
+
+/// CiA 301 table 22 and the manual's table of aborts: the device is in another state.
+const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
+const NO_SUB_INDEX: AbortCode = AbortCode(0x0609_0011);
+
+fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
+    program(setup.region(number), PRODUCT_CODE, len, number)
+}
+
+fn read(rig: &mut Rig, index: u16, sub: u8) -> Result<Vec<u8>, AbortCode> {
+    let mut bytes = [0; 64];
+    let len = rig.node.read(Address::new(index, sub), &mut bytes)?;
+    Ok(bytes[..len].to_vec())
+}
+
+fn word(value: u32) -> Result<Vec<u8>, AbortCode> {
+    Ok(value.to_le_bytes().to_vec())
+}
+
+// --- the objects of a program
+
+/// 2004h: address and size. 1F51h, 1F56h, 1F57h, 2005h: what is stored, of this program and no other.
+#[test]
+fn each_program_has_its_own_values_and_no_other_exists() {
+    let mut rig = Rig::new(&STANDARD_2, 1024);
+    let empty = |rig: &mut Rig, number| {
+        assert_eq!((rig.state(number), rig.identification(number), rig.status(number)), (3, 0, 0));
+        assert_eq!(rig.word(0x2005, number), 0);
+    };
+    empty(&mut rig, 1);
+    empty(&mut rig, 2);
+    let images = [raw(&STANDARD_2, 1, 700), raw(&STANDARD_2, 2, 900)];
+    rig.install(2, &images[1]);
+    empty(&mut rig, 1);
+    rig.install(1, &images[0]);
+    for _ in 0..2 {
+        for (number, image) in (1..).zip(&images) {
+            assert_eq!(rig.state(number), 0);
+            assert_eq!(rig.identification(number), crc32(image));
+            // The label of an image has its number as version.
+            assert_eq!(rig.word(0x2005, number), number.into());
+            let region = STANDARD_2.region(number);
+            let value = [region.base.to_le_bytes(), region.size.to_le_bytes()].concat();
+            assert_eq!(read(&mut rig, 0x2004, number), Ok(value));
+        }
+        rig.reset();
+    }
+    for number in [0, 3, 254, 255] {
+        assert_eq!(rig.command(number, START), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!(rig.begin(number, None, &[]), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!(rig.node.upload_start(Address::new(0x1F50, number)), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!((rig.state(number), rig.word(0x2005, number)), (3, 0), "{number}");
+        assert_eq!(read(&mut rig, 0x2004, number), Ok(vec![0; 8]), "{number}");
+    }
+}
+
+/// The label must lie inside the program: bytes behind it are none of its own.
+#[test]
+fn a_label_counts_from_the_first_size_that_holds_it() {
+    let whole = (label::OFFSET as usize) + label::SIZE;
+    for (size, version) in [(whole - 1, 0), (whole, 1), (whole + 1, 1)] {
+        let mut rig = Rig::new(&STANDARD_1, 1024);
+        let image = raw(&STANDARD_1, 1, whole + 4);
+        rig.install(1, &image[..size]);
+        assert_eq!(rig.word(0x2005, 1), version, "{size}");
+        assert_eq!(rig.identification(1), crc32(&image[..size]));
+    }
+}
+
+/// The version in a control block takes precedence over that of the label.
+#[test]
+fn a_control_block_names_the_version() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let image = raw(&STANDARD_1, 1, 600);
+    for (told, version) in [(0, 1), (77, 77)] {
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        // Manual L-1112d_10, figure 13: size, vendor-ID, product code, version, date.
+        let control = rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
+        let mut last = 600_u32.to_le_bytes().to_vec();
+        last.extend(crc32(&image).to_le_bytes());
+        for block in [
+            rig::block(0, 0, &control),
+            rig::block(1, STANDARD_1.region(1).base, &image),
+            rig::block(u32::MAX, 0, &last),
+        ] {
+            rig.send(1, &block).unwrap();
+            rig.settle();
+        }
+        assert_eq!((rig.state(1), rig.status(1)), (0, 0));
+        assert_eq!(rig.word(0x2005, 1), version);
+    }
+}
+
+/// Flash that is not written reads FFh, and belongs to the program: it is erased for it, too.
+#[test]
+fn a_hole_in_a_program_is_erased_with_it() {
+    let region = STANDARD_1.region(1);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 0x2C00));
+    let (first, last) = (raw(&STANDARD_1, 1, 256), [0x5A; 16]);
+    // The record of the end is cut off from the first data, and the end from the second.
+    let head = String::from_utf8(rig::hex(region.base, &first)).unwrap();
+    let tail = String::from_utf8(rig::hex(region.base + 0x2800, &last)).unwrap();
+    let text = head.lines().take(17).chain(tail.lines()).collect::<Vec<_>>().join("\n") + "\n";
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, text.as_bytes()).unwrap();
+    rig.settle();
+    assert_eq!((rig.state(1), rig.status(1)), (0, 0));
+    let mut whole = vec![0xFF; 0x2810];
+    whole[..256].copy_from_slice(&first);
+    whole[0x2800..].copy_from_slice(&last);
+    assert_eq!(rig.cells(1)[..whole.len()], whole);
+    assert_eq!(rig.identification(1), crc32(&whole));
+}
+
+// --- commands in each other's way
+
+/// While a program is programmed or checked, the other one is not touched and does not start.
+#[test]
+fn a_command_for_the_other_program_waits_for_the_end_of_a_download() {
+    let image = raw(&STANDARD_2, 1, 3000);
+    let mut installed = Rig::new(&STANDARD_2, 1024);
+    installed.install(2, &raw(&STANDARD_2, 2, 600));
+    let before = installed.cells(2);
+    for steps in 0..60 {
+        for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+            let mut rig = Rig::on(&STANDARD_2, 4096, installed.chip.model().clone());
+            rig.command(1, CLEAR).unwrap();
+            rig.settle();
+            rig.send(1, &image).unwrap();
+            rig.steps(steps);
+            let what = format!("{command:#x} after {steps} steps");
+            assert_eq!(rig.command(2, command), Err(MAN_BUSY), "{what}");
+            rig.settle();
+            // The refusal stays visible, and nothing else came of it.
+            assert_eq!(rig.status(2), 0x86, "{what}");
+            assert_eq!(rig.node.take_boot_request(), None, "{what}");
+            assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&image)), "{what}");
+            assert_eq!((rig.state(2), rig.cells(2)), (0, before.clone()), "{what}");
+        }
+    }
+}
+
+/// A request to leave the bootloader ends everything else.
+#[test]
+fn whoever_leaves_takes_no_further_order() {
+    let mut rig = Rig::new(&STANDARD_2, 1024);
+    rig.install(1, &raw(&STANDARD_2, 1, 600));
+    rig.install(2, &raw(&STANDARD_2, 2, 600));
+    rig.command(1, SET_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, START).unwrap();
+    for number in [1, 2] {
+        for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+            assert_eq!(rig.command(number, command), Err(MAN_BUSY));
+        }
+        assert_eq!(rig.begin(number, None, &[]), Err(MAN_BUSY));
+    }
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Failed)));
+    assert_eq!(rig.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(rig.node.take_boot_request(), None);
+    rig.settle();
+    assert_eq!((rig.state(1), rig.state(2)), (0, 0));
+}
+
+/// A reset would undo what is acknowledged: the device says so until it is done.
+#[test]
+fn an_acknowledged_order_is_finishing_until_it_is_stored() {
+    let mut rig = Rig::new(&STANDARD_1, 4096);
+    let image = raw(&STANDARD_1, 1, 900);
+    assert!(!rig.node.is_finishing());
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.begin(1, None, &image).unwrap();
+    rig.settle();
+    assert!(!rig.node.is_finishing(), "half a program is none");
+    rig.node.download_end(Address::new(0x1F50, 1)).unwrap();
+    let mut steps = 0;
+    while rig.node.is_finishing() {
+        assert!(rig.stored().records[0].is_none(), "step {steps}");
+        assert!(!rig.node.is_idle_after_step());
+        steps += 1;
+    }
+    assert!(steps > 10 && rig.stored().records[0].is_some());
+    rig.settle();
+    rig.command(1, SET_SIGNATURE).unwrap();
+    assert!(rig.node.is_finishing());
+    rig.settle();
+    assert!(!rig.node.is_finishing());
+    assert!(rig.stored().records[0].unwrap().2);
+}
+
+// --- layer setting services
+
+#[test]
+fn node_id_and_bit_rate_are_stored_one_after_the_other_and_kept() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let board = rig.stored().node;
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())), "nothing was asked for");
+    assert_eq!(rig.node.store(NodeId::new(9), Some(BitRate::K500)), Poll::Pending);
+    assert_eq!((rig.node.stored(), rig.stored().node), (Poll::Pending, board));
+    assert_eq!(rig.node.store(NodeId::new(10), None), Poll::Ready(Err(StoreError::Failed)), "one at a time");
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
+    assert_eq!(rig.stored().node, NodeParameters { id: NodeId::new(9), bit_rate: BitRate::K500 });
+    // Without a bit rate the one before is kept; without a node-ID the device has none.
+    assert_eq!(rig.node.store(None, None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.stored().node, NodeParameters { id: None, bit_rate: BitRate::K500 });
+    rig.reset();
+    assert_eq!(rig.node.store(NodeId::new(11), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.stored().node, NodeParameters { id: NodeId::new(11), bit_rate: BitRate::K500 });
+}
+
+/// The flash does one thing at a time. What is refused is told, and changes nothing.
+#[test]
+fn a_store_while_the_flash_works_is_refused() {
+    let image = raw(&STANDARD_1, 1, 900);
+    for steps in 0..40 {
+        let mut rig = Rig::new(&STANDARD_1, 4096);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let board = rig.stored().node;
+        rig.send(1, &image).unwrap();
+        rig.steps(steps);
+        assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Failed)), "{steps}");
+        rig.settle();
+        assert_eq!((rig.state(1), rig.stored().node), (0, board), "{steps}");
+    }
+}
+
+#[test]
+fn a_store_that_the_flash_refuses_is_told_and_the_old_values_stay() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let board = rig.stored().node;
+    let next = rig.chip.model().operations + 1;
+    rig.chip.model().fail = Some((next, FlashFault::Protected));
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Err(StoreError::Failed)));
+    assert_eq!(rig.stored().node, board);
+    // The next one is not held up by it.
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
+}
+
+#[test]
+fn a_device_that_stores_nothing_says_so() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_config(&mut flash, Config { lss_store: false, ..CONFIG }, 256);
+    assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Unsupported)));
+    assert!(bench.node.supports(BitRate::K125) && !bench.node.supports(BitRate::K800));
+    assert!(flash.touched.is_empty());
+}
+
+// --- emergencies, identity, the second server
+
+/// CiA 301 table 26: 5000h hardware, 6300h data set; then the code of 1F57h, and the program.
+#[test]
+fn the_end_of_work_is_told_by_an_emergency() {
+    let emergency = |rig: &mut Rig| rig.node.next_emergency();
+    // Operation 12 is one of the store, 20 one of the data.
+    for (fault, operation, code) in [
+        (FlashFault::Failed, 12, 0x10),
+        (FlashFault::Failed, 20, 0x0A),
+        (FlashFault::Protected, 20, 0x0E),
+    ] {
+        let mut rig = Rig::new(&STANDARD_2, 1024);
+        let image = raw(&STANDARD_2, 2, 600);
+        rig.command(2, CLEAR).unwrap();
+        rig.settle();
+        rig.begin(2, None, &image).unwrap();
+        assert_eq!(emergency(&mut rig), None);
+        let before = rig.chip.model().operations;
+        rig.chip.model().fail = Some((before + operation, fault));
+        rig.settle();
+        // Bits 0 and 7 of the error register: generic, manufacturer specific.
+        assert_eq!(emergency(&mut rig), Some([0x00, 0x50, 0x81, code, 2, 0, 0, 0]));
+        assert_eq!((emergency(&mut rig), read(&mut rig, 0x1001, 0)), (None, Ok(vec![0x81])));
+        rig.cancel(2);
+        rig.install(2, &image);
+        assert_eq!(emergency(&mut rig), Some([0; 8]), "error reset");
+        assert_eq!((emergency(&mut rig), read(&mut rig, 0x1001, 0)), (None, Ok(vec![0])));
+    }
+    // A block with a wrong CRC.
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let mut bad = rig::block(0, 0, &[0; 8]);
+    *bad.last_mut().unwrap() ^= 1;
+    assert!(rig.send(1, &bad).is_err());
+    rig.settle();
+    assert_eq!(emergency(&mut rig), Some([0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]));
+    assert_eq!(read(&mut rig, 0x1003, 1), word(0x0106_6300));
+}
+
+/// Why the device stayed: a fault and a crash loop are errors; with `boot_up_emergency`, each
+/// boot-up message is followed by the reason.
+#[test]
+fn a_device_tells_why_it_stayed() {
+    let messages = |reason: u8, boot_up_emergency| {
+        let mut flash = ModelFlash::new(&CHIP);
+        let journal = Journal::open(&flash, bench::LAYOUT.parameters);
+        let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
+        let buffer = Box::leak(vec![0; 256].into_boxed_slice());
+        let unsealer = Box::leak(Box::<boot_core::unseal::Room>::default()).unsealer();
+        let mut node = boot_core::bootloader::Bootloader::<_, _, 1>::new(
+            config,
+            0x1234_5678,
+            bench::node(),
+            reason,
+            journal,
+            &mut flash,
+            buffer,
+            unsealer,
+        );
+        assert_eq!(node.node_id(), NodeId::new(5));
+        assert_eq!(node.lss_address().serial_number, 0x1234_5678);
+        let mut bytes = [0; 4];
+        assert_eq!(node.read(Address::new(0x1018, 4), &mut bytes), Ok(4));
+        assert_eq!(bytes, 0x1234_5678_u32.to_le_bytes());
+        node.node_id_changed(None);
+        let before = [node.next_emergency(), node.next_emergency()];
+        node.node_id_changed(NodeId::new(5));
+        [before[0], before[1], node.next_emergency(), node.next_emergency()]
+    };
+    let boot = |reason| Some([0x00, 0xFF, 0, b'B', b'O', b'O', b'T', reason]);
+    assert_eq!(messages(0, false), [None; 4]);
+    assert_eq!(messages(0, true), [None, None, boot(0), None]);
+    assert_eq!(messages(8, true), [None, None, boot(8), None]);
+    for reason in [2, 7] {
+        let error = Some([0x00, 0x60, 0x01, reason, 0, 0, 0, 0]);
+        assert_eq!(messages(reason, false), [error, None, None, None]);
+    }
+}
+
+/// 1201h: written by a master, back to nothing with the next reset of the communication (CiA 301
+/// clause 7.3.2.2.1).
+#[cfg(not(feature = "sealed"))]
+#[test]
+fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_reset() {
+    use boot_core::bootloader::Bootloader;
+    type Device<'f> = Bootloader<'static, &'f mut ModelFlash, Journal, 1>;
+    assert!(<Device<'_> as Objects>::has_second_server());
+    for there in [true, false] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::with_config(&mut flash, Config { second_server: there, ..CONFIG }, 256);
+        let fresh = bench.node.second_server();
+        let at = |sub| Address::new(0x1201, sub);
+        let written = bench
+            .node
+            .write(at(1), &0x0000_06A0_u32.to_le_bytes())
+            .and_then(|()| bench.node.write(at(2), &0x0000_01A0_u32.to_le_bytes()));
+        if !there {
+            assert!(written.is_err());
+            assert_eq!(bench.node.second_server(), fresh);
+            let mut bytes = [0; 4];
+            assert!(bench.node.read(at(1), &mut bytes).is_err());
+            continue;
+        }
+        written.unwrap();
+        assert_eq!((bench.word(at(1)), bench.word(at(2))), (0x6A0, 0x1A0));
+        assert_ne!(bench.node.second_server(), fresh);
+        bench.node.node_id_changed(NodeId::new(5));
+        assert_eq!(bench.node.second_server(), fresh);
+        assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
+    }
+}
+
+// --- the lift profile: a stored program can be read
+
+#[test]
+fn a_stored_program_can_be_read_by_who_has_the_password() {
+    let mut rig = Rig::new(&LIFT_1, 1024);
+    let at = Address::new(0x1F50, 1);
+    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY), "locked");
+    rig.unlock(1).unwrap();
+    rig.settle();
+    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0800_0024)), "no data");
+    let mut image = raw(&LIFT_1, 1, 1500);
+    image[600..629].copy_from_slice(b"$CANopenSoftwareVersion\x004.7.1\0"[..29].try_into().unwrap());
+    image[629] = 0;
+    rig.install(1, &image);
+    assert_eq!(read(&mut rig, 0x100A, 0), Ok(b"4.7.1".to_vec()), "CiA 814-1 clause 6.5");
+    assert_eq!(rig.node.upload_start(at), Ok(Some(1500)));
+    for (offset, len, expected) in [
+        (0, 7, &image[..7]),
+        (7, 889, &image[7..896]),
+        (1490, 64, &image[1490..]),
+        (1500, 7, &[]),
+        (9000, 7, &[]),
+    ] {
+        let mut bytes = vec![0; len];
+        assert_eq!(rig.node.upload_data(at, offset, &mut bytes), Ok(expected.len()), "{offset}");
+        assert_eq!(bytes[..expected.len()], *expected, "{offset}");
+    }
+    // Not while the flash works.
+    rig.begin(1, None, &image).unwrap();
+    rig.steps(1);
+    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY));
+    // The standard profile has no such thing.
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 300));
+    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0601_0001)), "write only");
+}
+
+/// Program 2 of a lift is a set of parameters: any bytes, and 1F51h does not start it.
+#[test]
+fn data_of_the_application_are_any_bytes() {
+    let mut rig = Rig::new(&LIFT_2, 1024);
+    for data in [&b"x"[..], b"0123456789", &[0xFF; 100]] {
+        rig.install(2, data);
+        assert_eq!((rig.state(2), rig.identification(2)), (0, crc32(data)));
+        rig.command(2, START).unwrap();
+        rig.settle();
+        assert_eq!((rig.status(2), rig.node.take_boot_request()), (0x02, None), "NOVALPROG");
+    }
+}
+
+/// The steps of a device that has nothing to do.
+#[test]
+fn an_idle_device_stays_idle() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, Policy { read_back: true, ..Policy::DEFAULT });
+    assert_eq!(bench.node.step(), Step::Idle);
+    assert!(!bench.node.busy() && !bench.node.is_finishing());
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    bench.settle();
+    assert!(!bench.node.busy());
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    assert!(bench.node.busy());
+    assert_eq!(bench.status() & BUSY, BUSY);
+    bench.settle();
+    let journal = Journal::open(bench.node.flash(), bench::LAYOUT.parameters);
+    assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
+}
