@@ -296,11 +296,9 @@ fn a_device_that_stores_nothing_says_so() {
 fn the_end_of_work_is_told_by_an_emergency() {
     let emergency = |rig: &mut Rig| rig.node.next_emergency();
     // Operation 12 is one of the store, 20 one of the data.
-    for (fault, operation, code) in [
-        (FlashFault::Failed, 12, 0x10),
-        (FlashFault::Failed, 20, 0x0A),
-        (FlashFault::Protected, 20, 0x0E),
-    ] {
+    for (fault, operation, code) in
+        [(FlashFault::Failed, 12, 0x10), (FlashFault::Failed, 20, 0x0A), (FlashFault::Protected, 20, 0x0E)]
+    {
         let mut rig = Rig::new(&STANDARD_2, 1024);
         let image = raw(&STANDARD_2, 2, 600);
         rig.command(2, CLEAR).unwrap();

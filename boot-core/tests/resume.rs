@@ -133,7 +133,6 @@ fn a_host_that_comes_back_goes_on_with_the_next_block() {
     for block in &file[6..] {
         bench.good(block);
     }
-    drop(bench);
     assert!(is_installed(&flash, &image));
     assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0), "nothing is left to go on with");
 }
@@ -149,7 +148,6 @@ fn a_host_that_begins_again_gets_through() {
         for block in &file[..20] {
             bench.good(block);
         }
-        drop(bench);
         let mut bench = Bench::new(&mut flash);
         assert_ne!(partial(&mut bench).0, 0);
         if clear {
@@ -158,7 +156,6 @@ fn a_host_that_begins_again_gets_through() {
         for block in &file {
             bench.good(block);
         }
-        drop(bench);
         assert!(is_installed(&flash, &image), "clear: {clear}");
     }
 }
@@ -190,7 +187,6 @@ fn other_data_do_not_become_a_program() {
         bench.good(block);
     }
     assert_eq!(bench.block(&last(&other)).1, 0x02, "NOVALPROG: the CRC over all decides");
-    drop(bench);
     assert!(!is_installed(&flash, &other) && !is_installed(&flash, &image));
 
     // The device's half program was changed by a fault.
@@ -205,7 +201,6 @@ fn other_data_do_not_become_a_program() {
     for block in &file {
         bench.good(block);
     }
-    drop(bench);
     assert!(is_installed(&flash, &image));
 }
 
@@ -250,7 +245,6 @@ fn the_last_block_may_come_again_and_is_written_once() {
             assert_eq!(bench.transfer(&other), Err(AbortCode::DEVICE_STATE), "block {number}");
         }
     }
-    drop(bench);
     assert!(is_installed(&flash, &image));
     let mut words: Vec<u32> = flash.touched.iter().map(|region| region.base).collect();
     words.retain(|base| PROGRAM.contains(*base, 4));

@@ -1,13 +1,14 @@
 //! `cargo xtask test`: runs every test, with one summary at the end.
 
+use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
-use std::io::{BufRead, BufReader, Write};
-use std::process::Stdio;
+use std::io::{BufRead, BufReader, IsTerminal, Write};
 use std::time::Instant;
 
 use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
+use crate::json::quoted;
 use crate::setup::{self, Part, Setup};
 use crate::{build, evidence, examples, process, workspace, Outcome};
 
@@ -77,7 +78,7 @@ pub fn run(mut args: Args) -> Outcome {
         // together, all would be tested with them.
         let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
         let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
-        suite.run(board, &["--workspace".to_owned()].into_iter().chain(hosts).collect::<Vec<_>>())?;
+        suite.run_hosts(board, &["--workspace".to_owned()].into_iter().chain(hosts).collect::<Vec<_>>())?;
         let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
         suite.run(board, &[build::tests_args(board), sealed.to_vec()].concat())?;
         for other in others {
@@ -89,21 +90,17 @@ pub fn run(mut args: Args) -> Outcome {
     let summary = suite.summary;
 
     if is_whole {
-        let Summary { passed, failed, ignored, programs, .. } = &summary;
-        let seconds = started.elapsed().as_secs();
-        evidence::record(
-            "tests",
-            &format!("{{\"passed\": {passed}, \"failed\": {failed}, \"skipped\": {ignored}, \"programs\": {programs}, \"seconds\": {seconds}}}"),
-        )?;
+        evidence::record("tests", &summary.as_json(started.elapsed().as_secs()))?;
     }
     println!();
     for name in &summary.names_of_failed {
         println!("FAILED: {name}");
     }
-    println!("{} test programs in {} s", summary.programs, started.elapsed().as_secs());
+    let total = summary.total();
+    println!("{} test programs in {} s", total.programs, started.elapsed().as_secs());
     println!("{}", summary.line());
-    match summary.failed {
-        0 if summary.programs == 0 => Err("no test ran.".into()),
+    match total.failed {
+        0 if total.programs == 0 => Err("no test ran.".into()),
         0 => Ok(()),
         1 => Err("1 test failed; its output stands above.".into()),
         failed => Err(format!("{failed} tests failed; their output stands above.")),
@@ -129,6 +126,24 @@ const MAIN_TESTS: [&str; 12] = [
     "conform",
 ];
 
+/// The test programs that work with a program of others, unmodified; and which.
+const FOREIGN: [(&str, &str); 12] = [
+    ("c_application", "arm-none-eabi-gcc"),
+    ("clients", "python-canopen, canopen-asyncio"),
+    ("eds", "dcfchk, and python-canopen as a reader"),
+    ("examples", "cmake, arm-none-eabi-gcc"),
+    ("gdb_door", "gdb"),
+    ("image", "zx0decompress"),
+    ("peers", "python-canopen as a master of three devices"),
+    ("python_package", "maturin, pytest, python-can"),
+    ("sealed_client", "python-canopen"),
+    ("ui", "Chromium"),
+    ("virtual_can", "python-can, python-canopen"),
+    ("zencan", "zencan-client"),
+];
+/// The test program of `coflash conform`.
+const CONFORM: &str = "conform";
+
 /// The results of the run so far, and the needs of the tests.
 struct Suite {
     summary: Summary,
@@ -140,6 +155,17 @@ struct Suite {
 impl Suite {
     /// Runs `cargo test` with these arguments, and the images of a board.
     fn run(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
+        self.summary.place = Some(board.board.to_owned());
+        self.cargo_test(board, arguments)
+    }
+
+    /// The same for tests that need no board.
+    fn run_hosts(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
+        self.summary.place = None;
+        self.cargo_test(board, arguments)
+    }
+
+    fn cargo_test(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
         let images = workspace::firmware_dir(board);
         let environment: [(&str, &OsStr); 5] = [
             ("COBOOT_BOARD", board.board.as_ref()),
@@ -152,81 +178,212 @@ impl Suite {
     }
 }
 
+/// The counts of test programs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Counts {
+    programs: u32,
+    passed: u32,
+    failed: u32,
+    skipped: u32,
+}
+
+impl Counts {
+    fn add(&mut self, other: Self) {
+        self.programs += other.programs;
+        self.passed += other.passed;
+        self.failed += other.failed;
+        self.skipped += other.skipped;
+    }
+
+    fn as_json(self, named: &[(&str, &str)]) -> String {
+        let named: String =
+            named.iter().map(|(name, text)| format!("\"{name}\": {}, ", quoted(text))).collect();
+        let Self { programs, passed, failed, skipped } = self;
+        format!("{{{named}\"programs\": {programs}, \"passed\": {passed}, \"failed\": {failed}, \"skipped\": {skipped}}}")
+    }
+}
+
+/// What a test program is.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Level {
+    /// The tests within the sources of a crate.
+    Unit,
+    /// The tests of a crate from outside.
+    Crate,
+    /// The examples in the documentation.
+    Documentation,
+    /// The built firmware of this board, and the crates with sealed images.
+    Board(String),
+}
+
 /// The totals of many test programs.
 #[derive(Debug, Default, PartialEq, Eq)]
 struct Summary {
-    passed: u32,
-    failed: u32,
-    ignored: u32,
-    programs: u32,
+    /// The board whose firmware the tests run; `None` for those without one.
+    place: Option<String>,
+    /// What the test program is that runs now, and its name.
+    program: Option<(Level, String)>,
+    /// By test program.
+    counts: BTreeMap<(Level, String), Counts>,
+    /// What did not get as far as a count.
+    broken: u32,
     names_of_failed: Vec<String>,
 }
 
 impl Summary {
     /// Runs `cargo test` with these arguments, and takes what it prints.
     fn run(&mut self, arguments: &[String], environment: [(&str, &OsStr); 5]) -> Outcome {
+        let unreadable = |error: std::io::Error| format!("the output of the tests cannot be read: {error}.");
+        // cargo names the test program on one stream, and that reports on the other: in one pipe
+        // they stay in order.
+        let (printed, writer) = std::io::pipe().map_err(unreadable)?;
         let mut cargo = process::cargo("test");
         cargo
+            .args(std::io::stderr().is_terminal().then_some("--color=always"))
             .arg("--no-fail-fast")
             .args(arguments)
             .current_dir(workspace::root())
             .envs(environment)
-            .stdout(Stdio::piped());
+            .stdout(writer.try_clone().map_err(unreadable)?)
+            .stderr(writer);
         let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;
-        let failed = self.failed;
-        if let Some(printed) = tests.stdout.take() {
-            let mut printed = BufReader::new(printed);
-            let mut line = Vec::new();
-            // The output is read as bytes: a test may print invalid UTF-8.
-            while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
-                let mut out = std::io::stdout().lock();
-                let _ = out.write_all(&line).and_then(|()| out.flush());
-                self.take(&String::from_utf8_lossy(&line));
-                line.clear();
-            }
+        let shown = cargo.get_args().count();
+        // The pipe ends with the last program that can write into it.
+        drop(cargo);
+        let failed = self.total().failed;
+        let mut printed = BufReader::new(printed);
+        let mut line = Vec::new();
+        // The output is read as bytes: a test may print invalid UTF-8.
+        while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
+            let mut out = std::io::stdout().lock();
+            let _ = out.write_all(&line).and_then(|()| out.flush());
+            self.take(&String::from_utf8_lossy(&line));
+            line.clear();
         }
-        let status = tests.wait().map_err(|error| process::not_started(&cargo, &error))?;
-        if !status.success() && self.failed == failed {
+        let status = tests.wait().map_err(|error| format!("cargo test with {shown} arguments: {error}."))?;
+        if !status.success() && self.total().failed == failed {
             // It counts as a failure, so that the last line is never better than the run.
-            self.failed += 1;
+            self.broken += 1;
             self.names_of_failed
                 .push("something that did not build, or a test program that broke off".into());
         }
         Ok(())
     }
 
-    /// Takes one line of a test program's output.
+    /// Takes one line of what cargo and the test programs print.
     fn take(&mut self, line: &str) {
+        let line = without_colours(line);
         let line = line.trim_end();
         if let Some((_, counts)) = line.strip_prefix("test result: ").and_then(|line| line.split_once(". ")) {
             let count = |what: &str| -> u32 {
                 let field = counts.split("; ").find_map(|field| field.strip_suffix(what));
                 field.and_then(|number| number.trim().parse().ok()).unwrap_or(0)
             };
-            self.passed += count(" passed");
-            self.failed += count(" failed");
-            self.ignored += count(" ignored");
-            self.programs += 1;
+            let counts = Counts {
+                programs: 1,
+                passed: count(" passed"),
+                failed: count(" failed"),
+                skipped: count(" ignored"),
+            };
+            let program = self.program.clone().unwrap_or((Level::Crate, String::new()));
+            self.counts.entry(program).or_default().add(counts);
         } else if let Some(name) =
             line.strip_prefix("test ").and_then(|line| line.strip_suffix(" ... FAILED"))
         {
             self.names_of_failed.push(name.to_owned());
+        } else if let Some((level, name)) = started(line) {
+            self.program = Some((self.place.clone().map_or(level, Level::Board), name));
         }
+    }
+
+    fn sum(&self, of: impl Fn(&Level, &str) -> bool) -> Counts {
+        let mut sum = Counts::default();
+        let chosen = self.counts.iter().filter(|((level, name), _)| of(level, name));
+        chosen.for_each(|(_, counts)| sum.add(*counts));
+        sum
+    }
+
+    fn total(&self) -> Counts {
+        let sum = self.sum(|_, _| true);
+        Counts { failed: sum.failed + self.broken, ..sum }
     }
 
     /// The last line of a run; `.ci/run` repeats it.
     fn line(&self) -> String {
-        let mut line = format!("{} passed, {} failed", self.passed, self.failed);
-        if self.ignored > 0 {
-            line += &format!(", {} skipped", self.ignored);
+        let Counts { passed, failed, skipped, .. } = self.total();
+        let mut line = format!("{passed} passed, {failed} failed");
+        if skipped > 0 {
+            line += &format!(", {skipped} skipped");
         }
         line
     }
+
+    /// The record of a whole run.
+    fn as_json(&self, seconds: u64) -> String {
+        let mut levels: Vec<&Level> = self.counts.keys().map(|(level, _)| level).collect();
+        levels.dedup();
+        let of_levels = levels.iter().map(|level| {
+            let name = match level {
+                Level::Unit => "within a crate",
+                Level::Crate => "a crate from outside",
+                Level::Documentation => "documentation",
+                Level::Board(board) => &format!("firmware of {board}"),
+            };
+            self.sum(|of, _| of == *level).as_json(&[("level", name)])
+        });
+        let foreign = FOREIGN.iter().filter_map(|(name, others)| {
+            let counts = self.sum(|level, of| matches!(level, Level::Board(_)) && of == *name);
+            (counts.programs > 0).then(|| counts.as_json(&[("tests", *name), ("with", *others)]))
+        });
+        let conform = levels.iter().filter_map(|level| match level {
+            Level::Board(board) => {
+                let counts = self.sum(|of, name| of == *level && name == CONFORM);
+                (counts.programs > 0).then(|| counts.as_json(&[("board", board)]))
+            }
+            _ => None,
+        });
+        let list = |items: &mut dyn Iterator<Item = String>| items.collect::<Vec<_>>().join(",\n");
+        let Counts { programs, passed, failed, skipped } = self.total();
+        format!(
+            "{{\"passed\": {passed}, \"failed\": {failed}, \"skipped\": {skipped}, \"programs\": {programs}, \
+             \"seconds\": {seconds},\n\"levels\": [{}],\n\"foreign\": [{}],\n\"conformance\": [{}]}}",
+            list(&mut of_levels.into_iter()),
+            list(&mut foreign.into_iter()),
+            list(&mut conform.into_iter())
+        )
+    }
+}
+
+/// The test program that cargo starts: `Running tests/clients.rs (target/debug/deps/clients-…)`,
+/// `Running unittests src/lib.rs (…)`, `Doc-tests canopen`.
+fn started(line: &str) -> Option<(Level, String)> {
+    let line = line.trim_start();
+    if let Some(name) = line.strip_prefix("Doc-tests ") {
+        return Some((Level::Documentation, name.to_owned()));
+    }
+    let (source, _) = line.strip_prefix("Running ")?.split_once(" (")?;
+    if let Some(source) = source.strip_prefix("unittests ") {
+        return Some((Level::Unit, source.to_owned()));
+    }
+    let file = source.replace('\\', "/");
+    let name = file.rsplit('/').next()?.strip_suffix(".rs")?;
+    Some((Level::Crate, if name == "main" { file.clone() } else { name.to_owned() }))
+}
+
+/// A line without the terminal's colours (ECMA-48, SGR).
+fn without_colours(line: &str) -> String {
+    let mut parts = line.split("\u{1b}[");
+    let mut plain = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        plain += part.split_once('m').map_or("", |(_, rest)| rest);
+    }
+    plain
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::json::Value;
 
     /// Lines in libtest's format.
     #[test]
@@ -244,8 +401,69 @@ mod tests {
             summary.take(line);
         }
         assert_eq!(summary.line(), "21 passed, 1 failed, 1 skipped");
-        assert_eq!(summary.programs, 2);
+        assert_eq!(summary.total().programs, 2);
         assert_eq!(summary.names_of_failed, ["flash::cut"]);
         assert_eq!(Summary::default().line(), "0 passed, 0 failed");
+    }
+
+    /// Lines in cargo's format, with and without colours.
+    #[test]
+    fn each_program_counts_where_it_belongs() {
+        let mut summary = Summary::default();
+        let result = |passed, failed| {
+            format!(
+                "test result: ok. {passed} passed; {failed} failed; 0 ignored; 0 measured; 0 filtered out\n"
+            )
+        };
+        let mut take = |place: Option<&str>, header: &str, passed, failed| {
+            summary.place = place.map(str::to_owned);
+            summary.take(header);
+            summary.take(&result(passed, failed));
+        };
+        take(None, "     Running unittests src/lib.rs (target/debug/deps/canopen-01)\n", 5, 0);
+        take(None, "     Running unittests src/lib.rs (target/debug/deps/seal-02)\n", 6, 0);
+        take(
+            None,
+            "\u{1b}[1m\u{1b}[92m     Running\u{1b}[0m tests/conform.rs (target/debug/deps/conform-03)\n",
+            7,
+            0,
+        );
+        take(None, "   Doc-tests canopen\n", 8, 0);
+        take(Some("a-board"), "     Running tests/clients.rs (target/debug/deps/clients-04)\n", 9, 1);
+        take(Some("a-board"), "     Running tests/conform.rs (target/debug/deps/conform-05)\n", 10, 0);
+        take(Some("b-board"), "     Running tests/conform.rs (target/debug/deps/conform-05)\n", 11, 2);
+        summary.broken = 1;
+        let record = Value::parse(&summary.as_json(60)).unwrap();
+        let rows = |list: &str, name: &str, count: &str| -> Vec<(String, u32)> {
+            let row = |row: &Value| {
+                (row.get(name).text().unwrap().to_owned(), row.get(count).number().unwrap() as u32)
+            };
+            record.get(list).items().iter().map(row).collect()
+        };
+        let of = |rows: &[(&str, u32)]| {
+            rows.iter().map(|(name, count)| ((*name).to_owned(), *count)).collect::<Vec<_>>()
+        };
+        let levels = [
+            ("within a crate", 11),
+            ("a crate from outside", 7),
+            ("documentation", 8),
+            ("firmware of a-board", 19),
+            ("firmware of b-board", 11),
+        ];
+        assert_eq!(rows("levels", "level", "passed"), of(&levels));
+        assert_eq!(rows("foreign", "tests", "failed"), of(&[("clients", 1)]));
+        assert_eq!(rows("conformance", "board", "failed"), of(&[("a-board", 0), ("b-board", 2)]));
+        assert_eq!(record.get("passed").number(), Some(56.0));
+        assert_eq!(record.get("failed").number(), Some(4.0), "with what broke off");
+    }
+
+    #[test]
+    fn what_works_with_others_programs_is_there() {
+        for name in FOREIGN.iter().map(|(name, _)| *name).chain([CONFORM]) {
+            assert!(
+                workspace::root().join("tests/tests").join(name).with_extension("rs").is_file(),
+                "{name}"
+            );
+        }
     }
 }

@@ -207,9 +207,16 @@ fn none(record: &Value, name: &str, good: String) -> Result<String, String> {
 
 fn tests(record: &Value) -> (Result<String, String>, String) {
     let passed = format!("{} passed", shown(record.get("passed")));
-    let rows = [record.clone()];
-    let head = ["passed", "failed", "skipped", "programs", "seconds"];
-    (none(record, "failed", passed), table(&head, &rows))
+    let mut details = String::new();
+    for (title, list, names) in [
+        ("By level", "levels", ["level", "programs", "passed", "failed", "skipped"]),
+        ("With programs of others", "foreign", ["with", "tests", "passed", "failed", "skipped"]),
+        ("Conformance, by board", "conformance", ["board", "programs", "passed", "failed", "skipped"]),
+    ] {
+        let _ = writeln!(details, "<h3>{title}</h3>");
+        details += &table(&names, record.get(list).items());
+    }
+    (none(record, "failed", passed), details)
 }
 
 fn powercut(record: &Value) -> (Result<String, String>, String) {
