@@ -14,6 +14,7 @@ mod bench;
 mod book;
 mod build;
 mod chips;
+mod coverage;
 mod demo;
 mod deny;
 mod diagrams;
@@ -173,6 +174,12 @@ const JOBS: &[Job] = &[
         about: "two clones in two folders give the same firmware",
         help: reproduce::HELP,
         run: reproduce::run,
+    },
+    Job {
+        name: "coverage",
+        about: "which lines of the device's crates the tests reach",
+        help: coverage::HELP,
+        run: coverage::run,
     },
     Job {
         name: "mutants",

@@ -13,15 +13,15 @@ use std::{env, fs, process as std_process};
 use sha2::{Digest, Sha512_256};
 
 use crate::args::Args;
-use crate::json::Value;
-use crate::{build, process, setup, workspace, Outcome};
+use crate::json::{quoted, Value};
+use crate::{build, evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask sbom [--board BOARD]
 
 Writes the software bills of materials of bootloader and host tool (CycloneDX 1.5, JSON) into
 target/sbom, and prints each with its SHA-512/256: the hash that the manifest of a sealed image has
-room for. The same sources give the same bytes. The host tool's one is that of all systems together.
+room for; the hashes go to target/evidence/sbom.json. The same sources give the same bytes. The host tool's one is that of all systems together.
 
   --board BOARD   the board of the bootloader (default: stm32f407g-disc1)
 
@@ -43,6 +43,7 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     args.none_left()?;
     setup::rust_target(workspace::TARGET)?;
+    evidence::begin("sbom")?;
     let path = setup::tool("cargo-cyclonedx", VERSION)?;
     let folder = workspace::target_dir().join("sbom");
     fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, &error))?;
@@ -55,6 +56,7 @@ pub fn run(mut args: Args) -> Outcome {
         },
         Released { package: "coflash", target: "all", features: Vec::new() },
     ];
+    let mut rows = Vec::new();
     for released in &all {
         let text = tidy(&generate(released, &path)?, &workspace::root().display().to_string());
         let faults = faults(&Value::parse(&text)?, &closure(released)?);
@@ -70,8 +72,15 @@ pub fn run(mut args: Args) -> Outcome {
         fs::write(&file, &text).map_err(|error| unwritable(&file, &error))?;
         let hash: String = Sha512_256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
         println!("{}\n  SHA-512/256 {hash}", workspace::shown(&file));
+        let components = Value::parse(&text)?.get("components").items().len();
+        rows.push(format!(
+            "{{\"program\": {}, \"components\": {components}, \"sha_512_256\": {}}}",
+            quoted(&format!("{}, {name}", released.package)),
+            quoted(&hash)
+        ));
     }
-    Ok(())
+    let facts = format!("{{\"bills\": {}, \"failed\": 0, \"of\": [{}]}}", rows.len(), rows.join(", "));
+    evidence::record("sbom", &facts).map(drop)
 }
 
 fn unwritable(path: &std::path::Path, error: &std::io::Error) -> String {

@@ -47,6 +47,8 @@ pub enum Part {
     Qemu,
     /// Formatter and linter.
     Lint,
+    /// What counts the lines that tests reach.
+    Coverage,
     /// The package for Debian.
     Deb,
     /// The program for Windows: a linker for it.
@@ -94,6 +96,9 @@ impl Setup {
         }
         if parts.contains(&Part::Lint) {
             rust_components()?;
+        }
+        if parts.contains(&Part::Coverage) {
+            llvm_tools()?;
         }
         if parts.contains(&Part::Python) {
             python_environment()?;
@@ -254,7 +259,7 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
             Part::Windows => &[Tool::Mingw],
             Part::Qemu => &[Tool::Qemu],
             Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
-            Part::Python | Part::Firmware | Part::Lint => &[],
+            Part::Python | Part::Firmware | Part::Lint | Part::Coverage => &[],
         });
     }
     let missing: BTreeSet<_> = tools.into_iter().filter(|&tool| !is_there(tool)).map(Tool::package).collect();
@@ -377,8 +382,20 @@ fn rust_components() -> Outcome {
     if missing.is_empty() {
         return Ok(());
     }
+    add_components(&missing)
+}
+
+fn llvm_tools() -> Outcome {
+    let installed = process::output(Command::new("rustup").args(["component", "list", "--installed"]));
+    if installed.is_ok_and(|list| list.contains("llvm-tools")) {
+        return Ok(());
+    }
+    add_components(&["llvm-tools"])
+}
+
+fn add_components(missing: &[&str]) -> Outcome {
     println!("Adding {} to the Rust toolchain ...", missing.join(" and "));
-    process::run(Command::new("rustup").args(["component", "add"]).args(&missing)).map_err(|_| {
+    process::run(Command::new("rustup").args(["component", "add"]).args(missing)).map_err(|_| {
         format!(
             "{} could not be added. With rustup and a connection, this line does it:\n\n    \
              rustup component add {}",

@@ -55,6 +55,13 @@ const PARTS: &[Part] = &[
         show: |record| plain(record, "words"),
     },
     Part {
+        name: "coverage",
+        title: "Coverage",
+        command: "cargo xtask coverage",
+        about: "Lines of the crates without an operating system that tests on the host reach.",
+        show: coverage,
+    },
+    Part {
         name: "mutants",
         title: "Mutants",
         command: "cargo xtask mutants",
@@ -74,6 +81,13 @@ const PARTS: &[Part] = &[
         command: "cargo xtask reproduce",
         about: "Two clones in two folders give the same firmware.",
         show: |record| plain(record, "compared"),
+    },
+    Part {
+        name: "sbom",
+        title: "Bills of materials",
+        command: "cargo xtask sbom",
+        about: "The crates in bootloader and host tool, as CycloneDX; the hash fits into a sealed image.",
+        show: |record| plain(record, "bills"),
     },
     Part {
         name: "size",
@@ -394,6 +408,20 @@ fn size(record: &Value) -> (Result<String, String>, String) {
         _ => Err(format!("{over} images are over their budget")),
     };
     (verdict, table(&names, rows))
+}
+
+fn coverage(record: &Value) -> (Result<String, String>, String) {
+    let words = format!("{} % of {} lines", shown(record.get("percent")), shown(record.get("lines")));
+    let details = table(&["crate", "lines", "reached", "percent"], record.get("crates").items());
+    // A measure of the tests, with no limit: the mutants have one.
+    (
+        if record.get("percent").number().is_some() {
+            Ok(words)
+        } else {
+            Err("the record counts nothing".into())
+        },
+        details,
+    )
 }
 
 fn mutants(record: &Value) -> (Result<String, String>, String) {
