@@ -9,21 +9,23 @@
 //! borders only, so an interrupt comes at most one block late. A CPU with wait states takes some
 //! 1.3 cycles an instruction; budgets measured here want that much reserve.
 //!
-//! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting; the MPU is off;
+//! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting unless
+//! CCR.UNALIGN_TRP is set; the MPU is off;
 //! SEV is not seen (WFE ends by itself); an FPU instruction that a false IT condition skips faults
 //! all the same while the FPU is off; CCR.BFHFNMIGN is for stores that a register refuses, and an
 //! access to where nothing is locks the core up all the same at priority -1.
 
 mod accesses;
+mod traps;
 
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
-use unicorn_engine::{ArmCpuModel, RegisterARM, Unicorn};
+use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
     Masks, BUS_FAULT, DEBUG_MONITOR, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT,
 };
-use crate::cortex::scs::{cfsr, hfsr, RefusedStore};
+use crate::cortex::scs::{cfsr, hfsr, RefusedStore, Traps};
 use crate::machine::chip::{
     Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
     SYSTEM_PAGE,
@@ -32,6 +34,7 @@ use crate::machine::memory::{HostMemory, PAGE};
 use crate::machine::report::Access;
 use crate::machine::Error;
 use crate::time::Time;
+use traps::Instruction;
 
 /// Cycles from recognition of an exception to its first instruction (PM0214 section 2.3.7).
 const ENTRY_CYCLES: u64 = 12;
@@ -55,6 +58,9 @@ const XPSR_ALIGNED: u32 = 1 << 9;
 const CONTROL_NPRIV: u32 = 1 << 0;
 const CONTROL_SPSEL: u32 = 1 << 1;
 const CONTROL_FPCA: u32 = 1 << 2;
+/// Reserved in Armv7-M. Unicorn counts the core as secure, and gives an FPU context a fresh FPSCR as
+/// long as this bit is clear.
+const CONTROL_SFPA: u32 = 1 << 3;
 
 /// Words of the basic and of the extended stack frame.
 const BASIC_FRAME: u32 = 8;
@@ -107,13 +113,11 @@ impl Fault {
     }
 }
 
-/// The result of an attempt to enter an exception.
+/// The result of entering an exception.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Entry {
     /// The CPU is in the handler.
     Taken,
-    /// A fault while stacking or fetching the vector; the CPU is where it was.
-    Failed(Fault),
     /// The priority is too high for any fault to be taken: lockup (DDI 0403E B1.5.15).
     Lockup,
 }
@@ -138,6 +142,16 @@ struct Notes {
     executed: Vec<bool>,
     /// Pages of flash that code was fetched from.
     flash_executed: Vec<bool>,
+    /// The traps of CCR that [`on_instruction`] looks for, and its hook; none without a trap.
+    traps: Traps,
+    trap_hook: Option<UcHookId>,
+    /// The instructions from here on to there are those of an IT block, where the engine does not
+    /// stop.
+    it_block: (u32, u32),
+    /// An instruction in an IT block that may trap; the CPU has to stop before it.
+    in_doubt: Option<u32>,
+    /// The instruction that was in doubt and that the CPU is on its way to.
+    on_the_way_to: Option<u32>,
 }
 
 /// Hint instructions that end a block.
@@ -437,6 +451,8 @@ impl Cpu {
             executed: std::mem::take(&mut notes.executed),
             flash_executed: std::mem::take(&mut notes.flash_executed),
             blocks: std::mem::take(&mut notes.blocks),
+            traps: notes.traps,
+            trap_hook: notes.trap_hook.take(),
             ..Notes::default()
         };
         notes.blocks.clear();
@@ -539,30 +555,75 @@ impl Cpu {
     /// one instruction, wherever breakpoints are.
     pub fn run(&mut self, single: bool) -> Exit {
         self.drop_stale();
+        self.set_traps();
         self.chip_mut().leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
         self.uc.get_data_mut().notes.masks = masks;
         if self.has_breakpoint(self.pc()) {
             return Exit::Breakpoint;
         }
-        if self.steps() {
-            return self.step();
+        let exit = if self.steps() {
+            self.step()
+        } else if single {
+            self.one_instruction()
+        } else {
+            self.enter(None)
+        };
+        let notes = &mut self.uc.get_data_mut().notes;
+        if let Some(address) = notes.in_doubt.take() {
+            self.uncharge(self.pc());
+            return match self.run_up_to(address) {
+                // The next run judges it.
+                Exit::WaitForInterrupt if self.pc() == address => Exit::Slice,
+                exit => exit,
+            };
         }
-        if single {
-            return self.one_instruction();
-        }
-        let exit = self.enter(None);
-        let Some(address) = self.uc.get_data_mut().notes.fpu_instruction.take() else { return exit };
+        let Some(address) = notes.fpu_instruction.take() else { return exit };
         // The FPU is off: run up to its instruction, which faults.
         if address != self.pc() {
-            let _ = self.uc.ctl_remove_cache(u64::from(self.pc()), u64::from(address) + 4);
-            self.chip_mut().leave = false;
-            let exit = self.enter(Some(address));
+            let exit = self.run_up_to(address);
             if exit != Exit::WaitForInterrupt || self.pc() != address {
                 return exit;
             }
         }
         Exit::Fault(Fault::usage(cfsr::NOCP))
+    }
+
+    /// Runs up to the instruction at `address`, which lies in the block that comes next.
+    fn run_up_to(&mut self, address: u32) -> Exit {
+        let block = (u64::from(self.pc()), u64::from(address) + 4);
+        let _ = self.uc.ctl_remove_cache(block.0, block.1);
+        self.chip_mut().leave = false;
+        self.uc.get_data_mut().notes.on_the_way_to = Some(address);
+        let exit = self.enter(Some(address));
+        self.uc.get_data_mut().notes.on_the_way_to = None;
+        // The translation that ends there must not stay.
+        let _ = self.uc.ctl_remove_cache(block.0, block.1);
+        exit
+    }
+
+    /// Has every instruction looked at while a trap of CCR is set, and none otherwise: it costs
+    /// time.
+    fn set_traps(&mut self) {
+        let State { chip, notes } = self.uc.get_data_mut();
+        let traps = chip.scs.traps();
+        if traps == notes.traps {
+            return;
+        }
+        notes.traps = traps;
+        if traps.any() == notes.trap_hook.is_some() {
+            return;
+        }
+        match notes.trap_hook.take() {
+            Some(hook) => {
+                let _ = self.uc.remove_hook(hook);
+            }
+            None => {
+                let hook = self.uc.add_code_hook(1, 0, |uc, address, _| on_instruction(uc, address as u32));
+                self.uc.get_data_mut().notes.trap_hook = hook.ok();
+            }
+        }
+        let _ = self.uc.ctl_flush_tb();
     }
 
     fn enter(&mut self, until: Option<u32>) -> Exit {
@@ -667,10 +728,7 @@ impl Cpu {
         if !monitors {
             return self.take_fault(Fault::Hard(hfsr::DEBUGEVT));
         }
-        match self.enter_exception(DEBUG_MONITOR) {
-            Entry::Failed(fault) => self.take_fault(fault),
-            entry => entry,
-        }
+        self.enter_exception(DEBUG_MONITOR)
     }
 
     fn drop_stale(&mut self) {
@@ -813,15 +871,9 @@ impl Cpu {
         self.chip().scs.vtor.wrapping_add(4 * u32::from(exception))
     }
 
-    /// Enters `exception` (DDI 0403E B1.5.6).
+    /// Enters `exception` (DDI 0403E B1.5.6), or what comes before it if that faults.
     pub fn enter_exception(&mut self, exception: u16) -> Entry {
         use RegisterARM as R;
-        let Some(handler) = self.peek(self.vector_address(exception)) else {
-            if exception == HARD_FAULT || exception == NMI {
-                return Entry::Lockup;
-            }
-            return Entry::Failed(Fault::Hard(hfsr::VECTTBL));
-        };
         let thread = self.ipsr() == 0;
         let control = self.register(R::CONTROL);
         let on_psp = thread && control & CONTROL_SPSEL != 0;
@@ -850,9 +902,8 @@ impl Cpu {
             .iter()
             .enumerate()
             .fold(true, |ok, (n, word)| self.poke(frame.wrapping_add(4 * n as u32), *word) && ok);
-        if !stacked && exception != HARD_FAULT && exception != NMI {
-            return Entry::Failed(Fault::bus(cfsr::STKERR, None));
-        }
+        let exception = if stacked { exception } else { self.stacking_failed(exception) };
+        let Some((exception, handler)) = self.vector_of(exception) else { return Entry::Lockup };
         self.set(R::SP, frame);
         let return_to = match (thread, on_psp) {
             (false, _) => 0xFFFF_FFF1,
@@ -876,6 +927,39 @@ impl Cpu {
             *count += 1;
         }
         Entry::Taken
+    }
+
+    /// The frame of `original` could not be written: that is a BusFault, which becomes pending
+    /// beside it. Returns the one of the two that comes first; the stack pointer moves as if the
+    /// frame were there (DDI 0403E B1.5.11, derived exceptions).
+    fn stacking_failed(&mut self, original: u16) -> u16 {
+        let masks = self.privileged(|cpu| cpu.masks());
+        let scs = &mut self.chip_mut().scs;
+        scs.cfsr |= cfsr::STKERR;
+        let preempted = scs.exceptions.execution_priority(masks);
+        scs.exceptions.pend(original);
+        if scs.exceptions.is_enabled(BUS_FAULT) && scs.exceptions.group_priority(BUS_FAULT) < preempted {
+            scs.exceptions.pend(BUS_FAULT);
+        } else if preempted > -1 {
+            scs.hfsr |= hfsr::FORCED;
+            scs.exceptions.pend(HARD_FAULT);
+        }
+        scs.exceptions.first_pending().map_or(original, |(first, _)| first)
+    }
+
+    /// The vector of `exception`, or of the HardFault if it cannot be fetched, and whose it is; the
+    /// exception is pending then. `None` is lockup: NMI and HardFault have nothing above them.
+    fn vector_of(&mut self, exception: u16) -> Option<(u16, u32)> {
+        if let Some(handler) = self.peek(self.vector_address(exception)) {
+            return Some((exception, handler));
+        }
+        if matches!(exception, HARD_FAULT | NMI) {
+            return None;
+        }
+        let scs = &mut self.chip_mut().scs;
+        scs.hfsr |= hfsr::VECTTBL;
+        scs.exceptions.pend(exception);
+        Some((HARD_FAULT, self.peek(self.vector_address(HARD_FAULT))?))
     }
 
     /// Leaves the present exception by `value` (DDI 0403E B1.5.8); the fault that a bad value or
@@ -926,8 +1010,9 @@ impl Cpu {
             }
             self.set(R::FPSCR, contents[24]);
         }
-        let control =
-            npriv | if on_psp { CONTROL_SPSEL } else { 0 } | if floating { CONTROL_FPCA } else { 0 };
+        let control = npriv
+            | if on_psp { CONTROL_SPSEL } else { 0 }
+            | if floating { CONTROL_FPCA | CONTROL_SFPA } else { 0 };
         if handler && control & !CONTROL_NPRIV == 0 {
             self.set_ipsr(back_to);
         } else {
@@ -960,43 +1045,34 @@ impl Cpu {
     /// Takes a fault: at its own priority if it is enabled and high enough, as HardFault otherwise
     /// (DDI 0403E B1.5.10).
     pub fn take_fault(&mut self, fault: Fault) -> Entry {
-        let mut fault = fault;
-        // A fault while entering a fault's handler escalates once, to HardFault; a fault after that
-        // locks the CPU up.
-        for _ in 0..3 {
-            let masks = self.privileged(|cpu| cpu.masks());
-            let scs = &mut self.chip_mut().scs;
-            let current = scs.exceptions.execution_priority(masks);
-            let exception = match fault {
-                Fault::Configurable { exception, status, address } => {
-                    scs.cfsr |= status;
-                    if let Some(address) = address {
-                        scs.bfar = address;
-                        scs.cfsr |= cfsr::BFARVALID;
-                    }
-                    let taken = scs.exceptions.is_enabled(exception)
-                        && scs.exceptions.group_priority(exception) < current;
-                    if taken {
-                        exception
-                    } else {
-                        scs.hfsr |= hfsr::FORCED;
-                        HARD_FAULT
-                    }
+        let masks = self.privileged(|cpu| cpu.masks());
+        let scs = &mut self.chip_mut().scs;
+        let current = scs.exceptions.execution_priority(masks);
+        let exception = match fault {
+            Fault::Configurable { exception, status, address } => {
+                scs.cfsr |= status;
+                if let Some(address) = address {
+                    scs.bfar = address;
+                    scs.cfsr |= cfsr::BFARVALID;
                 }
-                Fault::Hard(status) => {
-                    scs.hfsr |= status;
+                let taken = scs.exceptions.is_enabled(exception)
+                    && scs.exceptions.group_priority(exception) < current;
+                if taken {
+                    exception
+                } else {
+                    scs.hfsr |= hfsr::FORCED;
                     HARD_FAULT
                 }
-            };
-            if exception == HARD_FAULT && current <= -1 {
-                return Entry::Lockup;
             }
-            match self.enter_exception(exception) {
-                Entry::Failed(next) => fault = next,
-                entry => return entry,
+            Fault::Hard(status) => {
+                scs.hfsr |= status;
+                HARD_FAULT
             }
+        };
+        if exception == HARD_FAULT && current <= -1 {
+            return Entry::Lockup;
         }
-        Entry::Lockup
+        self.enter_exception(exception)
     }
 
     /// Carries out SVC: the call is taken if its priority allows, and is a HardFault otherwise.
@@ -1004,10 +1080,7 @@ impl Cpu {
         let masks = self.privileged(|cpu| cpu.masks());
         let exceptions = &self.chip().scs.exceptions;
         if exceptions.group_priority(SV_CALL) < exceptions.execution_priority(masks) {
-            match self.enter_exception(SV_CALL) {
-                Entry::Failed(fault) => self.take_fault(fault),
-                entry => entry,
-            }
+            self.enter_exception(SV_CALL)
         } else {
             self.take_fault(Fault::Hard(hfsr::FORCED))
         }
@@ -1055,11 +1128,7 @@ fn locate_reports(uc: &mut Unicorn<'_, State>) {
         let code = Cpu::memory(chip, start)
             .and_then(|(memory, offset)| memory.bytes().get(offset..offset + size as usize))
             .unwrap_or(&[]);
-        let registers = std::array::from_fn(|n| match n {
-            13 => read(uc, RegisterARM::SP),
-            14 => read(uc, RegisterARM::LR),
-            _ => uc.reg_read(RegisterARM::R0 as i32 + n as i32).unwrap_or(0) as u32,
-        });
+        let registers = std::array::from_fn(|n| base_register(uc, n as u32));
         let offset = accesses::find(code, &registers, report.access, report.address).unwrap_or(0);
         report.pc = start.wrapping_add(offset);
         uc.get_data_mut().chip.reports.add(report);
@@ -1086,6 +1155,11 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         state.notes.flash_busy = true;
         return stop(uc);
     }
+    if state.notes.traps.any() && !judge_rest_of_it_block(uc, address) {
+        return stop(uc);
+    }
+    let state = uc.get_data_mut();
+    let chip = &mut state.chip;
     if single {
         chip.block = (address, size);
         return;
@@ -1117,6 +1191,87 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     chip.block = (address, size);
     chip.clock.cycles += block.instructions;
     chip.counters.instructions += block.instructions;
+}
+
+/// An instruction outside IT blocks is about to run, and a trap of CCR is set.
+fn on_instruction(uc: &mut Unicorn<'_, State>, address: u32) {
+    let State { chip, notes } = uc.get_data();
+    if (notes.it_block.0..notes.it_block.1).contains(&address) {
+        return;
+    }
+    let Some(instruction) = instruction(chip, address) else { return };
+    if let Some(it) = instruction.it_state() {
+        let first = address + instruction.len();
+        if !may_run_it_block(uc, first, it) {
+            stop(uc);
+        }
+        return;
+    }
+    if let Some(status) = instruction.traps(notes.traps, |n| base_register(uc, n)) {
+        uc.get_data_mut().notes.fault = Some(Fault::usage(status));
+        stop(uc);
+    }
+}
+
+/// A block starts at `address`, perhaps in the middle of an IT block: judges its first instruction.
+/// Whether it may start.
+fn judge_rest_of_it_block(uc: &mut Unicorn<'_, State>, address: u32) -> bool {
+    let xpsr = read(uc, RegisterARM::XPSR);
+    let it = traps::it_state(xpsr);
+    if it & 0xF == 0 {
+        uc.get_data_mut().notes.it_block = (0, 0);
+        return true;
+    }
+    let State { chip, notes } = uc.get_data();
+    let status = instruction(chip, address)
+        .filter(|_| traps::holds(it >> 4, xpsr))
+        .and_then(|instruction| instruction.traps(notes.traps, |n| base_register(uc, n)));
+    if let Some(status) = status {
+        uc.get_data_mut().notes.fault = Some(Fault::usage(status));
+        return false;
+    }
+    may_run_it_block(uc, address, it)
+}
+
+/// Whether the engine may run the instructions from `first` on, whose IT state is `it`, in one go:
+/// it does not stop among them. If not, [`Notes::in_doubt`] is the first one to stop at.
+fn may_run_it_block(uc: &mut Unicorn<'_, State>, first: u32, it: u8) -> bool {
+    let State { chip, notes } = uc.get_data();
+    let xpsr = read(uc, RegisterARM::XPSR);
+    let (mut at, mut state, mut in_doubt) = (first, it, None);
+    while state & 0xF != 0 {
+        let Some(instruction) = instruction(chip, at) else { break };
+        // What the first one finds is known; the others may find it changed.
+        let doubtful = if at == first {
+            traps::holds(state >> 4, xpsr)
+                && instruction.traps(notes.traps, |n| base_register(uc, n)).is_some()
+        } else {
+            instruction.may_trap(notes.traps)
+        };
+        if doubtful {
+            in_doubt = in_doubt.or(Some(at));
+        }
+        at = at.wrapping_add(instruction.len());
+        state = traps::advance(state);
+    }
+    let notes = &mut uc.get_data_mut().notes;
+    notes.it_block = (first, at);
+    notes.in_doubt = in_doubt.filter(|_| notes.on_the_way_to != in_doubt);
+    notes.in_doubt.is_none()
+}
+
+fn instruction(chip: &Chip, address: u32) -> Option<Instruction> {
+    let (memory, offset) = Cpu::memory(chip, address)?;
+    Instruction::take(address, memory.bytes().get(offset..)?)
+}
+
+/// r0 to r14.
+fn base_register(uc: &Unicorn<'_, State>, number: u32) -> u32 {
+    match number {
+        13 => read(uc, RegisterARM::SP),
+        14 => read(uc, RegisterARM::LR),
+        _ => uc.reg_read(RegisterARM::R0 as i32 + number as i32).unwrap_or(0) as u32,
+    }
 }
 
 /// The properties of a block of instructions that the model needs.

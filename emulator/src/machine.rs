@@ -408,7 +408,7 @@ impl Machine {
             if self.flash_holds(self.cpu.vector_address(exception)) {
                 return Entry::Taken;
             }
-            let entry = self.settle(|cpu| cpu.enter_exception(exception));
+            let entry = self.cpu.enter_exception(exception);
             return self.note_exception(entry);
         }
         self.cpu.chip_mut().limit_slice();
@@ -447,13 +447,6 @@ impl Machine {
             }
             Exit::Breakpoint => self.cpu.breakpoint(),
             Exit::Fault(fault) => self.cpu.take_fault(fault),
-        }
-    }
-
-    fn settle(&mut self, enter: impl FnOnce(&mut Cpu) -> Entry) -> Entry {
-        match enter(&mut self.cpu) {
-            Entry::Failed(fault) => self.cpu.take_fault(fault),
-            entry => entry,
         }
     }
 

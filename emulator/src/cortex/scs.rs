@@ -36,6 +36,8 @@ pub mod cfsr {
     pub const NOCP: u32 = 1 << 19;
     /// UsageFault: unaligned access.
     pub const UNALIGNED: u32 = 1 << 24;
+    /// UsageFault: division by zero.
+    pub const DIVBYZERO: u32 = 1 << 25;
 }
 
 /// HFSR bits (PM0214 section 4.4.14).
@@ -55,8 +57,8 @@ const AIRCR_PRIGROUP: u32 = 7 << 8;
 const SCR_SLEEPDEEP: u32 = 1 << 2;
 const SCR_MASK: u32 = 0b1_0110;
 const CCR_MASK: u32 = 0x31B;
-/// UNALIGN_TRP, DIV_0_TRP.
-const CCR_TRAPS: u32 = 0b11 << 3;
+const CCR_UNALIGN_TRP: u32 = 1 << 3;
+const CCR_DIV_0_TRP: u32 = 1 << 4;
 /// BFHFNMIGN.
 const CCR_IGNORES: u32 = 1 << 8;
 /// ACTLR: DISMCYCINT, DISDEFWBUF, DISFOLD, DISFPCA, DISOOFP (PM0214 section 4.4.1).
@@ -79,6 +81,25 @@ pub enum Effect {
     FpuAccess,
     /// Whether code runs step by step may have changed.
     Stepping,
+    /// The traps of CCR may have changed.
+    Traps,
+}
+
+/// The traps of CCR that are set.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Traps {
+    /// DIV_0_TRP.
+    pub division: bool,
+    /// UNALIGN_TRP.
+    pub unaligned: bool,
+}
+
+impl Traps {
+    /// Whether any is set.
+    #[must_use]
+    pub fn any(self) -> bool {
+        self.division || self.unaligned
+    }
 }
 
 /// The effect of a store that the bus refused.
@@ -162,6 +183,12 @@ impl Scs {
     #[must_use]
     pub fn sleeps_on_exit(&self) -> bool {
         self.scr & 1 << 1 != 0
+    }
+
+    /// CCR.DIV_0_TRP and CCR.UNALIGN_TRP.
+    #[must_use]
+    pub fn traps(&self) -> Traps {
+        Traps { division: self.ccr & CCR_DIV_0_TRP != 0, unaligned: self.ccr & CCR_UNALIGN_TRP != 0 }
     }
 
     /// CCR.STKALIGN.
@@ -283,11 +310,7 @@ impl Scs {
             0xD10 => self.scr = value & SCR_MASK,
             0xD14 => {
                 self.ccr = value & CCR_MASK;
-                if value & CCR_TRAPS != 0 {
-                    return Err(Unmodelled(
-                        "the traps of CCR (unaligned access, division by zero) are not modelled".into(),
-                    ));
-                }
+                return Ok(Effect::Traps);
             }
             0xD18..=0xD20 => self.set_priorities(4 + line_of(offset - 0xD18), value),
             0xD24 => self.write_shcsr(value),

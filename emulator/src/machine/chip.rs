@@ -856,7 +856,7 @@ impl Chip {
         }
         match self.scs.write(offset, value, now)? {
             Effect::None => {}
-            Effect::FpuAccess | Effect::Stepping => self.leave = true,
+            Effect::FpuAccess | Effect::Stepping | Effect::Traps => self.leave = true,
             Effect::SystemReset => {
                 self.reset_request = Some(ResetCause::Software);
                 self.leave = true;

@@ -40,9 +40,16 @@ struct Program {
 
 const SFPA: &str = "ours is wrong: bit 3 of CONTROL is reserved in Armv7-M (B1.4.4)";
 const EAGER: &str = "ours saves the FPU's registers at once: LSPACT stays 0 (B1.5.7)";
-const NO_TRAPS: &str = "ours ignores CCR.DIV_0_TRP and CCR.UNALIGN_TRP (B3.2.8)";
+const UNALIGNED: &str =
+    "ours lets unaligned LDM, STM, LDRD, STRD, VLDR, VSTR be without UNALIGN_TRP (A3.2.1)";
+const STREX: &str = "ours and QEMU look at the monitor before the alignment (B2.3.7)";
+const NO_SLEEP: &str = "QEMU ignores SCR.SLEEPONEXIT (B1.5.8)";
 
 fn programs(image: &Image) -> Vec<Program> {
+    /// Bits of CFSR and HFSR.
+    const U: u32 = 1 << 24;
+    const STKERR: u32 = 1 << 12;
+    const FORCED: u32 = 1 << 30;
     let frame = |sp, pc, xpsr| {
         let saved = [0xA0A0_A0A0, 0xA1A1_A1A1, 0xA2A2_A2A2, 0xA3A3_A3A3, 0xACAC_ACAC, 0xAEAE_AEAE];
         [&[0xFFFF_FFF9, sp][..], &saved, &[pc, xpsr]].concat()
@@ -64,6 +71,21 @@ fn programs(image: &Image) -> Vec<Program> {
             "basepri",
             "BASEPRI masks its priority and below; BASEPRI_MAX only raises (B1.4.3, B5.2.3)",
             &[1, 1, 0x10, 2, 0x40, 0x20, 0x20, 0x10, 3],
+        ),
+        program(
+            "basepri_max",
+            "BASEPRI_MAX against masked and unmasked lines (B5.2.3)",
+            &[0xC0, 0xC0, 0x80, 1, 2, 0x10, 3],
+        ),
+        program(
+            "reprioritised",
+            "a priority that changes while it is pending counts at once (B1.5.4)",
+            &[0x11, 0x10, 1, 2, 0x11, 3, 0x20, 0x21, 0x11, 0x22, 4],
+        ),
+        program(
+            "vector_table",
+            "VTOR moves the table; the vector is read on entry (B1.5.3, B1.5.6)",
+            &[14, 0x2000_2400, 0x20, 14, 1],
         ),
         program(
             "masks",
@@ -89,26 +111,63 @@ fn programs(image: &Image) -> Vec<Program> {
             )
         },
         program(
+            "fpscr",
+            "FPSCR survives an exception (B1.5.7)",
+            &[0xFFFF_FFE9, 0xA3C0_0081, 0x3EAA_AAAA, 0xA3C0_0091],
+        ),
+        program(
+            "nested_float",
+            "S0 and FPSCR in three contexts, one inside the other (B1.5.7)",
+            &[
+                [0xFFFF_FFE9, 0].as_slice(),
+                &[0xFFFF_FFE1, 0],
+                &[0x4000_0000, 2 << 22],
+                &[0x3F80_0000, 3 << 22],
+            ]
+            .concat(),
+        ),
+        program(
             "process_stack",
             "PSP, MSP and CONTROL; without privilege CPS and MSR are ignored (B1.4.4, B5.2)",
             &[2, 0x2000_8000, 0xFFFF_FFFD, 0x2000_7FE0, STACK, 0, 0, 0xFFFF_FFFD, 0x2000_7FE0, STACK, 1, 0],
         ),
         program("usage_fault", "an undefined instruction (B3.2.15)", &[0, 6, 1 << 16, 0]),
+        program(
+            "traps",
+            "division by zero and an unaligned access, trapped (B3.2.8, B3.2.15)",
+            &[0, 6, 1 << 25, 0, 0, 6, 1 << 24, 0, 1],
+        ),
+        program(
+            "traps_in_it",
+            "the same in IT blocks, by their conditions; the IT state is stacked (B1.4.2, B1.5.6)",
+            &[
+                [0x800, 0, 6, 1 << 25, 0, 5].as_slice(),
+                &[0x800, 0, 6, 1 << 25, 0],
+                &[3, 7],
+                &[0x400, 0, 6, 1 << 24, 0, 7, 0, 1],
+            ]
+            .concat(),
+        ),
         Program {
-            // Without the faults, the word 1 and the last one come first.
             gaps: &[
-                (0, 1, NO_TRAPS),
-                (1, LAST, NO_TRAPS),
-                (2, 0, NO_TRAPS),
-                (5, 0, NO_TRAPS),
-                (6, 0, NO_TRAPS),
-                (8, 0, NO_TRAPS),
-                (9, 0, NO_TRAPS),
+                (5, 0, STREX),
+                (7, 0, UNALIGNED),
+                (8, 0, UNALIGNED),
+                (9, 0, UNALIGNED),
+                (10, 0, UNALIGNED),
+                (11, 0, UNALIGNED),
+                (12, 0, UNALIGNED),
             ],
             ..program(
-                "traps",
-                "division by zero and an unaligned access, trapped (B3.2.8, B3.2.15)",
-                &[0, 6, 1 << 25, 0, 0, 6, 1 << 24, 0, 1],
+                "alignment",
+                "what must be aligned always, and what with UNALIGN_TRP (A3.2.1, B3.2.8)",
+                &[
+                    [0x5544_3322, 0x3322, 0xA7A8_2211, 0x88A7_A8A6].as_slice(),
+                    &[U, U, 0, U, U, U, U, U, U],
+                    &[U, U, 0, U, U, 0, 0, 0, U, U, U, U],
+                    &[0],
+                ]
+                .concat(),
             )
         },
         program(
@@ -122,6 +181,20 @@ fn programs(image: &Image) -> Vec<Program> {
             &[0, 3, 1 << 16, 1 << 30, 3, 0, 1 << 30, 0x40],
         ),
         program(
+            "stacking",
+            "no stack to write to: BusFault or HardFault and the exception, by priority (B1.5.11)",
+            &[
+                [5, STKERR, 0, 1 << 15, 11, 0, 0, 0, 1].as_slice(),
+                &[5, STKERR, 0, 0, 16, 0, 0, 0, 2],
+                &[5, STKERR | 1 << 16, 0, 1 << 12, 6, 0, 0, 0, 3],
+                &[11, STKERR, 0, 1 << 14, 5, 0, 0, 0, 4],
+                &[3, STKERR, FORCED, 1 << 15, 11, 0, 0, 0, 5],
+                &[3, STKERR, FORCED, 1 << 15, 11, 0, 0, 0, 6],
+                &[3, STKERR | 1 << 16, FORCED, 0, 7],
+            ]
+            .concat(),
+        ),
+        program(
             "bit_band",
             "the alias of SRAM: bit 0 of the value counts (B3.1)",
             &[8, 1, 0, 0x8000_0008, 0x8000_0000],
@@ -132,6 +205,10 @@ fn programs(image: &Image) -> Vec<Program> {
             &[0, 0x1_0005, 5, 9999],
         ),
         program("wait", "WFI ends for an exception that PRIMASK masks (B1.5.19)", &[1, 14, 2]),
+        Program {
+            differs: &[(0, 1, NO_SLEEP), (1, 2, NO_SLEEP)],
+            ..program("sleep_on_exit", "sleeps again behind each handler (B1.5.8)", &[3, 0])
+        },
         Program {
             differs: &[(
                 0,

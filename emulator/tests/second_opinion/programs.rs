@@ -76,7 +76,9 @@ core::arch::global_asm!(
     .equ ICSR,  0xE000ED04
     .equ VTOR,  0xE000ED08
     .equ AIRCR, 0xE000ED0C
+    .equ SCR,   0xE000ED10
     .equ CCR,   0xE000ED14
+    .equ SHPR1, 0xE000ED18
     .equ SHPR2, 0xE000ED1C
     .equ SHPR3, 0xE000ED20
     .equ SHCSR, 0xE000ED24
@@ -215,6 +217,31 @@ core::arch::global_asm!(
     put 3
     end
 
+    program basepri_max
+    vector 16, line
+    store ISER0, 1
+    store_byte IPR0, 0x80
+    movs r0, #0xC0
+    msr basepri_max, r0         // from 0, which masks nothing, any value raises
+    log_special basepri
+    movs r0, #0xF0
+    msr basepri_max, r0         // would lower: ignored
+    log_special basepri
+    movs r0, #0x80
+    msr basepri_max, r0         // raises, and masks the line
+    isb
+    log_special basepri
+    store ISPR0, 1
+    put 1
+    movs r0, #0xC0
+    msr basepri_max, r0         // does not let it in
+    isb
+    put 2
+    msr basepri, r0             // does
+    isb
+    put 3
+    end
+
     handler sets_faultmask
     cpsid f
     log_special faultmask
@@ -239,6 +266,69 @@ core::arch::global_asm!(
     vector 16, sets_faultmask   // the return from the handler clears it
     store ISPR0, 1
     log_special faultmask
+    end
+
+    // --- priorities that change
+
+    handler raises_the_other
+    put 0x20
+    store ISPR0, 2              // less urgent: waits
+    put 0x21
+    store_byte IPR0 + 1, 0x40   // more urgent now: interrupts
+    isb
+    put 0x22
+    bx lr
+    .ltorg
+
+    program reprioritised
+    vector 16, line
+    vector 17, second_line
+    store ISER0, 3
+    store_byte IPR0, 0x40
+    store_byte IPR0 + 1, 0x80
+    cpsid i
+    store ISPR0, 3
+    store_byte IPR0 + 1, 0x20   // both are pending
+    cpsie i
+    isb
+    put 1
+    store_byte IPR0 + 1, 0x80
+    movs r0, #0x80
+    msr basepri, r0
+    store ISPR0, 2
+    put 2
+    store_byte IPR0 + 1, 0x60   // above BASEPRI now
+    isb
+    put 3
+    movs r0, #0
+    msr basepri, r0
+    vector 16, raises_the_other
+    store_byte IPR0, 0x80
+    store_byte IPR0 + 1, 0xC0
+    store ISPR0, 1
+    put 4
+    end
+
+    // --- where the vectors are
+
+    handler from_the_second_table
+    put 0x20
+    bx lr
+    .ltorg
+
+    program vector_table
+    vector 14, log_exception
+    store 0x20002400 + 4 * 14, from_the_second_table
+    store ICSR, 0x10000000
+    store VTOR, 0x20002400
+    log_word VTOR
+    store ICSR, 0x10000000
+    cpsid i
+    store ICSR, 0x10000000
+    store VTOR, 0x20002000      // pending, but the vector is read when it is taken
+    cpsie i
+    isb
+    put 1
     end
 
     // --- stack frames
@@ -302,6 +392,75 @@ after_second:
     vmov r6, s0
     log r6
     log_special control
+    end
+
+    program fpscr
+    vector 11, log_lr
+    store CPACR, 0x00F00000
+    vmov.f32 s0, #1.0
+    vmov.f32 s1, #3.0
+    ldr r0, =0xA3C00081         // N, C; DN, FZ, towards zero; IDC, IOC
+    vmsr fpscr, r0
+    svc 0
+    vmrs r6, fpscr
+    log r6
+    vdiv.f32 s2, s0, s1         // 3EAAAAAAh towards zero, 3EAAAAABh to nearest
+    vmov r6, s2
+    log r6
+    vmrs r6, fpscr              // and IXC
+    log r6
+    end
+
+    handler log_lr
+    log lr
+    bx lr
+
+    .macro log_rounding         // what a new context takes from FPDSCR (FPSCR[26:22])
+    vmrs r6, fpscr
+    and r6, #0x07C00000
+    log r6
+    .endm
+
+    .macro log_s0
+    vmov r6, s0
+    log r6
+    .endm
+
+    .macro round mode           // FPSCR.RMode
+    ldr r6, =\mode << 22
+    vmsr fpscr, r6
+    .endm
+
+    handler outer_float
+    log lr
+    log_rounding
+    vmov.f32 s0, #2.0
+    round 2
+    store ISPR0, 1
+    log_s0
+    log_rounding
+    bx lr
+    .ltorg
+
+    handler inner_float
+    log lr
+    log_rounding
+    vmov.f32 s0, #3.0
+    round 1
+    bx lr
+    .ltorg
+
+    program nested_float
+    vector 11, outer_float
+    vector 16, inner_float
+    store CPACR, 0x00F00000
+    store SHPR2, 0x80000000
+    store ISER0, 1
+    vmov.f32 s0, #1.0
+    round 3
+    svc 0
+    log_s0
+    log_rounding
     end
 
     program process_stack
@@ -392,6 +551,124 @@ after_second:
     put 1
     end
 
+    // In an IT block: the IT state goes onto the stack, and does not come back.
+    handler log_fault_in_it
+    ldr r6, [sp, #28]
+    ldr r5, =0x0600FC00
+    and r4, r6, r5
+    log r4
+    bic r6, r5
+    str r6, [sp, #28]
+    b log_fault
+    .ltorg
+
+    .macro points               // 3 is the instruction at fault, 4 where to go on
+    adr.w r9, 3f
+    adr.w r8, 4f
+    cmp r0, r0                  // EQ
+    b 2f
+    .balign 4
+2:
+    .endm
+
+    program traps_in_it
+    vector 6, log_fault_in_it
+    store SHCSR, 0x00040000
+    store CCR, 0x00000218
+    movs r0, #6
+    movs r1, #0
+    points
+    itet eq
+    moveq r2, #5
+    udivne r2, r0, r1           // skipped
+3:  udiveq r2, r0, r1
+4:  log r2                      // as before
+    movs r1, #4
+    points
+    itt eq
+    moveq r1, #0                // brings the fault about
+3:  sdiveq r2, r0, r1
+4:  movs r1, #0
+    cmp r0, r0
+    itt eq
+    moveq r1, #2                // prevents it
+    udiveq r2, r0, r1
+    log r2
+    ldr r3, =0x20000402
+    cmp r0, r0
+    ite ne
+    ldrne r2, [r3]              // skipped
+    moveq r2, #7
+    log r2
+    points
+    nop
+    itt eq
+3:  streq r2, [r3]
+    moveq r2, #8                // not reached
+4:  log r2
+    log_word 0x20000400
+    put 1
+    end
+
+    handler count_fault
+    ldr r4, =CFSR
+    ldr r6, [r4]
+    str r6, [r4]
+    orr r10, r6
+    str r8, [sp, #24]
+    bx lr
+    .ltorg
+
+    .macro faults instruction:vararg    // CFSR, or 0 without a fault
+    mov r10, #0
+    fails \instruction
+    log r10
+    .endm
+
+    program alignment
+    vector 6, count_fault
+    store SHCSR, 0x00040000
+    store CPACR, 0x00F00000
+    store 0x20000400, 0x44332211
+    store 0x20000404, 0x88776655
+    ldr r0, =0x20000401
+    ldr r1, [r0]
+    log r1
+    ldrsh.w r1, [r0]
+    log r1
+    ldr r1, =0xA5A6A7A8
+    str r1, [r0, #1]
+    strh r1, [r0, #4]
+    log_word 0x20000400
+    log_word 0x20000404
+    add r0, #1
+    faults ldrex r1, [r0]
+    faults strex r2, r1, [r0]
+    faults ldrexh r1, [r0]      // 0x20000402: aligned
+    faults ldm r0, {{r1, r2}}
+    faults stm r0, {{r1, r2}}
+    faults ldrd r1, r2, [r0]
+    faults strd r1, r2, [r0]
+    faults vldr s0, [r0]
+    faults vstr s0, [r0]
+    store CCR, 0x00000208       // UNALIGN_TRP
+    faults ldr r1, [r0]
+    faults str r1, [r0]
+    faults ldrh r1, [r0]
+    faults ldrh r1, [r0, #1]
+    faults strh r1, [r0, #-1]
+    faults ldrb r1, [r0, #1]
+    faults ldr r1, [r0, #2]
+    movs r3, #1
+    faults ldr r1, [r0, r3, lsl #1]
+    faults ldr r1, [r0, r3]
+    faults ldm r0, {{r1, r2}}
+    faults strd r1, r2, [r0]
+    faults vldr s0, [r0]
+    store CCR, 0x00000200
+    faults ldr r1, [r0]
+    end
+
     program bus_fault
     vector 5, log_bus_fault
     store SHCSR, 0x00020000
@@ -411,6 +688,79 @@ after_second:
     isb
     fails svc 0                 // SVCall is masked
     log_special basepri
+    end
+
+    // --- no stack to write the frame to
+
+    // Makes a frame for the return to r8.
+    handler log_and_mend_stack
+    log_special ipsr
+    ldr r4, =CFSR
+    ldr r6, [r4]
+    log r6
+    str r6, [r4]
+    ldr r4, =HFSR
+    ldr r6, [r4]
+    log r6
+    str r6, [r4]
+    ldr r4, =SHCSR
+    ldr r6, [r4]
+    and r6, #0xF000             // what is pending
+    log r6
+    ldr r4, =0x20008000
+    str r8, [r4, #24]
+    mov r6, #0x01000000
+    str r6, [r4, #28]
+    msr psp, r4
+    bx lr
+    .ltorg
+
+    .macro without_stack instruction:vararg
+    ldr r0, =0xA0000100
+    msr psp, r0
+    isb
+    adr.w r8, 4f
+    \instruction
+    .balign 4
+4:
+    .endm
+
+    program stacking
+    vector 3, log_and_mend_stack
+    vector 5, log_and_mend_stack
+    vector 6, log_and_mend_stack
+    vector 11, log_and_mend_stack
+    vector 16, log_and_mend_stack
+    store ISER0, 1
+    store_byte IPR0, 0x80
+    store SHPR2, 0x80000000
+    movs r0, #2
+    msr control, r0
+    isb
+    store SHCSR, 0x00060000     // BusFault, UsageFault
+    store SHPR1, 0x00804000
+    without_stack svc 0         // BusFault first
+    put 1
+    without_stack store ISPR0, 1
+    put 2
+    without_stack udf #0
+    put 3
+    store SHPR1, 0x0000C000
+    without_stack svc 0         // BusFault second
+    put 4
+    store SHPR1, 0x00008000
+    store SHPR2, 0x40000000
+    movs r0, #0x60
+    msr basepri, r0
+    without_stack svc 0         // BusFault is masked: HardFault first
+    put 5
+    movs r0, #0
+    msr basepri, r0
+    store SHCSR, 0
+    without_stack svc 0         // BusFault is not enabled: HardFault first
+    put 6
+    without_stack udf #0        // neither is UsageFault: one HardFault
+    put 7
     end
 
     // --- the rest
@@ -450,6 +800,27 @@ after_second:
     cpsie i
     isb
     put 2
+    end
+
+    handler third_time_wakes
+    add r4, #1
+    cmp r4, #3
+    bne 1f
+    store SCR, 0
+1:  bx lr
+    .ltorg
+
+    program sleep_on_exit
+    vector 15, third_time_wakes
+    store 0xE000E014, 9999
+    store 0xE000E018, 0
+    movs r4, #0
+    store SCR, 2
+    store 0xE000E010, 7
+    wfi                         // goes on behind the third interrupt
+    log r4
+    log_word SCR
+    store 0xE000E010, 0
     end
 
     program priority_bits
