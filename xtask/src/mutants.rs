@@ -33,37 +33,39 @@ const VERSION: &str = "27.1.0";
 /// One run of cargo-mutants.
 struct Run {
     package: &'static str,
-    /// The files to change, as globs; all if it is empty.
-    files: &'static [&'static str],
-    /// The files that another run changes.
+    /// The files that this run does not change, as globs.
     but: &'static [&'static str],
+    /// A run with other features, behind one without: changes the files that begin with these, and
+    /// what the run before has not noticed, because it may not have been built there.
+    only: &'static [&'static str],
     features: &'static str,
-    /// The package with the tests, if it is not the one that is changed, and its test programs.
+    /// The packages with the tests besides the one that is changed, and arguments for cargo.
     tests: Option<(&'static str, &'static [&'static str])>,
 }
 
 impl Run {
     const fn of(package: &'static str) -> Self {
-        Self { package, files: &[], but: &[], features: "", tests: None }
+        Self { package, but: &[], only: &[], features: "", tests: None }
     }
 }
 
-/// Code that stands only in a bootloader for sealed images. Its tests need images with signatures,
-/// which the crate of the emulated tests makes.
-const SEALED: &[&str] = &["boot-core/src/unseal/*.rs", "boot-core/src/intake/sealed.rs"];
-/// Code in place of that and of resume, in which there is nothing to do.
+/// Code in place of sealed images and of resume, in which there is nothing to do.
 const ABSENT: &str = "boot-core/src/*/absent.rs";
 
 /// The crates without an operating system below them.
 const RUNS: &[Run] = &[
     Run::of("coboot-abi"),
     Run::of("coboot-canopen"),
-    Run { but: &[SEALED[0], SEALED[1], ABSENT], ..Run::of("coboot-core") },
     Run {
-        files: SEALED,
+        but: &["boot-core/src/unseal/*.rs", "boot-core/src/intake/sealed.rs", ABSENT],
+        ..Run::of("coboot-core")
+    },
+    // Its tests need images with signatures, which the crate of the emulated tests makes.
+    Run {
         but: &[ABSENT],
-        features: "sealed",
-        tests: Some(("coboot-tests", &["sealed_model"])),
+        only: &["boot-core/src/unseal/", "boot-core/src/intake/sealed.rs"],
+        features: "coboot-core/sealed",
+        tests: Some(("coboot-core,coboot-tests", &["--test=objects", "--test=sealed_model"])),
         ..Run::of("coboot-core")
     },
     Run::of("coboot-app"),
@@ -131,7 +133,8 @@ pub fn run(mut args: Args) -> Outcome {
     if !is_sample {
         evidence::record("mutants", &as_json(&rows, true))?;
     }
-    let mut unnamed = Vec::new();
+    // By package and line; what one run notices is noticed.
+    let mut ends = BTreeMap::<(&str, String), &str>::new();
     for (number, run) in runs.iter().enumerate() {
         let out = workspace::target_dir().join("mutants").join(format!("{}-{number}", run.package));
         let _ = fs::remove_dir_all(&out);
@@ -146,16 +149,21 @@ pub fn run(mut args: Args) -> Outcome {
         mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2", "--timeout-multiplier", "3"]);
         // The compiler computes the constants: a change can make it compute for ever.
         mutants.arg("--build-timeout=180");
-        let files = file.as_deref().map_or(run.files.to_vec(), |glob| vec![glob]);
-        mutants.args(files.iter().flat_map(|glob| ["--file", glob]));
+        mutants.args(file.iter().flat_map(|glob| ["--file", glob]));
         mutants.args(run.but.iter().flat_map(|glob| ["--exclude", glob]));
         mutants.args(shard.iter().flat_map(|part| ["--shard", part]));
+        if !run.only.is_empty() {
+            let missed =
+                ends.iter().filter(|((package, _), end)| *package == run.package && **end == "missed");
+            let names = missed.map(|((_, line), _)| format!("^{}$", exactly(line)));
+            let only = run.only.iter().map(|file| format!("^{}", exactly(file)));
+            mutants.args(names.chain(only).flat_map(|name| ["--re".to_owned(), name]));
+        }
         if !run.features.is_empty() {
             mutants.args(["--features", run.features]);
         }
-        if let Some((package, programs)) = run.tests {
-            mutants.args(["--test-package", package, "--"]);
-            mutants.args(programs.iter().flat_map(|program| ["--test", program]));
+        if let Some((packages, arguments)) = run.tests {
+            mutants.args(["--test-package", packages, "--"]).args(arguments);
         }
         // It fails if a change was missed, or a build took too long, which are results.
         let status = mutants.status().map_err(|error| process::not_started(&mutants, &error))?;
@@ -165,19 +173,27 @@ pub fn run(mut args: Args) -> Outcome {
         }
         for (end, list) in ENDS {
             let list = fs::read_to_string(out.join("mutants.out").join(list)).unwrap_or_default();
-            for (line, (file, change)) in list.lines().filter_map(|line| Some((line, parts(line)?))) {
-                let row = rows.entry(file.clone()).or_default();
-                run.package.clone_into(&mut row.package);
-                match end {
-                    "unviable" => row.unviable += 1,
-                    "missed" if reason(&file, change).is_some() => row.named += 1,
-                    "missed" => {
-                        row.missed += 1;
-                        unnamed.push(line.to_owned());
-                    }
-                    _ => row.caught += 1,
+            for line in list.lines() {
+                let before = ends.entry((run.package, line.to_owned())).or_insert(end);
+                if end != "unviable" {
+                    *before = end;
                 }
             }
+        }
+    }
+    let mut unnamed = Vec::new();
+    for ((package, line), end) in ends {
+        let Some((file, change)) = parts(&line) else { continue };
+        let row = rows.entry(file.clone()).or_default();
+        package.clone_into(&mut row.package);
+        match end {
+            "unviable" => row.unviable += 1,
+            "missed" if reason(&file, change).is_some() => row.named += 1,
+            "missed" => {
+                row.missed += 1;
+                unnamed.push(line);
+            }
+            _ => row.caught += 1,
         }
     }
     if !unnamed.is_empty() {
@@ -200,6 +216,12 @@ pub fn run(mut args: Args) -> Outcome {
         ([], count) => Err(format!("no test noticed {count} changes that have no reason; they stand above.")),
         (low, _) => Err(format!("too few changes were noticed in: {}.", low.join(", "))),
     }
+}
+
+/// A text as the regular expression that matches it.
+fn exactly(text: &str) -> String {
+    let is_meta = |letter: &char| r"\.+*?()|[]{}^$#&-~".contains(*letter);
+    text.chars().flat_map(|letter| is_meta(&letter).then_some('\\').into_iter().chain([letter])).collect()
 }
 
 /// The file and the change of a line of a list: `boot-core/src/flash.rs:12:5: replace ...`.
@@ -292,6 +314,7 @@ mod tests {
         assert_eq!(file, "boot-core/src/store/mod.rs");
         assert_eq!(change, "replace Journal::open -> Self with Default::default()");
         assert_eq!(parts("nothing"), None);
+        assert_eq!(exactly("a/b.rs:1: replace + with <T>"), r"a/b\.rs:1: replace \+ with <T>");
     }
 
     #[test]
