@@ -54,6 +54,7 @@ mod setup;
 mod size;
 mod test;
 mod timing;
+mod toolchain;
 mod workspace;
 mod zx0;
 

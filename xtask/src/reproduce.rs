@@ -8,7 +8,7 @@ use std::process::Command;
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::setup::{Part, Setup};
-use crate::{evidence, process, workspace, Outcome};
+use crate::{evidence, process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask reproduce [--board BOARD] [--yes]
@@ -74,6 +74,7 @@ pub fn run(mut args: Args) -> Outcome {
         return Err(format!("{failed} images differ; both builds are in {}.", workspace::shown(&base)));
     }
     let _ = fs::remove_dir_all(&base);
+    toolchain::notice();
     Ok(())
 }
 

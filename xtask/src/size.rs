@@ -11,7 +11,7 @@ use shared_abi::layout::{Layout, BOARDS};
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::setup::{Part, Setup};
-use crate::{build, evidence, pack, parts, workspace, Outcome};
+use crate::{build, evidence, pack, parts, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--image IMAGE] [--yes]
@@ -74,6 +74,7 @@ pub fn run(mut args: Args) -> Outcome {
         within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
     evidence::record("size", &format!("{{\"images\": [{}]}}", images.join(",\n")))?;
+    toolchain::notice();
     within
 }
 

@@ -7,14 +7,14 @@
 
 mod page;
 
+use std::fs;
 use std::path::PathBuf;
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::time::{SystemTime, UNIX_EPOCH};
-use std::{env, fs};
 
 use crate::args::Args;
 use crate::json::Value;
-use crate::{process, workspace, Outcome};
+use crate::{process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask evidence
@@ -41,7 +41,7 @@ pub fn run(args: Args) -> Outcome {
 /// written.
 pub fn record(name: &str, facts: &str) -> Outcome<PathBuf> {
     let seconds = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let text = with_origin(facts, &commit(), &toolchain(), &date(seconds))?;
+    let text = with_origin(facts, &commit(), &toolchain::line(), &date(seconds))?;
     let file = path(name);
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
     fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
@@ -98,13 +98,6 @@ pub fn commit() -> String {
     let Ok(commit) = git(&["rev-parse", "HEAD"]) else { return "unknown".to_owned() };
     let changed = git(&["status", "--porcelain", "--untracked-files=no"]).is_ok_and(|said| !said.is_empty());
     format!("{}{}", commit.trim(), if changed { "-dirty" } else { "" })
-}
-
-/// The compiler that cargo uses here.
-fn toolchain() -> String {
-    let mut rustc = Command::new(env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-    let said = process::output(rustc.arg("--version").current_dir(workspace::root()).stdin(Stdio::null()));
-    said.map_or_else(|_| "unknown".to_owned(), |said| said.trim().to_owned())
 }
 
 /// A time in seconds since 1970, as `2026-01-31T12:00:00Z`.

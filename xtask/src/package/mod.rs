@@ -18,7 +18,7 @@ use sha2::{Digest, Sha256};
 use crate::args::Args;
 use crate::json::Value;
 use crate::setup::{self, Setup};
-use crate::{process, sbom, workspace, Outcome};
+use crate::{process, sbom, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask package [--check] [--draft] [--yes] [PART ...]
@@ -39,7 +39,7 @@ SHA256SUMS has the sums of all files in target/dist.
             folder and compares the two programs byte by byte; verifies the crates against each other. This takes
             a quarter of an hour and more on two cores, so it is a job of its own and no part of .ci/run.
   --draft   a trial: also packs a tree with changes that are not committed (the source archive is without them),
-            or a commit without the tag of its version
+            or a commit without the tag of its version, and by another Rust than a release has
   --yes     installs missing packages with sudo
 ";
 
@@ -99,6 +99,8 @@ pub fn run(mut args: Args) -> Outcome {
     let draft = args.flag("--draft");
     let parts = parts(args.rest())?;
     if !draft {
+        toolchain::check(&toolchain::line())
+            .map_err(|other| format!("{other} Or add --draft for a trial."))?;
         releasable(&git(&["status", "--porcelain"])?, &git(&["tag", "--points-at", "HEAD"])?)?;
     }
     let target = workspace::target_dir();
