@@ -10,7 +10,8 @@
 //! 1.3 cycles an instruction; budgets measured here want that much reserve.
 //!
 //! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting unless
-//! CCR.UNALIGN_TRP is set; the MPU is off;
+//! CCR.UNALIGN_TRP is set; CCR.NONBASETHRDENA is ignored; FPDSCR does not reach a new FPU context;
+//! a fault on exception return stacks a frame of its own; the MPU is off;
 //! SEV is not seen (WFE ends by itself); an FPU instruction that a false IT condition skips faults
 //! all the same while the FPU is off; CCR.BFHFNMIGN is for stores that a register refuses, and an
 //! access to where nothing is locks the core up all the same at priority -1.

@@ -1,19 +1,24 @@
-//! `cargo xtask opinion`: the emulated CPU beside one that others wrote.
+//! `cargo xtask opinion`: the emulated CPU and board beside ones that others wrote.
 
 use std::fs;
 
+use shared_abi::layout::DEFAULT;
+
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{evidence, process, workspace, Outcome};
+use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json] [--yes]
 
 Runs the programs of emulator/tests/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
 (mps2-an386), and compares their results word for word. A difference that is not explained in the
-table of the programs is a failure.
+table of the programs is a failure. Then updates the bootloader with CAN over UART through the serial
+port of the emulated board and of QEMU's STM32F405 (netduinoplus2), and compares every sector of the
+two flashes.
 
-  --json          also writes the result to target/evidence/cpu.json: commit, counts, differences
+  --json          also writes the result of the programs to target/evidence/cpu.json: commit, counts,
+                  differences
   --yes           installs what is missing with sudo
 ";
 
@@ -22,6 +27,12 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator, Part::Qemu])?;
+    let cpu = cpu(json);
+    let board = board();
+    cpu.and(board)
+}
+
+fn cpu(json: bool) -> Outcome {
     let mut test = process::cargo("test");
     test.args(["--quiet", "--package", "coboot-emulator", "--test", "second_opinion"]);
     test.args(["--", "--include-ignored", "--nocapture", "--test-threads=1"]);
@@ -35,4 +46,12 @@ pub fn run(mut args: Args) -> Outcome {
     let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&result));
     evidence::record("cpu", &fs::read_to_string(&result).map_err(unread)?)?;
     ended
+}
+
+fn board() -> Outcome {
+    let images = build::images(DEFAULT, &["bootloader-virtual-can", "app-virtual-can"])?;
+    let mut test = process::cargo("test");
+    test.args(build::tests_args(DEFAULT));
+    test.args(["--quiet", "--test", "second_board", "--", "--include-ignored", "--nocapture"]);
+    process::run(test.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", images))
 }
