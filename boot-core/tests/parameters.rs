@@ -241,6 +241,11 @@ fn the_first_values_stand_behind_a_header_in_the_first_region() {
 fn the_tags_are_those_of_devices_in_the_field() {
     let tags = [Key::Program(1), Key::Program(254), Key::CrashCount, Key::Node].map(Key::tag);
     assert_eq!(tags, [0x0001_0001, 0x0001_00FE, 0x0002_0000, 0x0003_0000]);
+    #[cfg(feature = "sealed")]
+    {
+        let tags = [Key::Counter(1), Key::Counter(254), Key::Event(7), Key::Grants].map(Key::tag);
+        assert_eq!(tags, [0x0004_0001, 0x0004_00FE, 0x0005_0007, 0x0006_0000]);
+    }
 }
 
 /// 256 bytes are ten slots: a header and nine records. The tenth record needs the other region.
@@ -371,21 +376,46 @@ fn a_header_or_a_record_with_any_wrong_bit_does_not_count() {
 }
 
 /// A power cut may have left bits of the header between 0 and 1: the first store after a start
-/// writes it again, and only that one.
+/// writes it again, and only that one. The record goes to the first free slot, however full the
+/// region is.
 #[test]
 fn the_first_store_after_a_start_writes_the_header_again() {
-    let mut flash = ModelFlash::new(&SMALL);
-    let mut journal = Journal::open(&flash, REGIONS);
-    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
-    let mut journal = Journal::open(&flash, REGIONS);
-    let mut written = |key| {
-        flash.touched.clear();
-        store(&mut flash, &mut journal, key, [1, 0, 0, 0]).unwrap();
-        let slots = flash.touched.chunks(6).map(|words| (words[0].base - REGIONS[0].base) / SLOT);
-        slots.collect::<Vec<_>>()
-    };
-    assert_eq!(written(Key::CrashCount), [0, 2]);
-    assert_eq!(written(Key::CrashCount), [3]);
+    for full in 1..9 {
+        let mut flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        for n in 0..full {
+            store(&mut flash, &mut journal, Key::Node, [n, 1, 0, 0]).unwrap();
+        }
+        let mut journal = Journal::open(&flash, REGIONS);
+        let mut written = |key| {
+            flash.touched.clear();
+            store(&mut flash, &mut journal, key, [1, 0, 0, 0]).unwrap();
+            let slots = flash.touched.chunks(6).map(|words| (words[0].base - REGIONS[0].base) / SLOT);
+            slots.collect::<Vec<_>>()
+        };
+        assert_eq!(written(Key::CrashCount), [0, full + 1]);
+        if full < 8 {
+            assert_eq!(written(Key::CrashCount), [full + 2]);
+        }
+    }
+}
+
+/// Every start of the device looks for the end of its journal: by halves, so that it reads the
+/// region about once.
+#[test]
+fn to_open_a_journal_takes_a_look_at_each_byte_and_no_more() {
+    let region = LAYOUT.parameters[0];
+    for full in [0, 1, 300, 681] {
+        let mut flash = ModelFlash::new(LAYOUT.chip);
+        flash.poke(region.base, &header(1));
+        for n in 1..=full {
+            flash.poke(region.base + n * SLOT, &record(Key::Node, [n, 0, 0, 0]));
+        }
+        flash.bytes_read.set(0);
+        Journal::open(&flash, LAYOUT.parameters);
+        let read = flash.bytes_read.get();
+        assert!(read <= region.size as usize + 1024, "{full} records: {read} bytes");
+    }
 }
 
 // --- flash that does not take everything
@@ -447,6 +477,17 @@ fn a_worn_out_slot_costs_a_slot_and_no_value() {
                 assert_eq!(journal.get(&worn, Key::Node), stored, "slot {slot}, value {n}");
             }
         }
+    }
+}
+
+/// Eight places in a row may be bad; after the ninth the device gives up.
+#[test]
+fn a_store_tries_nine_places() {
+    for (bad, outcome) in [(8, Ok(())), (9, Err(StoreError::WornOut))] {
+        let flash = ModelFlash::new(&SMALL);
+        let mut journal = Journal::open(&flash, REGIONS);
+        let mut worn = Worn { flash, places: vec![Region::new(REGIONS[0].base + SLOT, bad * SLOT)] };
+        assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), outcome, "{bad} bad places");
     }
 }
 

@@ -6,6 +6,7 @@ use std::{env, fs};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::{read, Firmware};
+use coflash::update::GROUP_BLOCKS;
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::layout::{self, Layout};
@@ -98,14 +99,28 @@ pub fn blocks(name: &str) -> BlockFile {
     blocks_of_file(&dir().join(name))
 }
 
+/// An application in blocks of 4 KiB, as a group of devices gets it.
+///
+/// # Panics
+/// As [`blocks`].
+#[must_use]
+pub fn large_blocks(name: &str) -> BlockFile {
+    let _ = elf(name);
+    blocks_with(&dir().join(name), Options::default().block_size(GROUP_BLOCKS))
+}
+
 /// The same for an ELF file anywhere.
 ///
 /// # Panics
 /// If it is none, or does not fit the board.
 #[must_use]
 pub fn blocks_of_file(elf: &Path) -> BlockFile {
+    blocks_with(elf, Options::default())
+}
+
+fn blocks_with(elf: &Path, options: Options) -> BlockFile {
     let image = coflash::file::read::load(elf, None, None).expect("an ELF of ours");
-    let options = Options::default().region(Region::Strict(board().programs[0].into()));
+    let options = options.region(Region::Strict(board().programs[0].into()));
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }
 

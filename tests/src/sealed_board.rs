@@ -79,10 +79,16 @@ pub fn release() -> SigningKey {
 /// to be signed by [`release`].
 #[must_use]
 pub fn sealer(counter: u32) -> Sealer<'static> {
+    sealer_of_epoch(counter, 1)
+}
+
+/// The same, with a certificate of this epoch.
+#[must_use]
+pub fn sealer_of_epoch(counter: u32, epoch: u32) -> Sealer<'static> {
     let bsp::Identity { vendor_id, product_code, .. } = bsp::IDENTITY;
     let certificate = Certificate {
         role: Role::Release,
-        epoch: 1,
+        epoch,
         vendor_id,
         product_code: 0,
         lowest: 0,

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use canopen::program::ProgramControl;
 use canopen::BitRate;
 use coflash::device::Dialect;
+use coflash::file::block_file::BlockFile;
 use coflash::file::sealed::{SealedFile, Sealer};
 use coflash::update::{flash, FlashOptions, Program};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
@@ -121,6 +122,18 @@ pub const SCENARIOS: &[Scenario] = &[
         prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Raw)))),
     },
     Scenario {
+        name: "hex",
+        about: "the same in one download of Intel HEX",
+        is_slow: false,
+        prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Hex)))),
+    },
+    Scenario {
+        name: "group",
+        about: "the same in blocks of 4 KiB, as a group of devices gets them",
+        is_slow: false,
+        prepare: || update(|bench| write_file(bench, &firmware::large_blocks(firmware::APP_V2), &options())),
+    },
+    Scenario {
         name: "resume",
         about: "the same in blocks, after half of them have arrived",
         is_slow: false,
@@ -145,6 +158,12 @@ pub const SCENARIOS: &[Scenario] = &[
         prepare: || sealed(false),
     },
     Scenario { name: "compressed", about: "the same, compressed", is_slow: true, prepare: || sealed(true) },
+    Scenario {
+        name: "counter",
+        about: "version 2 once more, with a certificate of a higher epoch, while it runs",
+        is_slow: true,
+        prepare: counter,
+    },
 ];
 
 fn options() -> FlashOptions {
@@ -152,8 +171,11 @@ fn options() -> FlashOptions {
 }
 
 fn write(bench: &mut Bench, options: &FlashOptions) -> Result<(), String> {
-    let file = firmware::blocks(firmware::APP_V2);
-    match flash(&mut bench.session(), &file, options, &mut |_| {}) {
+    write_file(bench, &firmware::blocks(firmware::APP_V2), options)
+}
+
+fn write_file(bench: &mut Bench, file: &BlockFile, options: &FlashOptions) -> Result<(), String> {
+    match flash(&mut bench.session(), file, options, &mut |_| {}) {
         Ok(_) => Ok(()),
         Err(error) => Err(error.to_string()),
     }
@@ -270,22 +292,42 @@ fn store() -> Result<Story, String> {
     Ok(story)
 }
 
+/// An application as a sealed image with this security counter.
+fn seal(image: &str, compress: bool, counter: u32) -> Result<Program, String> {
+    seal_with(Sealer { compress, ..sealed_board::sealer(counter) }, image)
+}
+
+fn seal_with(sealer: Sealer<'_>, image: &str) -> Result<Program, String> {
+    let bytes =
+        sealer.seal(&firmware::raw(image), &sealed_board::release()).map_err(|error| error.to_string())?;
+    let file = SealedFile::parse(bytes).map_err(|error| error.to_string())?;
+    Ok(Program::Sealed(Arc::new(file)))
+}
+
+fn write_sealed(bench: &mut Bench, program: &Program) -> Result<(), String> {
+    coflash::update::flash_program(&mut bench.session(), program, &options(), &mut |_| {})
+        .map(drop)
+        .map_err(|error| error.to_string())
+}
+
 fn sealed(compress: bool) -> Result<Story, String> {
-    let seal = |image: &str, counter| -> Result<Program, String> {
-        let sealer = Sealer { compress, ..sealed_board::sealer(counter) };
-        let bytes = sealer
-            .seal(&firmware::raw(image), &sealed_board::release())
-            .map_err(|error| error.to_string())?;
-        let file = SealedFile::parse(bytes).map_err(|error| error.to_string())?;
-        Ok(Program::Sealed(Arc::new(file)))
-    };
-    let version_2 = seal(firmware::APP_V2, sealed_board::COUNTER + 1)?;
-    let version_1 = seal(firmware::APP_V1, sealed_board::COUNTER)?;
-    from_version_1(firmware::BOOTLOADER_SEALED, &version_1, move |bench| {
-        coflash::update::flash_program(&mut bench.session(), &version_2, &options(), &mut |_| {})
-            .map(drop)
-            .map_err(|error| error.to_string())
-    })
+    let version_2 = seal(firmware::APP_V2, compress, sealed_board::COUNTER + 1)?;
+    let version_1 = seal(firmware::APP_V1, compress, sealed_board::COUNTER)?;
+    from_version_1(firmware::BOOTLOADER_SEALED, &version_1, move |bench| write_sealed(bench, &version_2))
+}
+
+fn counter() -> Result<Story, String> {
+    let mut story = sealed(false)?;
+    let mut bench = running(&story);
+    (story.act)(&mut bench)?;
+    bench.power_off();
+    story.start = bench.machine().flash_cells();
+    story.from.outcome = Outcome::New;
+    // Nothing of the program is touched.
+    story.between = &[];
+    let higher = seal_with(sealed_board::sealer_of_epoch(sealed_board::COUNTER + 1, 2), firmware::APP_V2)?;
+    story.act = Box::new(move |bench| write_sealed(bench, &higher));
+    Ok(story)
 }
 
 /// The first bytes of the program's flash with this image, from the emulator's own ELF loader.
