@@ -14,13 +14,16 @@ use bench::{Bench, CONFIG, CONTROL};
 use boot_core::bootloader::Config;
 use boot_core::control::{Policy, Step};
 use boot_core::flash::FlashFault;
-use boot_core::store::{Journal, Key, NodeParameters, Parameters};
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
+use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
 use canopen::od::{Address, Objects};
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
 use model::{ModelFlash, CHIP};
-use rig::{crc32, program, Rig, Setup, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID};
+use rig::{
+    crc32, program, Rig, Setup, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
+};
 use shared_abi::label;
 use shared_abi::warm_start::BootRequest;
 
@@ -353,6 +356,11 @@ fn a_device_tells_why_it_stayed() {
         let mut bytes = [0; 4];
         assert_eq!(node.read(Address::new(0x1018, 4), &mut bytes), Ok(4));
         assert_eq!(bytes, 0x1234_5678_u32.to_le_bytes());
+        // Vendor-ID, product code and revision are those of the configuration.
+        for sub in 1..4 {
+            assert_eq!(node.read(Address::new(0x1018, sub), &mut bytes), Ok(4));
+            assert_eq!(bytes, [0; 4]);
+        }
         node.node_id_changed(None);
         let before = [node.next_emergency(), node.next_emergency()];
         node.node_id_changed(NodeId::new(5));
@@ -467,4 +475,227 @@ fn an_idle_device_stays_idle() {
     bench.settle();
     let journal = Journal::open(bench.node.flash(), bench::LAYOUT.parameters);
     assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
+}
+
+// --- what the mutants of the code showed to be untested
+
+/// Only the confirmation marks a program that has returned the device; it is stored once.
+#[test]
+fn a_program_that_came_back_is_confirmed_once() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    let confirmed = |bench: &mut Bench<'_>| {
+        let flash = bench.node.flash();
+        let journal = Journal::open(flash, bench::LAYOUT.parameters);
+        ProgramRecord::load(&journal, flash, 1).map(|record| record.confirmed)
+    };
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(confirmed(&mut bench), None, "there is no program");
+    bench.install(&bench::program(200, 0x11));
+    for nobody in [0, 2, 255] {
+        bench.node.confirm(nobody);
+        bench.settle();
+    }
+    assert_eq!(confirmed(&mut bench), Some(false));
+    // A store that fails costs a rescue window, and no emergency.
+    let next = bench.node.flash().operations + 1;
+    bench.node.flash().fail = Some((next, FlashFault::Protected));
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!((confirmed(&mut bench), bench.node.next_emergency(), bench.status()), (Some(false), None, 0));
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(confirmed(&mut bench), Some(true));
+    bench.node.flash().touched.clear();
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(bench.node.flash().touched, []);
+}
+
+/// A confirmation does not come between the operations of other work.
+#[test]
+fn a_busy_device_confirms_nothing() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&bench::program(200, 0x11));
+    assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Pending);
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(bench.node.stored(), Poll::Ready(Ok(())));
+    let flash = bench.node.flash();
+    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    assert_eq!(journal.get(flash, Key::Node).map(|[id, ..]| id), Some(9));
+    assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
+}
+
+/// CiA 301 table 26: 8120h, error passive.
+#[test]
+fn an_event_of_the_line_is_told() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.node.line_event(LineEvent::Passive);
+    assert_eq!(bench.node.next_emergency(), Some([0x20, 0x81, 0x11, 0, 0, 0, 0, 0]));
+}
+
+/// 1F57h is busy from the end of the transfer until the record is stored: a host that starts the
+/// program earlier would start the old one.
+#[test]
+fn the_status_is_busy_until_the_program_is_one() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &raw(&STANDARD_2, 1, 900)).unwrap();
+    while rig.stored().records[0].is_none() {
+        assert_eq!(rig.status(1) & BUSY, BUSY);
+        assert!(rig.node.is_finishing());
+        rig.steps(1);
+    }
+    rig.settle();
+    assert_eq!((rig.status(1), rig.status(2)), (0, 0));
+    rig.command(1, SET_SIGNATURE).unwrap();
+    while !rig.stored().records[0].unwrap().2 {
+        assert_eq!((rig.status(1) & BUSY, rig.status(2) & BUSY), (BUSY, 0));
+        rig.steps(1);
+    }
+}
+
+/// A queue that has no room for another block takes none; one that has takes the next block while
+/// the flash works, of this program and of no other.
+#[test]
+fn the_next_block_is_taken_while_the_flash_works_if_there_is_room() {
+    let region = STANDARD_2.region(1);
+    let image = raw(&STANDARD_2, 1, 600);
+    for (buffer, room) in [(1024, false), (64 * 1024, true)] {
+        let mut rig = Rig::new(&STANDARD_2, buffer);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.send(1, &rig::block(0, 0, &rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        assert_eq!(rig.status(1) & BUSY, u32::from(!room));
+        let next = rig.node.download_start(Address::new(0x1F50, 1), None);
+        assert_eq!(next, if room { Ok(()) } else { Err(MAN_BUSY) }, "{buffer}");
+        rig.cancel(1);
+        assert_eq!(rig.node.download_start(Address::new(0x1F50, 2), None), Err(MAN_BUSY), "{buffer}");
+    }
+}
+
+/// The end of a program may be flash that no block has: it must be erased all the same.
+#[test]
+fn what_no_block_has_belongs_to_the_program_and_is_erased() {
+    let region = STANDARD_1.region(1);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 0x2800));
+    let data = raw(&STANDARD_1, 1, 600);
+    let mut whole = vec![0xFF; 0x2400];
+    whole[..600].copy_from_slice(&data);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    for block in [
+        rig::block(0, 0, &[0; 8]),
+        rig::block(1, region.base, &data),
+        rig::block(u32::MAX, 0, &rig::words(&[0x2400, crc32(&whole)])),
+    ] {
+        rig.send(1, &block).unwrap();
+        rig.settle();
+    }
+    assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&whole)));
+    assert_eq!(rig.cells(1)[..whole.len()], whole);
+}
+
+/// A password is no way around other work.
+#[test]
+fn a_password_waits_for_what_is_acknowledged() {
+    let image = raw(&ESACADEMY_1, 1, 900);
+    let mut rig = Rig::new(&ESACADEMY_1, 4096);
+    rig.unlock(1).unwrap();
+    rig.settle();
+    rig.send(1, &image).unwrap();
+    while rig.stored().records[0].is_none() {
+        assert_eq!(rig.unlock(1), Err(MAN_BUSY));
+        rig.steps(1);
+    }
+    rig.settle();
+    // The program is about to start.
+    assert_eq!(rig.unlock(1), Err(MAN_BUSY));
+    assert!(rig.node.take_boot_request().is_some());
+    rig.unlock(1).unwrap();
+}
+
+/// A lift takes another program without CLEAR, the others do not.
+#[test]
+fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
+    for (setup, replaces) in [(&LIFT_1, true), (&STANDARD_1, false)] {
+        let mut rig = Rig::new(setup, 4096);
+        rig.install(1, &raw(setup, 1, 600));
+        rig.reset();
+        rig.unlock(1).unwrap();
+        rig.settle();
+        rig.send(1, &raw(setup, 1, 700)).map_or_else(|_| assert!(!replaces), |()| assert!(replaces));
+        rig.settle();
+        let size = if replaces { 700 } else { 600 };
+        assert_eq!(rig.stored().records[0].map(|record| record.0), Some(size));
+        // Once more in the same session.
+        if replaces {
+            rig.send(1, &raw(setup, 1, 800)).unwrap();
+            rig.settle();
+            assert_eq!(rig.stored().records[0].map(|record| record.0), Some(800));
+        }
+    }
+}
+
+/// Programming may be forbidden after CLEAR: then no block is taken, and nothing is lost.
+#[test]
+fn a_block_is_refused_while_programming_is_not_allowed() {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    static ALLOWED: AtomicBool = AtomicBool::new(true);
+    let policy = Policy { allowed: || ALLOWED.load(Ordering::Relaxed), ..Policy::DEFAULT };
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, policy);
+    bench.install(&bench::program(200, 0x11));
+    assert_eq!(bench.command(CLEAR), 0);
+    ALLOWED.store(false, Ordering::Relaxed);
+    bench.node.flash().touched.clear();
+    assert_eq!(bench.block(&bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
+    assert_eq!(bench.node.flash().touched, []);
+    ALLOWED.store(true, Ordering::Relaxed);
+    bench.install(&bench::program(300, 0x22));
+}
+
+/// SYS TEC manual, table 3: SECURED for what belongs to the bootloader, ADDRESS for all else.
+#[test]
+fn a_block_outside_the_program_is_refused_with_the_reason() {
+    let layout = STANDARD_1.layout;
+    let (boot, own) = (layout.bootloader, STANDARD_1.region(1));
+    let parameters = layout.parameters;
+    assert_eq!(parameters[1].end(), own.base, "the program follows the parameters");
+    const SECURED: u32 = 0x0E;
+    const ADDRESS: u32 = 0x0C;
+    for (base, size, status) in [
+        (boot.base, 4, SECURED),
+        (boot.end() - 1, 1, SECURED),
+        (boot.base - 4, 4, ADDRESS),
+        (boot.base - 4, 5, SECURED),
+        (boot.base - 4, 12, SECURED),
+        (parameters[0].base, 16, SECURED),
+        (parameters[1].end() - 1, 1, SECURED),
+        (own.base - 1, 2, SECURED),
+        (own.base - 1, 64, SECURED),
+        (own.end(), 1, ADDRESS),
+        (own.end() - 1, 2, ADDRESS),
+        (0, 4, ADDRESS),
+        (u32::MAX - 3, 4, ADDRESS),
+        (u32::MAX, 1, ADDRESS),
+    ] {
+        let mut rig = Rig::new(&STANDARD_1, 1024);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+        rig.settle();
+        rig.chip.model().touched.clear();
+        assert!(rig.send(1, &rig::block(1, base, &vec![0; size])).is_err(), "{base:#x}, {size}");
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{base:#x}, {size}");
+        assert_eq!(rig.chip.model().touched, [], "{base:#x}, {size}");
+    }
 }
