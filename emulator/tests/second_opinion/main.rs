@@ -164,7 +164,7 @@ fn programs(image: &Image) -> Vec<Program> {
                 &[
                     [0x5544_3322, 0x3322, 0xA7A8_2211, 0x88A7_A8A6].as_slice(),
                     &[U, U, 0, U, U, U, U, U, U],
-                    &[U, U, 0, U, U, 0, 0, 0, U, U, U, U],
+                    &[U, U, 0, U, U, 0, 0, 0, U, U, U, U, U],
                     &[0],
                 ]
                 .concat(),

@@ -662,6 +662,7 @@ after_second:
     movs r3, #1
     faults ldr r1, [r0, r3, lsl #1]
     faults ldr r1, [r0, r3]
+    faults strh r1, [r0, r3]
     faults ldm r0, {{r1, r2}}
     faults strd r1, r2, [r0]
     faults vldr s0, [r0]
