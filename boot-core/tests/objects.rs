@@ -529,6 +529,27 @@ fn a_busy_device_confirms_nothing() {
     assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
 }
 
+/// Both change the record: the second would be written from what the first has replaced. To start
+/// the program changes nothing.
+#[test]
+fn a_signature_waits_for_a_confirmation() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&bench::program(200, 0x11));
+    for command in [SET_SIGNATURE, CLR_SIGNATURE] {
+        bench.node.confirm(1);
+        assert_eq!(bench.node.write(CONTROL, &[command]), Err(MAN_BUSY));
+    }
+    assert_eq!(bench.node.write(CONTROL, &[START]), Ok(()));
+    bench.settle();
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    let flash = bench.node.flash();
+    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    let record = ProgramRecord::load(&journal, flash, 1).unwrap();
+    assert!(record.confirmed && record.signed);
+}
+
 /// CiA 301 table 26: 8120h, error passive.
 #[test]
 fn an_event_of_the_line_is_told() {
@@ -635,8 +656,11 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
         rig.settle();
         let size = if replaces { 700 } else { 600 };
         assert_eq!(rig.stored().records[0].map(|record| record.0), Some(size));
-        // Once more in the same session.
+        // Once more in the same session, also behind a download that broke off.
         if replaces {
+            rig.begin(1, None, &raw(setup, 1, 800)[..700]).unwrap();
+            rig.settle();
+            rig.cancel(1);
             rig.send(1, &raw(setup, 1, 800)).unwrap();
             rig.settle();
             assert_eq!(rig.stored().records[0].map(|record| record.0), Some(800));

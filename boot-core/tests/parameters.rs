@@ -412,9 +412,11 @@ fn to_open_a_journal_takes_a_look_at_each_byte_and_no_more() {
             flash.poke(region.base + n * SLOT, &record(Key::Node, [n, 0, 0, 0]));
         }
         flash.bytes_read.set(0);
-        Journal::open(&flash, LAYOUT.parameters);
+        let journal = Journal::open(&flash, LAYOUT.parameters);
         let read = flash.bytes_read.get();
         assert!(read <= region.size as usize + 1024, "{full} records: {read} bytes");
+        let latest = (full > 0).then_some([full, 0, 0, 0]);
+        assert_eq!(journal.get(&flash, Key::Node), latest);
     }
 }
 
