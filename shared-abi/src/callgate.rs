@@ -158,18 +158,24 @@ pub enum CallgateError {
     Refused(i32),
 }
 
-/// The callgate of the device's bootloader, found and checked.
-#[derive(Clone, Copy, Debug)]
-pub struct Callgate {
-    table: Table,
+/// What a table has in place of its entry point, and how it is entered.
+trait Enter: Copy {
+    /// Calls the entry; `None` where there is none.
+    fn enter(self, selector: Selector, args: *mut core::ffi::c_void) -> Option<i32>;
 }
 
-impl Callgate {
+/// The callgate of the device's bootloader, found and checked.
+#[derive(Clone, Copy, Debug)]
+pub struct Callgate<E = u32> {
+    table: Table<E>,
+}
+
+impl<E> Callgate<E> {
     /// Checks a table.
     ///
     /// # Errors
     /// [`CallgateError::Absent`] or [`CallgateError::Version`].
-    pub fn check(table: Table) -> Result<Self, CallgateError> {
+    pub fn check(table: Table<E>) -> Result<Self, CallgateError> {
         if table.magic != MAGIC || u32::from(table.length) < TABLE_SIZE {
             return Err(CallgateError::Absent);
         }
@@ -186,7 +192,8 @@ impl Callgate {
     }
 }
 
-impl Callgate {
+#[allow(private_bounds)]
+impl<E: Enter> Callgate<E> {
     /// CRC-32/ISO-HDLC of `len` bytes of flash from `address` on.
     ///
     /// # Errors
@@ -245,6 +252,14 @@ impl Callgate {
         let mut args = ProgramArgs { number: number.into(), ..ProgramArgs::default() };
         self.call(Selector::Invalidate, (&raw mut args).cast())
     }
+
+    fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
+        match self.table.entry.enter(selector, args) {
+            None => Err(CallgateError::Absent),
+            Some(status) if status == Status::Ok as i32 => Ok(()),
+            Some(status) => Err(CallgateError::Refused(status)),
+        }
+    }
 }
 
 #[cfg(target_arch = "arm")]
@@ -258,20 +273,18 @@ impl Callgate {
         // every bit pattern is a valid `Table`.
         Self::check(unsafe { (layout.callgate() as *const Table).read_volatile() })
     }
+}
 
-    fn call(&self, selector: Selector, args: *mut core::ffi::c_void) -> Result<(), CallgateError> {
+#[cfg(target_arch = "arm")]
+impl Enter for u32 {
+    fn enter(self, selector: Selector, args: *mut core::ffi::c_void) -> Option<i32> {
         // SAFETY: `check` found the magic and the version of a table written by this bootloader, so
         // the word is the address of an `Entry`; every caller passes the argument structure of its
         // selector.
-        let status = unsafe {
-            let entry: Entry = core::mem::transmute::<usize, Entry>(self.table.entry as usize);
+        Some(unsafe {
+            let entry: Entry = core::mem::transmute::<usize, Entry>(self as usize);
             entry(selector as u32, args)
-        };
-        if status == Status::Ok as i32 {
-            Ok(())
-        } else {
-            Err(CallgateError::Refused(status))
-        }
+        })
     }
 }
 
@@ -284,31 +297,15 @@ impl Callgate {
     pub const fn find(_layout: &Layout) -> Result<Self, CallgateError> {
         Err(CallgateError::Absent)
     }
+}
 
-    /// The entry of a table is an address of the chip.
-    #[allow(clippy::unused_self)]
-    const fn call(&self, _: Selector, _: *mut core::ffi::c_void) -> Result<(), CallgateError> {
-        Err(CallgateError::Absent)
+#[cfg(not(target_arch = "arm"))]
+impl Enter for u32 {
+    /// The word is an address of the chip.
+    fn enter(self, _: Selector, _: *mut core::ffi::c_void) -> Option<i32> {
+        None
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn tells_absence_from_another_version() {
-        let good = Table {
-            magic: MAGIC,
-            abi_version: 1,
-            length: 16,
-            bootloader_version: 0x0001_0000,
-            entry: 0x0800_0211,
-        };
-        assert_eq!(Callgate::check(good).unwrap().bootloader_version(), 0x0001_0000);
-        let erased = Table { magic: u32::MAX, abi_version: u16::MAX, length: u16::MAX, ..good };
-        assert_eq!(Callgate::check(erased).unwrap_err(), CallgateError::Absent);
-        assert_eq!(Callgate::check(Table { length: 12, ..good }).unwrap_err(), CallgateError::Absent);
-        assert_eq!(Callgate::check(Table { abi_version: 2, ..good }).unwrap_err(), CallgateError::Version(2));
-    }
-}
+mod tests;

@@ -32,7 +32,9 @@ pub mod memory_map;
 pub mod ram_image;
 #[cfg(target_arch = "arm")]
 pub mod reentry;
-#[cfg(target_arch = "arm")]
+#[cfg(any(target_arch = "arm", test))]
+mod registers;
+#[cfg(any(target_arch = "arm", test))]
 pub mod reset;
 pub mod vectors;
 pub mod warm_start;
