@@ -294,6 +294,26 @@ mod tests {
         assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");
     }
 
+    /// The numbers that a program in C uses (coboot.h).
+    #[test]
+    fn each_cause_has_its_number() {
+        use ResetCause::*;
+        let causes = [
+            Unknown,
+            PowerOn,
+            Pin,
+            Software,
+            IndependentWatchdog,
+            WindowWatchdog,
+            LowPower,
+            BrownOut,
+            Unknown,
+        ];
+        for (byte, cause) in (0..).zip(causes) {
+            assert_eq!(ResetCause::from_byte(byte), cause, "{byte}");
+        }
+    }
+
     /// Flag positions from RM0090 section 7.3.21.
     #[test]
     fn the_most_telling_reset_flag_wins() {

@@ -255,6 +255,16 @@ mod tests {
         }
     }
 
+    /// 255 is the largest number of 5 kbit/s in a byte.
+    #[test]
+    fn a_bit_rate_is_kept_in_units_of_5_kbit_per_second() {
+        for (given, kept) in
+            [(0, 0), (10_000, 10_000), (1_000_000, 1_000_000), (1_275_000, 1_275_000), (9_999, 5_000)]
+        {
+            assert_eq!(StoredNode::new(1, given).bits_per_second(), kept);
+        }
+    }
+
     #[test]
     fn any_single_bit_error_reads_as_no_request() {
         let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });

@@ -1,0 +1,89 @@
+//! What is made from a layout: regions, symbols and texts, worked out by hand for the board
+//! STM32F407G-DISC1 (RM0090 table 5; 82 interrupts, so 392 bytes of vectors).
+
+use shared_abi::geometry::Region;
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+use shared_abi::layout::toml::Toml;
+use shared_abi::layout::{by_name, chosen, Image};
+
+#[test]
+fn regions_of_the_bootloader_and_its_programs() {
+    assert_eq!(LAYOUT.callgate(), 0x0800_0040);
+    assert_eq!(LAYOUT.key_block(), Region::new(0x0800_7F00, 0x100));
+    assert_eq!(LAYOUT.bootloader_image(), Region::new(0x0800_0000, 0x7F00));
+    assert_eq!(LAYOUT.program(1), Some(Region::new(0x0801_0000, 0xF_0000)));
+    assert_eq!((LAYOUT.program(0), LAYOUT.program(2)), (None, None));
+}
+
+#[test]
+fn boards_have_names() {
+    assert_eq!(by_name("nucleo-f446re").map(|layout| layout.chip.chip), Some("stm32f446re"));
+    assert_eq!(by_name("nucleo"), None);
+    assert_eq!(chosen(None).board, "stm32f407g-disc1");
+    assert_eq!(chosen(Some("stm32f429i-disc1")).board, "stm32f429i-disc1");
+    let panic = std::panic::catch_unwind(|| chosen(Some("x"))).unwrap_err();
+    let said = panic.downcast_ref::<String>().unwrap();
+    assert!(
+        said.starts_with("COBOOT_BOARD=x: ") && said.contains("nucleo-f446re, stm32f407g-disc1, "),
+        "{said}"
+    );
+}
+
+#[test]
+fn the_linker_script_of_a_program() {
+    let text = LAYOUT.linker_script(Image::Program(1)).to_string();
+    for line in [
+        "  FLASH : ORIGIN = 0x08010000, LENGTH = 0xf0000",
+        "  RAM   : ORIGIN = 0x20000000, LENGTH = 0x1ffc0",
+        "__vector_table_alignment = 0x00000200;",
+        "__vector_table_size = 0x00000188;",
+        "__core_vectors_size = 0x00000040;",
+        "__label = 0x080101e0;",
+        "__label_end = 0x08010200;",
+        "__callgate_table = 0x08000040;",
+        "__callgate_table_size = 0x00000010;",
+        "__handoff = 0x2001ffc0;",
+        "__warm_start = 0x2001fff0;",
+        "__sram_end = 0x20020000;",
+        "__programs = 0x00000001;",
+    ] {
+        assert!(text.lines().any(|of| of == line), "{line}\n{text}");
+    }
+    let bootloader = LAYOUT.linker_script(Image::Bootloader).to_string();
+    assert!(bootloader.contains("FLASH : ORIGIN = 0x08000000, LENGTH = 0x7f00\n"), "{bootloader}");
+}
+
+/// Each row by its words: name, first and last address, size, sectors.
+#[test]
+fn the_map_for_people() {
+    let text = LAYOUT.to_string();
+    let rows: Vec<Vec<&str>> = text.lines().map(|line| line.split_whitespace().collect()).collect();
+    for row in [
+        "stm32f407g-disc1 (stm32f407vg: flash 1024 KiB, SRAM 128 KiB)",
+        "bootloader 0800_0000 - 0800_7FFF 32 KiB sectors 0-1: vectors of the core, then the callgate",
+        "parameters A 0800_8000 - 0800_BFFF 16 KiB sector 2",
+        "parameters B 0800_C000 - 0800_FFFF 16 KiB sector 3",
+        "program 1 0801_0000 - 080F_FFFF 960 KiB sectors 4-11",
+        "handoff 2001_FFC0 - 2001_FFEF 48 B bootloader -> application",
+        "The callgate is at 0800_0040.",
+    ] {
+        assert!(rows.contains(&row.split_whitespace().collect()), "{row}\n{text}");
+    }
+}
+
+#[test]
+fn the_layout_as_toml() {
+    let text = Toml(&LAYOUT).to_string();
+    for line in [
+        "board = \"stm32f407g-disc1\"",
+        "bootloader = { base = 0x08000000, size = 0x8000 }",
+        "callgate-offset = 0x40",
+        "programs = [\n  { base = 0x08010000, size = 0xf0000 },\n]",
+        "warm-start = { base = 0x2001fff0, size = 0x10 }",
+        "name = \"stm32f407vg\"",
+        "  { count = 7, size = 0x20000 },\n]",
+        "interrupts = 82\nports = 9",
+    ] {
+        assert!(text.contains(&format!("{line}\n")), "{line}\n{text}");
+    }
+}
