@@ -86,6 +86,14 @@ mod tests {
         assert_eq!(BitTiming::new(42_000_000, u32::MAX), None);
     }
 
+    /// 42 MHz / (6 * 14) is 500 kbit/s; 800 kbit/s would be 52.5 cycles.
+    #[test]
+    fn a_table_has_each_bit_rate_in_its_place() {
+        let table = BitTiming::table(42_000_000, [800_000, 500_000]);
+        assert_eq!(table, [None, BitTiming::new(42_000_000, 500_000)]);
+        assert!(table[1].is_some());
+    }
+
     /// RM0090 section 32.9.2: BRP, TS1 and TS2 each hold one less; SJW 0 is one quantum.
     #[test]
     fn the_register_is_that_of_the_manual() {

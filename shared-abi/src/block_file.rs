@@ -232,6 +232,16 @@ mod tests {
         assert_eq!(told.emit(), last);
     }
 
+    /// A date behind 2106-02-07 needs more than 32 bits; its low word comes first.
+    #[test]
+    fn a_date_has_64_bits() {
+        let mut control = [0; 24];
+        control[16..].copy_from_slice(&[0x04, 0x03, 0x02, 0x01, 0x08, 0x07, 0x06, 0x05]);
+        let Some(told @ Control::Dated { date, .. }) = Control::parse(&control) else { panic!() };
+        assert_eq!(date, 0x0506_0708_0102_0304);
+        assert_eq!(told.emit(), (control, 24));
+    }
+
     #[test]
     fn only_the_lengths_of_the_manual_are_control_data() {
         for len in 0..=32 {
