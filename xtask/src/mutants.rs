@@ -3,8 +3,10 @@
 mod reasons;
 
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fmt::Write;
 use std::fs;
+use std::path::Path;
 use std::process::Command;
 
 use crate::args::Args;
@@ -14,8 +16,8 @@ use crate::{evidence, process, setup, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N]
 
-Changes the code of the crates that the device is made of, in one place at a time (cargo-mutants), and
-runs the tests of that crate: each change must make one fail. Prints what no test noticed, and counts;
+Changes the code of the crates that the device is made of, in one place at a time, as cargo-mutants
+does, and runs the tests of that crate: each change must make one fail. Prints what no test noticed, and counts;
 they go to target/evidence/mutants.json. It fails if a group of files has too few of its changes
 noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
 
@@ -24,13 +26,15 @@ noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does n
   --file GLOB     the changes in these files alone, as '**/store/*.rs'; nothing is recorded
   --shard K/N     every N-th change, beginning with the K-th from 0: a sample; nothing is recorded
 
-All of it takes hours. cargo-mutants is installed into target/tools where it is missing.
+All changes of a package stand in one build, and a variable turns one on (mutants/); what cannot stand
+there, and what no test has noticed, is then built one by one. cargo-mutants is installed into
+target/tools where it is missing.
 ";
 
 /// The version to install if there is none.
 const VERSION: &str = "27.1.0";
 
-/// One run of cargo-mutants.
+/// The changes of a package that are tried with the same tests.
 struct Run {
     package: &'static str,
     /// The files that this run does not change, as globs.
@@ -137,47 +141,31 @@ pub fn run(mut args: Args) -> Outcome {
     let mut ends = BTreeMap::<(&str, String), &str>::new();
     for (number, run) in runs.iter().enumerate() {
         let out = workspace::target_dir().join("mutants").join(format!("{}-{number}", run.package));
-        let _ = fs::remove_dir_all(&out);
-        fs::create_dir_all(&out)
-            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&out)))?;
-        let mut mutants = Command::new("cargo-mutants");
-        mutants.env("PATH", &path).current_dir(workspace::root());
-        // One crate is built again for each change: what was built before counts, and nobody
-        // debugs it.
-        mutants.envs([("CARGO_INCREMENTAL", "1"), ("CARGO_PROFILE_DEV_DEBUG", "0")]);
-        mutants.args(["mutants", "--package", run.package, "--output"]).arg(&out);
-        mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2", "--timeout-multiplier", "3"]);
-        // The compiler computes the constants: a change can make it compute for ever.
-        mutants.arg("--build-timeout=180");
-        mutants.args(file.iter().flat_map(|glob| ["--file", glob]));
-        mutants.args(run.but.iter().flat_map(|glob| ["--exclude", glob]));
-        mutants.args(shard.iter().flat_map(|part| ["--shard", part]));
-        if !run.only.is_empty() {
-            let missed =
-                ends.iter().filter(|((package, _), end)| *package == run.package && **end == "missed");
-            let names = missed.map(|((_, line), _)| format!("^{}$", exactly(line)));
-            let only = run.only.iter().map(|file| format!("^{}", exactly(file)));
-            mutants.args(names.chain(only).flat_map(|name| ["--re".to_owned(), name]));
+        let missed = ends.iter().filter(|((package, _), end)| *package == run.package && **end == "missed");
+        let names = missed.map(|((_, line), _)| line.as_str());
+        let again: Vec<String> = match run.only {
+            [] => Vec::new(),
+            only => only.iter().map(|file| format!("^{}", exactly(file))).chain(whole(names)).collect(),
+        };
+        let mut selection: Vec<String> = run.but.iter().map(|glob| format!("--exclude={glob}")).collect();
+        selection.extend(file.iter().map(|glob| format!("--file={glob}")));
+        selection.extend(shard.iter().map(|part| format!("--shard={part}")));
+        selection.extend(again.into_iter().map(|name| format!("--re={name}")));
+        let quick = in_one_build(run, &selection, &path, &out)?;
+        let left: Vec<&str> = quick
+            .iter()
+            .filter(|(_, end)| matches!(**end, "missed" | "alone"))
+            .map(|(line, _)| line.as_str())
+            .collect();
+        println!("{}: {} changes are built one by one", run.package, left.len());
+        let mut found = quick.clone();
+        if !left.is_empty() {
+            found.extend(one_by_one(run, whole(left.iter().copied()), &path, &out)?);
         }
-        if !run.features.is_empty() {
-            mutants.args(["--features", run.features]);
-        }
-        if let Some((packages, arguments)) = run.tests {
-            mutants.args(["--test-package", packages, "--"]).args(arguments);
-        }
-        // It fails if a change was missed, or a build took too long, which are results.
-        let status = mutants.status().map_err(|error| process::not_started(&mutants, &error))?;
-        let known = [0, 2, 3];
-        if !status.code().is_some_and(|code| known.contains(&code)) {
-            return Err(format!("cargo-mutants failed ({status}); what it printed above says why."));
-        }
-        for (end, list) in ENDS {
-            let list = fs::read_to_string(out.join("mutants.out").join(list)).unwrap_or_default();
-            for line in list.lines() {
-                let before = ends.entry((run.package, line.to_owned())).or_insert(end);
-                if end != "unviable" {
-                    *before = end;
-                }
+        for (line, end) in found {
+            let before = ends.entry((run.package, line)).or_insert(end);
+            if end != "unviable" {
+                *before = end;
             }
         }
     }
@@ -188,8 +176,9 @@ pub fn run(mut args: Args) -> Outcome {
         package.clone_into(&mut row.package);
         match end {
             "unviable" => row.unviable += 1,
-            "missed" if reason(&file, change).is_some() => row.named += 1,
-            "missed" => {
+            // What cargo-mutants gives no result for was not noticed either.
+            "missed" | "alone" if reason(&file, change).is_some() => row.named += 1,
+            "missed" | "alone" => {
                 row.missed += 1;
                 unnamed.push(line);
             }
@@ -216,6 +205,68 @@ pub fn run(mut args: Args) -> Outcome {
         ([], count) => Err(format!("no test noticed {count} changes that have no reason; they stand above.")),
         (low, _) => Err(format!("too few changes were noticed in: {}.", low.join(", "))),
     }
+}
+
+/// What became of the changes of a run, by the line that names one.
+type Found = BTreeMap<String, &'static str>;
+
+/// Tries the changes that can stand side by side in one build (mutants/). Those that no test has
+/// noticed may be noticed by an example in the documentation, which takes no part there.
+fn in_one_build(run: &Run, selection: &[String], path: &OsStr, out: &Path) -> Outcome<Found> {
+    let mut all = process::cargo("run");
+    all.args(["--quiet", "--package", "coboot-mutants", "--", "--package", run.package, "--out"]).arg(out);
+    all.env("PATH", path).current_dir(workspace::root());
+    all.args(selection.iter().map(|part| format!("--select={part}")));
+    if !run.features.is_empty() {
+        all.args(["--features", run.features]);
+    }
+    if let Some((packages, arguments)) = run.tests {
+        all.args(["--test-package", packages, "--"]).args(arguments);
+    }
+    process::run(&mut all)?;
+    let lists = ["caught", "missed", "unviable", "alone"].map(|end| (end, format!("{end}.txt")));
+    Ok(found_in(out, &lists))
+}
+
+/// Tries these changes with cargo-mutants.
+fn one_by_one(run: &Run, names: Vec<String>, path: &OsStr, out: &Path) -> Outcome<Found> {
+    let mut mutants = Command::new("cargo-mutants");
+    mutants.env("PATH", path).current_dir(workspace::root());
+    // One crate is built again for each change: what was built before counts, and nobody
+    // debugs it.
+    mutants.envs([("CARGO_INCREMENTAL", "1"), ("CARGO_PROFILE_DEV_DEBUG", "0")]);
+    mutants.args(["mutants", "--package", run.package, "--output"]).arg(out);
+    mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2", "--timeout-multiplier", "3"]);
+    // The compiler computes the constants: a change can make it compute for ever.
+    mutants.arg("--build-timeout=180");
+    mutants.args(names.iter().flat_map(|name| ["--re", name]));
+    if !run.features.is_empty() {
+        mutants.args(["--features", run.features]);
+    }
+    if let Some((packages, arguments)) = run.tests {
+        mutants.args(["--test-package", packages, "--"]).args(arguments);
+    }
+    // It fails if a change was missed, or a build took too long, which are results.
+    let status = mutants.status().map_err(|error| process::not_started(&mutants, &error))?;
+    let known = [0, 2, 3];
+    if !status.code().is_some_and(|code| known.contains(&code)) {
+        return Err(format!("cargo-mutants failed ({status}); what it printed above says why."));
+    }
+    Ok(found_in(&out.join("mutants.out"), &ENDS.map(|(end, list)| (end, list.to_owned()))))
+}
+
+fn found_in(folder: &Path, lists: &[(&'static str, String)]) -> Found {
+    let mut found = Found::new();
+    for (end, list) in lists {
+        let list = fs::read_to_string(folder.join(list)).unwrap_or_default();
+        found.extend(list.lines().map(|line| (line.to_owned(), *end)));
+    }
+    found
+}
+
+/// Regular expressions that match these names and no others.
+fn whole<'n>(names: impl Iterator<Item = &'n str>) -> Vec<String> {
+    names.map(|name| format!("^{}$", exactly(name))).collect()
 }
 
 /// A text as the regular expression that matches it.
