@@ -83,13 +83,29 @@ mod tests {
     #[test]
     fn the_right_password_opens_and_others_do_not() {
         let mut now = 0;
-        for given in [&b""[..], b"INI", b"INIT!", b"INIU", b"JNIT"] {
+        // Two wrong letters whose differences are the same do not cancel each other.
+        for given in [&b""[..], b"INI", b"INIT!", b"INIU", b"JNIT", b"NIIT", b"JOIT", b"JOJU"] {
             let mut lock = Lock::new(b"INIT");
             now += 100_000;
             assert_eq!(lock.open(given, Instant::from_millis(now)), WRONG, "{given:?}");
             assert_eq!(lock.failures(), 1);
         }
         assert_eq!(Lock::new(b"INIT").open(b"INIT", Instant::from_millis(0)), Ok(()));
+    }
+
+    /// A success of another kind: the next wait is the first one again.
+    #[test]
+    fn a_success_makes_the_next_wait_short() {
+        let mut lock = Lock::new(b"INIT");
+        let mut now = Instant::from_millis(0);
+        for _ in 0..4 {
+            lock.fail(now);
+            now = now + 60_000;
+        }
+        lock.succeed();
+        assert_eq!(lock.failures(), 0);
+        lock.fail(now);
+        assert!(lock.is_waiting(now + 499) && !lock.is_waiting(now + 500));
     }
 
     /// Half a second, one, two … half a minute; during the wait even the right password is refused.

@@ -271,3 +271,50 @@ fn a_caller_can_give_up() {
     let general = [0x80, 0x00, 0x20, 3, 0x00, 0x00, 0x00, 0x08];
     aborts(&mut client, 0, general, SdoError::Client(AbortCode(0x0800_0000)));
 }
+
+/// A late answer about another object, or another sub-index, belongs to an earlier transfer: it is
+/// neither success nor failure of this one.
+#[test]
+fn an_answer_about_another_object_is_no_answer() {
+    use canopen::sdo::client::Block;
+    const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 300 };
+    let object = Address::new(0x2000, 3);
+    let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
+    /// A client that waits, the answer to it without the object, and what it sends next, if it has
+    /// not ended.
+    type Case = (Box<dyn Transfer>, u8, [u8; 4], Option<u8>);
+    let cases: Vec<Case> = vec![
+        (Box::new(download(&[1])), 0x60, [0; 4], None),
+        (Box::new(download(nine)), 0x60, [0; 4], Some(0x00)),
+        (Box::new(upload()), 0x4F, [7, 0, 0, 0], None),
+        (Box::new(upload()), 0x41, [9, 0, 0, 0], Some(0x60)),
+        (
+            Box::new(Download::as_blocks(node(), object, nine, CONFIG, BLOCK)),
+            0xA4,
+            [127, 0, 0, 0],
+            Some(0x01),
+        ),
+        (
+            Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK)),
+            0xC6,
+            [9, 0, 0, 0],
+            Some(0xA3),
+        ),
+    ];
+    for (mut client, command, [a, b, c, d], next) in cases {
+        assert!(matches!(client.poll(at(0)), Step::Send(_)));
+        for (index, sub) in [(0x2001_u16, 3), (0x2100, 3), (0x2000, 4), (0x2000, 0)] {
+            let [low, high] = index.to_le_bytes();
+            client.handle(&response([command, low, high, sub, a, b, c, d]), at(1));
+            assert!(matches!(client.poll(at(1)), Step::Wait(_)), "{command:#x}, {index:#x}, {sub}");
+        }
+        client.handle(&response([command, 0x00, 0x20, 3, a, b, c, d]), at(2));
+        match (client.poll(at(2)), next) {
+            (Step::Send(frame), Some(next)) => {
+                assert_eq!(frame.exactly::<8>().map(|bytes| bytes[0]), Some(next), "{command:#x}")
+            }
+            (Step::Done(Ok(())), None) => {}
+            (other, _) => panic!("{command:#x}: {other:?}"),
+        }
+    }
+}

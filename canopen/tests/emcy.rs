@@ -192,3 +192,39 @@ fn a_stopped_node_keeps_its_emergencies() {
     let first_four: Vec<_> = (1..=4).map(|number| emergency([number, 0x10, 0x01, 0, 0, 0, 0, 0])).collect();
     assert_eq!(bench.sent(), first_four);
 }
+
+/// CiA 301 table 51: bit 0 is set with each of the others, and stays when it is told by itself.
+#[test]
+fn the_generic_bit_is_set_with_each_error() {
+    for bits in [0, register::GENERIC, register::COMMUNICATION, register::GENERIC | register::MANUFACTURER] {
+        let mut emcy = Emcy::new();
+        emcy.raise(code::GENERIC, bits, [0; 5]);
+        assert_eq!(emcy.register(), bits | 1, "{bits:#x}");
+    }
+}
+
+/// Events of the line: lost frames and bus-off have ended when they are told, error passive has not.
+#[test]
+fn events_of_the_line_are_errors_that_end() {
+    use canopen::line::LineEvent;
+    for (event, code, stays) in [
+        (LineEvent::Passive, 0x8120, true),
+        (LineEvent::Lost(0x1234), 0x8110, false),
+        (LineEvent::Recovered, 0x8140, false),
+    ] {
+        let mut emcy = Emcy::new();
+        emcy.line_event(event);
+        let told = emcy.next_message().map(|bytes| Emergency::parse(&bytes)).unwrap();
+        assert_eq!((told.code, told.register), (code, 0x11), "{event:?}");
+        assert_eq!(emcy.register(), if stays { 0x11 } else { 0 }, "{event:?}");
+        emcy.line_event(LineEvent::Active);
+        let ended = emcy.next_message().map(|bytes| Emergency::parse(&bytes)).unwrap();
+        assert_eq!((ended.code, ended.register, emcy.next_message()), (0, 0, None), "{event:?}");
+        // 1003h keeps it; the places behind it are empty.
+        let mut bytes = [0; 4];
+        assert_eq!(emcy.read(node(), Address::new(0x1003, 1), &mut bytes), Some(Ok(4)));
+        assert_eq!(bytes[..2], (code as u16).to_le_bytes());
+        let empty = emcy.read(node(), Address::new(0x1003, 2), &mut bytes);
+        assert_eq!(empty, Some(Err(AbortCode(0x0800_0024))));
+    }
+}

@@ -479,3 +479,32 @@ fn a_value_of_the_wrong_length_is_the_devices_fault() {
     assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
     assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x80, 0x00, 0x20, 0, 0x47, 0x00, 0x04, 0x06]);
 }
+
+/// An answer that waits can be taken back, or become a refusal; one that was fetched cannot.
+#[test]
+fn an_answer_that_waits_can_be_withdrawn_or_refused() {
+    let asked = [0x2F, 0x51, 0x1F, 1, 0x83, 0, 0, 0];
+    let answer = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+    let mut bench = bench();
+    assert!(bench.server.is_idle() && !bench.server.has_answer());
+    bench.send(&request(asked));
+    assert!(!bench.server.is_idle() && bench.server.has_answer());
+    assert!(!bench.server.withdraw_answer(&[0x60, 0x51, 0x1F, 2, 0, 0, 0, 0]), "another answer");
+    assert!(bench.server.has_answer());
+    assert!(bench.server.withdraw_answer(&answer));
+    assert!(!bench.server.withdraw_answer(&answer), "it is gone");
+    assert_eq!(bench.poll(), None);
+
+    bench.send(&request(asked));
+    bench.server.refuse(AbortCode::DEVICE_STATE);
+    let refused = bench.poll().map(|frame| *frame.exactly().unwrap());
+    assert_eq!(refused, Some([0x80, 0x51, 0x1F, 1, 0x22, 0x00, 0x00, 0x08]));
+    bench.server.refuse(AbortCode::DEVICE_STATE);
+    assert_eq!(bench.poll(), None, "nothing waits");
+    // A transfer that goes on is no idleness, although no answer waits.
+    bench.device.text = vec![b'x'; 20];
+    assert!(bench.answer([0x40, 0x01, 0x20, 0, 0, 0, 0, 0]).is_some());
+    assert!(!bench.server.is_idle() && !bench.server.has_answer());
+    assert_eq!(bench.answer([0x80, 0x01, 0x20, 0, 0, 0, 0, 0]), None);
+    still_serves(&mut bench);
+}

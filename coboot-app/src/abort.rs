@@ -37,3 +37,16 @@ impl From<Abort> for canopen::AbortCode {
         Self(code)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use super::Abort;
+
+    /// As the manuals write it.
+    #[test]
+    fn an_abort_is_shown_as_its_code() {
+        assert_eq!(std::format!("{:?}", Abort::NO_SUB_INDEX), "Abort(06090011h)");
+    }
+}

@@ -237,4 +237,15 @@ mod tests {
             }
         }
     }
+
+    /// On the host there is no bootloader: each service says so, and none pretends to have worked.
+    #[test]
+    fn without_a_bootloader_each_service_says_so() {
+        let mut bootloader = Bootloader::new(&shared_abi::layout::stm32f407g_disc1::LAYOUT);
+        let absent = CallgateError::Absent;
+        assert_eq!(bootloader.store_node(Some(5), 125_000), Err(absent));
+        assert_eq!(bootloader.invalidate(1), Err(absent));
+        assert!(matches!(bootloader.program_info(1), Err(CallgateError::Absent)));
+        assert_eq!(bootloader.confirm(1), Err(absent));
+    }
 }

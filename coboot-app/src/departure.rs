@@ -259,4 +259,40 @@ mod tests {
         departure.begin('b', true, 3);
         assert_eq!(departure.proceed(false, 3), Next::Leave('o'));
     }
+
+    /// A promise is kept, whatever comes behind it; another promise takes its place, and a request
+    /// that promised nothing gives way.
+    #[test]
+    fn only_a_promise_takes_the_place_of_a_promise() {
+        for (first, second, leaves) in
+            [(true, true, 's'), (true, false, 'f'), (false, true, 's'), (false, false, 's')]
+        {
+            let mut departure = Departure::Staying;
+            departure.begin('f', first, 0);
+            departure.begin('s', second, 1);
+            departure.proceed(true, 1);
+            assert_eq!(departure.proceed(true, 100), Next::Leave(leaves), "{first}, {second}");
+        }
+    }
+
+    /// The bootloader answers: the device leaves when all frames are on the bus, and not before.
+    #[test]
+    fn a_silent_departure_waits_for_the_frames_of_an_answer_before() {
+        let mut departure = Departure::Staying;
+        departure.begin('f', false, 0);
+        departure.begin_silent('s', 1);
+        for ms in 1..3 {
+            assert_eq!(departure.proceed(false, ms), Next::Wait);
+        }
+        // The pause of 11 ms begins when the answer is on the bus.
+        assert_eq!(departure.proceed(true, 3), Next::Wait);
+        assert_eq!(departure.proceed(true, 13), Next::Wait);
+        assert_eq!(departure.proceed(false, 14), Next::Wait, "a frame is on its way");
+        assert_eq!(departure.proceed(true, 15), Next::Leave('s'));
+        // Without a bus it leaves all the same.
+        let mut departure = Departure::Staying;
+        departure.begin_silent('s', 0);
+        assert_eq!(departure.proceed(false, 14), Next::Wait);
+        assert_eq!(departure.proceed(false, 15), Next::Leave('s'));
+    }
 }

@@ -457,4 +457,26 @@ mod tests {
         assert_eq!(again.write(1, &[2], 0, &mut { STORES }), Ok(Answer::Send));
         assert_eq!(request_behind(&mut again), Next::Leave(BootRequest::Start(1)));
     }
+
+    /// A place without a program may have a record: only the flag says that one is installed.
+    #[test]
+    fn a_program_that_is_not_installed_is_absent() {
+        struct NotInstalled(u32);
+        impl Services for NotInstalled {
+            fn program_info(&mut self, _: u8) -> Result<ProgramArgs, CallgateError> {
+                Ok(ProgramArgs { flags: self.0, ..ProgramArgs::default() })
+            }
+
+            fn confirm(&mut self, _: u8) -> Result<Confirmed, CallgateError> {
+                Err(CallgateError::Absent)
+            }
+        }
+        let control = control(false);
+        assert_eq!((control.program(), control.programs()), (1, 3));
+        let second = Start { program: 2, ..Start::new(None, DEFAULTS) };
+        assert_eq!(ProgramControl::new(&second, 3, 0).program(), 2);
+        for (flags, state) in [(0, 3), (2, 3), (0xFFFF_FFFE, 3), (1, 0), (3, 0)] {
+            assert_eq!(control.state(2, &mut NotInstalled(flags)), Ok(state), "{flags:#x}");
+        }
+    }
 }

@@ -568,4 +568,10 @@ mod tests {
             }
         }
     }
+
+    /// CiA 301 table 37: NMT has identifier 0, requests to node 5 have 605h.
+    #[test]
+    fn the_device_lets_its_own_identifiers_through() {
+        assert_eq!(responder().identifiers(), [0, 0x605]);
+    }
 }
