@@ -223,7 +223,7 @@ fn events_of_the_line_are_errors_that_end() {
         // 1003h keeps it; the places behind it are empty.
         let mut bytes = [0; 4];
         assert_eq!(emcy.read(node(), Address::new(0x1003, 1), &mut bytes), Some(Ok(4)));
-        assert_eq!(bytes[..2], (code as u16).to_le_bytes());
+        assert_eq!(bytes[..2], code.to_le_bytes());
         let empty = emcy.read(node(), Address::new(0x1003, 2), &mut bytes);
         assert_eq!(empty, Some(Err(AbortCode(0x0800_0024))));
     }
