@@ -31,10 +31,10 @@ const START: u8 = 0x01;
 const CLEAR: u8 = 0x03;
 const SET_SIGNATURE: u8 = 0x83;
 const CLR_SIGNATURE: u8 = 0x84;
-/// 1F57h: busy; NO_ACCESS with it would be another word.
+/// 1F57h: the flash works, and nothing has failed.
 const BUSY: u32 = 1;
 
-/// CiA 301 table 22 and the manual's table of aborts: the device is in another state.
+/// CiA 301, abort codes of SDO: not now, the device is in another state.
 const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
 const NO_SUB_INDEX: AbortCode = AbortCode(0x0609_0011);
 
@@ -420,8 +420,7 @@ fn a_stored_program_can_be_read_by_who_has_the_password() {
     rig.settle();
     assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0800_0024)), "no data");
     let mut image = raw(&LIFT_1, 1, 1500);
-    image[600..629].copy_from_slice(b"$CANopenSoftwareVersion\x004.7.1\0"[..29].try_into().unwrap());
-    image[629] = 0;
+    image[600..630].copy_from_slice(b"$CANopenSoftwareVersion\x004.7.1\0");
     rig.install(1, &image);
     assert_eq!(read(&mut rig, 0x100A, 0), Ok(b"4.7.1".to_vec()), "CiA 814-1 clause 6.5");
     assert_eq!(rig.node.upload_start(at), Ok(Some(1500)));
@@ -477,7 +476,7 @@ fn an_idle_device_stays_idle() {
     assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
 }
 
-// --- what the mutants of the code showed to be untested
+// --- confirmation, the queue's room, and where a block may lie
 
 /// Only the confirmation marks a program that has returned the device; it is stored once.
 #[test]
@@ -705,13 +704,14 @@ fn a_block_outside_the_program_is_refused_with_the_reason() {
         (parameters[1].end() - 1, 1, SECURED),
         (own.base - 1, 2, SECURED),
         (own.base - 1, 64, SECURED),
+        (own.base, own.size as usize + 1, ADDRESS),
         (own.end(), 1, ADDRESS),
         (own.end() - 1, 2, ADDRESS),
         (0, 4, ADDRESS),
         (u32::MAX - 3, 4, ADDRESS),
         (u32::MAX, 1, ADDRESS),
     ] {
-        let mut rig = Rig::new(&STANDARD_1, 1024);
+        let mut rig = Rig::new(&STANDARD_1, 32 * 1024);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
         rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();

@@ -192,7 +192,7 @@ impl<E> Callgate<E> {
     }
 }
 
-#[allow(private_bounds)]
+#[allow(private_bounds, reason = "only a table of the chip, and one of a test, can be entered")]
 impl<E: Enter> Callgate<E> {
     /// CRC-32/ISO-HDLC of `len` bytes of flash from `address` on.
     ///

@@ -11,24 +11,26 @@ use std::process::Command;
 
 use crate::args::Args;
 use crate::json::{quoted, Value};
-use crate::{evidence, process, setup, workspace, Outcome};
+use crate::setup::{self, Part, Setup};
+use crate::{evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N]
+usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N] [--yes]
 
 Changes the code of the crates that the device is made of, in one place at a time, as cargo-mutants
-does, and runs the tests of that crate: each change must make one fail. Prints what no test noticed, and counts;
-they go to target/evidence/mutants.json. It fails if a group of files has too few of its changes
-noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
+does, and runs the tests of that crate: each change must make one fail. Prints what no test noticed,
+and counts; they go to target/evidence/mutants.json. It fails if a group of files has too few of its
+changes noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
 
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal;
                   what was measured of the others of this commit is kept
   --file GLOB     the changes in these files alone, as '**/store/*.rs'; nothing is recorded
   --shard K/N     every N-th change, beginning with the K-th from 0: a sample; nothing is recorded
+  --yes           install Debian's packages without asking
 
 All changes of a package stand in one build, and a variable turns one on (mutants/); what cannot stand
 there, and what no test has noticed, is then built one by one. cargo-mutants is installed into
-target/tools where it is missing.
+target/tools where it is missing, Debian's packages for the tests with signatures by apt-get.
 ";
 
 /// The version to install if there is none.
@@ -118,8 +120,7 @@ type Rows = BTreeMap<String, Row>;
 
 pub fn run(mut args: Args) -> Outcome {
     let (package, file, shard) = (args.value("--package")?, args.value("--file")?, args.value("--shard")?);
-    // The jobs of the night have it in common; nothing is installed by a package manager.
-    let _ = args.flag("--yes");
+    let setup = Setup::from(&mut args);
     args.none_left()?;
     let is_chosen = |run: &&Run| package.as_deref().is_none_or(|name| name == run.package);
     let runs: Vec<&Run> = RUNS.iter().filter(is_chosen).collect();
@@ -127,6 +128,10 @@ pub fn run(mut args: Args) -> Outcome {
         let mut known: Vec<&str> = RUNS.iter().map(|run| run.package).collect();
         known.dedup();
         return Err(format!("there is no crate \"{name}\"; there is: {}.", known.join(", ")));
+    }
+    if runs.iter().any(|run| run.tests.is_some()) {
+        // The crate with those tests builds the emulator, too.
+        setup.prepare(&[Part::Emulator])?;
     }
     let path = setup::tool("cargo-mutants", VERSION)?;
     let is_sample = file.is_some() || shard.is_some();
@@ -137,36 +142,33 @@ pub fn run(mut args: Args) -> Outcome {
     if !is_sample {
         evidence::record("mutants", &as_json(&rows, true))?;
     }
-    // By package and line; what one run notices is noticed.
-    let mut ends = BTreeMap::<(&str, String), &str>::new();
+    let out = |number: usize| {
+        let name = format!("{}-{number}", runs[number].package);
+        workspace::target_dir().join("mutants").join(name)
+    };
+    // What one run notices is noticed. First all runs in one build each, which are quick: only what
+    // none of them has noticed is built one by one.
+    let mut ends = Ends::new();
     for (number, run) in runs.iter().enumerate() {
-        let out = workspace::target_dir().join("mutants").join(format!("{}-{number}", run.package));
-        let missed = ends.iter().filter(|((package, _), end)| *package == run.package && **end == "missed");
-        let names = missed.map(|((_, line), _)| line.as_str());
         let again: Vec<String> = match run.only {
             [] => Vec::new(),
-            only => only.iter().map(|file| format!("^{}", exactly(file))).chain(whole(names)).collect(),
+            only => {
+                let files = only.iter().map(|file| format!("^{}", exactly(file)));
+                files.chain(unnoticed(&ends, run).iter().map(|line| whole(line))).collect()
+            }
         };
         let mut selection: Vec<String> = run.but.iter().map(|glob| format!("--exclude={glob}")).collect();
         selection.extend(file.iter().map(|glob| format!("--file={glob}")));
         selection.extend(shard.iter().map(|part| format!("--shard={part}")));
         selection.extend(again.into_iter().map(|name| format!("--re={name}")));
-        let quick = in_one_build(run, &selection, &path, &out)?;
-        let left: Vec<&str> = quick
-            .iter()
-            .filter(|(_, end)| matches!(**end, "missed" | "alone"))
-            .map(|(line, _)| line.as_str())
-            .collect();
-        println!("{}: {} changes are built one by one", run.package, left.len());
-        let mut found = quick.clone();
+        merge(&mut ends, run, in_one_build(run, &selection, &path, &out(number))?);
+    }
+    for (number, run) in runs.iter().enumerate() {
+        let left = unnoticed(&ends, run);
         if !left.is_empty() {
-            found.extend(one_by_one(run, whole(left.iter().copied()), &path, &out)?);
-        }
-        for (line, end) in found {
-            let before = ends.entry((run.package, line)).or_insert(end);
-            if end != "unviable" {
-                *before = end;
-            }
+            println!("{}: {} changes are built one by one", run.package, left.len());
+            let names = left.iter().map(|line| whole(line)).collect();
+            merge(&mut ends, run, one_by_one(run, names, &path, &out(number))?);
         }
     }
     let mut unnamed = Vec::new();
@@ -209,6 +211,27 @@ pub fn run(mut args: Args) -> Outcome {
 
 /// What became of the changes of a run, by the line that names one.
 type Found = BTreeMap<String, &'static str>;
+
+/// The same of all runs, by package and line.
+type Ends = BTreeMap<(&'static str, String), &'static str>;
+
+/// Adds what a run has found. What was not built in this run keeps the end that it had.
+fn merge(ends: &mut Ends, run: &Run, found: Found) {
+    for (line, end) in found {
+        let before = ends.entry((run.package, line)).or_insert(end);
+        if end != "unviable" || *before == "alone" {
+            *before = end;
+        }
+    }
+}
+
+/// The changes of a run's package that no run before has noticed.
+fn unnoticed(ends: &Ends, run: &Run) -> Vec<String> {
+    let left = ends
+        .iter()
+        .filter(|((package, _), end)| *package == run.package && matches!(**end, "missed" | "alone"));
+    left.map(|((_, line), _)| line.clone()).collect()
+}
 
 /// Tries the changes that can stand side by side in one build (mutants/). Those that no test has
 /// noticed may be noticed by an example in the documentation, which takes no part there.
@@ -264,9 +287,9 @@ fn found_in(folder: &Path, lists: &[(&'static str, String)]) -> Found {
     found
 }
 
-/// Regular expressions that match these names and no others.
-fn whole<'n>(names: impl Iterator<Item = &'n str>) -> Vec<String> {
-    names.map(|name| format!("^{}$", exactly(name))).collect()
+/// The regular expression that matches this name and no other.
+fn whole(name: &str) -> String {
+    format!("^{}$", exactly(name))
 }
 
 /// A text as the regular expression that matches it.
@@ -366,6 +389,26 @@ mod tests {
         assert_eq!(change, "replace Journal::open -> Self with Default::default()");
         assert_eq!(parts("nothing"), None);
         assert_eq!(exactly("a/b.rs:1: replace + with <T>"), r"a/b\.rs:1: replace \+ with <T>");
+    }
+
+    #[test]
+    fn what_one_run_notices_is_noticed() {
+        let [first, second] = [Run::of("coboot-core"), Run { only: &["a"], ..Run::of("coboot-core") }];
+        let found = |lines: [(&str, &'static str); 5]| lines.map(|(line, end)| (line.to_owned(), end)).into();
+        let mut ends = Ends::new();
+        merge(
+            &mut ends,
+            &first,
+            found([("a", "caught"), ("b", "missed"), ("c", "alone"), ("d", "alone"), ("e", "missed")]),
+        );
+        assert_eq!(unnoticed(&ends, &second), ["b", "c", "d", "e"]);
+        assert!(unnoticed(&ends, &Run::of("coboot-app")).is_empty());
+        merge(
+            &mut ends,
+            &second,
+            found([("b", "caught"), ("c", "missed"), ("d", "unviable"), ("e", "unviable"), ("f", "timeout")]),
+        );
+        assert_eq!(unnoticed(&ends, &second), ["c", "e"], "what one run cannot build, another has missed");
     }
 
     #[test]

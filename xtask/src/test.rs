@@ -128,7 +128,7 @@ const MAIN_TESTS: [&str; 12] = [
 
 /// The test programs that work with a program of others, unmodified; and which.
 const FOREIGN: [(&str, &str); 12] = [
-    ("c_application", "arm-none-eabi-gcc"),
+    ("c_application", "clang"),
     ("clients", "python-canopen, canopen-asyncio"),
     ("eds", "dcfchk, and python-canopen as a reader"),
     ("examples", "cmake, arm-none-eabi-gcc"),
@@ -247,7 +247,6 @@ impl Summary {
             .stdout(writer.try_clone().map_err(unreadable)?)
             .stderr(writer);
         let mut tests = cargo.spawn().map_err(|error| process::not_started(&cargo, &error))?;
-        let shown = cargo.get_args().count();
         // The pipe ends with the last program that can write into it.
         drop(cargo);
         let failed = self.total().failed;
@@ -260,7 +259,7 @@ impl Summary {
             self.take(&String::from_utf8_lossy(&line));
             line.clear();
         }
-        let status = tests.wait().map_err(|error| format!("cargo test with {shown} arguments: {error}."))?;
+        let status = tests.wait().map_err(unreadable)?;
         if !status.success() && self.total().failed == failed {
             // It counts as a failure, so that the last line is never better than the run.
             self.broken += 1;

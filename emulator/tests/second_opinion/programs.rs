@@ -507,7 +507,7 @@ after_second:
     sub r6, r6, r9
     log r6
 
-    handler log_status
+    .macro log_reasons          // the exception and its reasons, which are cleared
     log_special ipsr
     ldr r4, =CFSR
     ldr r6, [r4]
@@ -517,6 +517,10 @@ after_second:
     ldr r6, [r4]
     log r6
     str r6, [r4]
+    .endm
+
+    handler log_status
+    log_reasons
     str r8, [sp, #24]
     bx lr
     .ltorg
@@ -695,15 +699,7 @@ after_second:
 
     // Makes a frame for the return to r8.
     handler log_and_mend_stack
-    log_special ipsr
-    ldr r4, =CFSR
-    ldr r6, [r4]
-    log r6
-    str r6, [r4]
-    ldr r4, =HFSR
-    ldr r6, [r4]
-    log r6
-    str r6, [r4]
+    log_reasons
     ldr r4, =SHCSR
     ldr r6, [r4]
     and r6, #0xF000             // what is pending

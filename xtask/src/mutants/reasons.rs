@@ -35,11 +35,6 @@ pub const REASONS: &[(&str, &str, &str)] = &[
         "replace > with >= in Downloader<'_, P, PROGRAMS>::download_start",
         "With one program there is no other whose download could have ended this one.",
     ),
-    (
-        "boot-core/src/intake/judge.rs",
-        "replace < with <= in Judge<'_>::check_place",
-        "The address behind a region is the first of the next one, which is also secured or the program's own.",
-    ),
     ("boot-core/src/queue.rs", "replace | with ^ in Queue<'b>::word", DISJOINT),
     (
         "boot-core/src/store/journal.rs",
