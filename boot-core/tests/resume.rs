@@ -203,6 +203,35 @@ fn other_data_do_not_become_a_program() {
     assert!(is_installed(&flash, &image));
 }
 
+/// Two files that are sent into each other, without CLEAR between them, are a download that cannot
+/// go on: neither file is named for data of the other one, before a cut or after it.
+#[test]
+fn a_download_of_two_files_does_not_go_on() {
+    let (image, other) = (program(0xC00, 0x33), program(0x1240, 0x44));
+    let (file, control_of_other) = (named(&image), named(&other).swap_remove(0));
+    // How many data blocks of the first file have come when the second one begins: none, fewer and
+    // more than the device stores its progress after.
+    for sent in [0, 4, 24] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        for block in &file[..=sent] {
+            bench.good(block);
+        }
+        assert_eq!(partial(&mut bench).0, crc_of(&file[0]));
+        bench.good(&control_of_other);
+        assert_eq!(partial(&mut bench).0, 0, "{sent} blocks");
+        // The flash takes nothing where there are data, and everything behind them.
+        for (number, data) in (1..).zip(other.chunks(CHUNK).skip(sent)) {
+            let address = PROGRAM.base + (sent * CHUNK) as u32 + (number - 1) * CHUNK as u32;
+            bench.good(&block(number, address, data));
+            assert_eq!(partial(&mut bench).0, 0, "{sent} blocks");
+        }
+        assert_eq!(partial(&mut Bench::new(&mut flash)).0, 0, "{sent} blocks");
+        send(&mut flash, &file);
+        assert!(is_installed(&flash, &image));
+    }
+}
+
 /// CLEAR gives up what was there; a command of another kind does not.
 #[test]
 fn clear_ends_what_could_go_on() {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::time::Instant;
 use std::{env, fmt, fs};
 
 use crate::args::Args;
@@ -10,19 +11,22 @@ use crate::json::Value;
 use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask fuzz [--seconds N] [--target NAME] [--keep | --replay]
+usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAME] [--keep | --replay]
 
 Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
 program download by blocks and in one piece,
 downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
-configuration files, sealed images, as files and as they arrive, with their signatures and their compression. What they find in this run is built upon in the next one.
+configuration files, requests to coflash ui, sealed images, as files and as they arrive, with their
+signatures and their compression. What they find in this run is built upon in the next one.
 The counts of all runs go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
+  --inputs N      each target runs until N inputs were tried in all runs together
   --target NAME   this one alone
   --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
-                  fuzz/seeds for the replay
+                  fuzz/seeds for the replay, and the counts into fuzz/counts.json, where a fresh
+                  clone goes on counting
   --replay        runs no fuzzer: every input of fuzz/seeds and fuzz/corpus once, with the Rust that
                   builds the rest; it needs no nightly toolchain, and about a minute
 
@@ -34,8 +38,15 @@ where it is missing.
 const CARGO_FUZZ: &str = "0.13.2";
 /// The longest time for one input of a target, in seconds. They need microseconds.
 const TOO_LONG: u32 = 10;
+/// The longest input, in bytes, and that of targets in which each byte is a command with much work
+/// behind it: many short lives find more than a few long ones.
+const LONGEST_INPUT: u32 = 4096;
+const SHORT_INPUTS: [(&str, u32); 2] = [("resume", 192), ("sealed_stream", 256)];
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
+
+/// The counts that are kept with the seeds, in fuzz/.
+const KEPT_COUNTS: &str = "counts.json";
 
 /// The feature for sealed images.
 const SEALED: &str = "sealed";
@@ -140,6 +151,11 @@ impl Counts {
         Self(targets.iter().filter_map(|(name, counts)| Some((name.clone(), row(counts)?))).collect())
     }
 
+    /// The inputs of all runs of a target.
+    fn tried(&self, target: &str) -> u64 {
+        self.0.get(target).map_or(0, |row| row.sums[0])
+    }
+
     fn add(&mut self, target: &str, more: [u64; 2], last: [u64; 2]) {
         let row = self.0.entry(target.to_owned()).or_insert_with(|| Row {
             since: evidence::commit(),
@@ -169,7 +185,11 @@ impl fmt::Display for Counts {
 }
 
 pub fn run(mut args: Args) -> Outcome {
-    let seconds = seconds(args.value("--seconds")?)?;
+    let (seconds, inputs) = (args.value("--seconds")?, args.value("--inputs")?);
+    if seconds.is_some() && inputs.is_some() {
+        return Err("--seconds and --inputs do not go together.".into());
+    }
+    let (seconds, inputs) = (self::seconds(seconds)?, self::inputs(inputs)?);
     let only = args.value("--target")?;
     let (keep, replay) = (args.flag("--keep"), args.flag("--replay"));
     args.none_left()?;
@@ -190,46 +210,66 @@ pub fn run(mut args: Args) -> Outcome {
     toolchain()?;
     let path = setup::tool("cargo-fuzz", CARGO_FUZZ)?;
 
-    let fuzz = |words: &[&str]| {
+    let fuzz = |word: &str, words: &[&str]| {
         let mut command = Command::new("rustup");
-        command.args(["run", "nightly", "cargo", "fuzz"]).args(words).current_dir(workspace::root());
+        command.args(["run", "nightly", "cargo", "fuzz", word]);
+        // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
+        command.arg("--sanitizer=none").args(words).current_dir(workspace::root());
         command.env("PATH", &path).env("CARGO_TARGET_DIR", target_dir()).env_remove("CARGO");
         command
     };
     println!("Building the fuzz targets ...");
-    process::run(&mut fuzz(&["build"]))?;
+    process::run(&mut fuzz("build", &[]))?;
     for target in SEALED_TARGETS {
-        process::run(&mut fuzz(&["build", "--features", SEALED, target]))?;
+        process::run(&mut fuzz("build", &["--features", SEALED, target]))?;
     }
     let mut failed = Vec::new();
-    let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
+    let kept_counts = folder.join(KEPT_COUNTS);
+    let mut counts = match evidence::recorded(EVIDENCE) {
+        Some(recorded) => Counts::read(&recorded),
+        None => fs::read_to_string(&kept_counts)
+            .ok()
+            .and_then(|text| Value::parse(&text).ok())
+            .map_or(Counts(BTreeMap::new()), |kept| Counts::read(&kept)),
+    };
     for target in &targets {
         let corpus = folder.join("corpus").join(target);
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
         let log = target_dir().join(target).with_extension("log");
         let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
-        let mut command = fuzz(&["run", "--features", features(target), target]);
+        let mut command = fuzz("run", &["--features", features(target), target]);
         command.arg(&corpus);
         let seeds = folder.join("seeds").join(target);
         if seeds.is_dir() {
             command.arg(&seeds);
         }
         command.args(["--", "-print_final_stats=1"]);
-        command.args([format!("-max_total_time={seconds}"), format!("-timeout={TOO_LONG}")]);
+        match inputs.map(|inputs| inputs.saturating_sub(counts.tried(target))) {
+            Some(0) => continue,
+            Some(left) => command.arg(format!("-runs={left}")),
+            None => command.arg(format!("-max_total_time={seconds}")),
+        };
+        let short = SHORT_INPUTS.iter().find(|(name, _)| name == target);
+        let longest = short.map_or(LONGEST_INPUT, |(_, longest)| *longest);
+        command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
+        let started = Instant::now();
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
         let status = command.status().map_err(|error| process::not_started(&command, &error))?;
         let said = fs::read(&log).unwrap_or_default();
         let said = String::from_utf8_lossy(&said);
         match (status.success(), runs(&said)) {
             (true, Some(runs @ 1..)) => {
+                let seconds = started.elapsed().as_secs();
                 println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
                 let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
-                counts.add(target, [runs, seconds.into()], [edges(&said).unwrap_or(0), files]);
+                counts.add(target, [runs, seconds], [edges(&said).unwrap_or(0), files]);
                 evidence::record(EVIDENCE, &counts.to_string())?;
                 if keep {
-                    let mut least = fuzz(&["cmin", "--features", features(target), target]);
+                    let mut least = fuzz("cmin", &["--features", features(target), target]);
                     process::output(least.arg(&corpus))?;
                     put_by(&corpus, &folder.join("seeds").join(target))?;
+                    fs::write(&kept_counts, format!("{counts}\n"))
+                        .map_err(|error| unwritable(&kept_counts, &error))?;
                 }
             }
             (good, _) => {
@@ -257,6 +297,14 @@ fn seconds(value: Option<String>) -> Outcome<u32> {
     match value.parse() {
         Ok(seconds @ 1..) => Ok(seconds),
         _ => Err(format!("--seconds takes a number from 1 on, not \"{value}\".")),
+    }
+}
+
+fn inputs(value: Option<String>) -> Outcome<Option<u64>> {
+    let Some(value) = value else { return Ok(None) };
+    match value.parse() {
+        Ok(inputs @ 1..) => Ok(Some(inputs)),
+        _ => Err(format!("--inputs takes a number from 1 on, not \"{value}\".")),
     }
 }
 
@@ -350,8 +398,10 @@ mod tests {
     fn a_time_is_a_number_from_one_on() {
         assert_eq!(seconds(None), Ok(30));
         assert_eq!(seconds(Some("5".into())), Ok(5));
+        assert_eq!((inputs(None), inputs(Some("10000000".into()))), (Ok(None), Ok(Some(10_000_000))));
         for wrong in ["0", "-1", "x", "", "1.5"] {
             assert!(seconds(Some(wrong.into())).is_err(), "{wrong}");
+            assert!(inputs(Some(wrong.into())).is_err(), "{wrong}");
         }
     }
 
@@ -375,7 +425,9 @@ mod tests {
         let mut counts = Counts::read(&Value::parse(&counts.to_string()).unwrap());
         counts.add("lss", [u64::MAX, 3], [701, 29]);
         counts.add("lzma", [5, 1], [60, 7]);
-        let Counts(rows) = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        let counts = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        assert_eq!((counts.tried("lzma"), counts.tried("none")), (5, 0));
+        let Counts(rows) = counts;
         let lss = &rows["lss"];
         assert_eq!((lss.sums, lss.last), ([u64::MAX, 5], [701, 29]));
         assert_eq!((rows["lzma"].sums, rows.len()), ([5, 1], 2));

@@ -279,11 +279,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let partial = ProgramRecord::load_partial(&self.parameters, flash, program);
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
-                    state.partial = partial;
                     if record.is_none() {
                         state.identification = 0;
                     }
                     let open = matches!(state.session, Session::Open { .. });
+                    if !open {
+                        state.partial = partial;
+                    }
                     if ends && open && self.programmer.unsealer().is_same() {
                         state.session = Session::Idle;
                     }

@@ -7,7 +7,7 @@ use shared_abi::block_file::FRAMING;
 use super::{find, Downloader, Transfer};
 use crate::intake::{Destination, Intake, Judge, Progress};
 use crate::refusal::Refusal;
-use crate::resume::{LastBlock, ANY};
+use crate::resume::{LastBlock, Partial, ANY};
 use crate::session::Session;
 use crate::store::Parameters;
 
@@ -144,11 +144,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(begin) = progress.begins {
             state.version = begin.version;
             let mut next = 1;
-            let goes_on = self.policy.resume && state.partial.is_same(begin.partial);
+            let is_same = state.partial.is_same(begin.partial);
+            let goes_on = self.policy.resume && is_same;
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
                     next = ANY;
+                }
+                if !is_same {
+                    state.partial = Partial::NONE;
+                    self.programmer.disown();
                 }
             } else {
                 let mut partial = begin.partial;

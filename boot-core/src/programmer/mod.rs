@@ -197,6 +197,17 @@ impl<'b> Programmer<'b> {
         });
     }
 
+    /// The pieces of the [opened](Self::open) program are of another file from here on: behind a
+    /// cut, neither of them can go on.
+    pub(crate) fn disown(&mut self) {
+        let Some(target) = &mut self.target else { return };
+        // The first piece removes the record in any case.
+        if target.partial.disown() && target.untouched.is_none() {
+            let program = target.program;
+            self.void(program);
+        }
+    }
+
     /// The [opened](Self::open) program arrives as a sealed image.
     #[cfg(feature = "sealed")]
     pub(crate) fn unseal(&mut self) {

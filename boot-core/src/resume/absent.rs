@@ -30,6 +30,10 @@ impl Partial {
         false
     }
 
+    pub(crate) const fn disown(&mut self) -> bool {
+        false
+    }
+
     pub(crate) const fn is_resumed(self) -> bool {
         false
     }

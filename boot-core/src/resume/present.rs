@@ -47,6 +47,11 @@ impl Partial {
         self.id != 0 && self.id == other.id
     }
 
+    /// It does not go on behind a cut any more. Returns whether it could.
+    pub(crate) const fn disown(&mut self) -> bool {
+        core::mem::replace(&mut self.id, 0) != 0
+    }
+
     /// Whether it goes on behind a cut.
     pub(crate) const fn is_resumed(self) -> bool {
         self.resumed
