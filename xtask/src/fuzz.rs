@@ -68,15 +68,18 @@ fn features(target: &str) -> &'static str {
 /// Runs every kept input once, without the fuzzer.
 fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
     let programs = target_dir().join("replay");
-    let mut build = process::cargo_on(folder, "build");
-    build.args(["--quiet", "--release", "--bins"]).env("CARGO_TARGET_DIR", &programs);
-    process::run(&mut build)?;
+    // Building takes longer than running: without optimisation, and without what a debugger needs.
+    let build = || {
+        let mut build = process::cargo_on(folder, "build");
+        build.arg("--quiet").env("CARGO_TARGET_DIR", &programs).env("CARGO_PROFILE_DEV_DEBUG", "0");
+        build
+    };
+    process::run(build().arg("--bins"))?;
     // Only those: the others would be replaced by what they are with the feature.
-    let mut build = process::cargo_on(folder, "build");
-    build.args(["--quiet", "--release", "--features", SEALED]).env("CARGO_TARGET_DIR", &programs);
-    process::run(build.args(SEALED_TARGETS.iter().flat_map(|target| ["--bin", target])))?;
+    let sealed = SEALED_TARGETS.iter().flat_map(|target| ["--bin", target]);
+    process::run(build().args(["--features", SEALED]).args(sealed))?;
     for target in targets {
-        let mut program = Command::new(programs.join("release").join(target));
+        let mut program = Command::new(programs.join("debug").join(target));
         for kept in ["seeds", "corpus"] {
             let inputs = folder.join(kept).join(target);
             if inputs.is_dir() {

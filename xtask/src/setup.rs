@@ -365,6 +365,12 @@ fn install(name: &str, version: &str, options: &[&str]) -> Outcome {
     let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     install.args(["install", "--quiet", "--locked", name, "--version", version]).args(options);
     install.arg("--root").arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
+    // It runs for seconds and compiles for minutes: an optimised one takes twice as long in all.
+    install.envs([
+        ("CARGO_PROFILE_RELEASE_OPT_LEVEL", "0"),
+        ("CARGO_PROFILE_RELEASE_LTO", "off"),
+        ("CARGO_PROFILE_RELEASE_CODEGEN_UNITS", "64"),
+    ]);
     process::run(&mut install)
         .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
     // The build files are large and not needed again.
