@@ -132,6 +132,16 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         (device, event)
     }
 
+    /// Its flash.
+    pub fn flash(&mut self) -> Option<&mut FileFlash> {
+        match &mut self.phase {
+            Phase::Bootloader(running) => Some(running.device.flash()),
+            Phase::StandIn(running, _) => Some(running.device.flash()),
+            Phase::Silent(idle) => Some(&mut idle.flash),
+            Phase::None => None,
+        }
+    }
+
     /// Processes any frame of the bus.
     pub fn handle(&mut self, frame: &Frame, now: Instant) {
         match &mut self.phase {

@@ -12,13 +12,14 @@ use crate::{build, evidence, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask attack [--frames N] [--seed S] [--yes]
 
-Attacks emulated boards with the built firmware, in virtual time: two masters that do what masters
-do, mixed with noise, floods, frames that are nearly right, errors on the bus and power cuts. After
-each burst it checks that the device answers in time, and that only what was asked for has changed.
+Attacks emulated boards with the built firmware, and nodes without a chip, in virtual time: two
+masters that do what masters do, mixed with noise, floods, frames that are nearly right, errors on
+the bus and power cuts. After each burst it checks that the device answers in time, and that only what was asked for has changed.
 Fails if a rule is broken, and prints the seed and the last frames. The same seed gives the same
 attack. The counts go to target/evidence/attacker.json.
 
-  --frames N      the frames of the masters (default: 200000, about a minute)
+  --frames N      the frames of the masters on the boards (default: 200000, about two minutes); the
+                  nodes, which are faster, get twenty times as many
   --seed S        the first seed (default: 1)
   --yes           installs what is missing with sudo
 ";

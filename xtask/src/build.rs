@@ -183,13 +183,14 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
     images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
 
-/// Builds everything for several boards ([`all`] and [`c_applications`]), several chips at once,
-/// since the last step of each image uses only one core.
+/// Builds the images with these names for several boards, or everything ([`all`] and
+/// [`c_applications`]) where there are no names; several chips at once, since the last step of each
+/// image uses only one core.
 ///
 /// # Errors
 /// As for [`images`]; the first error.
-pub fn boards(boards: &[&Layout]) -> Outcome {
-    let mut chips: Vec<&str> = boards.iter().map(|board| board.chip.line.name()).collect();
+pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
+    let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     chips.sort_unstable();
     chips.dedup();
     std::thread::scope(|scope| {
@@ -197,7 +198,11 @@ pub fn boards(boards: &[&Layout]) -> Outcome {
             .into_iter()
             .map(|chip| {
                 scope.spawn(move || {
-                    boards.iter().filter(|board| board.chip.line.name() == chip).try_for_each(|board| {
+                    let own = boards.iter().filter(|(board, _)| board.chip.line.name() == chip);
+                    own.copied().try_for_each(|(board, names)| {
+                        if !names.is_empty() {
+                            return images(board, names).map(drop);
+                        }
                         all(board)?;
                         c_applications(board)
                     })

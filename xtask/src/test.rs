@@ -16,8 +16,8 @@ pub const HELP: &str = "\
 usage: cargo xtask test [--board BOARD] [--yes] [ARGS]
 
 Sets the machine up, builds the firmware and runs the tests of all host crates, among them those that
-run the firmware in the emulator and those that use a third-party CANopen client; then the main ones
-among those with the firmware of every other board.
+run the firmware in the emulator and those that use a third-party CANopen client; then those that a
+chip can make fail, with the firmware of a board of every other chip.
 
   --board BOARD   only the tests that run firmware, all of them, with that of this board
   --yes           installs what is missing with sudo
@@ -42,7 +42,7 @@ pub fn run(mut args: Args) -> Outcome {
         Part::Browser,
     ])?;
     let chosen = args.rest();
-    // A run without arguments runs the main tests for the other chips, too.
+    // A run without arguments runs the tests of a chip for the other chips, too.
     let others: Vec<&Layout> = BOARDS
         .iter()
         .copied()
@@ -50,7 +50,9 @@ pub fn run(mut args: Args) -> Outcome {
         .collect();
     // The boards with room for two programs are for the tests of two programs.
     let two = BOARDS.iter().copied().filter(|other| other.programs.len() > 1 && other.board != board.board);
-    build::boards(&[board].into_iter().chain(two).chain(others.iter().copied()).collect::<Vec<_>>())?;
+    let whole = [board].into_iter().chain(two).map(|board| (board, &[][..]));
+    let others_too = others.iter().map(|other| (*other, &CHIP_IMAGES[..]));
+    build::boards(&whole.chain(others_too).collect::<Vec<_>>())?;
     // A board with CAN2.
     build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
     examples::all()?;
@@ -67,8 +69,13 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let started = Instant::now();
     let python = setup::python().into_os_string();
-    let mut suite =
-        Suite { summary: Summary::default(), coflash: built("coflash"), node: built("coboot-node"), python };
+    let new_suite = || Suite {
+        summary: Summary::default(),
+        coflash: built("coflash"),
+        node: built("coboot-node"),
+        python: python.clone(),
+    };
+    let mut suite = new_suite();
     if chosen_board {
         suite.run(board, &[build::tests_args(board), chosen].concat())?;
     } else if !chosen.is_empty() {
@@ -78,14 +85,20 @@ pub fn run(mut args: Args) -> Outcome {
         // together, all would be tested with them.
         let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
         let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
-        suite.run_hosts(board, &["--workspace".to_owned()].into_iter().chain(hosts).collect::<Vec<_>>())?;
-        let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
-        suite.run(board, &[build::tests_args(board), sealed.to_vec()].concat())?;
-        for other in others {
-            println!("\n-- {} --", other.board);
-            let tests = MAIN_TESTS.iter().map(|test| format!("--test={test}"));
-            suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
-        }
+        let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(hosts).collect();
+        let mut host_suite = new_suite();
+        // Side by side: many tests have one thread, or wait for a clock.
+        std::thread::scope(|scope| {
+            let host_tests = scope.spawn(|| host_suite.run_hosts(board, &hosts));
+            let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+            suite.run(board, &[build::tests_args(board), sealed.to_vec()].concat())?;
+            for other in others {
+                let tests = CHIP_TESTS.iter().map(|test| format!("--test={test}"));
+                suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
+            }
+            host_tests.join().unwrap_or_else(|_| Err("the tests of the host broke off.".into()))
+        })?;
+        suite.summary.add(host_suite.summary);
     }
     let summary = suite.summary;
 
@@ -110,21 +123,11 @@ pub fn run(mut args: Args) -> Outcome {
 /// The packages that are built for a chip, or by another tool.
 const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
 
-/// The test programs that run for every board: they show the mistakes that a port can have.
-const MAIN_TESTS: [&str; 12] = [
-    "main_job",
-    "device",
-    "masters",
-    "watchdog",
-    "boot_time",
-    "abi",
-    "image",
-    "c_application",
-    "handover",
-    "log",
-    "virtual_can",
-    "conform",
-];
+/// The test programs that run for a board of each chip: they show the mistakes that a port can have.
+/// Dialects, logs and the rest are the same on all of them; at night all tests run for each chip.
+const CHIP_TESTS: [&str; 7] = ["main_job", "device", "watchdog", "boot_time", "abi", "handover", "conform"];
+/// The images that they need.
+const CHIP_IMAGES: [&str; 4] = ["bootloader", "bootloader-paulus", "app-v1", "app-v2"];
 
 /// The test programs that work with a program of others, unmodified; and which.
 const FOREIGN: [(&str, &str); 12] = [
@@ -252,10 +255,13 @@ impl Summary {
         let failed = self.total().failed;
         let mut printed = BufReader::new(printed);
         let mut line = Vec::new();
+        // Several runs print side by side.
+        let place = format!("[{}] ", self.place.as_deref().unwrap_or("host"));
         // The output is read as bytes: a test may print invalid UTF-8.
         while printed.read_until(b'\n', &mut line).is_ok_and(|len| len > 0) {
             let mut out = std::io::stdout().lock();
-            let _ = out.write_all(&line).and_then(|()| out.flush());
+            let _ = out.write_all(place.as_bytes()).and_then(|()| out.write_all(&line));
+            let _ = out.flush();
             self.take(&String::from_utf8_lossy(&line));
             line.clear();
         }
@@ -300,6 +306,15 @@ impl Summary {
         let chosen = self.counts.iter().filter(|((level, name), _)| of(level, name));
         chosen.for_each(|(_, counts)| sum.add(*counts));
         sum
+    }
+
+    /// Adds the results of tests that ran beside these.
+    fn add(&mut self, other: Self) {
+        for (program, counts) in other.counts {
+            self.counts.entry(program).or_default().add(counts);
+        }
+        self.broken += other.broken;
+        self.names_of_failed.extend(other.names_of_failed);
     }
 
     fn total(&self) -> Counts {
@@ -403,6 +418,10 @@ mod tests {
         assert_eq!(summary.total().programs, 2);
         assert_eq!(summary.names_of_failed, ["flash::cut"]);
         assert_eq!(Summary::default().line(), "0 passed, 0 failed");
+        let mut more = Summary { broken: 1, ..Summary::default() };
+        more.take("test result: ok. 4 passed; 0 failed; 0 ignored; 0 measured; 0 filtered out\n");
+        summary.add(more);
+        assert_eq!(summary.line(), "25 passed, 2 failed, 1 skipped");
     }
 
     /// Lines in cargo's format, with and without colours.

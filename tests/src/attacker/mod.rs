@@ -13,6 +13,7 @@
 //! | [`target`] | what the attacker needs of a device |
 //! | [`board`] | the built firmware in the emulator |
 //! | [`line`](mod@line) | the same with CAN over its UART |
+//! | [`node`] | `coboot-node`: the same code without a chip, for millions of frames |
 //! | [`model`] | what the masters asked for, read from the bus |
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
@@ -25,6 +26,7 @@ pub mod board;
 pub mod line;
 mod masters;
 pub mod model;
+pub mod node;
 pub mod setup;
 pub mod target;
 

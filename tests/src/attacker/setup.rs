@@ -9,7 +9,7 @@ use shared_abi::layout::Layout;
 
 use super::board::Board;
 use super::line::SerialBoard;
-use super::model::Node;
+use super::model;
 use super::target::Target;
 use crate::firmware;
 
@@ -26,19 +26,27 @@ pub struct Image {
     pub blocks: Vec<Vec<u8>>,
 }
 
+/// What is attacked.
+#[derive(Clone, Copy)]
+enum Device {
+    /// The emulated board with the image of this bootloader.
+    Image(&'static str),
+    /// `coboot-node`.
+    Node(&'static Profile),
+}
+
 /// A device to attack.
 #[derive(Clone)]
 pub struct Setup {
     /// Its name.
     pub name: &'static str,
-    /// The image of the bootloader.
-    bootloader: &'static str,
+    device: Device,
     /// The layout of the board.
     pub layout: &'static Layout,
     /// The node-ID that the bootloader always has.
     pub fixed: Option<u8>,
     /// Node-ID and bit rate without stored values.
-    pub default: Node,
+    pub default: model::Node,
     /// 1000h of the bootloader.
     pub device_type: u32,
     /// The object for the password of a program, and the password.
@@ -77,37 +85,39 @@ impl Setup {
             println!("not run: {} has the chip of another board", LAYOUT.board);
             return Vec::new();
         }
+        let image =
+            |name, image, profile, images: &[_]| Self::of(name, Device::Image(image), profile, images);
+        let node = |name, profile, images: &[_]| Self::of(name, Device::Node(profile), profile, images);
+        let lift = firmware::APP_LIFT.map(|image| (1, image));
         let applications = [(1, firmware::APP_V1), (1, firmware::APP_V2), (2, firmware::PROGRAM_2)];
         vec![
-            Self::of("standard", firmware::BOOTLOADER, &Profile::STANDARD, &applications),
-            Self::of("esacademy", firmware::BOOTLOADER_ESACADEMY, &Profile::ESACADEMY, &applications),
-            Self::of(
-                "lift",
-                firmware::BOOTLOADER_LIFT,
-                &Profile::LIFT,
-                &[(1, firmware::APP_LIFT[0]), (1, firmware::APP_LIFT[1])],
-            ),
-            Self::of("sealed", firmware::BOOTLOADER_SEALED, &Profile::STANDARD, &applications),
-            Self::of(
+            image("standard", firmware::BOOTLOADER, &Profile::STANDARD, &applications),
+            image("esacademy", firmware::BOOTLOADER_ESACADEMY, &Profile::ESACADEMY, &applications),
+            image("lift", firmware::BOOTLOADER_LIFT, &Profile::LIFT, &lift),
+            image("sealed", firmware::BOOTLOADER_SEALED, &Profile::STANDARD, &applications),
+            image(
                 "serial",
                 firmware::BOOTLOADER_VIRTUAL_CAN,
                 &Profile::STANDARD,
                 &[(1, firmware::APP_VIRTUAL_CAN), (1, "app-virtual-can-v2.elf")],
             ),
+            node("node", &Profile::STANDARD, &applications),
+            node("node-esacademy", &Profile::ESACADEMY, &applications),
+            node("node-lift", &Profile::LIFT, &lift),
         ]
     }
 
     fn of(
         name: &'static str,
-        bootloader: &'static str,
-        profile: &Profile,
+        device: Device,
+        profile: &'static Profile,
         images: &[(u8, &'static str)],
     ) -> Self {
         use boot_core::bootloader::PasswordObject;
         let default = profile.default_node.map_or((NODE_ID, 4), |(id, rate)| (id.get(), rate as u8));
         Self {
             name,
-            bootloader,
+            device,
             layout: &LAYOUT,
             fixed: profile.node_id.map(canopen::NodeId::get),
             default,
@@ -123,11 +133,24 @@ impl Setup {
         }
     }
 
-    /// A board with this firmware, switched on.
+    /// How many frames it takes in the time of one on an emulated board, at least.
+    #[must_use]
+    pub fn pace(&self) -> u64 {
+        match self.device {
+            Device::Image(_) => 1,
+            Device::Node(_) => 20,
+        }
+    }
+
+    /// Such a device, switched on.
     #[must_use]
     pub fn target(&self) -> Box<dyn Target> {
-        let bootloader = firmware::of_board(self.layout.board, self.bootloader);
-        if self.bootloader == firmware::BOOTLOADER_VIRTUAL_CAN {
+        let image = match self.device {
+            Device::Node(profile) => return Box::new(super::node::Node::new(profile)),
+            Device::Image(image) => image,
+        };
+        let bootloader = firmware::of_board(self.layout.board, image);
+        if image == firmware::BOOTLOADER_VIRTUAL_CAN {
             Box::new(SerialBoard::new(self.layout, &bootloader))
         } else {
             Box::new(Board::new(self.layout, &bootloader))

@@ -7,7 +7,8 @@ use std::thread;
 use coboot_tests::attacker::setup::Setup;
 use coboot_tests::attacker::{run, Found, Summary};
 
-/// The frames of an attack on one board; then a new board is attacked with the next seed.
+/// The frames of an attack on one board, and many times as many on a node; then a new one is attacked
+/// with the next seed.
 const EACH: u64 = 50_000;
 
 struct Options {
@@ -56,7 +57,7 @@ fn main() -> ExitCode {
     if setups.is_empty() {
         return refuse("there is nothing to attack: choose the board stm32f407g-disc1.");
     }
-    let attacks = options.frames.div_ceil(EACH).max(1);
+    let attacks = options.frames.div_ceil(EACH).max(setups.len() as u64);
     let frames = options.frames.div_ceil(attacks).max(1);
     let rows =
         setups.iter().map(|setup| Row { name: setup.name, seeds: Vec::new(), summary: Summary::default() });
@@ -76,7 +77,7 @@ fn main() -> ExitCode {
                 };
                 // Each setup gets each seed in turn.
                 let (at, seed) = (n as usize % setups.len(), options.seed + n / setups.len() as u64);
-                let result = run(&setups[at], seed, frames);
+                let result = run(&setups[at], seed, frames * setups[at].pace());
                 let mut work = work.lock().expect("no attack panics");
                 match result {
                     Ok(summary) => {

@@ -1,0 +1,227 @@
+//! `coboot-node` in virtual time: the firmware's `boot-core` and `canopen` without a chip, and the
+//! stand-in for a program. A frame takes its time on the bus; work on the flash takes none. It is
+//! some hundred times as fast as the emulator, and its bus has no errors.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::{env, fs};
+
+use boot_core::bootloader::{self, entries, entry_count};
+use boot_core::control::Policy;
+use boot_core::flash::Flash as _;
+use boot_core::profile::Profile;
+use boot_core::store::NodeParameters;
+use bsp::NODE_ID;
+use canopen::device::Device as Says;
+use canopen::od::Entry;
+use canopen::{BitRate, Frame, Instant, NodeId};
+use coboot_node::device::{self, Setup, BUFFER};
+use coboot_node::file_flash::{FileFlash, Speed};
+use coboot_node::stand_in::StandIn;
+use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
+use shared_abi::layout::Layout;
+
+use super::target::{Event, Happened, PowerCut, Target};
+
+/// A frame with 8 bytes at 125 kbit/s, in us.
+const FRAME_US: u64 = 1000;
+/// More steps than any work has.
+const ENDLESS: u32 = 10_000_000;
+
+/// The device, and its bus.
+pub struct Node {
+    setup: Setup,
+    /// `None` without power.
+    device: Option<device::Device<'static, 2>>,
+    path: PathBuf,
+    now_us: u64,
+    /// Frames of the masters.
+    waiting: VecDeque<Frame>,
+    /// The bus is busy until then.
+    busy_until: u64,
+    events: Vec<Event>,
+    /// Steps of work so far.
+    steps: u64,
+    /// The flash at the last look.
+    cells: Vec<u8>,
+}
+
+/// The object dictionary of a profile.
+fn table(profile: &Profile) -> &'static [Entry] {
+    macro_rules! tables {
+        ($($profile:ident),*) => {
+            $(if profile.extras == Profile::$profile.extras {
+                static ENTRIES: [Entry; entry_count(2, Profile::$profile.extras)] =
+                    entries(2, Profile::$profile.extras).entries();
+                return &ENTRIES;
+            })*
+        };
+    }
+    tables!(STANDARD, ESACADEMY, LIFT);
+    panic!("a profile without a table")
+}
+
+impl Node {
+    /// A node with erased flash and this profile, switched on.
+    ///
+    /// # Panics
+    /// If its file cannot be created.
+    #[must_use]
+    pub fn new(profile: &'static Profile) -> Self {
+        static NUMBER: AtomicU32 = AtomicU32::new(0);
+        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
+        let path = env::temp_dir().join(format!("coboot-attacked-{}-{number}.flash", std::process::id()));
+        let config = Box::leak(Box::new(bootloader::Config {
+            entries: table(profile),
+            device: Says {
+                device_type: profile.device_type,
+                name: "coboot-node",
+                hardware_version: "none",
+                software_version: "coboot",
+                heartbeat_ms: 1000,
+                vendor_id: bsp::IDENTITY.vendor_id,
+                product_code: bsp::IDENTITY.product_code,
+                revision: 0x0001_0000,
+                serial_number: 0,
+            },
+            node_id: profile.node_id,
+            layout: &LAYOUT,
+            supports: coboot_node::supports,
+            boot_up_emergency: true,
+            lss_store: true,
+            second_server: true,
+            download: Policy { ..profile.download },
+            password: profile.password,
+        }));
+        let default =
+            profile.default_node.unwrap_or((NodeId::new(NODE_ID).expect("1 to 127"), BitRate::K125));
+        let setup = Setup {
+            config,
+            stand_in: Some(Vec::leak(StandIn::entries(2))),
+            serial_number: 1,
+            node: NodeParameters { id: Some(default.0), bit_rate: default.1 },
+            strap: false,
+        };
+        let mut node = Self {
+            setup,
+            device: None,
+            path,
+            now_us: 0,
+            waiting: VecDeque::new(),
+            busy_until: 0,
+            events: Vec::new(),
+            steps: 0,
+            cells: Vec::new(),
+        };
+        node.power_on();
+        node
+    }
+
+    fn work(&mut self) {
+        let Some(device) = &mut self.device else { return };
+        let now = Instant::from_millis((self.now_us / 1000) as u32);
+        let (at, events) = (self.now_us, &mut self.events);
+        let mut told = Vec::new();
+        for steps in 0.. {
+            assert!(steps < ENDLESS, "the work never ends");
+            let mut send = |frame| events.push((at, Happened::Frame { by_device: true, frame }));
+            let more = device.work(now, &mut send, &mut |event| told.push(event));
+            for event in told.drain(..) {
+                if !matches!(event, device::Event::NodeId(_)) {
+                    events.push((at, Happened::Reset));
+                }
+            }
+            if !more.expect("its file can be written") {
+                return;
+            }
+            self.steps += 1;
+        }
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.path);
+    }
+}
+
+impl Target for Node {
+    fn layout(&self) -> &'static Layout {
+        &LAYOUT
+    }
+
+    fn now_us(&self) -> u64 {
+        self.now_us
+    }
+
+    fn send(&mut self, _master: usize, frame: &Frame) {
+        self.waiting.push_back(*frame);
+    }
+
+    fn is_drained(&mut self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    fn pass_us(&mut self, us: u64) {
+        let until = self.now_us + us;
+        loop {
+            if self.busy_until <= self.now_us {
+                if let Some(frame) = self.waiting.pop_front() {
+                    self.events.push((self.now_us, Happened::Frame { by_device: false, frame }));
+                    if let Some(device) = &mut self.device {
+                        device.handle(&frame, Instant::from_millis((self.now_us / 1000) as u32));
+                    }
+                    self.busy_until = self.now_us + FRAME_US;
+                }
+            }
+            self.work();
+            if self.now_us >= until {
+                return;
+            }
+            self.now_us = until.min(self.now_us + FRAME_US / 2);
+        }
+    }
+
+    fn events(&mut self) -> Vec<Event> {
+        std::mem::take(&mut self.events)
+    }
+
+    fn flash(&mut self) -> &[u8] {
+        if let Some(flash) = self.device.as_mut().and_then(device::Device::flash) {
+            self.cells.resize(LAYOUT.chip.flash.size as usize, 0xFF);
+            flash.read(LAYOUT.chip.flash.base, &mut self.cells);
+        }
+        &self.cells
+    }
+
+    fn flash_activity(&mut self) -> (u64, bool) {
+        (self.steps, false)
+    }
+
+    /// Its bus has no error frames.
+    fn disturb(&mut self, _frames: u64) {}
+
+    fn cut_power(&mut self, cut: PowerCut) {
+        // Its operations take no time, so that nothing can be in the middle of one.
+        if matches!(cut, PowerCut::Now) {
+            self.device = None;
+        }
+    }
+
+    fn power_on(&mut self) {
+        if self.device.is_some() {
+            return;
+        }
+        let flash = FileFlash::open(Path::new(&self.path), &LAYOUT, Speed::Instant).expect("a file");
+        let (device, _) = device::Device::new(self.setup, flash, vec![0; BUFFER].leak());
+        self.device = Some(device);
+    }
+
+    /// Its bus has no bit rate.
+    fn set_bit_rate(&mut self, _bit_rate: u32) {}
+
+    fn complaint(&mut self) -> Option<String> {
+        None
+    }
+}
