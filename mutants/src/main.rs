@@ -64,7 +64,7 @@ fn main() -> Result<()> {
         target: arguments.out.join("target"),
     };
     let built = compile::build(&tests, &copy, &changes)?;
-    let ends = run::all(&built.programs, &built.active)?;
+    let ends = run::all(&built.programs, &built.active, &arguments.out)?;
     let mut lists = [
         ("caught", String::new()),
         ("missed", String::new()),

@@ -10,29 +10,50 @@ use syn::visit::{self, Visit};
 
 use crate::list::{offset, Change, Genre};
 
-/// What the library of the changed crate gets in addition: which change is on.
+/// What the library of the changed crate gets in addition: which change is on. `MUTANT` is its
+/// number; or the name of a file, which then gets the numbers of all places that are reached.
 pub const SWITCH: &str = r#"
 #[doc(hidden)]
 #[allow(missing_docs)]
 pub mod mutant_switch {
     extern crate std;
-    use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
-    /// Not asked yet; the greatest number but one is none.
-    static ON: AtomicU32 = AtomicU32::new(u32::MAX);
+    use core::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+    const UNKNOWN: u32 = u32::MAX;
+    const NONE: u32 = u32::MAX - 1;
+    const RECORD: u32 = u32::MAX - 2;
+    static ON: AtomicU32 = AtomicU32::new(UNKNOWN);
+    static REACHED: [AtomicBool; 1 << 14] = [const { AtomicBool::new(false) }; 1 << 14];
     #[inline(always)]
     pub fn on(number: u32) -> bool {
         match ON.load(Relaxed) {
-            u32::MAX => ask() == number,
+            UNKNOWN => ask(number),
+            RECORD => record(number),
             on => on == number,
         }
     }
     #[cold]
     #[inline(never)]
-    fn ask() -> u32 {
-        let told = std::env::var("MUTANT").ok().and_then(|text| text.parse().ok());
-        let on = told.unwrap_or(u32::MAX - 1);
+    fn ask(number: u32) -> bool {
+        let told = std::env::var("MUTANT").unwrap_or_default();
+        let on = told.parse().unwrap_or(if told.is_empty() { NONE } else { RECORD });
         ON.store(on, Relaxed);
-        on
+        if on == RECORD {
+            return record(number);
+        }
+        on == number
+    }
+    #[inline(never)]
+    fn record(number: u32) -> bool {
+        use std::io::Write;
+        let is_new = REACHED.get(number as usize).is_none_or(|seen| !seen.swap(true, Relaxed));
+        if is_new {
+            let name = std::env::var_os("MUTANT").unwrap_or_default();
+            let file = std::fs::OpenOptions::new().create(true).append(true).open(name);
+            let line = std::format!("{number}\n");
+            // One write: the lines of several threads do not mix.
+            file.and_then(|mut file| file.write_all(line.as_bytes())).expect("the file can be written");
+        }
+        false
     }
 }
 "#;

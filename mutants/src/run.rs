@@ -1,6 +1,9 @@
 //! Runs the tests for each change.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsStr;
+use std::fs;
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::Mutex;
@@ -12,35 +15,43 @@ use anyhow::{ensure, Context, Result};
 use crate::compile::Program;
 
 /// No test runs for ever: what takes as many times as long as without a change is noticed.
-const TIMES: u32 = 10;
+const TIMES: u32 = 5;
 /// The shortest time for a test program.
 const SHORTEST: Duration = Duration::from_secs(10);
 /// The memory of a test program, in KiB: a change may make it fill the machine's.
 const MEMORY: &str = "4000000";
 
-/// Whether each of these changes makes a test fail. The quickest test programs run first.
+/// Whether each of these changes makes a test fail. The quickest test programs run first, and only
+/// those that reach the place of the change.
 ///
 /// # Errors
-/// When a test fails without a change.
-pub fn all(programs: &[Program], changes: &[usize]) -> Result<BTreeMap<usize, bool>> {
+/// When a test fails without a change, or the folder for notes cannot be written.
+pub fn all(programs: &[Program], changes: &[usize], notes: &Path) -> Result<BTreeMap<usize, bool>> {
     let mut timed = Vec::new();
-    for program in programs {
+    fs::create_dir_all(notes).with_context(|| notes.display().to_string())?;
+    for (n, program) in programs.iter().enumerate() {
+        let note = notes.join(format!("reached-{n}"));
+        let _ = fs::remove_file(&note);
         let started = Instant::now();
-        let passes = passes(program, None, Duration::from_secs(900))?;
+        let passes = passes(program, Some(note.as_os_str()), Duration::from_secs(900))?;
         ensure!(passes, "{} fails without a change", program.0.display());
-        timed.push((started.elapsed(), program));
+        timed.push((started.elapsed(), program, reached(&note)));
     }
     timed.sort();
-    let limits: Vec<(&Program, Duration)> =
-        timed.iter().map(|(took, program)| (*program, (*took * TIMES).max(SHORTEST))).collect();
+    let limits: Vec<(&Program, Duration, BTreeSet<usize>)> = timed
+        .into_iter()
+        .map(|(took, program, reached)| (program, (took * TIMES).max(SHORTEST), reached))
+        .collect();
     let (next, ends, problem) = (AtomicUsize::new(0), Mutex::new(BTreeMap::new()), Mutex::new(None));
     let threads = thread::available_parallelism().map_or(1, usize::from);
     thread::scope(|scope| {
         for _ in 0..threads {
             scope.spawn(|| {
                 while let Some(number) = changes.get(next.fetch_add(1, Ordering::Relaxed)) {
-                    let is_noticed = limits.iter().try_fold(false, |noticed, (program, limit)| {
-                        Ok::<_, anyhow::Error>(noticed || !passes(program, Some(*number), *limit)?)
+                    let change = number.to_string();
+                    let mut there = limits.iter().filter(|(_, _, reached)| reached.contains(number));
+                    let is_noticed = there.try_fold(false, |noticed, (program, limit, _)| {
+                        Ok::<_, anyhow::Error>(noticed || !passes(program, Some(change.as_ref()), *limit)?)
                     });
                     match is_noticed {
                         Ok(is_noticed) => {
@@ -67,11 +78,18 @@ fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }
 
-/// Whether a test program passes within this time, with this change.
-fn passes((program, folder): &Program, change: Option<usize>, limit: Duration) -> Result<bool> {
+/// The changes whose places a test program has reached.
+fn reached(note: &Path) -> BTreeSet<usize> {
+    let lines = fs::read_to_string(note).unwrap_or_default();
+    lines.lines().filter_map(|line| line.parse().ok()).collect()
+}
+
+/// Whether a test program passes within this time, with this change; or with a note of what it
+/// reaches.
+fn passes((program, folder): &Program, mutant: Option<&OsStr>, limit: Duration) -> Result<bool> {
     let mut test = Command::new("sh");
     test.args(["-c", "ulimit -v \"$0\" && exec \"$@\"", MEMORY]).arg(program).current_dir(folder);
-    test.envs(change.map(|number| ("MUTANT", number.to_string())));
+    test.envs(mutant.map(|mutant| ("MUTANT", mutant)));
     // The first failure is enough.
     test.env("PROPTEST_MAX_SHRINK_ITERS", "0").env("RUST_BACKTRACE", "0");
     test.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
@@ -109,9 +127,28 @@ mod tests {
         let program = |path: &str| (path.into(), "/".into());
         let long = Duration::from_secs(60);
         assert!(passes(&program("/bin/true"), None, long).unwrap());
-        assert!(!passes(&program("/bin/false"), Some(3), long).unwrap());
+        assert!(!passes(&program("/bin/false"), Some("3".as_ref()), long).unwrap());
         assert!(!passes(&program("/usr/bin/yes"), None, Duration::from_millis(50)).unwrap());
-        assert!(all(&[program("/bin/false")], &[1]).is_err());
-        assert_eq!(all(&[program("/bin/true")], &[1, 2]).unwrap(), BTreeMap::from([(1, false), (2, false)]));
+        let notes = std::env::temp_dir().join(format!("coboot-mutants-{}", std::process::id()));
+        assert!(all(&[program("/bin/false")], &[1], &notes).is_err());
+        let ends = all(&[program("/bin/true")], &[1, 2], &notes).unwrap();
+        assert_eq!(ends, BTreeMap::from([(1, false), (2, false)]));
+        fs::remove_dir_all(notes).unwrap();
+    }
+
+    /// A test program that reaches two places and fails with one of the changes.
+    #[test]
+    fn a_program_runs_only_for_the_changes_that_it_reaches() {
+        use std::os::unix::fs::PermissionsExt;
+        let notes = std::env::temp_dir().join(format!("coboot-mutants-reached-{}", std::process::id()));
+        fs::create_dir_all(&notes).unwrap();
+        let path = notes.join("program");
+        let text =
+            "#!/bin/sh\ncase $MUTANT in\n/*) printf '1\\n2\\n' > $MUTANT ;;\n1) ;;\n*) exit 1 ;;\nesac\n";
+        fs::write(&path, text).unwrap();
+        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+        let ends = all(&[(path, "/".into())], &[1, 2, 3], &notes).unwrap();
+        assert_eq!(ends, BTreeMap::from([(1, false), (2, true), (3, false)]), "3 is never reached");
+        fs::remove_dir_all(notes).unwrap();
     }
 }
