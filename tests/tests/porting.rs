@@ -139,7 +139,7 @@ fn a_board_is_made_as_the_guide_says() {
     let app_c = copy.target.join("firmware/my-board/app-c.elf");
     // The result of an earlier run.
     let _ = fs::remove_file(&app_c);
-    copy.xtask(&["build", "--all", "--board", "my-board"]);
+    copy.xtask(&["build", "bootloader", "app-v1", "app-v2", "app-c", "--board", "my-board"]);
     assert!(app_c.exists(), "no application in C");
     // The main job, in the emulator.
     let told = copy.xtask(&["demo", "--board", "my-board"]);

@@ -52,12 +52,38 @@ pub fn run(mut args: Args) -> Outcome {
     let two = BOARDS.iter().copied().filter(|other| other.programs.len() > 1 && other.board != board.board);
     let whole = [board].into_iter().chain(two).map(|board| (board, &[][..]));
     let others_too = others.iter().map(|other| (*other, &CHIP_IMAGES[..]));
-    build::boards(&whole.chain(others_too).collect::<Vec<_>>())?;
-    // A board with CAN2.
-    build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
-    examples::all()?;
-    let programs = ["--package", "coflash", "--package", "coboot-node"];
-    process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
+    let images = || {
+        build::boards(&whole.chain(others_too).collect::<Vec<_>>())?;
+        // A board with CAN2.
+        build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
+        examples::all()
+    };
+    // The crate of the emulated tests has sealed images, without which a bootloader has more:
+    // together, all would be tested with them.
+    let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
+    let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
+    let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(hosts).collect();
+    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+    let with_board = [build::tests_args(board), sealed.to_vec()].concat();
+    let programs = || {
+        let programs = ["--package", "coflash", "--package", "coboot-node"];
+        process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
+        if chosen_board || !chosen.is_empty() {
+            return Ok(());
+        }
+        // What does not build is told by the run of the tests.
+        [&hosts, &with_board].into_iter().try_for_each(|tests| {
+            let mut compile = process::cargo("test");
+            compile.args(["--no-run", "--quiet"]).args(tests).current_dir(workspace::root());
+            compile.status().map(drop).map_err(|error| process::not_started(&compile, &error))
+        })
+    };
+    // The last step of an image uses one core: the programs for this machine are built beside it.
+    std::thread::scope(|scope| {
+        let images = scope.spawn(images);
+        programs()?;
+        images.join().unwrap_or_else(|_| Err("the build of the images broke off.".into()))
+    })?;
     let built = |name: &str| {
         let path = workspace::target_dir().join("debug").join(name);
         path.with_extension(std::env::consts::EXE_EXTENSION).into_os_string()
@@ -81,17 +107,12 @@ pub fn run(mut args: Args) -> Outcome {
     } else if !chosen.is_empty() {
         suite.run(board, &chosen)?;
     } else {
-        // The crate of the emulated tests has sealed images, without which a bootloader has more:
-        // together, all would be tested with them.
-        let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
-        let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
-        let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(hosts).collect();
         let mut host_suite = new_suite();
-        // Side by side: many tests have one thread, or wait for a clock.
+        // Side by side: many tests have one thread, or wait for a clock. The tests of another chip
+        // have to wait, since they are the same programs, compiled for another board.
         std::thread::scope(|scope| {
             let host_tests = scope.spawn(|| host_suite.run_hosts(board, &hosts));
-            let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
-            suite.run(board, &[build::tests_args(board), sealed.to_vec()].concat())?;
+            suite.run(board, &with_board)?;
             for other in others {
                 let tests = CHIP_TESTS.iter().map(|test| format!("--test={test}"));
                 suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
