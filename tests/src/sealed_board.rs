@@ -115,9 +115,17 @@ pub fn board() -> Bench {
 /// # Panics
 /// Never: the place of the keys is in flash.
 pub fn provision(bench: &mut Bench) {
-    let block = key_block(&[root().public()], &*KEKS, COUNTER, 0, false).expect("one root and one key");
     let place = firmware::board().key_block();
-    bench.machine().load_bin(place.base, &block).expect("it is in flash");
+    bench.machine().load_bin(place.base, &keys()).expect("it is in flash");
+}
+
+/// The key block of the devices.
+///
+/// # Panics
+/// Never: there is one root and one key.
+#[must_use]
+pub fn keys() -> [u8; 256] {
+    key_block(&[root().public()], &*KEKS, COUNTER, 0, false).expect("one root and one key")
 }
 
 /// The same without keys: a device that is not sealed.

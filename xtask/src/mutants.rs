@@ -23,7 +23,7 @@ and counts; they go to target/evidence/mutants.json. It fails if a group of file
 changes noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
 
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal;
-                  what was measured of the others of this commit is kept
+                  what was measured of the others of this code is kept
   --file GLOB     the changes in these files alone, as '**/store/*.rs'; nothing is recorded
   --shard K/N     every N-th change, beginning with the K-th from 0: a sample; nothing is recorded
   --yes           install Debian's packages without asking
@@ -136,7 +136,7 @@ pub fn run(mut args: Args) -> Outcome {
     let path = setup::tool("cargo-mutants", VERSION)?;
     let is_sample = file.is_some() || shard.is_some();
     let mut rows = match package {
-        Some(package) => kept(evidence::recorded("mutants").as_ref(), &evidence::commit(), &package),
+        Some(package) => kept(evidence::recorded("mutants").as_ref(), evidence::is_same_code, &package),
         None => Rows::new(),
     };
     if !is_sample {
@@ -326,9 +326,9 @@ fn share(caught: u32, viable: u32) -> f64 {
     }
 }
 
-/// What was recorded of the other packages of this commit.
-fn kept(record: Option<&Value>, commit: &str, package: &str) -> Rows {
-    let Some(record) = record.filter(|record| record.get("commit").text() == Some(commit)) else {
+/// What was recorded of the other packages, if it holds for the sources as they are.
+fn kept(record: Option<&Value>, is_same_code: impl Fn(&str) -> bool, package: &str) -> Rows {
+    let Some(record) = record.filter(|record| record.get("commit").text().is_some_and(is_same_code)) else {
         return Rows::new();
     };
     let count = |row: &Value, name| row.get(name).number().map(|count| count as u32);
@@ -447,8 +447,9 @@ mod tests {
         assert_eq!(record.get("groups").items()[0].get("percent").number(), Some(85.0));
         assert_eq!(record.get("groups").items()[1].get("percent").number(), Some(90.0));
         let files = |rows: Rows| rows.into_keys().collect::<Vec<_>>();
-        assert_eq!(kept(Some(&record), "12", "c"), rows);
-        assert_eq!(files(kept(Some(&record), "12", "a")), ["canopen/src/lib.rs"]);
-        assert!(kept(Some(&record), "13", "c").is_empty() && kept(None, "12", "c").is_empty());
+        let same = |of: &str| of == "12";
+        assert_eq!(kept(Some(&record), same, "c"), rows);
+        assert_eq!(files(kept(Some(&record), same, "a")), ["canopen/src/lib.rs"]);
+        assert!(kept(Some(&record), |_| false, "c").is_empty() && kept(None, same, "c").is_empty());
     }
 }

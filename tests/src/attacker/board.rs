@@ -25,10 +25,14 @@ pub struct Board {
 const US: u64 = Span::from_micros(1).0;
 
 impl Board {
-    /// A board with this bootloader, switched on.
+    /// A board with this bootloader and these bytes in its key block, switched on.
+    ///
+    /// # Panics
+    /// Never: the key block is in flash.
     #[must_use]
-    pub fn new(layout: &'static Layout, bootloader: &str) -> Self {
+    pub fn new(layout: &'static Layout, bootloader: &str, keys: &[u8]) -> Self {
         let mut bench = Bench::of_image(bootloader);
+        bench.machine().load_bin(layout.key_block().base, keys).expect("it is in flash");
         let masters = [0; 2].map(|_| bench.world.add_host_port(BIT_RATE));
         bench.power_on();
         Self { bench, layout, masters, cuts: 0 }

@@ -42,7 +42,7 @@ impl SerialBoard {
     #[must_use]
     pub fn new(layout: &'static Layout, bootloader: &str) -> Self {
         Self {
-            board: Board::new(layout, bootloader),
+            board: Board::new(layout, bootloader, &[]),
             to_send: VecDeque::new(),
             frames: VecDeque::new(),
             ordered: 0,

@@ -177,7 +177,7 @@ impl Attack {
         let data = Address::new(0x1F50, image.program);
         // A raw image has no check of its own: noise in it would be a part of it.
         let downloads = if manner.noise == 0 && manner.stops_after == u32::MAX && self.random.chance(25) {
-            vec![image.raw]
+            vec![image.whole]
         } else {
             image.blocks
         };

@@ -4,6 +4,7 @@ use boot_core::profile::Profile;
 use bsp::NODE_ID;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::read;
+use coflash::file::sealed::Sealer;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 use shared_abi::layout::Layout;
 
@@ -12,16 +13,18 @@ use super::line::SerialBoard;
 use super::model;
 use super::target::Target;
 use crate::firmware;
+use crate::sealed_board::{keys, release, sealer, COUNTER, KEKS};
 
 /// A program to send.
 #[derive(Clone)]
 pub struct Image {
     /// Its number.
     pub program: u8,
-    /// The CRC of the program, from its block file and as a raw image.
-    pub crcs: [u32; 2],
-    /// The raw image.
-    pub raw: Vec<u8>,
+    /// The CRCs that its program may have: from its block file, and as a raw image. None if a device
+    /// must not accept it.
+    pub crcs: Vec<u32>,
+    /// What is sent in one download: the raw image, or the sealed one.
+    pub whole: Vec<u8>,
     /// The blocks of its block file, each a download.
     pub blocks: Vec<Vec<u8>>,
 }
@@ -31,6 +34,8 @@ pub struct Image {
 enum Device {
     /// The emulated board with the image of this bootloader.
     Image(&'static str),
+    /// The emulated board with the bootloader for sealed images, and with keys.
+    Sealed,
     /// `coboot-node`.
     Node(&'static Profile),
 }
@@ -70,10 +75,24 @@ impl Image {
         let raw = firmware::raw_from(region.base, &name);
         Self {
             program,
-            crcs: [file.program_crc(), crate::sealed::crc32(&raw)],
-            raw,
+            crcs: vec![file.program_crc(), crate::sealed::crc32(&raw)],
+            whole: raw,
             blocks: file.blocks().iter().map(|block| block.emit()).collect(),
         }
+    }
+
+    /// The same for a device that accepts only sealed images.
+    fn refused(self) -> Self {
+        Self { crcs: Vec::new(), ..self }
+    }
+
+    /// The same as an image that such a device accepts, in all kinds of payload.
+    fn sealed(self, encrypted: bool, compress: bool) -> Self {
+        let encrypt_for: &[_] = if encrypted { &*KEKS } else { &[] };
+        let sealer = Sealer { program: self.program, encrypt_for, compress, ..sealer(COUNTER) };
+        let whole = sealer.seal(&self.whole, &release()).expect("it can be sealed");
+        let crcs = vec![crate::sealed::crc32(&self.whole)];
+        Self { crcs, blocks: vec![whole.clone()], whole, ..self }
     }
 }
 
@@ -90,7 +109,14 @@ impl Setup {
         let node = |name, profile, images: &[_]| Self::of(name, Device::Node(profile), profile, images);
         let lift = firmware::APP_LIFT.map(|image| (1, image));
         let applications = [(1, firmware::APP_V1), (1, firmware::APP_V2), (2, firmware::PROGRAM_2)];
+        let mut sealed = Self::of("keys", Device::Sealed, &Profile::STANDARD, &applications);
+        let kinds = [(false, false), (true, true), (true, false)];
+        for (image, (encrypted, compress)) in sealed.images.iter_mut().zip(kinds) {
+            *image = image.clone().sealed(encrypted, compress);
+        }
+        sealed.images.push(Image::new(1, firmware::APP_LIFT[0]).refused());
         vec![
+            sealed,
             image("standard", firmware::BOOTLOADER, &Profile::STANDARD, &applications),
             image("esacademy", firmware::BOOTLOADER_ESACADEMY, &Profile::ESACADEMY, &applications),
             image("lift", firmware::BOOTLOADER_LIFT, &Profile::LIFT, &lift),
@@ -137,7 +163,7 @@ impl Setup {
     #[must_use]
     pub fn pace(&self) -> u64 {
         match self.device {
-            Device::Image(_) => 1,
+            Device::Image(_) | Device::Sealed => 1,
             Device::Node(_) => 20,
         }
     }
@@ -145,15 +171,16 @@ impl Setup {
     /// Such a device, switched on.
     #[must_use]
     pub fn target(&self) -> Box<dyn Target> {
-        let image = match self.device {
-            Device::Node(profile) => return Box::new(super::node::Node::new(profile)),
-            Device::Image(image) => image,
-        };
-        let bootloader = firmware::of_board(self.layout.board, image);
-        if image == firmware::BOOTLOADER_VIRTUAL_CAN {
-            Box::new(SerialBoard::new(self.layout, &bootloader))
-        } else {
-            Box::new(Board::new(self.layout, &bootloader))
+        let of_board = |image| firmware::of_board(self.layout.board, image);
+        match self.device {
+            Device::Node(profile) => Box::new(super::node::Node::new(profile)),
+            Device::Image(image @ firmware::BOOTLOADER_VIRTUAL_CAN) => {
+                Box::new(SerialBoard::new(self.layout, &of_board(image)))
+            }
+            Device::Image(image) => Box::new(Board::new(self.layout, &of_board(image), &[])),
+            Device::Sealed => {
+                Box::new(Board::new(self.layout, &of_board(firmware::BOOTLOADER_SEALED), &keys()))
+            }
         }
     }
 }

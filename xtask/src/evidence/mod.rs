@@ -29,7 +29,7 @@ pub fn run(args: Args) -> Outcome {
     let file = workspace::target_dir().join("evidence").join("index.html");
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
     fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
-    fs::write(&file, page::page(&commit(), recorded)).map_err(unwritable)?;
+    fs::write(&file, page::page(&commit(), recorded, is_same_code)).map_err(unwritable)?;
     println!("The page is {}.", workspace::shown(&file));
     Ok(())
 }
@@ -100,6 +100,21 @@ pub fn commit() -> String {
     format!("{}{}", commit.trim(), if changed { "-dirty" } else { "" })
 }
 
+/// Whether what was measured of a commit holds for the sources as they are: since then only texts and
+/// kept inputs changed.
+pub fn is_same_code(of: &str) -> bool {
+    let is_commit = of.len() == 40 && of.bytes().all(|byte| byte.is_ascii_hexdigit());
+    let mut git = Command::new("git");
+    git.current_dir(workspace::root()).args(["diff", "--name-only", of, "--"]);
+    is_commit && process::output(&mut git).is_ok_and(|changed| changed.lines().all(is_text))
+}
+
+/// Whether no program and no test program is made of this file.
+fn is_text(file: &str) -> bool {
+    file.ends_with(".md")
+        || ["docs/", "fuzz/seeds/", "fuzz/counts.json"].iter().any(|of| file.starts_with(of))
+}
+
 /// A time in seconds since 1970, as `2026-01-31T12:00:00Z`.
 fn date(seconds: u64) -> String {
     let (mut days, rest) = (seconds / 86400, seconds % 86400);
@@ -135,6 +150,22 @@ mod tests {
             assert_eq!(value.get("toolchain").text(), Some("rustc 1 'x'"));
             assert_eq!(value.get("date").text(), Some("2026-01-31T12:00:00Z"));
             assert_eq!(*value.get("count"), count.map_or(Value::Null, |count| Value::Number(count.into())));
+        }
+    }
+
+    #[test]
+    fn a_result_holds_for_the_same_code() {
+        for file in
+            ["README.md", "docs/adr/0018-toolchain-of-a-release.md", "fuzz/seeds/lss/1", "fuzz/counts.json"]
+        {
+            assert!(is_text(file), "{file}");
+        }
+        for file in ["fuzz/src/lib.rs", "canopen/src/lib.rs", "Cargo.lock", ".ci/run", "docsy/a.rs"] {
+            assert!(!is_text(file), "{file}");
+        }
+        // No commits; among them an option for git.
+        for of in ["unknown", "", "0123-dirty", "--output=x", &"0".repeat(40)] {
+            assert!(!is_same_code(of), "{of}");
         }
     }
 

@@ -104,12 +104,17 @@ const NOT_VERIFIED: &str = "Nothing here ran on silicon. The emulated chip follo
     tolerance, brown-out levels, the wear of the flash and the erase times of a real device are not verified. \
     <code>cargo xtask hil</code> runs the same tests on a board.";
 
-/// The page for sources of this commit, with the records that `read` finds.
-pub fn page(commit: &str, read: impl Fn(&str) -> Option<Value>) -> String {
+/// The page for sources of this commit, with the records that `read` finds. `is_same_code` tells of
+/// another commit whether its code is that of the sources, too.
+pub fn page(
+    commit: &str,
+    read: impl Fn(&str) -> Option<Value>,
+    is_same_code: impl Fn(&str) -> bool,
+) -> String {
     let (mut cards, mut sections) = (String::new(), String::new());
     for part in PARTS {
         let record = read(part.name);
-        let (class, verdict, details) = judge(part, commit, record.as_ref());
+        let (class, verdict, details) = judge(part, commit, record.as_ref(), &is_same_code);
         let _ = writeln!(
             cards,
             "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>",
@@ -137,7 +142,12 @@ pub fn page(commit: &str, read: impl Fn(&str) -> Option<Value>) -> String {
 }
 
 /// The class, the verdict and the details of a part.
-fn judge(part: &Part, commit: &str, record: Option<&Value>) -> (&'static str, String, String) {
+fn judge(
+    part: &Part,
+    commit: &str,
+    record: Option<&Value>,
+    is_same_code: impl Fn(&str) -> bool,
+) -> (&'static str, String, String) {
     let Some(record) = record else {
         return ("none", format!("not run: <code>{}</code>", part.command), String::new());
     };
@@ -148,6 +158,10 @@ fn judge(part: &Part, commit: &str, record: Option<&Value>) -> (&'static str, St
     let of = record.get("commit").text().unwrap_or("unknown");
     match verdict {
         Err(what) => ("bad", what, details),
+        // The tests read the texts, too.
+        Ok(what) if of != commit && part.name != "tests" && is_same_code(of) => {
+            ("good", format!("{what}; only texts changed since"), details)
+        }
         Ok(what) if of != commit => {
             let of = if of.ends_with("-dirty") { "of changed sources" } else { "of another commit" };
             ("old", format!("{what}; {of}"), details)
@@ -503,7 +517,8 @@ mod tests {
 
     /// The page with one record, the tests'.
     fn with(record: Option<&str>) -> String {
-        page(COMMIT, |name| record.filter(|_| name == "tests").map(|text| Value::parse(text).unwrap()))
+        let read = |name: &str| record.filter(|_| name == "tests").map(|text| Value::parse(text).unwrap());
+        page(COMMIT, read, |_| true)
     }
 
     fn class(page: &str) -> &str {
@@ -526,8 +541,18 @@ mod tests {
             assert_eq!(class(&with(record)), expected, "{record:?}");
         }
         // Sources that are no commit's give no green mark, whatever was measured of them.
-        let dirty = page("1-dirty", |_| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap()));
-        assert!(!dirty.contains("class=\"card good\""));
+        let record = |_: &str| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap());
+        assert!(!page("1-dirty", record, |_| false).contains("class=\"card good\""));
+    }
+
+    #[test]
+    fn a_result_holds_while_only_texts_change() {
+        let old = |_: &str| Some(Value::parse(r#"{"frames": 5, "failed": 0, "commit": "4567"}"#).unwrap());
+        let green =
+            |is_same_code: bool| page(COMMIT, old, |_| is_same_code).matches("class=\"card good").count();
+        assert_eq!(green(false), 0);
+        assert!(green(true) > 0);
+        assert_eq!(class(&page(COMMIT, old, |_| true)), "old", "the tests read the texts");
     }
 
     #[test]
@@ -542,7 +567,7 @@ mod tests {
             r#"{"a": "<b>", "commit": "<i>"}"#,
         ] {
             let record = Value::parse(record).unwrap();
-            let page = page(COMMIT, |_| Some(record.clone()));
+            let page = page(COMMIT, |_| Some(record.clone()), |_| false);
             assert!(page.ends_with("</html>\n") && !page.contains("<b>\"") && !page.contains("<i>,"));
             assert!(!page.contains("class=\"card good\""), "{record:?}");
         }

@@ -27,7 +27,6 @@ pub enum BlockFault {
 /// The key block of a device with these roots and key-encryption keys. The device accepts no
 /// program with a lower security counter and no certificate with a lower epoch. With `for_tests` it
 /// also accepts programs signed with test keys.
-/// that are signed with test keys.
 ///
 /// # Errors
 /// See [`BlockFault`].
