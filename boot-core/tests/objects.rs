@@ -723,3 +723,215 @@ fn a_block_outside_the_program_is_refused_with_the_reason() {
         assert_eq!(rig.chip.model().touched, [], "{base:#x}, {size}");
     }
 }
+
+// --- the limits of a block, and what is seen of work by another client
+
+/// SYS TEC manual, table 3, shifted by the bit for busy: FORMAT, ADDRESS and SEQUENCE.
+const FORMAT: u32 = 0x04;
+const ADDRESS: u32 = 0x0C;
+const SEQUENCE: u32 = 0x88;
+const LENGTH: AbortCode = AbortCode(0x0607_0010);
+const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
+const LENGTH_TOO_LOW: AbortCode = AbortCode(0x0607_0013);
+
+/// A device behind CLEAR and a control block, with this buffer.
+fn open(setup: &'static Setup, buffer: usize) -> Rig {
+    let mut rig = Rig::new(setup, buffer);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.settle();
+    rig
+}
+
+/// A block is 12 bytes in front of its data and 4 behind them (SYS TEC manual, figure 5).
+#[test]
+fn a_block_that_is_no_block_is_told_how() {
+    let base = STANDARD_1.region(1).base;
+    let whole = rig::block(1, base, &raw(&STANDARD_1, 1, 64));
+    for (len, abort) in [
+        (4, LENGTH_TOO_LOW),
+        (11, LENGTH_TOO_LOW),
+        (12, LENGTH),
+        (15, LENGTH),
+        (whole.len() - 1, LENGTH),
+        (whole.len() + 1, LENGTH),
+    ] {
+        let mut rig = open(&STANDARD_1, 1024);
+        let mut bytes = whole.clone();
+        bytes.resize(len, 0);
+        rig.begin(1, None, &bytes).unwrap();
+        assert_eq!(rig.node.download_end(Address::new(0x1F50, 1)), Err(abort), "{len}");
+        assert_eq!(rig.status(1), FORMAT, "{len}");
+    }
+}
+
+/// The buffer is the limit: for the size that is announced, for the size in the header, and for what
+/// comes without either.
+#[test]
+fn a_block_is_as_large_as_the_buffer_and_no_larger() {
+    let base = STANDARD_1.region(1).base;
+    let block = |size: usize| rig::block(1, base, &raw(&STANDARD_1, 1, size));
+    for (buffer, largest) in [(1024, 1024), (16 * 1024, 16_384), (64 * 1024, 16_384)] {
+        let largest = largest - 16;
+        // The program has less flash than the largest block.
+        let fits = largest <= STANDARD_1.region(1).size as usize;
+        for announced in [true, false] {
+            let mut rig = open(&STANDARD_1, buffer);
+            let size = |bytes: &[u8]| announced.then_some(bytes.len() as u32);
+            let (good, large) = (block(largest), block(largest + 1));
+            // So few bytes that the header is not complete, and so many that it is.
+            rig.begin(1, size(&good), &good[..8]).unwrap();
+            rig.cancel(1);
+            let first = rig.begin(1, size(&large), &large[..8]);
+            assert_eq!(first, if announced { Err(LENGTH_TOO_HIGH) } else { Ok(()) }, "{buffer}");
+            rig.cancel(1);
+            assert_eq!(rig.begin(1, size(&large), &large[..12]), Err(LENGTH_TOO_HIGH), "{buffer}");
+            // What the header does not tell.
+            let mut hidden = block(largest + 2);
+            hidden[8..12].copy_from_slice(&4_u32.to_le_bytes());
+            rig.begin(1, None, &hidden[..largest + 16]).unwrap();
+            rig.cancel(1);
+            assert_eq!(rig.begin(1, None, &hidden[..largest + 17]), Err(LENGTH_TOO_HIGH), "{buffer}");
+            if fits {
+                assert_eq!(rig.begin(1, size(&good), &good), Ok(()), "{buffer}");
+            }
+        }
+    }
+}
+
+/// No flash has 65536 blocks: a larger number begins something else.
+#[test]
+fn the_first_number_tells_a_block() {
+    let base = STANDARD_1.region(1).base;
+    for (number, status) in [(0xFFFF, SEQUENCE), (0x1_0000, FORMAT)] {
+        let mut rig = Rig::new(&STANDARD_1, 1024);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        assert!(rig.send(1, &rig::block(number, base, &[0; 64])).is_err());
+        assert_eq!(rig.status(1), status, "{number:X}");
+    }
+}
+
+/// The last block of the manual of 2008 has 32 bytes more than its header says, and no other has.
+#[test]
+fn only_the_last_block_may_be_longer_than_it_says() {
+    let region = STANDARD_1.region(1);
+    let image = raw(&STANDARD_1, 1, 64);
+    let old = |number: u32, address: u32, data: &[u8; 40], told: u32| {
+        let mut bytes = rig::words(&[number, address, told]);
+        bytes.extend(data);
+        bytes.extend(crc32(&bytes).to_le_bytes());
+        bytes
+    };
+    let mut last = [0; 40];
+    last[32..36].copy_from_slice(&64_u32.to_le_bytes());
+    last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
+    for (number, told, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
+        let mut rig = open(&STANDARD_1, 1024);
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.settle();
+        let sent = rig.send(1, &old(number, region.base + 64, &last, told));
+        assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {told}");
+        rig.settle();
+        assert_eq!(rig.state(1), if good { 0 } else { 3 });
+    }
+}
+
+/// The two first vectors are the least that can be started, and less is no program.
+#[test]
+fn a_program_is_its_first_two_vectors_at_least() {
+    let region = STANDARD_1.region(1);
+    for (size, status) in [(7, FORMAT), (8, 0)] {
+        let image = raw(&STANDARD_1, 1, 8);
+        let mut rig = open(&STANDARD_1, 1024);
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.settle();
+        let last = rig::block(u32::MAX, 0, &rig::words(&[size, crc32(&image[..size as usize])]));
+        assert_eq!(rig.send(1, &last).is_ok(), status == 0, "{size}");
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{size}");
+    }
+}
+
+/// Intel HEX with segments reaches 64 KiB from the base of the segment. What lies below is at a place
+/// that is no program's; what goes beyond is not Intel HEX.
+#[test]
+fn a_record_stays_in_its_segment() {
+    let segment = ihex::record(0, 2, &[0x10, 0x00]);
+    for (offset, status) in [(0x2000, ADDRESS), (0xFFF0, ADDRESS), (0xFFF1, FORMAT)] {
+        let mut rig = Rig::new(&STANDARD_1, 4096);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let text = format!("{segment}\n{}\n", ihex::record(offset, 0, &[0; 16]));
+        assert!(rig.send(1, text.as_bytes()).is_err());
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{offset:X}");
+    }
+}
+
+/// A raw image with a size: all its flash is erased while it comes, not only what it has reached.
+#[test]
+fn a_size_that_is_told_is_erased_ahead() {
+    let image = raw(&STANDARD_1, 1, 0x3000);
+    for told in [true, false] {
+        let mut rig = Rig::new(&STANDARD_1, 8 * 1024);
+        rig.install(1, &image);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let next = raw(&STANDARD_1, 1, 0x2800);
+        rig.begin(1, told.then_some(next.len() as u32), &next[..1600]).unwrap();
+        rig.settle();
+        assert_eq!(rig.cells(1)[0x2000..0x2800].iter().all(|byte| *byte == 0xFF), told, "told: {told}");
+    }
+}
+
+/// CLEAR of the program that is being downloaded begins it anew, at any time; the other one waits.
+#[test]
+fn clear_ends_the_download_of_its_own_program() {
+    let image = raw(&STANDARD_2, 1, 600);
+    let mut rig = open(&STANDARD_2, 1024);
+    rig.send(1, &rig::block(1, STANDARD_2.region(1).base, &image)).unwrap();
+    assert_eq!(rig.status(1) & BUSY, BUSY);
+    assert_eq!(rig.command(2, CLEAR), Err(MAN_BUSY));
+    assert_eq!(rig.command(1, CLEAR), Ok(()));
+    rig.settle();
+    rig.install(1, &image);
+}
+
+/// A command for one program fails beside an open block of the other one, which goes on.
+#[test]
+fn a_block_goes_on_beside_a_command_that_fails() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    let (one, two) = (raw(&STANDARD_2, 1, 600), raw(&STANDARD_2, 2, 600));
+    rig.install(2, &two);
+    rig.command(2, CLR_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let base = STANDARD_2.region(1).base;
+    let last = rig::words(&[600, crc32(&one)]);
+    for block in [rig::block(0, 0, &[0; 8]), rig::block(1, base, &one), rig::block(u32::MAX, 0, &last)] {
+        rig.begin(1, None, &block[..10]).unwrap();
+        let next = rig.chip.model().operations + 1;
+        rig.chip.model().fail = Some((next, FlashFault::Protected));
+        rig.command(2, SET_SIGNATURE).unwrap();
+        rig.settle();
+        assert_eq!(rig.status(2), 0x10, "NVDATA");
+        let at = Address::new(0x1F50, 1);
+        assert_eq!(rig.node.download_data(at, &block[10..]), Ok(()));
+        assert_eq!(rig.node.download_end(at), Ok(()));
+        rig.settle();
+    }
+    assert_eq!((rig.state(1), rig.identification(1)), (0, crc32(&one)));
+}
+
+/// An emergency tells of work that has ended: a block that is refused has its answer.
+#[test]
+fn a_refused_block_is_no_emergency() {
+    let mut rig = open(&STANDARD_1, 1024);
+    let base = STANDARD_1.region(1).base;
+    assert!(rig.send(1, &rig::block(7, base + 0x400, &[0; 64])).is_err());
+    rig.settle();
+    assert_eq!((rig.status(1), rig.node.next_emergency()), (SEQUENCE, None));
+}

@@ -121,3 +121,26 @@ impl LastBlock {
         self.number.wrapping_add(1)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Each KiB of a short program, a sixteenth of a long one: the journal has room for so many.
+    #[test]
+    fn progress_is_noted_sixteen_times_and_not_more_often_than_each_kib() {
+        let base = 0x0800_4000;
+        for (size, step) in
+            [(0, 1024), (1000, 1024), (16 * 1024, 1024), (32 * 1024, 2048), (1024 * 1024, 64 * 1024)]
+        {
+            let mut partial = Partial::begin(3, base);
+            assert!(!partial.note(base + step - 1, size), "{size}");
+            assert_eq!(partial.words(), [3, base]);
+            assert!(partial.note(base + step, size), "{size}");
+            assert!(!partial.note(base + step, size) && !partial.note(base, size), "{size}");
+            assert_eq!(partial.words(), [3, base + step]);
+        }
+        let mut other = Partial::begin(0, base);
+        assert!(!other.note(base + 0x10_0000, 0), "it cannot go on");
+    }
+}
