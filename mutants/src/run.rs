@@ -3,9 +3,11 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
 use std::fs;
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{self, Receiver};
 use std::sync::Mutex;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -90,25 +92,39 @@ fn passes((program, folder): &Program, mutant: Option<&OsStr>, limit: Duration) 
     let mut test = Command::new("sh");
     test.args(["-c", "ulimit -v \"$0\" && exec \"$@\"", MEMORY]).arg(program).current_dir(folder);
     test.envs(mutant.map(|mutant| ("MUTANT", mutant)));
-    // The first failure is enough.
     test.env("PROPTEST_MAX_SHRINK_ITERS", "0").env("RUST_BACKTRACE", "0");
-    test.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+    test.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
     let mut test = test.spawn().context("a test program cannot be started")?;
-    let passed = wait(&mut test, limit)?;
-    if passed.is_none() {
+    // The first failure is enough; the program itself would go on with its other tests.
+    let (sender, failed) = mpsc::channel();
+    if let Some(said) = test.stdout.take() {
+        thread::spawn(move || {
+            let mut lines = BufReader::new(said).lines().map_while(std::io::Result::ok);
+            if lines.by_ref().any(|line| line.ends_with("... FAILED")) {
+                let _ = sender.send(());
+            }
+            // Nobody else reads the pipe.
+            lines.for_each(drop);
+        });
+    }
+    let passed = wait(&mut test, &failed, limit)?;
+    if test.try_wait()?.is_none() {
         test.kill().context("a test program cannot be ended")?;
         test.wait()?;
     }
     Ok(passed == Some(true))
 }
 
-/// Whether a program succeeds; `None` if it still runs after this time.
-fn wait(program: &mut Child, limit: Duration) -> Result<Option<bool>> {
+/// Whether a program succeeds, and no test in it fails; `None` if it still runs after this time.
+fn wait(program: &mut Child, failed: &Receiver<()>, limit: Duration) -> Result<Option<bool>> {
     let started = Instant::now();
     let mut pause = Duration::from_millis(1);
     loop {
         if let Some(status) = program.try_wait()? {
             return Ok(Some(status.success()));
+        }
+        if failed.try_recv().is_ok() {
+            return Ok(Some(false));
         }
         if started.elapsed() > limit {
             return Ok(None);
@@ -122,13 +138,24 @@ fn wait(program: &mut Child, limit: Duration) -> Result<Option<bool>> {
 mod tests {
     use super::*;
 
+    fn executable(path: &Path, text: &str) {
+        use std::os::unix::fs::PermissionsExt;
+        fs::write(path, text).unwrap();
+        fs::set_permissions(path, fs::Permissions::from_mode(0o755)).unwrap();
+    }
+
     #[test]
-    fn a_program_fails_by_its_status_or_by_its_time() {
+    fn a_program_fails_by_its_status_by_a_test_or_by_its_time() {
         let program = |path: &str| (path.into(), "/".into());
         let long = Duration::from_secs(60);
         assert!(passes(&program("/bin/true"), None, long).unwrap());
         assert!(!passes(&program("/bin/false"), Some("3".as_ref()), long).unwrap());
         assert!(!passes(&program("/usr/bin/yes"), None, Duration::from_millis(50)).unwrap());
+        // It would go on for an hour.
+        let path = std::env::temp_dir().join(format!("coboot-mutants-fails-{}", std::process::id()));
+        executable(&path, "#!/bin/sh\necho 'test a ... ok'\necho 'test b ... FAILED'\nexec sleep 3600\n");
+        assert!(!passes(&(path.clone(), "/".into()), None, Duration::from_secs(3000)).unwrap());
+        fs::remove_file(path).unwrap();
         let notes = std::env::temp_dir().join(format!("coboot-mutants-{}", std::process::id()));
         assert!(all(&[program("/bin/false")], &[1], &notes).is_err());
         let ends = all(&[program("/bin/true")], &[1, 2], &notes).unwrap();
@@ -139,14 +166,12 @@ mod tests {
     /// A test program that reaches two places and fails with one of the changes.
     #[test]
     fn a_program_runs_only_for_the_changes_that_it_reaches() {
-        use std::os::unix::fs::PermissionsExt;
         let notes = std::env::temp_dir().join(format!("coboot-mutants-reached-{}", std::process::id()));
         fs::create_dir_all(&notes).unwrap();
         let path = notes.join("program");
         let text =
             "#!/bin/sh\ncase $MUTANT in\n/*) printf '1\\n2\\n' > $MUTANT ;;\n1) ;;\n*) exit 1 ;;\nesac\n";
-        fs::write(&path, text).unwrap();
-        fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+        executable(&path, text);
         let ends = all(&[(path, "/".into())], &[1, 2, 3], &notes).unwrap();
         assert_eq!(ends, BTreeMap::from([(1, false), (2, true), (3, false)]), "3 is never reached");
         fs::remove_dir_all(notes).unwrap();
