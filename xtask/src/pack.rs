@@ -7,14 +7,11 @@
 //! (gdb). `.data` keeps its contents for the debugger, but belongs to no segment with contents any
 //! more: gdb's `load` writes it to the RAM, and the boot stage later puts the same bytes there.
 
-use std::hash::{DefaultHasher, Hash, Hasher};
-use std::{fs, process};
-
 use crc::{Crc, CRC_32_ISO_HDLC};
 use shared_abi::ram_image::{Method, MAGIC, SERVICES_VERSION};
 
 use crate::elf::{Elf, Section};
-use crate::{workspace, zx0, Outcome};
+use crate::{zx0, Outcome};
 
 /// The linker's section with the header.
 const HEADER: &str = ".ram_image";
@@ -50,7 +47,7 @@ pub fn pack(file: &[u8]) -> Outcome<Vec<u8>> {
     }
 
     let front = in_front(&elf, header, contents)?;
-    let packed = compressed(&front, &with_absolute_calls(contents(image), image.address));
+    let packed = zx0::compress(&front, &with_absolute_calls(contents(image), image.address), OFFSETS);
     // The words after the CRC, which covers them too.
     let rest = bytes(&[SERVICES_VERSION, Method::Zx0 as u32, word(packed.len())?, image.size]);
     let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&[&front[..], &rest, &packed].concat());
@@ -103,23 +100,6 @@ fn with_absolute_calls(image: &[u8], address: u32) -> Vec<u8> {
         at += 2;
     }
     out
-}
-
-/// Compresses to the smallest stream of the format. That takes seconds, so the result is kept in
-/// the build folder, under a hash of the input.
-fn compressed(front: &[u8], raw: &[u8]) -> Vec<u8> {
-    let mut hasher = DefaultHasher::new();
-    (front, raw, OFFSETS.unit, OFFSETS.is_low_byte).hash(&mut hasher);
-    let folder = workspace::target_dir().join("packed");
-    let kept = folder.join(format!("{:016x}.zx0", hasher.finish()));
-    fs::read(&kept).unwrap_or_else(|_| {
-        let packed = zx0::compress(front, raw, OFFSETS);
-        // It has another name until it is complete. If it cannot be kept, only time is lost.
-        let part = kept.with_extension(process::id().to_string());
-        let written = fs::create_dir_all(&folder).and_then(|()| fs::write(&part, &packed));
-        let _ = written.and_then(|()| fs::rename(&part, &kept));
-        packed
-    })
 }
 
 /// One of the two tables of an ELF file (System V ABI, chapter 4): the positions of its offset, its

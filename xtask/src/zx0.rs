@@ -54,7 +54,8 @@ struct Piece {
 /// The state of one offset.
 #[derive(Clone, Copy, Default)]
 struct Offset {
-    /// The number of bytes up to here that equal the bytes at this distance before.
+    /// The end of the last bytes that equal the bytes at this distance before, and their number.
+    end: usize,
     equal: usize,
     /// The last copy of the cheapest stream whose last offset is this one.
     copy: Option<usize>,
@@ -81,67 +82,74 @@ fn cheapest(input: &[u8], start: usize, coding: Offsets) -> Vec<Piece> {
     offsets[1].copy = Some(START);
     // For each number of equal bytes, the best length of a copy.
     let mut lengths = vec![2; input.len() + 3];
+    // The places of each byte, by their distance from a multiple of the unit.
+    let mut places = vec![Vec::new(); 256 * unit];
+    let place = |at: usize| usize::from(input[at]) * unit + at % unit;
+    (0..start).for_each(|at| places[place(at)].push(at));
+    // The copies behind which literals may be the cheapest.
+    let mut open = vec![START];
 
     for end in start + 1..=input.len() {
+        let here = end - 1;
+        let literals = |copy: &usize| with_literals(&pieces[*copy], end);
+        let copy = open.iter().copied().min_by_key(literals).expect("one is the cheapest");
+        let bits = literals(&copy);
+        // Of the codes of two lengths, one is longer by so many bits at most.
+        open.retain(|copy| literals(copy) <= bits + number_bits(usize::MAX));
+        pieces.push(Piece { bits, end, offset: 0, before: copy });
+        best[end] = pieces.len() - 1;
+
         let mut known = 2;
-        let mut cheapest: Option<usize> = None;
-        let reach = ((end - 1) / unit).max(1);
-        for (offset, state) in offsets[..=reach].iter_mut().enumerate().skip(1) {
-            let here = end - 1;
-            // A stream begins with a literal. In RAM the output does not follow the data before it:
-            // no copy crosses that border.
-            let from =
-                here.checked_sub(offset * unit).filter(|from| here > start && (*from != start || start == 0));
-            let is_equal = from.is_some_and(|from| input[here] == input[from]);
-            let mut candidate = None;
-            if is_equal {
-                if state.equal == 0 {
-                    state.literals = state.copy.map(|copy| {
-                        let bits = with_literals(&pieces[copy], here);
-                        pieces.push(Piece { bits, end: here, offset: 0, before: copy });
-                        pieces.len() - 1
-                    });
-                }
-                state.equal += 1;
-                if let Some(literals) = state.literals {
-                    let bits = pieces[literals].bits + 1 + number_bits(end - pieces[literals].end);
-                    candidate = Some(Piece { bits, end, offset, before: literals });
-                }
-                if state.equal > 1 {
-                    let cost =
-                        |length: usize| pieces[best[end - length]].bits.wrapping_add(number_bits(length - 1));
-                    while known < state.equal {
-                        known += 1;
-                        let shorter = lengths[known - 1];
-                        lengths[known] = if cost(known) <= cost(shorter) { known } else { shorter };
-                    }
-                    let length = lengths[state.equal];
-                    let bits = cost(length) + 1 + coding.low_bits() + number_bits(coding.parts(offset).0);
-                    if candidate.is_none_or(|other| bits < other.bits) {
-                        candidate = Some(Piece { bits, end, offset, before: best[end - length] });
-                    }
-                }
-                if let Some(piece) = candidate {
-                    pieces.push(piece);
-                    state.copy = Some(pieces.len() - 1);
-                }
-            } else {
+        let mut cheapest_copy: Option<usize> = None;
+        // A stream begins with a literal. In RAM the output does not follow the data before it: no
+        // copy crosses that border.
+        let equal = places[place(here)].iter().rev().copied();
+        for from in equal.filter(|from| here > start && (*from != start || start == 0)) {
+            let offset = (here - from) / unit;
+            let state = &mut offsets[offset];
+            if state.end != here {
                 state.equal = 0;
-                candidate = state.copy.map(|copy| {
-                    let bits = with_literals(&pieces[copy], end);
-                    Piece { bits, end, offset: 0, before: copy }
+                state.literals = state.copy.map(|copy| {
+                    let bits = with_literals(&pieces[copy], here);
+                    pieces.push(Piece { bits, end: here, offset: 0, before: copy });
+                    pieces.len() - 1
                 });
             }
-            if let Some(piece) = candidate {
-                if cheapest.is_none_or(|other| piece.bits < pieces[other].bits) {
-                    if !is_equal {
-                        pieces.push(piece);
-                    }
-                    cheapest = Some(pieces.len() - 1);
+            state.equal += 1;
+            state.end = end;
+            let mut candidate = state.literals.map(|literals| {
+                let bits = pieces[literals].bits + 1 + number_bits(end - pieces[literals].end);
+                Piece { bits, end, offset, before: literals }
+            });
+            if state.equal > 1 {
+                let cost =
+                    |length: usize| pieces[best[end - length]].bits.wrapping_add(number_bits(length - 1));
+                while known < state.equal {
+                    known += 1;
+                    let shorter = lengths[known - 1];
+                    lengths[known] = if cost(known) <= cost(shorter) { known } else { shorter };
+                }
+                let length = lengths[state.equal];
+                let bits = cost(length) + 1 + coding.low_bits() + number_bits(coding.parts(offset).0);
+                if candidate.is_none_or(|other| bits < other.bits) {
+                    candidate = Some(Piece { bits, end, offset, before: best[end - length] });
                 }
             }
+            let Some(piece) = candidate else { continue };
+            pieces.push(piece);
+            let copy = pieces.len() - 1;
+            state.copy = Some(copy);
+            if cheapest_copy.is_none_or(|other| piece.bits < pieces[other].bits) {
+                cheapest_copy = Some(copy);
+            }
         }
-        best[end] = cheapest.expect("literals alone are always a stream");
+        if let Some(copy) = cheapest_copy {
+            open.push(copy);
+            if pieces[copy].bits < pieces[best[end]].bits {
+                best[end] = copy;
+            }
+        }
+        places[place(here)].push(here);
     }
 
     let mut found = Vec::new();
