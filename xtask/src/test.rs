@@ -58,32 +58,10 @@ pub fn run(mut args: Args) -> Outcome {
         build::images(&stm32f407g_disc1_can2::LAYOUT, &build::MAIN)?;
         examples::all()
     };
-    // The crate of the emulated tests has sealed images, without which a bootloader has more:
-    // together, all would be tested with them.
-    let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
-    let hosts = NOT_ON_HOST.iter().chain(&["coboot-tests"]).flat_map(others_than);
-    let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(hosts).collect();
-    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
-    let with_board = [build::tests_args(board), sealed.to_vec()].concat();
     let programs = || {
-        let programs = ["--package", "coflash", "--package", "coboot-node"];
-        process::run(process::cargo("build").current_dir(workspace::root()).args(programs))?;
-        if chosen_board || !chosen.is_empty() {
-            return Ok(());
-        }
-        // What does not build is told by the run of the tests.
-        [&hosts, &with_board].into_iter().try_for_each(|tests| {
-            let mut compile = process::cargo("test");
-            compile.args(["--no-run", "--quiet"]).args(tests).current_dir(workspace::root());
-            compile.status().map(drop).map_err(|error| process::not_started(&compile, &error))
-        })
+        let packages = ["--package", "coflash", "--package", "coboot-node"];
+        process::run(process::cargo("build").current_dir(workspace::root()).args(packages))
     };
-    // The last step of an image uses one core: the programs for this machine are built beside it.
-    std::thread::scope(|scope| {
-        let images = scope.spawn(images);
-        programs()?;
-        images.join().unwrap_or_else(|_| Err("the build of the images broke off.".into()))
-    })?;
     let built = |name: &str| {
         let path = workspace::target_dir().join("debug").join(name);
         path.with_extension(std::env::consts::EXE_EXTENSION).into_os_string()
@@ -101,25 +79,15 @@ pub fn run(mut args: Args) -> Outcome {
         node: built("coboot-node"),
         python: python.clone(),
     };
-    let mut suite = new_suite();
-    if chosen_board {
-        suite.run(board, &[build::tests_args(board), chosen].concat())?;
-    } else if !chosen.is_empty() {
-        suite.run(board, &chosen)?;
+    let mut suite;
+    if is_whole {
+        suite = side_by_side(board, &others, images, programs, new_suite)?;
     } else {
-        let mut host_suite = new_suite();
-        // Side by side: many tests have one thread, or wait for a clock. The tests of another chip
-        // have to wait, since they are the same programs, compiled for another board.
-        std::thread::scope(|scope| {
-            let host_tests = scope.spawn(|| host_suite.run_hosts(board, &hosts));
-            suite.run(board, &with_board)?;
-            for other in others {
-                let tests = CHIP_TESTS.iter().map(|test| format!("--test={test}"));
-                suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
-            }
-            host_tests.join().unwrap_or_else(|_| Err("the tests of the host broke off.".into()))
-        })?;
-        suite.summary.add(host_suite.summary);
+        images()?;
+        programs()?;
+        suite = new_suite();
+        let own = if chosen_board { build::tests_args(board) } else { Vec::new() };
+        suite.run(board, &[own, chosen].concat())?;
     }
     let summary = suite.summary;
 
@@ -141,6 +109,47 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
+/// Builds the images, and runs all tests as soon as what they need is built: the link of an image uses
+/// one core, many tests have one thread, or wait for a clock.
+fn side_by_side(
+    board: &Layout,
+    others: &[&Layout],
+    images: impl FnOnce() -> Outcome + Send,
+    programs: impl FnOnce() -> Outcome,
+    new_suite: impl Fn() -> Suite,
+) -> Outcome<Suite> {
+    // The crate of the emulated tests has sealed images, without which a bootloader has more:
+    // together, all would be tested with them.
+    let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
+    let without = NOT_ON_HOST.iter().chain(&["coboot-tests", TOOLS]).flat_map(others_than);
+    let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(without).collect();
+    let tools = [format!("--package={TOOLS}")];
+    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+    let with_board = [build::tests_args(board), sealed.to_vec()].concat();
+    let broken_off = |_| "a part of the tests broke off.".to_owned();
+    let (mut suite, mut beside) = (new_suite(), new_suite());
+    std::thread::scope(|scope| {
+        let images = scope.spawn(images);
+        programs()?;
+        let hosts = scope.spawn(|| beside.run_hosts(board, &hosts).map(|()| beside));
+        images.join().map_err(broken_off)??;
+        let beside = scope.spawn(|| {
+            let mut beside = hosts.join().map_err(broken_off)??;
+            beside.run_hosts(board, &tools).map(|()| beside)
+        });
+        suite.run(board, &with_board)?;
+        // The tests of another chip are the same programs, compiled for another board.
+        for other in others {
+            let tests = CHIP_TESTS.iter().map(|test| format!("--test={test}"));
+            suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
+        }
+        suite.summary.add(beside.join().map_err(broken_off)??.summary);
+        Ok(suite)
+    })
+}
+
+/// The package with the jobs, whose tests flash the images.
+const TOOLS: &str = "xtask";
 /// The packages that are built for a chip, or by another tool.
 const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
 
