@@ -678,20 +678,44 @@ impl Host<'_> {
         (outcome, self.status(program))
     }
 
-    /// The holder of a root asks for rights (2002h); returns whether they are granted.
-    pub fn grant(&mut self, root: &SigningKey, rights: u32, argument: u32) -> bool {
+    /// 2002h/1: unique ID, nonce, and the word with the rights.
+    pub fn challenge(&mut self) -> [u8; CHALLENGE] {
         let mut challenge = [0; CHALLENGE];
         self.node.read(Address::new(0x2002, 1), &mut challenge).expect("it can be read");
+        challenge
+    }
+
+    /// The granted rights, and [`SEALED`](seal::access::SEALED).
+    pub fn rights(&mut self) -> u32 {
+        u32::from_le_bytes([44, 45, 46, 47].map(|at| self.challenge()[at]))
+    }
+
+    /// A request for rights, signed by this key for the present challenge.
+    pub fn request(&mut self, root: &SigningKey, rights: u32, argument: u32) -> Vec<u8> {
+        let challenge = self.challenge();
         let mut request = Vec::new();
         for word in [rights, argument, root.public().id()] {
             request.extend(word.to_le_bytes());
         }
         let message = [&ACCESS_DOMAIN[..], &challenge[..SIGNED_CHALLENGE], &request].concat();
         request.extend(root.sign(&message));
-        let asked = self.node.write(Address::new(0x2002, 2), &request);
+        request
+    }
+
+    /// Sends a request for rights (2002h/2), without waiting for its check.
+    ///
+    /// # Errors
+    /// The abort.
+    pub fn ask(&mut self, request: &[u8]) -> Result<(), AbortCode> {
+        self.node.write(Address::new(0x2002, 2), request)
+    }
+
+    /// The holder of a root asks for rights; returns whether they are granted.
+    pub fn grant(&mut self, root: &SigningKey, rights: u32, argument: u32) -> bool {
+        let request = self.request(root, rights, argument);
+        let asked = self.ask(&request);
         self.settle();
-        self.node.read(Address::new(0x2002, 1), &mut challenge).expect("it can be read");
-        asked.is_ok() && u32::from_le_bytes([44, 45, 46, 47].map(|at| challenge[at])) & rights == rights
+        asked.is_ok() && self.rights() & rights == rights
     }
 
     /// A client with the right to do so erases the program.

@@ -71,7 +71,17 @@ const RUNS: &[Run] = &[
         but: &[ABSENT],
         only: &["boot-core/src/unseal/", "boot-core/src/intake/sealed.rs"],
         features: "coboot-core/sealed",
-        tests: Some(("coboot-core,coboot-tests", &["--test=objects", "--test=sealed_model"])),
+        tests: Some((
+            "coboot-core,coboot-tests",
+            &[
+                "--test=objects",
+                "--test=sealed_access",
+                "--test=sealed_blocks",
+                "--test=sealed_confirmation",
+                "--test=sealed_dictionary",
+                "--test=sealed_model",
+            ],
+        )),
         ..Run::of("coboot-core")
     },
     Run::of("coboot-app"),
