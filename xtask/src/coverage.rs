@@ -35,7 +35,7 @@ const CRATES: [(&str, &str); 5] = [
     ("coboot-seal", "seal"),
 ];
 /// The tests of sealed images that need no built firmware.
-const SEALED_TESTS: [&str; 1] = ["sealed_model"];
+pub const SEALED_TESTS: [&str; 4] = ["sealed_access", "sealed_dictionary", "sealed_model", "sealed_pieces"];
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);

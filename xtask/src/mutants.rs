@@ -12,7 +12,7 @@ use std::process::Command;
 use crate::args::Args;
 use crate::json::{quoted, Value};
 use crate::setup::{self, Part, Setup};
-use crate::{evidence, process, workspace, Outcome};
+use crate::{coverage, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N] [--yes]
@@ -45,13 +45,23 @@ struct Run {
     /// what the run before has not noticed, because it may not have been built there.
     only: &'static [&'static str],
     features: &'static str,
-    /// The packages with the tests besides the one that is changed, and arguments for cargo.
-    tests: Option<(&'static str, &'static [&'static str])>,
+    /// The tests are those of the objects and of sealed images alone.
+    with_sealed_tests: bool,
 }
 
 impl Run {
     const fn of(package: &'static str) -> Self {
-        Self { package, but: &[], only: &[], features: "", tests: None }
+        Self { package, but: &[], only: &[], features: "", with_sealed_tests: false }
+    }
+
+    /// The arguments for the tests, last in a command line.
+    fn tests(&self) -> Vec<String> {
+        if !self.with_sealed_tests {
+            return Vec::new();
+        }
+        let packages = ["--test-package", "coboot-core,coboot-tests", "--"].map(str::to_owned);
+        let tests = ["objects"].iter().chain(&coverage::SEALED_TESTS).map(|test| format!("--test={test}"));
+        packages.into_iter().chain(tests).collect()
     }
 }
 
@@ -71,17 +81,7 @@ const RUNS: &[Run] = &[
         but: &[ABSENT],
         only: &["boot-core/src/unseal/", "boot-core/src/intake/sealed.rs"],
         features: "coboot-core/sealed",
-        tests: Some((
-            "coboot-core,coboot-tests",
-            &[
-                "--test=objects",
-                "--test=sealed_access",
-                "--test=sealed_blocks",
-                "--test=sealed_confirmation",
-                "--test=sealed_dictionary",
-                "--test=sealed_model",
-            ],
-        )),
+        with_sealed_tests: true,
         ..Run::of("coboot-core")
     },
     Run::of("coboot-app"),
@@ -139,7 +139,7 @@ pub fn run(mut args: Args) -> Outcome {
         known.dedup();
         return Err(format!("there is no crate \"{name}\"; there is: {}.", known.join(", ")));
     }
-    if runs.iter().any(|run| run.tests.is_some()) {
+    if runs.iter().any(|run| run.with_sealed_tests) {
         // The crate with those tests builds the emulator, too.
         setup.prepare(&[Part::Emulator])?;
     }
@@ -253,9 +253,7 @@ fn in_one_build(run: &Run, selection: &[String], path: &OsStr, out: &Path) -> Ou
     if !run.features.is_empty() {
         all.args(["--features", run.features]);
     }
-    if let Some((packages, arguments)) = run.tests {
-        all.args(["--test-package", packages, "--"]).args(arguments);
-    }
+    all.args(run.tests());
     process::run(&mut all)?;
     let lists = ["caught", "missed", "unviable", "alone"].map(|end| (end, format!("{end}.txt")));
     Ok(found_in(out, &lists))
@@ -276,9 +274,7 @@ fn one_by_one(run: &Run, names: Vec<String>, path: &OsStr, out: &Path) -> Outcom
     if !run.features.is_empty() {
         mutants.args(["--features", run.features]);
     }
-    if let Some((packages, arguments)) = run.tests {
-        mutants.args(["--test-package", packages, "--"]).args(arguments);
-    }
+    mutants.args(run.tests());
     // It fails if a change was missed, or a build took too long, which are results.
     let status = mutants.status().map_err(|error| process::not_started(&mutants, &error))?;
     let known = [0, 2, 3];

@@ -1,0 +1,103 @@
+//! A sealed image in the blocks of a block file, on the model of the flash: in blocks of any size, and
+//! with one that is not right. (The same on the emulated chip: `sealed_blocks.rs`.)
+
+use coboot_tests::sealed::{
+    block, image, keys, seal, sealer, Device, Host, CLEAR, FORMS, STANDARD_1, STANDARD_2,
+};
+use coboot_tests::sealed_board::status;
+use coflash::file::convert::blocks_of_sealed;
+use coflash::file::sealed::{SealedFile, Sealer};
+
+/// The blocks of a sealed image.
+fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {
+    let file = SealedFile::parse(file.to_vec()).expect("it is one");
+    let blocks = blocks_of_sealed(&file, STANDARD_1.region(1).base, size).expect("it can be cut");
+    blocks.blocks().iter().map(|block| block.emit_with(blocks.checksum())).collect()
+}
+
+/// Sends the blocks, with this many bytes at once; returns the first status that is not OK.
+fn send_all(host: &mut Host<'_>, blocks: &[Vec<u8>], piece: usize) -> u32 {
+    assert_eq!(host.commanded(1, CLEAR), status::OK);
+    let words = blocks.iter().map(|block| host.send(1, block, piece).1);
+    words.into_iter().find(|word| *word != status::OK).unwrap_or(status::OK)
+}
+
+#[test]
+fn a_sealed_image_is_installed_from_blocks_of_any_size() {
+    let region = STANDARD_1.region(1);
+    for (form, seed) in FORMS.into_iter().zip(1..) {
+        let image = image(region, 1900, seed);
+        let file = seal(&sealer(form), &image);
+        for (size, piece) in [(40, 7), (100, 20), (128, 1), (1000, 7), (1500, 100)] {
+            let device = Device::sealed(&STANDARD_1);
+            let blocks = blocks(&file, size);
+            device.run(|host| assert_eq!(send_all(host, &blocks, piece), status::OK, "{form:?}, {size}"));
+            assert!(device.holds(1, &image), "{form:?}, {size}");
+        }
+    }
+}
+
+#[test]
+fn a_wrong_block_costs_nothing() {
+    let region = STANDARD_1.region(1);
+    let old = image(region, 700, 1);
+    let new = seal(&sealer((false, false)), &image(region, 900, 2));
+    let good = blocks(&new, 128);
+    /// A block with other data and a matching CRC.
+    fn changed(original: &[u8], change: impl Fn(&mut [u8])) -> Vec<u8> {
+        let word = |at: usize| u32::from_le_bytes(original[at..at + 4].try_into().unwrap());
+        let mut data = original[12..original.len() - 4].to_vec();
+        change(&mut data);
+        block(word(0), word(4), &data)
+    }
+    type Spoil = fn(&mut Vec<Vec<u8>>);
+    let cases: [(&str, Spoil, u32); 8] = [
+        ("a bit of the manifest", |all| all[1] = changed(&all[1], |data| data[50] ^= 1), status::SIGNATURE),
+        ("a bit, and the CRC of its block", |all| all[1][50] ^= 1, status::CRC),
+        ("no sealed image", |all| all[1] = changed(&all[1], |data| data[0] ^= 1), status::NO_ACCESS),
+        (
+            "no sealed image by its last letter",
+            |all| all[1] = changed(&all[1], |data| data[3] ^= 1),
+            status::NO_ACCESS,
+        ),
+        ("a block is left out", |all| drop(all.remove(2)), status::SEQUENCE),
+        ("block 0 in the middle", |all| all.insert(2, all[0].clone()), status::SEQUENCE),
+        ("the end too early", |all| drop(all.drain(2..all.len() - 1)), status::FORMAT),
+        ("nothing but the end", |all| drop(all.drain(1..all.len() - 1)), status::SEQUENCE),
+    ];
+    for (what, spoil, expected) in cases {
+        let device = Device::sealed(&STANDARD_1);
+        device.run(|host| host.install(1, &seal(&sealer((false, false)), &old)));
+        let mut blocks = good.clone();
+        spoil(&mut blocks);
+        device.take_touched();
+        device.run(|host| {
+            assert_eq!(send_all(host, &blocks, 7), expected, "{what}");
+            assert!(!device.was_touched(1), "{what}");
+            host.wait();
+            assert_eq!(send_all(host, &good, 7), status::OK, "{what}");
+        });
+        assert!(device.holds(1, &image(region, 900, 2)), "{what}");
+    }
+}
+
+/// The blocks of a program that is not sealed, which has a block 1 without a manifest.
+#[test]
+fn blocks_of_an_unsealed_program_are_refused() {
+    let region = STANDARD_2.region(1);
+    let program = image(region, 600, 3);
+    let device = Device::sealed(&STANDARD_2);
+    device.run(|host| host.install(1, &seal(&sealer((false, false)), &image(region, 700, 1))));
+    device.take_touched();
+    device.run(|host| {
+        assert_eq!(host.commanded(1, CLEAR), status::OK);
+        assert_eq!(host.send(1, &block(0, 0, &[0; 8]), 7).1, status::OK);
+        assert_eq!(host.send(1, &block(1, region.base, &program), 7).1, status::NO_ACCESS);
+        host.wait();
+        // For the other program, sealed.
+        let other = image(STANDARD_2.region(2), 600, 4);
+        let sealer = Sealer { program: 2, ..sealer((false, false)) };
+        host.install(2, &sealer.seal(&other, &keys().release).unwrap());
+    });
+    assert!(!device.was_touched(1) && device.holds(1, &image(region, 700, 1)));
+}
