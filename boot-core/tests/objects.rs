@@ -935,3 +935,75 @@ fn a_refused_block_is_no_emergency() {
     rig.settle();
     assert_eq!((rig.status(1), rig.node.next_emergency()), (SEQUENCE, None));
 }
+
+/// A release that is stored does not end the download that has begun, and has changed nothing yet.
+#[test]
+fn a_release_beside_an_open_download_leaves_it_open() {
+    let (old, new) = (raw(&STANDARD_1, 1, 600), raw(&STANDARD_1, 1, 900));
+    let mut rig = Rig::new(&STANDARD_1, 4096);
+    rig.install(1, &old);
+    rig.command(1, CLR_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.command(1, SET_SIGNATURE).unwrap();
+    rig.settle();
+    assert_eq!(rig.stored().records[0].map(|record| record.2), Some(true), "it is released");
+    let base = STANDARD_1.region(1).base;
+    let last = rig::words(&[900, crc32(&new)]);
+    for block in [rig::block(1, base, &new), rig::block(u32::MAX, 0, &last)] {
+        assert_eq!(rig.send(1, &block), Ok(()));
+        rig.settle();
+    }
+    assert_eq!((rig.status(1), rig.identification(1)), (0, crc32(&new)));
+}
+
+/// One piece of a stream may begin the program and be refused: then nothing waits for the flash.
+#[test]
+fn a_stream_that_is_refused_as_it_begins_leaves_nothing() {
+    let image = raw(&STANDARD_1, 1, 600);
+    let text = ihex::intel_hex(STANDARD_1.region(1).base, &image);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let at = Address::new(0x1F50, 1);
+    rig.node.download_start(at, None).unwrap();
+    // More than a piece of 128 bytes, and behind it no record.
+    let bad = format!("{}\n:X", text.lines().take(12).collect::<Vec<_>>().join("\n"));
+    assert!(rig.node.download_data(at, bad.as_bytes()).is_err());
+    rig.cancel(1);
+    rig.settle();
+    assert_eq!(rig.status(1), FORMAT);
+    rig.install(1, &image);
+}
+
+/// A record waits beside the piece that it belongs to in half of the buffer.
+#[test]
+fn a_record_fits_into_half_of_the_buffer() {
+    let image = raw(&STANDARD_1, 1, 640);
+    let base = STANDARD_1.region(1).base;
+    // Half of it is a record of 16 bytes and 4 headers of 8, exactly, or a byte less.
+    for (buffer, fits) in [(96, true), (95, false)] {
+        let mut rig = Rig::new(&STANDARD_1, buffer);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let sent = rig.send(1, ihex::intel_hex(base, &image).as_bytes());
+        assert_eq!(sent.is_ok(), fits, "{buffer}: {sent:?}");
+        rig.settle();
+        assert_eq!(rig.state(1) == 0, fits, "{buffer}");
+    }
+}
+
+/// While the flash erases, a quarter of the buffer is kept for answers that are held back.
+#[test]
+fn a_quarter_of_the_buffer_is_for_held_answers() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.begin(1, None, &raw(&STANDARD_1, 1, 600)[..7]).unwrap();
+    let at = Address::new(0x1F50, 1);
+    let (free, held) = (rig.node.download_space(at, false), rig.node.download_space(at, true));
+    // The open piece has a header of 8 bytes; another one, and its end, may follow.
+    assert_eq!((free, held), (1024 - 8 - 7 - 2 * 8 - 256, 1024 - 8 - 7 - 2 * 8));
+}

@@ -232,6 +232,47 @@ fn a_download_of_two_files_does_not_go_on() {
     }
 }
 
+/// Before the first data, the installed program stays: two files cost it no more than one.
+#[test]
+fn two_files_without_data_cost_nothing() {
+    let (old, image, other) = (program(0xC00, 0x11), program(0xC00, 0x33), program(0x1240, 0x44));
+    let mut flash = ModelFlash::new(&CHIP);
+    send(&mut flash, &named(&old));
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(partial(&mut bench), (0, 0));
+    assert_eq!(bench.command(CLEAR), 0);
+    for file in [&image, &other, &image] {
+        bench.good(&named(file)[0]);
+    }
+    assert!(is_installed(&flash, &old));
+    send(&mut flash, &named(&image));
+    assert!(is_installed(&flash, &image));
+}
+
+/// Progress is stored with each KiB of a short program, and a program that is one is no progress.
+#[test]
+fn progress_is_stored_each_kib_and_ends_with_the_program() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    let end = file.len() - 1;
+    for sent in 0..=end {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        for block in &file[..=sent] {
+            bench.good(block);
+        }
+        let told = partial(&mut bench);
+        let stored = partial(&mut Bench::new(&mut flash));
+        if sent == 0 || sent == end {
+            assert_eq!(stored, (0, 0), "{sent} blocks");
+        } else {
+            let kibs = sent * CHUNK / 1024 * 1024;
+            assert_eq!(stored, (crc_of(&file[0]), PROGRAM.base + kibs as u32), "{sent} blocks");
+        }
+        assert_eq!(told == (0, 0), sent == end, "{sent} blocks");
+    }
+}
+
 /// CLEAR gives up what was there; a command of another kind does not.
 #[test]
 fn clear_ends_what_could_go_on() {

@@ -4,10 +4,10 @@
 use canopen::od::Address;
 use canopen::AbortCode;
 use coboot_tests::sealed::{
-    image, keys, seal, sealer, Device, Host, Parts, CLEAR, CLR_SIGNATURE, STANDARD_1, STANDARD_2,
+    crc32, image, keys, seal, sealer, Device, Host, Parts, CLEAR, CLR_SIGNATURE, STANDARD_1, STANDARD_2,
 };
 use coboot_tests::sealed_board::status;
-use coflash::file::sealed::Sealer;
+use coflash::file::sealed::{key_block, Sealer};
 use seal::access::{event, right, EVENTS, REQUEST, SEALED};
 
 /// CiA 301: the length does not match; a value that is not allowed; not now.
@@ -61,10 +61,12 @@ fn rights_add_up_and_end_with_the_power() {
             });
         }
     }
-    // Nothing to grant: it has no keys.
+    // Nothing to grant: it has no keys, and the erased flash is none.
     Device::open(&STANDARD_1).run(|host| {
         assert_eq!(host.rights(), 0);
-        let request = host.request(&keys().root, right::ERASE, 0);
+        let mut request = host.request(&keys().root, right::ERASE, 0);
+        assert_eq!(host.ask(&request), Err(INVALID_VALUE));
+        request[8..12].copy_from_slice(&[0xFF; 4]);
         assert_eq!(host.ask(&request), Err(INVALID_VALUE));
     });
 }
@@ -94,7 +96,7 @@ fn a_request_is_good_for_one_challenge() {
 
 #[test]
 fn what_is_no_request_is_told_at_once() {
-    Device::sealed(&STANDARD_1).run(|host| {
+    Device::with_keys(&STANDARD_1, &keys_of_one_root()).run(|host| {
         let good = host.request(&keys().root, right::ERASE, 0);
         for len in [0, 1, REQUEST - 1, REQUEST + 1] {
             let mut request = good.clone();
@@ -182,19 +184,79 @@ fn without_its_right_a_program_is_not_lost() {
     assert!(device.verified(1).is_err());
 }
 
-/// A right for a lower counter is for one program, with this counter at least.
+/// A right for a lower counter is for one program, with this counter at least; the others stay.
 #[test]
 fn a_lower_counter_needs_its_right_each_time() {
     let device = Device::sealed(&STANDARD_1);
     device.run(|host| host.install(1, &sealed(1, 9, 1)));
     device.run(|host| {
         assert_eq!(host.update(1, &sealed(2, 5, 1), 7).1, status::ROLLBACK);
-        assert!(host.grant(&keys().root, right::LOWER_COUNTER, 5));
+        assert!(host.grant(&keys().root, right::LOWER_COUNTER | right::READ_BACK, 5));
+        // Its argument is for this right alone.
+        assert!(host.grant(&keys().root, right::STORE, 0));
         assert_eq!(host.update(1, &sealed(2, 4, 1), 7).1, status::ROLLBACK);
         host.install(1, &sealed(2, 5, 1));
+        assert_eq!(host.rights(), SEALED | right::READ_BACK | right::STORE);
+        host.install(1, &sealed(1, 9, 2));
+        assert_eq!(host.update(1, &sealed(2, 5, 2), 7).1, status::ROLLBACK);
     });
-    assert!(device.holds(1, &program(2)));
-    device.run(|host| assert_eq!(host.update(1, &sealed(3, 4, 1), 7).1, status::ROLLBACK));
+    assert!(device.holds(1, &program(1)));
+}
+
+/// The holder of a root opens the device for ever: from the next reset on it is as without keys.
+#[test]
+fn an_opened_device_stays_open() {
+    let device = Device::sealed(&STANDARD_1);
+    device.run(|host| {
+        assert!(host.grant(&keys().root, right::OPEN, 0));
+        // What is granted behind it takes nothing back.
+        assert!(host.grant(&keys().root, right::STORE, 0));
+        assert_eq!(host.rights(), SEALED | right::OPEN | right::STORE);
+        assert_ne!(host.update(1, &program(1), 7).1, status::OK);
+    });
+    device.run(|host| {
+        assert_eq!(host.rights(), 0);
+        host.install(1, &program(1));
+    });
+    assert!(device.holds(1, &program(1)));
+}
+
+/// A key block with a fault opens nothing: it accepts no image at all.
+#[test]
+fn a_damaged_key_block_accepts_nothing() {
+    let good = keys_of_one_root();
+    let check = |mut block: [u8; 256]| {
+        let crc = crc32(&block[..252]);
+        block[252..].copy_from_slice(&crc.to_le_bytes());
+        block
+    };
+    assert_eq!(check(good), good);
+    let flipped = |at: usize| {
+        let mut block = good;
+        block[at] ^= 1;
+        block
+    };
+    for (what, block) in [
+        ("its magic", check(flipped(0))),
+        ("its CRC", flipped(252)),
+        ("a bit of the root", flipped(30)),
+        ("a bit that nothing reads", flipped(200)),
+    ] {
+        let device = Device::with_keys(&STANDARD_1, &block);
+        device.run(|host| {
+            assert_eq!(host.rights() & SEALED, SEALED, "{what}");
+            assert_ne!(host.update(1, &sealed(1, 9, 1), 7).1, status::OK, "{what}");
+            host.wait();
+            assert_ne!(host.update(1, &program(1), 7).1, status::OK, "{what}");
+        });
+        assert!(device.verified(1).is_err(), "{what}");
+    }
+    Device::with_keys(&STANDARD_1, &good).run(|host| host.install(1, &sealed(1, 9, 1)));
+}
+
+/// With room for another root.
+fn keys_of_one_root() -> [u8; 256] {
+    key_block(&[keys().root.public()], &keys().keks, 0, 0, false).expect("it has room for them")
 }
 
 #[test]

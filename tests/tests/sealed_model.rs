@@ -423,6 +423,7 @@ fn with_confirmation_the_counter_waits_for_it() {
         host.confirm(1);
     });
     refused(&device, 4, ROLLBACK);
+    device.copy().run(|host| host.install(1, &of_counter(6, 1, &two)));
     device.run(|host| {
         host.install(1, &of_counter(9, 2, &two));
         host.confirm(1);

@@ -1,8 +1,10 @@
 //! `cargo xtask test`: runs every test, with one summary at the end.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::ffi::{OsStr, OsString};
+use std::fs;
 use std::io::{BufRead, BufReader, IsTerminal, Write};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
@@ -87,7 +89,7 @@ pub fn run(mut args: Args) -> Outcome {
         programs()?;
         suite = new_suite();
         let own = if chosen_board { build::tests_args(board) } else { Vec::new() };
-        suite.run(board, &[own, chosen].concat())?;
+        suite.run(board, Some(board), &[own, chosen].concat())?;
     }
     let summary = suite.summary;
 
@@ -109,8 +111,8 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
-/// Builds the images, and runs all tests as soon as what they need is built: the link of an image uses
-/// one core, many tests have one thread, or wait for a clock.
+/// Builds the images, and runs all tests as soon as what they need is built, two test programs side
+/// by side: the link of an image uses one core, and many tests have one thread, or wait for a clock.
 fn side_by_side(
     board: &Layout,
     others: &[&Layout],
@@ -123,33 +125,63 @@ fn side_by_side(
     let others_than = |package: &&str| ["--exclude".to_owned(), (*package).to_owned()];
     let without = NOT_ON_HOST.iter().chain(&["coboot-tests", TOOLS]).flat_map(others_than);
     let hosts: Vec<String> = ["--workspace".to_owned()].into_iter().chain(without).collect();
-    let tools = [format!("--package={TOOLS}")];
-    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
-    let with_board = [build::tests_args(board), sealed.to_vec()].concat();
+    let queue = Mutex::new(with_images(board)?);
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+    let all = |mut suite: Suite| {
+        while let Some((place, arguments)) = next() {
+            suite.run(board, place, &arguments)?;
+        }
+        Outcome::Ok(suite)
+    };
     let broken_off = |_| "a part of the tests broke off.".to_owned();
-    let (mut suite, mut beside) = (new_suite(), new_suite());
+    let (mut suite, beside) = (new_suite(), new_suite());
     std::thread::scope(|scope| {
         let images = scope.spawn(images);
         programs()?;
-        let hosts = scope.spawn(|| beside.run_hosts(board, &hosts).map(|()| beside));
+        let hosts = scope.spawn(|| suite.run(board, None, &hosts).map(|()| suite));
         images.join().map_err(broken_off)??;
-        let beside = scope.spawn(|| {
-            let mut beside = hosts.join().map_err(broken_off)??;
-            beside.run_hosts(board, &tools).map(|()| beside)
-        });
-        suite.run(board, &with_board)?;
+        let beside = scope.spawn(|| all(beside));
+        let mut suite = all(hosts.join().map_err(broken_off)??)?;
+        suite.summary.add(beside.join().map_err(broken_off)??.summary);
         // The tests of another chip are the same programs, compiled for another board.
         for other in others {
             let tests = CHIP_TESTS.iter().map(|test| format!("--test={test}"));
-            suite.run(other, &build::tests_args(other).into_iter().chain(tests).collect::<Vec<_>>())?;
+            let arguments: Vec<String> = build::tests_args(other).into_iter().chain(tests).collect();
+            suite.run(other, Some(other), &arguments)?;
         }
-        suite.summary.add(beside.join().map_err(broken_off)??.summary);
         Ok(suite)
     })
 }
 
+/// The runs of tests that need the images of a board, with the place that they count for: those that
+/// take minutes one by one.
+fn with_images(board: &Layout) -> Outcome<VecDeque<(Option<&Layout>, Vec<String>)>> {
+    let mut names = Vec::new();
+    for folder in ["tests/tests", "boot-core/tests", "canopen/tests"] {
+        let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
+        for entry in fs::read_dir(workspace::root().join(folder)).map_err(unreadable)? {
+            let path = entry.map_err(unreadable)?.path();
+            let is_program = path.extension() == Some("rs".as_ref());
+            let name =
+                path.file_stem().and_then(OsStr::to_str).filter(|name| is_program && !SLOW.contains(name));
+            names.extend(name.map(|name| format!("--test={name}")));
+        }
+    }
+    names.sort();
+    names.dedup();
+    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+    let board_too =
+        |tests: &[String]| (Some(board), [&build::tests_args(board)[..], &sealed, tests].concat());
+    let rest = ["--lib", "--bins"].map(str::to_owned).into_iter().chain(names).collect::<Vec<_>>();
+    let slow = SLOW.iter().map(|name| board_too(&[format!("--test={name}")]));
+    let tools = (None, vec![format!("--package={TOOLS}")]);
+    Ok([board_too(&rest), tools].into_iter().chain(slow).collect())
+}
+
 /// The package with the jobs, whose tests flash the images.
 const TOOLS: &str = "xtask";
+/// The test programs that take a minute and more.
+const SLOW: [&str; 6] = ["porting", "powercut_board", "python_package", "powercut", "examples", "clients"];
 /// The packages that are built for a chip, or by another tool.
 const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
 
@@ -186,19 +218,10 @@ struct Suite {
 }
 
 impl Suite {
-    /// Runs `cargo test` with these arguments, and the images of a board.
-    fn run(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
-        self.summary.place = Some(board.board.to_owned());
-        self.cargo_test(board, arguments)
-    }
-
-    /// The same for tests that need no board.
-    fn run_hosts(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
-        self.summary.place = None;
-        self.cargo_test(board, arguments)
-    }
-
-    fn cargo_test(&mut self, board: &Layout, arguments: &[String]) -> Outcome {
+    /// Runs `cargo test` with these arguments and the images of a board. The results count for
+    /// `place`; `None` for tests without a board.
+    fn run(&mut self, board: &Layout, place: Option<&Layout>, arguments: &[String]) -> Outcome {
+        self.summary.place = place.map(|place| place.board.to_owned());
         let images = workspace::firmware_dir(board);
         let environment: [(&str, &OsStr); 5] = [
             ("COBOOT_BOARD", board.board.as_ref()),
@@ -506,12 +529,14 @@ mod tests {
     }
 
     #[test]
-    fn what_works_with_others_programs_is_there() {
-        for name in FOREIGN.iter().map(|(name, _)| *name).chain([CONFORM]) {
-            assert!(
-                workspace::root().join("tests/tests").join(name).with_extension("rs").is_file(),
-                "{name}"
-            );
+    fn each_test_program_runs_once_and_what_is_named_is_there() {
+        let runs = with_images(&shared_abi::layout::stm32f407g_disc1::LAYOUT).unwrap();
+        let of = |name: &str| {
+            let argument = format!("--test={name}");
+            runs.iter().flat_map(|(_, arguments)| arguments).filter(|other| **other == argument).count()
+        };
+        for name in FOREIGN.iter().map(|(name, _)| *name).chain([CONFORM]).chain(SLOW).chain(CHIP_TESTS) {
+            assert_eq!(of(name), 1, "{name}");
         }
     }
 }

@@ -130,9 +130,14 @@ mod tests {
     #[test]
     fn progress_is_noted_sixteen_times_and_not_more_often_than_each_kib() {
         let base = 0x0800_4000;
-        for (size, step) in
-            [(0, 1024), (1000, 1024), (16 * 1024, 1024), (32 * 1024, 2048), (1024 * 1024, 64 * 1024)]
-        {
+        for (size, step) in [
+            (0, 1024),
+            (1000, 1024),
+            (8000, 1024),
+            (16 * 1024, 1024),
+            (32 * 1024, 2048),
+            (1024 * 1024, 64 * 1024),
+        ] {
             let mut partial = Partial::begin(3, base);
             assert!(!partial.note(base + step - 1, size), "{size}");
             assert_eq!(partial.words(), [3, base]);
