@@ -76,9 +76,12 @@ fn is_of_its_own(board: &Layout) -> bool {
     BOARDS.iter().find(alike).is_some_and(|first| first.board == board.board)
 }
 
+/// The images of the scenarios on a board.
+const IMAGES: [&str; 4] = ["bootloader", "bootloader-sealed", "app-v1", "app-v2"];
+
 /// The program that cuts the power on a board, after its images were built.
 fn command(board: &Layout, arguments: &[String]) -> Outcome<Command> {
-    let images = build::all(board)?;
+    let images = build::images(board, &IMAGES)?;
     let mut powercut = process::cargo("run");
     powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]).args(arguments);
     powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
