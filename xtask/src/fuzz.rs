@@ -25,7 +25,7 @@ The counts of all runs go to target/evidence/fuzz.json.
   --inputs N      each target runs until N inputs were tried in all runs together
   --target NAME   this one alone
   --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
-                  fuzz/seeds for the replay, and the counts into fuzz/counts.json, where a fresh
+                  fuzz/seeds for the replay, and the counts into docs/evidence, where a fresh
                   clone goes on counting
   --replay        runs no fuzzer: every input of fuzz/seeds and fuzz/corpus once, with the Rust that
                   builds the rest; it needs no nightly toolchain, and about a minute
@@ -44,9 +44,6 @@ const LONGEST_INPUT: u32 = 4096;
 const SHORT_INPUTS: [(&str, u32); 2] = [("resume", 192), ("sealed_stream", 256)];
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
-
-/// The counts that are kept with the seeds, in fuzz/.
-const KEPT_COUNTS: &str = "counts.json";
 
 /// The feature for sealed images.
 const SEALED: &str = "sealed";
@@ -227,14 +224,7 @@ pub fn run(mut args: Args) -> Outcome {
         process::run(&mut fuzz("build", &["--features", SEALED, target]))?;
     }
     let mut failed = Vec::new();
-    let kept_counts = folder.join(KEPT_COUNTS);
-    let mut counts = match evidence::recorded(EVIDENCE) {
-        Some(recorded) => Counts::read(&recorded),
-        None => fs::read_to_string(&kept_counts)
-            .ok()
-            .and_then(|text| Value::parse(&text).ok())
-            .map_or(Counts(BTreeMap::new()), |kept| Counts::read(&kept)),
-    };
+    let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
     for target in &targets {
         let corpus = folder.join("corpus").join(target);
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
@@ -271,8 +261,7 @@ pub fn run(mut args: Args) -> Outcome {
                     let mut least = fuzz("cmin", &["--features", features(target), target]);
                     process::output(least.arg(&corpus))?;
                     put_by(&corpus, &folder.join("seeds").join(target))?;
-                    fs::write(&kept_counts, format!("{counts}\n"))
-                        .map_err(|error| unwritable(&kept_counts, &error))?;
+                    evidence::keep(EVIDENCE)?;
                 }
             }
             (good, _) => {

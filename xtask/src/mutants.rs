@@ -23,7 +23,7 @@ and counts; they go to target/evidence/mutants.json. It fails if a group of file
 changes noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
 
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal;
-                  what was measured of the others of this code is kept
+                  what was measured of the others is kept, if nothing of theirs has changed since
   --file GLOB     the changes in these files alone, as '**/store/*.rs'; nothing is recorded
   --shard K/N     every N-th change, beginning with the K-th from 0: a sample; nothing is recorded
   --yes           install Debian's packages without asking
@@ -63,6 +63,42 @@ impl Run {
         let tests = ["objects"].iter().chain(&coverage::SEALED_TESTS).map(|test| format!("--test={test}"));
         packages.into_iter().chain(tests).collect()
     }
+}
+
+/// The folders that the changes and the tests of a package are made of.
+const READS: [(&str, &[&str]); 5] = [
+    ("coboot-abi", &["shared-abi/"]),
+    ("coboot-canopen", &["canopen/"]),
+    (
+        "coboot-core",
+        // The tests with sealed images are those of the emulated tests, which use host tool and node.
+        &[
+            "shared-abi/",
+            "canopen/",
+            "boot-core/",
+            "seal/",
+            "coboot-app/",
+            "coflash/",
+            "emulator/",
+            "node/",
+            "tests/",
+        ],
+    ),
+    ("coboot-app", &["shared-abi/", "canopen/", "coboot-app/"]),
+    ("coboot-seal", &["seal/"]),
+];
+/// What all of them are made of and measured with.
+const READ_BY_ALL: [&str; 4] = ["Cargo.toml", "Cargo.lock", "mutants/", "xtask/src/mutants"];
+
+/// Whether the result of a package may be another after a change of this file.
+fn is_read(package: &str, file: &str) -> bool {
+    let own = READS.iter().filter(|(name, _)| *name == package).flat_map(|(_, folders)| *folders);
+    own.chain(&READ_BY_ALL).any(|begin| file.starts_with(begin)) && !file.ends_with(".md")
+}
+
+/// Whether the result of any package may be another after a change of this file.
+pub fn reads(file: &str) -> bool {
+    READS.iter().any(|(package, _)| is_read(package, file))
 }
 
 /// Code in place of sealed images and of resume, in which there is nothing to do.
@@ -118,6 +154,8 @@ const ENDS: [(&str, &str); 4] = [
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 struct Row {
     package: String,
+    /// The commit of the run.
+    commit: String,
     caught: u32,
     /// Unnoticed, with a reason.
     named: u32,
@@ -146,7 +184,10 @@ pub fn run(mut args: Args) -> Outcome {
     let path = setup::tool("cargo-mutants", VERSION)?;
     let is_sample = file.is_some() || shard.is_some();
     let mut rows = match package {
-        Some(package) => kept(evidence::recorded("mutants").as_ref(), evidence::is_same_code, &package),
+        Some(package) => {
+            let holds = |of: &str, commit: &str| evidence::is_unchanged(commit, |file| is_read(of, file));
+            kept(evidence::recorded("mutants").as_ref(), holds, &package)
+        }
         None => Rows::new(),
     };
     if !is_sample {
@@ -181,11 +222,12 @@ pub fn run(mut args: Args) -> Outcome {
             merge(&mut ends, run, one_by_one(run, names, &path, &out(number))?);
         }
     }
-    let mut unnamed = Vec::new();
+    let (mut unnamed, commit) = (Vec::new(), evidence::commit());
     for ((package, line), end) in ends {
         let Some((file, change)) = parts(&line) else { continue };
         let row = rows.entry(file.clone()).or_default();
         package.clone_into(&mut row.package);
+        commit.clone_into(&mut row.commit);
         match end {
             "unviable" => row.unviable += 1,
             // What cargo-mutants gives no result for was not noticed either.
@@ -332,21 +374,25 @@ fn share(caught: u32, viable: u32) -> f64 {
     }
 }
 
-/// What was recorded of the other packages, if it holds for the sources as they are.
-fn kept(record: Option<&Value>, is_same_code: impl Fn(&str) -> bool, package: &str) -> Rows {
-    let Some(record) = record.filter(|record| record.get("commit").text().is_some_and(is_same_code)) else {
-        return Rows::new();
-    };
+/// What was recorded of the other packages, as far as it holds for the sources as they are.
+fn kept(record: Option<&Value>, holds: impl Fn(&str, &str) -> bool, package: &str) -> Rows {
     let count = |row: &Value, name| row.get(name).number().map(|count| count as u32);
     let row = |row: &Value| {
-        let package = row.get("package").text()?.to_owned();
+        let [package, commit] = ["package", "commit"].map(|name| row.get(name).text().map(str::to_owned));
         let [caught, named, missed, unviable] =
             ["caught", "named", "missed", "unviable"].map(|name| count(row, name));
-        let counts = Row { package, caught: caught?, named: named?, missed: missed?, unviable: unviable? };
+        let counts = Row {
+            package: package?,
+            commit: commit?,
+            caught: caught?,
+            named: named?,
+            missed: missed?,
+            unviable: unviable?,
+        };
         Some((row.get("file").text()?.to_owned(), counts))
     };
-    let rows = record.get("files").items().iter().filter_map(row);
-    rows.filter(|(_, row)| row.package != package).collect()
+    let rows = record.map_or(&[][..], |record| record.get("files").items()).iter().filter_map(row);
+    rows.filter(|(_, row)| row.package != package && holds(&row.package, &row.commit)).collect()
 }
 
 fn as_json(rows: &Rows, is_unfinished: bool) -> String {
@@ -363,11 +409,16 @@ fn as_json(rows: &Rows, is_unfinished: bool) -> String {
         )
     });
     let _ = write!(text, "\"groups\": [{}]", groups.collect::<Vec<_>>().join(", "));
-    let files = rows.iter().map(|(file, Row { package, caught, named, missed, unviable })| {
+    let left = READS.iter().filter(|(package, _)| !rows.values().any(|row| row.package == *package));
+    let left = left.map(|(package, _)| quoted(package)).collect::<Vec<_>>().join(", ");
+    let _ = write!(text, ", \"left\": [{left}]");
+    let files = rows.iter().map(|(file, Row { package, commit, caught, named, missed, unviable })| {
         format!(
-            "\n{{\"file\": {}, \"package\": {}, \"caught\": {caught}, \"named\": {named}, \"missed\": {missed}, \"unviable\": {unviable}}}",
+            "\n{{\"file\": {}, \"package\": {}, \"commit\": {}, \"caught\": {caught}, \"named\": {named}, \
+             \"missed\": {missed}, \"unviable\": {unviable}}}",
             quoted(file),
-            quoted(package)
+            quoted(package),
+            quoted(commit)
         )
     });
     let _ = write!(text, ", \"files\": [{}]", files.collect::<Vec<_>>().join(","));
@@ -435,27 +486,51 @@ mod tests {
     }
 
     #[test]
-    fn what_is_recorded_is_kept_for_the_same_commit_and_another_package() {
+    fn what_is_recorded_is_kept_of_another_package_while_it_holds() {
         let row = |package: &str, caught, missed| Row {
             package: package.into(),
+            commit: "12".into(),
             caught,
             named: 1,
             missed,
             unviable: 3,
         };
         let rows = Rows::from([
-            ("seal/src/lib.rs".to_owned(), row("a", 17, 2)),
-            ("canopen/src/lib.rs".to_owned(), row("b", 9, 0)),
+            ("seal/src/lib.rs".to_owned(), row("coboot-seal", 17, 2)),
+            ("canopen/src/lib.rs".to_owned(), row("coboot-canopen", 9, 0)),
         ]);
-        let text = as_json(&rows, false).replacen('{', "{\"commit\": \"12\", ", 1);
-        let record = Value::parse(&text).unwrap();
+        let record = Value::parse(&as_json(&rows, false)).unwrap();
         assert_eq!(record.get("viable").number(), Some(30.0));
         assert_eq!(record.get("groups").items()[0].get("percent").number(), Some(85.0));
         assert_eq!(record.get("groups").items()[1].get("percent").number(), Some(90.0));
+        let left: Vec<_> = record.get("left").items().iter().filter_map(Value::text).collect();
+        assert_eq!(left, ["coboot-abi", "coboot-core", "coboot-app"]);
         let files = |rows: Rows| rows.into_keys().collect::<Vec<_>>();
-        let same = |of: &str| of == "12";
-        assert_eq!(kept(Some(&record), same, "c"), rows);
-        assert_eq!(files(kept(Some(&record), same, "a")), ["canopen/src/lib.rs"]);
-        assert!(kept(Some(&record), |_| false, "c").is_empty() && kept(None, same, "c").is_empty());
+        let same = |_: &str, of: &str| of == "12";
+        assert_eq!(kept(Some(&record), same, "coboot-app"), rows);
+        assert_eq!(files(kept(Some(&record), same, "coboot-seal")), ["canopen/src/lib.rs"]);
+        let only_seal = |package: &str, _: &str| package == "coboot-seal";
+        assert_eq!(files(kept(Some(&record), only_seal, "coboot-app")), ["seal/src/lib.rs"]);
+        assert!(kept(None, same, "coboot-app").is_empty());
+    }
+
+    #[test]
+    fn a_package_has_the_folders_of_what_it_is_made_of() {
+        for run in RUNS {
+            assert!(READS.iter().any(|(package, _)| *package == run.package), "{}", run.package);
+        }
+        for folder in READS.iter().flat_map(|(_, folders)| *folders) {
+            let manifest = fs::read_to_string(workspace::root().join(folder).join("Cargo.toml"));
+            assert!(manifest.is_ok(), "{folder}");
+        }
+        assert!(
+            is_read("coboot-canopen", "canopen/src/lib.rs")
+                && !is_read("coboot-canopen", "boot-core/src/lib.rs")
+        );
+        assert!(
+            is_read("coboot-core", "canopen/src/lib.rs")
+                && is_read("coboot-abi", "xtask/src/mutants/reasons.rs")
+        );
+        assert!(reads("Cargo.lock") && !reads("docs/testing.md") && !reads("xtask/src/main.rs"));
     }
 }

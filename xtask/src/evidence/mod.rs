@@ -1,5 +1,5 @@
 //! `cargo xtask evidence`: the page of what the jobs have measured, and the files in
-//! `target/evidence` from which it is made.
+//! `target/evidence` from which it is made; `docs/evidence` keeps the last results with the sources.
 //!
 //! Each file is one JSON object. It begins with `commit` (with `-dirty` behind it if the sources
 //! were changed since), `toolchain` (the line of `rustc --version`) and `date` (UTC, ISO 8601);
@@ -14,22 +14,40 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::args::Args;
 use crate::json::Value;
-use crate::{process, toolchain, workspace, Outcome};
+use crate::{mutants, process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask evidence
+usage: cargo xtask evidence [--keep]
 
 Writes target/evidence/index.html: one page, without any other file, of what the last runs have
 measured. It runs nothing itself: a part of which there is no result, or one of other sources, says so
 and names the command.
+
+  --keep   puts the results of target/evidence into docs/evidence, from where the page of another clone
+           takes what it has not measured itself. A run that was broken off, or of sources that are no
+           commit's, is not kept
 ";
 
-pub fn run(args: Args) -> Outcome {
+/// The folder of the results that are kept with the sources.
+const KEPT: &str = "docs/evidence/";
+/// The inputs that the fuzzer has found.
+const SEEDS: &str = "fuzz/seeds/";
+
+pub fn run(mut args: Args) -> Outcome {
+    let keep_all = args.flag("--keep");
     args.none_left()?;
+    if keep_all {
+        for name in page::names() {
+            match keep(name) {
+                Ok(()) => println!("  {name:<10} kept"),
+                Err(why) => println!("  {name:<10} not kept: {why}"),
+            }
+        }
+    }
     let file = workspace::target_dir().join("evidence").join("index.html");
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
     fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
-    fs::write(&file, page::page(&commit(), recorded, is_same_code)).map_err(unwritable)?;
+    fs::write(&file, page::page(&commit(), recorded, holds)).map_err(unwritable)?;
     println!("The page is {}.", workspace::shown(&file));
     Ok(())
 }
@@ -67,9 +85,34 @@ pub fn file_for(name: &str) -> PathBuf {
     file
 }
 
-/// What was recorded last under this name, if it can be read.
+/// What was recorded last under this name, in this folder or else with the sources.
 pub fn recorded(name: &str) -> Option<Value> {
-    Value::parse(&fs::read_to_string(path(name)).ok()?).ok()
+    [path(name), kept(name)].iter().find_map(|file| Value::parse(&fs::read_to_string(file).ok()?).ok())
+}
+
+/// Puts the result of this name to those that are kept with the sources.
+///
+/// # Errors
+/// When there is none, when it is that of a run that was broken off or of changed sources, or when it
+/// cannot be written.
+pub fn keep(name: &str) -> Outcome {
+    let text = fs::read_to_string(path(name)).map_err(|_| "there is no result.")?;
+    if !is_whole(&Value::parse(&text)?) {
+        return Err("the run was broken off, or its sources were no commit's.".into());
+    }
+    let file = kept(name);
+    let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
+    fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
+    fs::write(&file, text).map_err(unwritable)
+}
+
+/// Whether a record is the result of a commit.
+fn is_whole(record: &Value) -> bool {
+    *record.get("unfinished") != Value::Bool(true) && record.get("commit").text().is_some_and(is_commit)
+}
+
+fn kept(name: &str) -> PathBuf {
+    workspace::root().join(KEPT).join(name).with_extension("json")
 }
 
 fn path(name: &str) -> PathBuf {
@@ -91,28 +134,45 @@ fn with_origin(facts: &str, commit: &str, toolchain: &str, date: &str) -> Outcom
     Ok(format!("{{{}{comma}{inner}\n", own.join(",\n")))
 }
 
-/// The commit of the sources; `unknown` outside a clone.
+/// The commit of the sources; `unknown` outside a clone. What jobs have written does not change it.
 pub fn commit() -> String {
     let git =
         |words: &[&str]| process::output(Command::new("git").current_dir(workspace::root()).args(words));
     let Ok(commit) = git(&["rev-parse", "HEAD"]) else { return "unknown".to_owned() };
-    let changed = git(&["status", "--porcelain", "--untracked-files=no"]).is_ok_and(|said| !said.is_empty());
+    let changed = git(&["diff", "--name-only", "HEAD"]).is_ok_and(|files| !files.lines().all(is_result));
     format!("{}{}", commit.trim(), if changed { "-dirty" } else { "" })
 }
 
-/// Whether what was measured of a commit holds for the sources as they are: since then only texts and
-/// kept inputs changed.
-pub fn is_same_code(of: &str) -> bool {
-    let is_commit = of.len() == 40 && of.bytes().all(|byte| byte.is_ascii_hexdigit());
-    let mut git = Command::new("git");
-    git.current_dir(workspace::root()).args(["diff", "--name-only", of, "--"]);
-    is_commit && process::output(&mut git).is_ok_and(|changed| changed.lines().all(is_text))
+fn is_commit(of: &str) -> bool {
+    of.len() == 40 && of.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Whether no program and no test program is made of this file.
-fn is_text(file: &str) -> bool {
-    file.ends_with(".md")
-        || ["docs/", "fuzz/seeds/", "fuzz/counts.json"].iter().any(|of| file.starts_with(of))
+/// Whether what a job has measured of a commit holds for the sources as they are.
+pub fn holds(job: &str, of: &str) -> bool {
+    is_unchanged(of, |file| matters(job, file))
+}
+
+/// Whether no file that matters has changed since a commit.
+pub fn is_unchanged(since: &str, matters: impl Fn(&str) -> bool) -> bool {
+    let mut git = Command::new("git");
+    git.current_dir(workspace::root()).args(["diff", "--name-only", since, "--"]);
+    is_commit(since) && process::output(&mut git).is_ok_and(|changed| !changed.lines().any(matters))
+}
+
+/// Whether the result of a job may be another after a change of this file. Only the tests read texts.
+fn matters(job: &str, file: &str) -> bool {
+    let is_text = file.ends_with(".md") || file.starts_with("docs/");
+    match job {
+        _ if is_result(file) => false,
+        "tests" => true,
+        "mutants" => mutants::reads(file),
+        _ => !is_text,
+    }
+}
+
+/// Whether jobs have written this file: what they have measured, and inputs that they have found.
+fn is_result(file: &str) -> bool {
+    [KEPT, SEEDS].iter().any(|folder| file.starts_with(folder))
 }
 
 /// A time in seconds since 1970, as `2026-01-31T12:00:00Z`.
@@ -154,18 +214,39 @@ mod tests {
     }
 
     #[test]
-    fn a_result_holds_for_the_same_code() {
-        for file in
-            ["README.md", "docs/adr/0018-toolchain-of-a-release.md", "fuzz/seeds/lss/1", "fuzz/counts.json"]
-        {
-            assert!(is_text(file), "{file}");
-        }
-        for file in ["fuzz/src/lib.rs", "canopen/src/lib.rs", "Cargo.lock", ".ci/run", "docsy/a.rs"] {
-            assert!(!is_text(file), "{file}");
+    fn a_result_holds_until_a_file_changes_that_its_job_reads() {
+        for (file, of_tests, of_mutants, of_bench) in [
+            ("README.md", true, false, false),
+            ("docs/adr/0018-toolchain-of-a-release.md", true, false, false),
+            ("docs/evidence/bench.json", false, false, false),
+            ("fuzz/seeds/lss/1", false, false, false),
+            ("canopen/src/lib.rs", true, true, true),
+            ("boot-core/tests/objects.rs", true, true, true),
+            ("Cargo.lock", true, true, true),
+            ("xtask/src/main.rs", true, false, true),
+            ("docsy/a.rs", true, false, true),
+        ] {
+            for (job, expected) in [("tests", of_tests), ("mutants", of_mutants), ("bench", of_bench)] {
+                assert_eq!(matters(job, file), expected, "{job}, {file}");
+            }
         }
         // No commits; among them an option for git.
         for of in ["unknown", "", "0123-dirty", "--output=x", &"0".repeat(40)] {
-            assert!(!is_same_code(of), "{of}");
+            assert!(!holds("bench", of), "{of}");
+        }
+    }
+
+    #[test]
+    fn only_the_whole_result_of_a_commit_is_kept() {
+        let commit = "0123456789abcdef0123456789abcdef01234567";
+        for (record, expected) in [
+            (format!(r#"{{"commit": "{commit}"}}"#), true),
+            (format!(r#"{{"commit": "{commit}", "unfinished": true}}"#), false),
+            (format!(r#"{{"commit": "{commit}-dirty"}}"#), false),
+            (r#"{"commit": "unknown"}"#.to_owned(), false),
+            ("{}".to_owned(), false),
+        ] {
+            assert_eq!(is_whole(&Value::parse(&record).unwrap()), expected, "{record}");
         }
     }
 

@@ -104,17 +104,22 @@ const NOT_VERIFIED: &str = "Nothing here ran on silicon. The emulated chip follo
     tolerance, brown-out levels, the wear of the flash and the erase times of a real device are not verified. \
     <code>cargo xtask hil</code> runs the same tests on a board.";
 
-/// The page for sources of this commit, with the records that `read` finds. `is_same_code` tells of
-/// another commit whether its code is that of the sources, too.
+/// The names of the records.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    PARTS.iter().map(|part| part.name)
+}
+
+/// The page for sources of this commit, with the records that `read` finds. `holds` tells of a record and
+/// another commit whether what was measured of it holds for these sources, too.
 pub fn page(
     commit: &str,
     read: impl Fn(&str) -> Option<Value>,
-    is_same_code: impl Fn(&str) -> bool,
+    holds: impl Fn(&str, &str) -> bool,
 ) -> String {
     let (mut cards, mut sections) = (String::new(), String::new());
     for part in PARTS {
         let record = read(part.name);
-        let (class, verdict, details) = judge(part, commit, record.as_ref(), &is_same_code);
+        let (class, verdict, details) = judge(part, commit, record.as_ref(), |of| holds(part.name, of));
         let _ = writeln!(
             cards,
             "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>",
@@ -146,7 +151,7 @@ fn judge(
     part: &Part,
     commit: &str,
     record: Option<&Value>,
-    is_same_code: impl Fn(&str) -> bool,
+    holds: impl Fn(&str) -> bool,
 ) -> (&'static str, String, String) {
     let Some(record) = record else {
         return ("none", format!("not run: <code>{}</code>", part.command), String::new());
@@ -158,9 +163,8 @@ fn judge(
     let of = record.get("commit").text().unwrap_or("unknown");
     match verdict {
         Err(what) => ("bad", what, details),
-        // The tests read the texts, too.
-        Ok(what) if of != commit && part.name != "tests" && is_same_code(of) => {
-            ("good", format!("{what}; only texts changed since"), details)
+        Ok(what) if of != commit && holds(of) => {
+            ("good", format!("{what}; what it measures has not changed since"), details)
         }
         Ok(what) if of != commit => {
             let of = if of.ends_with("-dirty") { "of changed sources" } else { "of another commit" };
@@ -362,7 +366,7 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
             Value::Object(row)
         })
         .collect();
-    let head = ["target", "inputs", "seconds", "edges", "corpus"];
+    let head = ["target", "inputs", "seconds", "edges", "corpus", "since"];
     let verdict = format!("{} inputs without a fault, at least {} a target", of(inputs), of(fewest));
     (if rows.is_empty() { Err("no target ran".into()) } else { Ok(verdict) }, table(&head, &rows))
 }
@@ -452,9 +456,18 @@ fn mutants(record: &Value) -> (Result<String, String>, String) {
     let is_low = |group: &Value| {
         number(group, "percent").partial_cmp(&number(group, "least")).is_none_or(Ordering::is_lt)
     };
-    let is_good = !groups.is_empty() && !groups.iter().any(is_low) && number(record, "missed") == 0.0;
+    let left = record.get("left").items();
+    let words = if left.is_empty() {
+        words
+    } else {
+        format!("{words}; not measured: {}", left.iter().map(shown).collect::<Vec<_>>().join(", "))
+    };
+    let is_good = !groups.is_empty()
+        && !groups.iter().any(is_low)
+        && number(record, "missed") == 0.0
+        && left.is_empty();
     let names = ["group", "viable", "caught", "percent", "least"];
-    let of_files = ["file", "caught", "named", "missed", "unviable"];
+    let of_files = ["file", "caught", "named", "missed", "unviable", "commit"];
     let details = table(&names, groups) + &table(&of_files, record.get("files").items());
     (if is_good { Ok(words) } else { Err(words) }, details)
 }
@@ -518,7 +531,7 @@ mod tests {
     /// The page with one record, the tests'.
     fn with(record: Option<&str>) -> String {
         let read = |name: &str| record.filter(|_| name == "tests").map(|text| Value::parse(text).unwrap());
-        page(COMMIT, read, |_| true)
+        page(COMMIT, read, |_, _| false)
     }
 
     fn class(page: &str) -> &str {
@@ -542,17 +555,17 @@ mod tests {
         }
         // Sources that are no commit's give no green mark, whatever was measured of them.
         let record = |_: &str| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap());
-        assert!(!page("1-dirty", record, |_| false).contains("class=\"card good\""));
+        assert!(!page("1-dirty", record, |_, _| false).contains("class=\"card good\""));
     }
 
     #[test]
-    fn a_result_holds_while_only_texts_change() {
+    fn a_result_of_another_commit_is_green_while_it_holds() {
         let old = |_: &str| Some(Value::parse(r#"{"frames": 5, "failed": 0, "commit": "4567"}"#).unwrap());
-        let green =
-            |is_same_code: bool| page(COMMIT, old, |_| is_same_code).matches("class=\"card good").count();
+        let green = |holds: bool| page(COMMIT, old, |_, _| holds).matches("class=\"card good").count();
         assert_eq!(green(false), 0);
         assert!(green(true) > 0);
-        assert_eq!(class(&page(COMMIT, old, |_| true)), "old", "the tests read the texts");
+        let of_tests = |name: &str, of: &str| name == "tests" && of == "4567";
+        assert_eq!(class(&page(COMMIT, old, of_tests)), "good");
     }
 
     #[test]
@@ -567,7 +580,7 @@ mod tests {
             r#"{"a": "<b>", "commit": "<i>"}"#,
         ] {
             let record = Value::parse(record).unwrap();
-            let page = page(COMMIT, |_| Some(record.clone()), |_| false);
+            let page = page(COMMIT, |_| Some(record.clone()), |_, _| false);
             assert!(page.ends_with("</html>\n") && !page.contains("<b>\"") && !page.contains("<i>,"));
             assert!(!page.contains("class=\"card good\""), "{record:?}");
         }
