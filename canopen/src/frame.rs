@@ -291,5 +291,16 @@ mod tests {
         assert_eq!(format!("{frame}"), "77F#7F");
         let remote = Frame::new_remote(ExtendedId::new(0x12345).unwrap(), 2).unwrap();
         assert_eq!(format!("{remote}"), "00012345#R2");
+        assert_eq!(format!("{remote:?}"), "00012345#R2");
+    }
+
+    #[test]
+    fn an_identifier_is_given_back_as_it_was_given() {
+        let standard = Id::from(StandardId::new(0x605).unwrap());
+        let extended = Id::from(ExtendedId::new(0x1234_5678).unwrap());
+        for id in [standard, extended] {
+            assert_eq!(Frame::new(id, &[]).unwrap().id(), id);
+            assert_eq!(Frame::new_remote(id, 0).unwrap().id(), id);
+        }
     }
 }

@@ -149,6 +149,21 @@ fn a_buffer_takes_what_fits_and_no_more() {
     aborts(&mut client, 0, out_of_memory, error);
 }
 
+/// The size is looked at when it is announced, through a reference, too; one that just fits is taken.
+#[test]
+fn a_buffer_is_asked_when_the_size_is_announced() {
+    for (announced, next) in
+        [(4, [0x60, 0, 0, 0, 0, 0, 0, 0]), (5, [0x80, 0x18, 0x10, 1, 0x05, 0x00, 0x04, 0x05])]
+    {
+        let mut bytes = [0; 4];
+        let mut buffer = Buffer::new(&mut bytes);
+        let mut client = Upload::new(node(), Address::new(0x1018, 1), &mut buffer, CONFIG);
+        sends(&mut client, 0, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]);
+        client.handle(&response([0x41, 0x18, 0x10, 1, announced, 0, 0, 0]), at(0));
+        assert_eq!(client.poll(at(0)), Step::Send(request(next)), "{announced}");
+    }
+}
+
 #[test]
 fn an_abort_of_the_server_is_reported() {
     let abort = response([0x80, 0x00, 0x20, 3, 0x30, 0x00, 0x09, 0x06]);
@@ -269,6 +284,10 @@ fn a_caller_can_give_up() {
     sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 5, 0, 0, 0]);
     client.abort(AbortCode::GENERAL);
     let general = [0x80, 0x00, 0x20, 3, 0x00, 0x00, 0x00, 0x08];
+    aborts(&mut client, 0, general, SdoError::Client(AbortCode(0x0800_0000)));
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    client.abort(AbortCode::GENERAL);
     aborts(&mut client, 0, general, SdoError::Client(AbortCode(0x0800_0000)));
 }
 

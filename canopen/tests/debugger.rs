@@ -2,13 +2,19 @@
 
 mod memory;
 
-use canopen::debugger::{Command, Kind, Stop, COMMAND, DATA, PIECE};
+use core::task::Poll;
+
+use canopen::debugger::{Command, Debugged, Debugger, Kind, Stop, COMMAND, DATA, ENTRIES, PIECE};
 use canopen::frame::Channel;
+use canopen::line::LineEvent;
+use canopen::lss::{LssDevice, StoreError};
+use canopen::od::Entry;
 use canopen::sdo::client::{Block, Config, Download, Step, Transfer, Upload};
 use canopen::sdo::SdoError;
-use canopen::{AbortCode, Address, CobId, Frame};
+use canopen::slave::SlaveDevice;
+use canopen::{AbortCode, Address, BitRate, CobId, Frame, NodeId, Objects};
 use embedded_can::Frame as _;
-use memory::{at, node, request, Target, RAM, ROM, SIZE};
+use memory::{at, node, request, Model, Target, RAM, ROM, SIZE};
 use proptest::collection::vec;
 use proptest::prelude::*;
 
@@ -221,6 +227,130 @@ fn the_second_server_of_the_device_answers() {
     assert_eq!(target.poll(0), Some(Frame::of(answer, &[0x4F, 0x25, 0x10, 0x02, 0, 0, 0, 0])));
     // The first server still answers with its own COB-ID.
     assert_eq!(status(&mut target), 0);
+}
+
+/// Each piece is read once, and the last read ends with the command's bytes.
+#[test]
+fn a_read_touches_each_piece_once() {
+    let mut target = Target::new();
+    let len = 2 * PIECE as u16 + 5;
+    command(&mut target, Kind::Read, ROM, len).unwrap();
+    assert_eq!(read(&mut target).unwrap(), target.model().rom[..len.into()]);
+    let piece = |number: u32, len| (Kind::Read, ROM + number * PIECE as u32, len);
+    assert_eq!(target.model().touched, [piece(0, PIECE), piece(1, PIECE), piece(2, 5)]);
+    // At the end there is less than was asked for.
+    let mut device = target.debugger.attach(&mut target.device);
+    assert_eq!(device.upload_data(DATA, u32::from(len) - 2, &mut [0; 7]), Ok(2));
+}
+
+/// A client that has missed segments asks for them from an offset in the middle of a piece that is
+/// no longer in the buffer.
+#[test]
+fn a_read_goes_back_into_a_piece() {
+    let mut target = Target::new();
+    command(&mut target, Kind::Read, ROM, 300).unwrap();
+    let expected = target.model().rom[..300].to_vec();
+    // Blocks of 40 segments, which are 280 bytes.
+    assert_eq!(target.ask([0xA0, 0x25, 0x10, 4, 40, 0, 0, 0])[0] & !4, 0xC2);
+    target.handle(&request([0xA3, 0, 0, 0, 0, 0, 0, 0]), 0);
+    let segments = |target: &mut Target| -> Vec<[u8; 8]> {
+        core::iter::from_fn(|| target.poll(0)).map(|frame| *frame.exactly().unwrap()).collect()
+    };
+    let first = segments(&mut target);
+    assert_eq!((first.len(), &first[39][1..]), (40, &expected[273..280]));
+    // Ten have arrived, which are 70 bytes.
+    target.handle(&request([0xA2, 10, 40, 0, 0, 0, 0, 0]), 0);
+    let again = segments(&mut target);
+    assert_eq!((again.len(), &again[0][1..]), (33, &expected[70..77]));
+    assert_eq!(&again[8][1..], &expected[126..133], "of two pieces");
+    assert_eq!(&again[32][..7], [&[0x80 | 33][..], &expected[294..]].concat());
+}
+
+/// The first frame says that it is too long: nothing waits for the data.
+#[test]
+fn a_size_that_is_not_that_of_the_command_is_refused_at_once() {
+    for (size, code) in [(10, 0x12), (8, 0x13)] {
+        let mut target = Target::new();
+        command(&mut target, Kind::Write, RAM, 9).unwrap();
+        let answer = target.ask([0x21, 0x25, 0x10, 4, size, 0, 0, 0]);
+        assert_eq!(answer, [0x80, 0x25, 0x10, 4, code, 0x00, 0x07, 0x06], "{size}");
+    }
+}
+
+#[test]
+fn an_abort_of_the_client_is_an_error_of_the_command() {
+    let mut target = Target::new();
+    command(&mut target, Kind::Write, RAM, 9).unwrap();
+    assert_eq!(target.ask([0x21, 0x25, 0x10, 4, 9, 0, 0, 0])[0], 0x60);
+    assert_eq!(status(&mut target), 2, "a request for another object ends the download, too");
+    assert_eq!(target.ask([0x21, 0x25, 0x10, 4, 9, 0, 0, 0])[0], 0x60);
+    target.handle(&request([0x80, 0x25, 0x10, 4, 0, 0, 0, 8]), 0);
+    assert_eq!((target.poll(0), status(&mut target)), (None, 2));
+}
+
+/// A device that notes what it is asked.
+#[derive(Default)]
+struct Noted(Vec<&'static str>);
+
+impl Objects for Noted {
+    fn entries(&self) -> &'static [Entry] {
+        &ENTRIES
+    }
+
+    fn read(&mut self, _: Address, _: &mut [u8]) -> Result<usize, AbortCode> {
+        Err(AbortCode::NO_DATA)
+    }
+
+    fn download_space(&mut self, _: Address, _: bool) -> usize {
+        7
+    }
+
+    fn download_cancel(&mut self, _: Address) {
+        self.0.push("cancel");
+    }
+}
+
+impl LssDevice for Noted {
+    fn supports(&mut self, rate: BitRate) -> bool {
+        rate == BitRate::K125
+    }
+
+    fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        Poll::Pending
+    }
+
+    fn stored(&mut self) -> Poll<Result<(), StoreError>> {
+        Poll::Ready(Err(StoreError::Failed))
+    }
+}
+
+impl SlaveDevice for Noted {
+    fn line_event(&mut self, _: LineEvent) {
+        self.0.push("line");
+    }
+
+    fn node_id_changed(&mut self, _: Option<NodeId>) {
+        self.0.push("node-ID");
+    }
+}
+
+#[test]
+fn what_is_not_of_the_interface_is_the_devices() {
+    type Both<'a> = Debugged<'a, Noted, Model>;
+    let mut debugger = Debugger::new(Model::default());
+    let mut noted = Noted::default();
+    let mut both = debugger.attach(&mut noted);
+    let other = Address::new(0x1F50, 1);
+    assert!(!Both::has_second_server());
+    assert_eq!(both.download_space(other, false), 7);
+    assert_eq!(both.download_space(DATA, false), usize::MAX);
+    assert!(both.supports(BitRate::K125) && !both.supports(BitRate::K250));
+    assert_eq!(both.store(None, None), Poll::Pending);
+    assert_eq!(both.stored(), Poll::Ready(Err(StoreError::Failed)));
+    both.download_cancel(other);
+    both.line_event(LineEvent::Recovered);
+    both.node_id_changed(None);
+    assert_eq!(noted.0, ["cancel", "line", "node-ID"]);
 }
 
 proptest! {

@@ -245,3 +245,296 @@ fn hostile_answers_neither_hang_nor_panic() {
         }
     }
 }
+
+/// The frames of one download of 20 bytes to two servers, written by hand from CiA 301 section
+/// 7.2.4.3.9: three segments, of which the last has one byte that is no data.
+mod by_hand {
+    use super::*;
+
+    const TAKEN: [u8; 8] = [0xA1, 0, 0, 0, 0, 0, 0, 0];
+    /// 08000020h.
+    const REFUSED: [u8; 8] = [0x80, 0x50, 0x1F, 1, 0x20, 0x00, 0x00, 0x08];
+    /// 08000000h and 05040000h, to all servers.
+    const GENERAL: [u8; 8] = [0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x00, 0x08];
+    const TIMED_OUT: [u8; 8] = [0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x04, 0x05];
+    /// How long all servers may be silent, and one when the others have answered.
+    const SILENT_MS: u32 = 500;
+    const LATE_MS: u32 = 120;
+
+    fn granted(blksize: u8) -> [u8; 8] {
+        [0xA4, 0x50, 0x1F, 1, blksize, 0, 0, 0]
+    }
+
+    fn acknowledged(ackseq: u8, blksize: u8) -> [u8; 8] {
+        [0xA2, ackseq, blksize, 0, 0, 0, 0, 0]
+    }
+
+    /// A download to the servers 0 and 1, whose initiate is sent at 0 ms.
+    struct Master(GroupDownload<[u8; 20]>);
+
+    impl Master {
+        fn begun() -> Self {
+            Self::begun_to(0b11)
+        }
+
+        fn begun_to(servers: Servers) -> Self {
+            let mut master = Self(GroupDownload::new(id(0x6DF), servers, AT, [0x55; 20], TIMEOUT));
+            master.sends(0, [0xC6, 0x50, 0x1F, 1, 20, 0, 0, 0]);
+            master
+        }
+
+        /// With this block size granted by both.
+        fn with_blocks_of(blksize: u8) -> Self {
+            let mut master = Self::begun();
+            master.hears(0, granted(blksize), 0);
+            master.hears(1, granted(blksize), 0);
+            master
+        }
+
+        /// With the three segments sent at 0 ms.
+        fn sent() -> Self {
+            let mut master = Self::with_blocks_of(127);
+            master.sends(0, [1, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55]);
+            master.sends(0, [2, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55]);
+            master.sends(0, [0x83, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x00]);
+            master
+        }
+
+        /// With the end sent at 0 ms.
+        fn ended() -> Self {
+            let mut master = Self::sent();
+            master.hears(0, acknowledged(3, 127), 0);
+            master.hears(1, acknowledged(3, 127), 0);
+            master.ends_data(0);
+            master
+        }
+
+        #[track_caller]
+        fn sends(&mut self, now: u32, bytes: [u8; 8]) {
+            assert_eq!(self.0.poll(at(now)), GroupStep::Send(Frame::of(id(0x6DF), &bytes)));
+        }
+
+        /// The end of the data: one byte is not used.
+        #[track_caller]
+        fn ends_data(&mut self, now: u32) {
+            match self.0.poll(at(now)) {
+                GroupStep::Send(frame) => assert_eq!(frame.exactly::<8>().unwrap()[0], 0xC5),
+                other => panic!("{other:?}"),
+            }
+        }
+
+        #[track_caller]
+        fn hears(&mut self, server: usize, bytes: [u8; 8], now: u32) {
+            assert_eq!(self.0.handle(server, &bytes, at(now)), Ok(()));
+        }
+
+        #[track_caller]
+        fn is_refused_by(&mut self, server: usize) {
+            assert_eq!(self.0.handle(server, &REFUSED, at(0)), Err(AbortCode(0x0800_0020)));
+        }
+
+        #[track_caller]
+        fn waits(&mut self, now: u32, until: u32) {
+            assert_eq!(self.0.poll(at(now)), GroupStep::Wait(at(until)));
+        }
+
+        /// Its end, which nothing changes any more.
+        #[track_caller]
+        fn is_done(&mut self, missing: Servers, ended: bool) {
+            let done = GroupStep::Done(GroupResult { missing, ended });
+            assert_eq!(self.0.poll(at(0)), done);
+            self.0.abort();
+            self.hears(0, TAKEN, 0);
+            self.hears(1, REFUSED, 0);
+            assert_eq!(self.0.poll(at(9999)), done);
+        }
+    }
+
+    #[test]
+    fn a_download_to_two() {
+        let mut master = Master::ended();
+        master.hears(1, TAKEN, 0);
+        master.waits(0, LATE_MS);
+        master.hears(0, TAKEN, 0);
+        master.is_done(0, true);
+    }
+
+    #[test]
+    fn who_refuses_before_the_end_ends_the_download_for_all() {
+        let mut one_granted = Master::begun();
+        one_granted.hears(0, granted(127), 0);
+        let mut half_sent = Master::with_blocks_of(127);
+        half_sent.sends(0, [1, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55]);
+        let mut all_acknowledged = Master::sent();
+        all_acknowledged.hears(0, acknowledged(3, 127), 0);
+        all_acknowledged.hears(1, acknowledged(3, 127), 0);
+        for mut master in [Master::begun(), one_granted, half_sent, Master::sent(), all_acknowledged] {
+            master.is_refused_by(1);
+            master.sends(0, GENERAL);
+            master.is_done(0b10, false);
+        }
+    }
+
+    /// The end of a download is each server's own.
+    #[test]
+    fn who_refuses_the_end_is_alone_without_the_data() {
+        let mut master = Master::ended();
+        master.hears(0, TAKEN, 0);
+        master.hears(0, REFUSED, 0);
+        master.waits(0, LATE_MS);
+        master.is_refused_by(1);
+        // An abort ends the transfer of a server that has not understood the end.
+        master.sends(0, GENERAL);
+        master.is_done(0b10, true);
+
+        let mut master = Master::ended();
+        master.is_refused_by(1);
+        // Server 0 is still missing, and no other.
+        master.waits(0, LATE_MS);
+        master.hears(1, TAKEN, 0);
+        master.waits(0, LATE_MS);
+        master.hears(0, TAKEN, 0);
+        master.sends(0, GENERAL);
+        master.is_done(0b10, true);
+    }
+
+    #[test]
+    fn who_is_silent_behind_the_end_is_without_the_data() {
+        let mut master = Master::ended();
+        master.waits(SILENT_MS - 1, SILENT_MS);
+        master.sends(SILENT_MS, TIMED_OUT);
+        master.is_done(0b11, true);
+
+        let mut master = Master::ended();
+        master.is_refused_by(1);
+        master.sends(LATE_MS, TIMED_OUT);
+        master.is_done(0b11, true);
+
+        let mut master = Master::ended();
+        master.hears(1, TAKEN, 0);
+        master.sends(LATE_MS, TIMED_OUT);
+        master.is_done(0b01, true);
+    }
+
+    #[test]
+    fn who_is_silent_behind_the_initiate_ends_the_download_for_all() {
+        let mut master = Master::begun();
+        master.waits(0, SILENT_MS);
+        master.sends(SILENT_MS, TIMED_OUT);
+        master.is_done(0b11, false);
+
+        let mut master = Master::begun();
+        master.hears(0, granted(127), 100);
+        master.waits(100, 100 + LATE_MS);
+        // The same answer again puts nothing off.
+        master.hears(0, granted(127), 150);
+        master.waits(150, 100 + LATE_MS);
+        master.sends(100 + LATE_MS, TIMED_OUT);
+        master.is_done(0b10, false);
+    }
+
+    #[test]
+    fn an_answer_for_another_object_or_of_somebody_else_is_none() {
+        let mut master = Master::begun_to(0b101);
+        for (server, answer) in [
+            (0, [0xA4, 0x51, 0x1F, 1, 127, 0, 0, 0]),
+            (0, [0xA4, 0x50, 0x1F, 2, 0, 0, 0, 0]),
+            (0, acknowledged(1, 127)),
+            (0, TAKEN),
+            (1, granted(127)),
+            (1, granted(0)),
+            (1, REFUSED),
+        ] {
+            master.hears(server, answer, 100);
+        }
+        master.waits(100, SILENT_MS);
+    }
+
+    #[test]
+    fn servers_agree_on_a_block_size_from_1_to_127() {
+        for (first, second, missing) in [
+            (0, None, 0b01),
+            (128, None, 0b01),
+            (255, None, 0b01),
+            (127, Some(0), 0b10),
+            (127, Some(126), 0b10),
+        ] {
+            let mut master = Master::begun();
+            master.hears(0, granted(first), 0);
+            if let Some(second) = second {
+                master.hears(1, granted(second), 0);
+            }
+            master.sends(0, GENERAL);
+            master.is_done(missing, false);
+
+            let mut master = Master::sent();
+            master.hears(0, acknowledged(3, first), 0);
+            if let Some(second) = second {
+                master.hears(1, acknowledged(3, second), 0);
+            }
+            master.sends(0, GENERAL);
+            master.is_done(missing, false);
+        }
+    }
+
+    /// Who has not got as far as another one stays behind, and is missed at the end.
+    #[test]
+    fn a_silent_server_holds_up_only_while_another_misses_segments() {
+        // Nobody has acknowledged.
+        let mut master = Master::sent();
+        master.waits(0, SILENT_MS);
+        master.sends(SILENT_MS, TIMED_OUT);
+        master.is_done(0b11, false);
+        // Server 0 has all.
+        let mut master = Master::sent();
+        master.hears(0, acknowledged(3, 127), 0);
+        master.waits(0, LATE_MS);
+        master.ends_data(LATE_MS);
+        // Server 0 has two of three.
+        let mut master = Master::sent();
+        master.hears(0, acknowledged(2, 127), 0);
+        master.waits(0, SILENT_MS);
+        master.sends(SILENT_MS, TIMED_OUT);
+        master.is_done(0b10, false);
+    }
+
+    /// An acknowledgement of more than was sent is that of the sub-block before, late; and each server
+    /// has one.
+    #[test]
+    fn a_second_or_late_acknowledgement_is_none() {
+        let mut master = Master::sent();
+        master.hears(0, acknowledged(4, 1), 0);
+        master.waits(0, SILENT_MS);
+        master.hears(0, acknowledged(3, 127), 0);
+        master.hears(0, acknowledged(3, 1), 0);
+        master.hears(0, acknowledged(1, 127), 0);
+        master.waits(0, LATE_MS);
+        master.hears(1, acknowledged(3, 127), 0);
+        master.ends_data(0);
+    }
+
+    #[test]
+    fn each_sub_block_waits_for_all_servers() {
+        let mut master = Master::with_blocks_of(2);
+        master.sends(0, [1, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55]);
+        master.sends(0, [2, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55]);
+        master.hears(1, acknowledged(2, 2), 0);
+        master.waits(0, LATE_MS);
+        master.hears(0, acknowledged(2, 2), 0);
+        master.sends(0, [0x81, 0x55, 0x55, 0x55, 0x55, 0x55, 0x55, 0x00]);
+        master.waits(0, SILENT_MS);
+        master.hears(0, acknowledged(1, 2), 0);
+        master.waits(0, LATE_MS);
+        master.hears(1, acknowledged(1, 2), 0);
+        master.ends_data(0);
+    }
+
+    #[test]
+    fn the_owner_can_give_up() {
+        for mut master in [Master::begun(), Master::sent(), Master::ended()] {
+            master.0.abort();
+            master.sends(0, GENERAL);
+            master.is_done(0b11, false);
+        }
+    }
+}

@@ -119,6 +119,20 @@ fn reset_communication_takes_a_new_node_id() {
     assert_eq!(bench.sent(160), [Frame::of(CobId::new(0x586).unwrap(), &IS_1000)]);
 }
 
+/// The configuration of the SDO server, here its block size, is that of the owner.
+#[test]
+fn a_restart_keeps_the_configuration() {
+    let sdo = canopen::sdo::server::Config { blksize: 4, ..Default::default() };
+    let mut bench = Bench::new(Config { sdo, ..Config::default() });
+    bench.sent(0);
+    for _ in 0..2 {
+        bench.handle(&request([0xC2, 0x50, 0x1F, 1, 9, 0, 0, 0]), 1);
+        assert_eq!(bench.sent(1), [response([0xA0 | 4, 0x50, 0x1F, 1, 4, 0, 0, 0])]);
+        bench.node.restart(node(), &mut bench.device);
+        assert_eq!(bench.sent(1), [state(0x00)]);
+    }
+}
+
 #[test]
 fn what_is_no_nmt_command_is_none() {
     let mut bench = Bench::new(Config::default());

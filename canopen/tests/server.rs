@@ -2,7 +2,7 @@
 
 mod common;
 
-use canopen::sdo::server::{Config, SdoServer};
+use canopen::sdo::server::{Config, SdoServer, VALUE_MAX};
 use canopen::{AbortCode, CobId, Frame, Objects};
 use common::{at, node, request, response, Bench, Device, Event};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
@@ -205,7 +205,7 @@ fn breaks(dialogue: &[([u8; 8], [u8; 8])], events: &[Event]) {
 }
 
 /// The bytes of a string that is too long (the feature `sealed` increases the limit).
-const TOO_LONG: u8 = canopen::sdo::server::VALUE_MAX as u8 + 1;
+const TOO_LONG: u8 = VALUE_MAX as u8 + 1;
 
 const START_9: ([u8; 8], [u8; 8]) = ([0x21, 0x50, 0x1F, 1, 9, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]);
 const FIRST: ([u8; 8], [u8; 8]) = ([0x00, 1, 2, 3, 4, 5, 6, 7], [0x20, 0, 0, 0, 0, 0, 0, 0]);
@@ -478,6 +478,15 @@ fn a_value_of_the_wrong_length_is_the_devices_fault() {
     );
     assert_eq!(ask(&mut device, [0x40, 0x00, 0x20, 0, 0, 0, 0, 0]), [0x41, 0x00, 0x20, 0, 8, 0, 0, 0]);
     assert_eq!(ask(&mut device, [0x60, 0, 0, 0, 0, 0, 0, 0]), [0x80, 0x00, 0x20, 0, 0x47, 0x00, 0x04, 0x06]);
+}
+
+/// The longest value fills the server's room.
+#[test]
+fn a_value_of_the_greatest_length_is_read() {
+    let mut bench = bench();
+    bench.device.text = vec![b'x'; VALUE_MAX];
+    let answer = bench.answer([0x40, 0x01, 0x20, 0, 0, 0, 0, 0]);
+    assert_eq!(answer, Some([0x41, 0x01, 0x20, 0, VALUE_MAX as u8, 0, 0, 0]));
 }
 
 /// An answer that waits can be taken back, or become a refusal; one that was fetched cannot.

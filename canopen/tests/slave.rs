@@ -5,6 +5,7 @@ mod common;
 use core::task::Poll;
 
 use canopen::bit_rate::Heard;
+use canopen::frame::Channel;
 use canopen::line::{Confinement, LineEvent, Status};
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{Access, DataType, Entry, Objects};
@@ -357,4 +358,102 @@ fn activates_a_bit_rate_and_keeps_silent_meanwhile() {
     bench.now = 200;
     // The answer that was waiting.
     assert_eq!(bench.outputs(), [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
+}
+
+/// What the owner does with an answer that waits.
+#[test]
+fn an_answer_that_waits_can_be_withdrawn_or_refused() {
+    let asked = [0x40, 0, 0x10, 0, 0, 0, 0, 0];
+    let answer = [0x43, 0, 0x10, 0, 1, 2, 3, 4];
+    let mut bench = Bench::new(5, BitRate::K125);
+    assert!(!bench.slave.withdraw_answer(&answer) && bench.slave.node().is_none());
+    bench.outputs();
+    assert_eq!(bench.slave.node().map(|node| node.id().get()), Some(5));
+    bench.put(0x605, &asked);
+    assert!(!bench.slave.withdraw_answer(&[0x43, 0, 0x10, 0, 1, 2, 3, 5]), "another answer");
+    assert!(!bench.slave.is_idle());
+    assert!(bench.slave.withdraw_answer(&answer));
+    assert!(bench.slave.is_idle());
+    assert_eq!(bench.outputs(), []);
+    bench.put(0x605, &asked);
+    bench.slave.refuse(AbortCode::DEVICE_STATE);
+    assert_eq!(bench.outputs(), [send(0x585, &[0x80, 0, 0x10, 0, 0x22, 0x00, 0x00, 0x08])]);
+}
+
+#[test]
+fn a_heartbeat_that_is_set_is_sent_and_stays_behind_a_restart() {
+    let mut bench = Bench::new(5, BitRate::K125);
+    bench.outputs();
+    bench.slave.set_heartbeat_ms(100, at(0));
+    bench.now = 99;
+    assert_eq!(bench.outputs(), []);
+    bench.now = 100;
+    assert_eq!(bench.outputs(), [send(0x705, &[0x7F])]);
+    assert!(bench.ask(0x000, &[0x82, 5]).contains(&send(0x705, &[0x00])));
+    bench.now = 200;
+    assert_eq!(bench.outputs(), [send(0x705, &[0x7F])]);
+}
+
+/// A device with a second SDO server, whose COB-IDs a write to 2000h sets.
+#[derive(Default)]
+struct Grouped(Option<Channel>);
+
+impl Objects for Grouped {
+    fn has_second_server() -> bool {
+        true
+    }
+
+    fn entries(&self) -> &'static [Entry] {
+        const { &[Entry::var(0x2000, "Group", DataType::Unsigned8, Access::Rw)] }
+    }
+
+    fn read(&mut self, _: Address, _: &mut [u8]) -> Result<usize, AbortCode> {
+        Err(AbortCode::NO_DATA)
+    }
+
+    fn write(&mut self, _: Address, data: &[u8]) -> Result<(), AbortCode> {
+        let id = |number| CobId::new(number).unwrap();
+        self.0 =
+            (data[0] != 0).then(|| Channel { request: id(0x6D0 + u16::from(data[0])), response: id(0x681) });
+        Ok(())
+    }
+
+    fn second_server(&self) -> Channel {
+        self.0.unwrap_or(Channel::NONE)
+    }
+}
+
+impl LssDevice for Grouped {
+    fn supports(&mut self, _: BitRate) -> bool {
+        true
+    }
+
+    fn store(&mut self, _: Option<NodeId>, _: Option<BitRate>) -> Poll<Result<(), StoreError>> {
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl SlaveDevice for Grouped {}
+
+/// The requests of a group are let in from the frame on that sets their COB-ID, and only that frame
+/// changes the filters.
+#[test]
+fn the_filters_follow_the_second_server() {
+    let mut device = Grouped::default();
+    let mut slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K125, Config::default());
+    let mut ask = |id: u16, data: &[u8]| -> Vec<Output> {
+        slave.handle(&frame(id, data), at(0), &mut device);
+        core::iter::from_fn(|| slave.poll(at(0), true, &mut device)).collect()
+    };
+    let write = |group: u8| [0x2F, 0x00, 0x20, 0, group, 0, 0, 0];
+    let accept =
+        |second: u16| Output::Accept([0x000, 0x7E5, 0x605, second].map(|id| CobId::new(id).unwrap()));
+    let done = |id: u16| send(id, &[0x60, 0x00, 0x20, 0, 0, 0, 0, 0]);
+    assert_eq!(ask(0x605, &write(1)), [accept(0x000), Output::Join(BitRate::K125), send(0x705, &[0])]);
+    assert_eq!(ask(0x6D1, &write(2)), [], "nobody listens there");
+    assert_eq!(ask(0x605, &write(1)), [accept(0x6D1), done(0x585)]);
+    assert_eq!(ask(0x605, &write(1)), [done(0x585)]);
+    // The answer to a request of the group comes from the server that took it.
+    assert_eq!(ask(0x6D1, &write(2)), [accept(0x6D2), done(0x681)]);
+    assert_eq!(ask(0x605, &write(0)), [accept(0x000), done(0x585)]);
 }

@@ -5,7 +5,7 @@ use canopen::debugger::Stop;
 use canopen::device::Device;
 use canopen::od::{Access, DataType, Entry, Table};
 use canopen::program::{control_count, region_of, region_value};
-use canopen::{AbortCode, Address, BitRate, NodeId, Objects};
+use canopen::{AbortCode, Address, BitRate, CobId, Instant, NodeId, Objects};
 
 #[test]
 fn bit_rates_are_found_by_their_number_of_bits() {
@@ -84,6 +84,23 @@ fn addresses_and_codes_are_printed_as_the_documents_write_them() {
     assert_eq!(format!("{:?}", AbortCode(0x0602_0000)), "AbortCode(06020000h)");
     assert!(format!("{}", Address::new(0x1F50, 1)).contains("1F50"));
     assert!(format!("{}", NodeId::new(42).unwrap()).contains("42"));
+    assert_eq!(format!("{}", CobId::new(0x85).unwrap()), "085h");
+}
+
+/// The counter starts again behind 2^32 ms; half of that lies ahead, and half behind.
+#[test]
+fn a_deadline_lies_ahead_for_half_the_range_of_the_counter() {
+    for (now, deadline, has_passed) in [
+        (0, 0, true),
+        (0, 1, false),
+        (0x7FFF_FFFF, 0, true),
+        (0x8000_0000, 0, false),
+        (0, 0x8000_0001, true),
+        (5, 0xFFFF_FFFF, true),
+    ] {
+        let reached = Instant::from_millis(now).has_reached(Instant::from_millis(deadline));
+        assert_eq!(reached, has_passed, "{now:#x}, {deadline:#x}");
+    }
 }
 
 /// A device with a table and no more: 06010000h for what it does not implement.

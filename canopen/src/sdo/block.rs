@@ -269,6 +269,39 @@ mod tests {
         assert_eq!(*tail, [2, 2]);
     }
 
+    /// The other side sends segments 3 and 4 of the sub-block before it reads that 2 were acknowledged.
+    #[test]
+    fn the_rest_of_a_sub_block_that_was_closed_early_is_none_of_the_next() {
+        for (seqno, is_of_the_next) in [(2, true), (3, false), (4, false)] {
+            let mut receiver = Receiver::new(false);
+            receiver.open(4);
+            assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
+            assert_eq!(receiver.take(&segment(false, 2), true), Ok(DATA));
+            assert_eq!(receiver.close(), 2);
+            receiver.open(4);
+            let other = BlockSegment { last: false, seqno, data: [0xEE; 7] }.emit();
+            assert_eq!(receiver.take(&other, false).map(|received| received.is_data), Ok(false));
+            assert_eq!(receiver.is_within(), is_of_the_next, "{seqno}");
+        }
+    }
+
+    /// Behind a lost segment 30, number 32 reads as an initiate (20h), and follows 31.
+    #[test]
+    fn the_successor_of_the_last_segment_is_one_also_behind_a_gap() {
+        let mut receiver = Receiver::new(false);
+        receiver.open(127);
+        for seqno in 1..=29 {
+            assert_eq!(receiver.take(&segment(false, seqno), true), Ok(DATA));
+        }
+        for seqno in [31, 32] {
+            assert_eq!(receiver.take(&segment(false, seqno), true), Ok(NOTHING));
+            assert!(!receiver.is_doubtful, "{seqno}");
+        }
+        // 34 follows no 33.
+        assert_eq!(receiver.take(&segment(false, 34), true), Ok(NOTHING));
+        assert!(receiver.is_doubtful);
+    }
+
     #[test]
     fn a_number_above_the_block_size_is_none() {
         let mut receiver = Receiver::new(false);

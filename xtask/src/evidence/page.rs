@@ -4,6 +4,7 @@ use std::cmp::Ordering;
 use std::fmt::Write;
 
 use crate::json::Value;
+use crate::mutants::reason;
 
 /// A part of the page, from one record.
 struct Part {
@@ -468,7 +469,23 @@ fn mutants(record: &Value) -> (Result<String, String>, String) {
         && left.is_empty();
     let names = ["group", "viable", "caught", "percent", "least"];
     let of_files = ["file", "caught", "named", "missed", "unviable", "commit"];
-    let details = table(&names, groups) + &table(&of_files, record.get("files").items());
+    let files = record.get("files").items();
+    let mut details = table(&names, groups) + &table(&of_files, files);
+    details += "<h3>What no test notices, and why</h3>\n<div class=\"wide\"><table>";
+    for file in files {
+        let name = file.get("file").text().unwrap_or_default();
+        for change in file.get("unnoticed").items().iter().filter_map(Value::text) {
+            let why = reason(name, change).unwrap_or("no reason is given");
+            let _ = writeln!(
+                details,
+                "<tr><td>{}</td><td>{}</td><td>{}</td></tr>",
+                text(name),
+                text(change),
+                text(why)
+            );
+        }
+    }
+    details += "</table></div>\n";
     (if is_good { Ok(words) } else { Err(words) }, details)
 }
 

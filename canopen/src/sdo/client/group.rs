@@ -126,6 +126,10 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
     /// The abort of a server that refuses the data.
     pub fn handle(&mut self, number: usize, bytes: &[u8; 8], now: Instant) -> Result<(), AbortCode> {
         let server = 1 << (number % SERVERS_MAX) & self.servers;
+        // One that is not addressed, for example late from an attempt before.
+        if server == 0 {
+            return Ok(());
+        }
         let response = Response::parse(bytes);
         if let Some(Response::Abort(_, code)) = response {
             match &mut self.state {
