@@ -230,6 +230,11 @@ mod tests {
         let told = Last { program_size: 4096, program_crc: 0xCBF4_3926 };
         assert_eq!(Last::parse(&last), Some(told));
         assert_eq!(told.emit(), last);
+        // With the 32 reserved bytes of 2008 in front, and with other lengths.
+        for (reserved, expected) in [(32, Some(told)), (31, None), (33, None), (4, None), (248, None)] {
+            let old = [&[0xA5; 248][..reserved], &last[..]].concat();
+            assert_eq!(Last::parse(&old), expected, "{reserved}");
+        }
     }
 
     /// A date behind 2106-02-07 needs more than 32 bits; its low word comes first.

@@ -349,6 +349,29 @@ impl Geometry {
 mod tests {
     use super::*;
 
+    /// The order codes of the data sheet (DS8626, ordering information): package and range behind the
+    /// code, then options.
+    #[test]
+    fn a_chip_is_named_by_its_order_code() {
+        for (name, expected) in [
+            ("STM32F407VG", true),
+            ("stm32f407vg", true),
+            ("STM32F407VGT6", true),
+            ("STM32F407VGT6TR", true),
+            ("STM32F407VGH6ABC", true),
+            ("STM32F407VGH6ABCD", false),
+            ("STM32F407VGT", false),
+            ("STM32F407VG66", false),
+            ("STM32F407VGTT", false),
+            ("STM32F407VGT6-R", false),
+            ("STM32F407VE", false),
+            ("STM32F407V", false),
+            ("", false),
+        ] {
+            assert_eq!(STM32F407VG.is_named(name), expected, "{name}");
+        }
+    }
+
     /// RM0090 table 5, copied from the manual.
     #[test]
     fn sectors_of_the_f407_are_those_of_the_manual() {

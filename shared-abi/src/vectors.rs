@@ -55,7 +55,7 @@ impl VectorTable {
     pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
         // A full descending stack: the pointer may point directly after the last byte, and needs
         // room below.
-        let on_stack = |ram: &Region| ram.size > 0 && word > ram.base && word <= ram.end();
+        let on_stack = |ram: &Region| word > ram.base && word <= ram.end();
         word.is_multiple_of(8) && (on_stack(&layout.ram) || on_stack(&layout.chip.ccm))
     }
 

@@ -93,12 +93,7 @@ const READ_BY_ALL: [&str; 4] = ["Cargo.toml", "Cargo.lock", "mutants/", "xtask/s
 /// Whether the result of a package may be another after a change of this file.
 fn is_read(package: &str, file: &str) -> bool {
     let own = READS.iter().filter(|(name, _)| *name == package).flat_map(|(_, folders)| *folders);
-    own.chain(&READ_BY_ALL).any(|begin| file.starts_with(begin)) && !file.ends_with(".md")
-}
-
-/// Whether the result of any package may be another after a change of this file.
-pub fn reads(file: &str) -> bool {
-    READS.iter().any(|(package, _)| is_read(package, file))
+    own.chain(&READ_BY_ALL).any(|begin| file.starts_with(begin))
 }
 
 /// Code in place of sealed images and of resume, in which there is nothing to do.
@@ -366,7 +361,7 @@ fn parts(line: &str) -> Option<(String, &str)> {
 }
 
 /// Why no test can notice a change, or need not.
-pub fn reason(file: &str, change: &str) -> Option<&'static str> {
+fn reason(file: &str, change: &str) -> Option<&'static str> {
     let is_it = |named: &&(&str, &str, &'static str)| named.0 == file && named.1 == change;
     reasons::REASONS.iter().find(is_it).map(|(_, _, why)| *why)
 }
@@ -390,7 +385,8 @@ fn kept(record: Option<&Value>, holds: impl Fn(&str, &str) -> bool, package: &st
     let row = |row: &Value| {
         let [package, commit] = ["package", "commit"].map(|name| row.get(name).text().map(str::to_owned));
         let [caught, unviable] = ["caught", "unviable"].map(|name| count(row, name));
-        let unnoticed = row.get("unnoticed").items().iter().filter_map(Value::text).map(str::to_owned);
+        let unnoticed = row.get("unnoticed").items().iter();
+        let unnoticed = unnoticed.filter_map(|row| row.get("change").text()).map(str::to_owned);
         let counts = Row {
             package: package?,
             commit: commit?,
@@ -420,10 +416,16 @@ fn as_json(rows: &Rows, is_unfinished: bool) -> String {
     let _ = write!(text, "\"groups\": [{}]", groups.collect::<Vec<_>>().join(", "));
     let left = READS.iter().filter(|(package, _)| !rows.values().any(|row| row.package == *package));
     let left = left.map(|(package, _)| quoted(package)).collect::<Vec<_>>().join(", ");
-    let _ = write!(text, ", \"left\": [{left}]");
+    let reads = READS.iter().flat_map(|(_, folders)| *folders).chain(&READ_BY_ALL);
+    let reads = reads.map(|begin| quoted(begin)).collect::<Vec<_>>().join(", ");
+    let _ = write!(text, ", \"left\": [{left}], \"reads\": [{reads}]");
     let files = rows.iter().map(|(file, row)| {
         let (named, missed) = row.named_and_missed(file);
-        let unnoticed = row.unnoticed.iter().map(|change| quoted(change)).collect::<Vec<_>>();
+        let unnoticed = row.unnoticed.iter().map(|change| {
+            let why = reason(file, change).map_or("null".to_owned(), quoted);
+            format!("{{\"change\": {}, \"why\": {why}}}", quoted(change))
+        });
+        let unnoticed = unnoticed.collect::<Vec<_>>();
         format!(
             "\n{{\"file\": {}, \"package\": {}, \"commit\": {}, \"caught\": {}, \"named\": {named}, \
              \"missed\": {missed}, \"unviable\": {}, \"unnoticed\": [{}]}}",
@@ -550,6 +552,6 @@ mod tests {
                 && !is_read("coboot-core", "canopen/tests/lss.rs")
                 && !is_read("coboot-abi", "xtask/src/mutants/reasons.rs")
         );
-        assert!(reads("Cargo.lock") && !reads("docs/testing.md") && !reads("xtask/src/main.rs"));
+        assert!(is_read("coboot-seal", "Cargo.lock") && !is_read("coboot-seal", "xtask/src/main.rs"));
     }
 }

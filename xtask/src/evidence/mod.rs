@@ -3,7 +3,8 @@
 //!
 //! Each file is one JSON object. It begins with `commit` (with `-dirty` behind it if the sources
 //! were changed since), `toolchain` (the line of `rustc --version`) and `date` (UTC, ISO 8601);
-//! the rest is the job's own. A job that has begun and not ended leaves `unfinished`.
+//! the rest is the job's own. A job that has begun and not ended leaves `unfinished`. `reads` is how the
+//! paths begin of the files that the result depends on: without it, all but texts.
 
 mod page;
 
@@ -14,7 +15,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 
 use crate::args::Args;
 use crate::json::Value;
-use crate::{mutants, process, toolchain, workspace, Outcome};
+use crate::{process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask evidence [--keep]
@@ -147,9 +148,10 @@ fn is_commit(of: &str) -> bool {
     of.len() == 40 && of.bytes().all(|byte| byte.is_ascii_hexdigit())
 }
 
-/// Whether what a job has measured of a commit holds for the sources as they are.
-pub fn holds(job: &str, of: &str) -> bool {
-    is_unchanged(of, |file| matters(job, file))
+/// Whether a result holds for the sources as they are, although it may be of another commit.
+pub fn holds(record: &Value) -> bool {
+    let commit = record.get("commit").text().unwrap_or_default();
+    is_unchanged(commit, |file| matters(record.get("reads").items(), file))
 }
 
 /// Whether no file that matters has changed since a commit.
@@ -159,14 +161,13 @@ pub fn is_unchanged(since: &str, matters: impl Fn(&str) -> bool) -> bool {
     is_commit(since) && process::output(&mut git).is_ok_and(|changed| !changed.lines().any(matters))
 }
 
-/// Whether the result of a job may be another after a change of this file. Only the tests read texts.
-fn matters(job: &str, file: &str) -> bool {
+/// Whether a result that depends on these files may be another after a change of this one.
+fn matters(reads: &[Value], file: &str) -> bool {
     let is_text = file.ends_with(".md") || file.starts_with("docs/");
-    match job {
+    match reads {
         _ if is_result(file) => false,
-        "tests" => true,
-        "mutants" => mutants::reads(file),
-        _ => !is_text,
+        [] => !is_text,
+        reads => reads.iter().filter_map(Value::text).any(|begin| file.starts_with(begin)),
     }
 }
 
@@ -215,24 +216,25 @@ mod tests {
 
     #[test]
     fn a_result_holds_until_a_file_changes_that_its_job_reads() {
-        for (file, of_tests, of_mutants, of_bench) in [
+        let reads = |record: &str| Value::parse(record).unwrap().get("reads").items().to_vec();
+        let (all, some) = (reads(r#"{"reads": [""]}"#), reads(r#"{"reads": ["canopen/", "Cargo.lock"]}"#));
+        for (file, is_in_all, is_in_some, is_code) in [
             ("README.md", true, false, false),
             ("docs/adr/0018-toolchain-of-a-release.md", true, false, false),
             ("docs/evidence/bench.json", false, false, false),
             ("fuzz/seeds/lss/1", false, false, false),
             ("canopen/src/lib.rs", true, true, true),
-            ("boot-core/tests/objects.rs", true, true, true),
             ("Cargo.lock", true, true, true),
             ("xtask/src/main.rs", true, false, true),
             ("docsy/a.rs", true, false, true),
         ] {
-            for (job, expected) in [("tests", of_tests), ("mutants", of_mutants), ("bench", of_bench)] {
-                assert_eq!(matters(job, file), expected, "{job}, {file}");
-            }
+            assert_eq!(matters(&all, file), is_in_all, "{file}");
+            assert_eq!(matters(&some, file), is_in_some, "{file}");
+            assert_eq!(matters(&[], file), is_code, "{file}");
         }
         // No commits; among them an option for git.
         for of in ["unknown", "", "0123-dirty", "--output=x", &"0".repeat(40)] {
-            assert!(!holds("bench", of), "{of}");
+            assert!(!is_unchanged(of, |_| false), "{of}");
         }
     }
 

@@ -4,7 +4,6 @@ use std::cmp::Ordering;
 use std::fmt::Write;
 
 use crate::json::Value;
-use crate::mutants::reason;
 
 /// A part of the page, from one record.
 struct Part {
@@ -110,17 +109,13 @@ pub fn names() -> impl Iterator<Item = &'static str> {
     PARTS.iter().map(|part| part.name)
 }
 
-/// The page for sources of this commit, with the records that `read` finds. `holds` tells of a record and
-/// another commit whether what was measured of it holds for these sources, too.
-pub fn page(
-    commit: &str,
-    read: impl Fn(&str) -> Option<Value>,
-    holds: impl Fn(&str, &str) -> bool,
-) -> String {
+/// The page for sources of this commit, with the records that `read` finds. `holds` tells of one
+/// that is of another commit whether it is the result of these sources, too.
+pub fn page(commit: &str, read: impl Fn(&str) -> Option<Value>, holds: impl Fn(&Value) -> bool) -> String {
     let (mut cards, mut sections) = (String::new(), String::new());
     for part in PARTS {
         let record = read(part.name);
-        let (class, verdict, details) = judge(part, commit, record.as_ref(), |of| holds(part.name, of));
+        let (class, verdict, details) = judge(part, commit, record.as_ref(), &holds);
         let _ = writeln!(
             cards,
             "<a class=\"card {class}\" href=\"#{}\"><b>{}</b><span>{verdict}</span></a>",
@@ -152,7 +147,7 @@ fn judge(
     part: &Part,
     commit: &str,
     record: Option<&Value>,
-    holds: impl Fn(&str) -> bool,
+    holds: impl Fn(&Value) -> bool,
 ) -> (&'static str, String, String) {
     let Some(record) = record else {
         return ("none", format!("not run: <code>{}</code>", part.command), String::new());
@@ -164,7 +159,7 @@ fn judge(
     let of = record.get("commit").text().unwrap_or("unknown");
     match verdict {
         Err(what) => ("bad", what, details),
-        Ok(what) if of != commit && holds(of) => {
+        Ok(what) if of != commit && holds(record) => {
             ("good", format!("{what}; what it measures has not changed since"), details)
         }
         Ok(what) if of != commit => {
@@ -474,15 +469,10 @@ fn mutants(record: &Value) -> (Result<String, String>, String) {
     details += "<h3>What no test notices, and why</h3>\n<div class=\"wide\"><table>";
     for file in files {
         let name = file.get("file").text().unwrap_or_default();
-        for change in file.get("unnoticed").items().iter().filter_map(Value::text) {
-            let why = reason(name, change).unwrap_or("no reason is given");
-            let _ = writeln!(
-                details,
-                "<tr><td>{}</td><td>{}</td><td>{}</td></tr>",
-                text(name),
-                text(change),
-                text(why)
-            );
+        for row in file.get("unnoticed").items() {
+            let (change, why) = (shown(row.get("change")), row.get("why").text());
+            let why = text(why.unwrap_or("no reason is given"));
+            let _ = writeln!(details, "<tr><td>{}</td><td>{change}</td><td>{why}</td></tr>", text(name));
         }
     }
     details += "</table></div>\n";
@@ -491,7 +481,7 @@ fn mutants(record: &Value) -> (Result<String, String>, String) {
 
 /// A record that says `failed` itself, and what it has counted.
 fn plain(record: &Value, counted: &str) -> (Result<String, String>, String) {
-    let own = ["commit", "toolchain", "date"];
+    let own = ["commit", "toolchain", "date", "reads"];
     let members: Vec<(&str, &Value)> = record.members().filter(|(name, _)| !own.contains(name)).collect();
     let mut details = String::from("<div class=\"wide\"><table>");
     let mut lists = String::new();
@@ -548,7 +538,7 @@ mod tests {
     /// The page with one record, the tests'.
     fn with(record: Option<&str>) -> String {
         let read = |name: &str| record.filter(|_| name == "tests").map(|text| Value::parse(text).unwrap());
-        page(COMMIT, read, |_, _| false)
+        page(COMMIT, read, |_| false)
     }
 
     fn class(page: &str) -> &str {
@@ -572,17 +562,17 @@ mod tests {
         }
         // Sources that are no commit's give no green mark, whatever was measured of them.
         let record = |_: &str| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap());
-        assert!(!page("1-dirty", record, |_, _| false).contains("class=\"card good\""));
+        assert!(!page("1-dirty", record, |_| false).contains("class=\"card good\""));
     }
 
     #[test]
     fn a_result_of_another_commit_is_green_while_it_holds() {
         let old = |_: &str| Some(Value::parse(r#"{"frames": 5, "failed": 0, "commit": "4567"}"#).unwrap());
-        let green = |holds: bool| page(COMMIT, old, |_, _| holds).matches("class=\"card good").count();
+        let green = |holds: bool| page(COMMIT, old, |_| holds).matches("class=\"card good").count();
         assert_eq!(green(false), 0);
         assert!(green(true) > 0);
-        let of_tests = |name: &str, of: &str| name == "tests" && of == "4567";
-        assert_eq!(class(&page(COMMIT, old, of_tests)), "good");
+        let of_them = |record: &Value| record.get("commit").text() == Some("4567");
+        assert_eq!(class(&page(COMMIT, old, of_them)), "good");
     }
 
     #[test]
@@ -597,7 +587,7 @@ mod tests {
             r#"{"a": "<b>", "commit": "<i>"}"#,
         ] {
             let record = Value::parse(record).unwrap();
-            let page = page(COMMIT, |_| Some(record.clone()), |_, _| false);
+            let page = page(COMMIT, |_| Some(record.clone()), |_| false);
             assert!(page.ends_with("</html>\n") && !page.contains("<b>\"") && !page.contains("<i>,"));
             assert!(!page.contains("class=\"card good\""), "{record:?}");
         }

@@ -7,12 +7,14 @@ const ON_CHIP: &str = "It stands for the chip alone, where the tests in the emul
 /// `boot_core::resume::HAS_ROOM` is a constant, and true in a bootloader without sealed images.
 const HAS_ROOM: &str = "A constant that is true where this code is built.";
 
-/// `boot-core/src/intake/stream.rs`, [`Stream::close`]: only data change the flash.
+/// `Stream::close` in `boot-core/src/intake/stream.rs`: only data change the flash.
 const BEGINS: &str =
     "A stream that begins before its first piece, or begins again, changes nothing: it cannot go on behind a cut.";
 /// The bound of a step is a promise about time.
 const LONGER: &str =
     "It does more in one step, whose time the tests on the emulated chip bound (tests/tests/sealed.rs).";
+/// What stands in the code is what the change puts there.
+const BODY: &str = "It is the body of this function.";
 const PREPARED: &str = "Constants that were not prepared are computed with the first signature.";
 const NO_ROOM: &str = "Without input and without room the decoder does nothing.";
 
@@ -126,7 +128,26 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("canopen/src/sdo/server/segmented.rs", "replace | with ^ in SdoServer::download_segment", DISJOINT),
     ("canopen/src/sdo/server/segmented.rs", "replace | with ^ in SdoServer::answer_upload", DISJOINT),
     ("canopen/src/sdo/server/segmented.rs", "replace | with ^ in SdoServer::upload_segment", DISJOINT),
-    ("canopen/src/od.rs", "replace Objects::download_end -> Result<(), AbortCode> with Ok(())", "It is the body of this function."),
+    ("canopen/src/od.rs", "replace Objects::download_end -> Result<(), AbortCode> with Ok(())", BODY),
+    ("canopen/src/od.rs", "replace Objects::download_cancel with ()", BODY),
+    ("canopen/src/lss.rs", "replace LssDevice::stored -> Poll<Result<(), StoreError>> with Poll::from(Ok(()))", BODY),
+    ("canopen/src/slave.rs", "replace SlaveDevice::line_event with ()", BODY),
+    ("canopen/src/slave.rs", "replace SlaveDevice::node_id_changed with ()", BODY),
+    ("canopen/src/sdo/client/upload.rs", "replace Sink::announce -> Result<(), AbortCode> with Ok(())", BODY),
+    ("canopen/src/sdo/client/group.rs", "replace | with ^ in GroupDownload<D>::wait", DISJOINT),
+    ("canopen/src/sdo/server/block_upload.rs", "replace | with ^ in Sender::count", DISJOINT),
+    ("canopen/src/sdo/server/block_upload.rs", "replace | with ^ in Sender::acknowledged", DISJOINT),
+    (
+        "canopen/src/sdo/server/mod.rs",
+        "replace < with <= in SdoServer::may_answer",
+        "With room for one segment it gives one in either case.",
+    ),
+    ("canopen/src/debugger/mod.rs", "replace > with >= in Debugger<M>::command", "Eight bytes never come here."),
+    (
+        "canopen/src/debugger/mod.rs",
+        "replace > with >= in Debugger<M>::download_data",
+        "Before the first byte there is nothing to write.",
+    ),
     (
         "coboot-app/src/bootloader.rs",
         "replace Bootloader::program_crc -> u32 with 0",
