@@ -372,6 +372,41 @@ mod tests {
         }
     }
 
+    #[test]
+    fn a_region_contains_what_lies_between_its_ends() {
+        let region = Region::new(0x100, 0x10);
+        for (address, len, expected) in [
+            (0x100, 0x10, true),
+            (0x10F, 1, true),
+            (0x100, 0, true),
+            (0x10F, 0, true),
+            (0x110, 0, false),
+            (0x110, 1, false),
+            (0x10F, 2, false),
+            (0x0FF, 1, false),
+            (0x0FF, 0, false),
+            (0x100, 0x11, false),
+            (0x100, u32::MAX, false),
+            (u32::MAX, u32::MAX, false),
+        ] {
+            assert_eq!(region.contains(address, len), expected, "{address:#x}, {len:#x}");
+        }
+    }
+
+    #[test]
+    fn whole_sectors_are_one_at_least() {
+        for (base, kib, expected) in [
+            (0x0800_4000, 16, true),
+            (0x0800_4000, 0, false),
+            (0x0800_0000, 64, true),
+            (0x0800_4000, 17, false),
+            (0x0800_4400, 15, false),
+        ] {
+            let region = Region::new(base, kib * 1024);
+            assert_eq!(STM32F407VG.is_whole_sectors(&region), expected, "{base:#x}, {kib}");
+        }
+    }
+
     /// RM0090 table 5, copied from the manual.
     #[test]
     fn sectors_of_the_f407_are_those_of_the_manual() {

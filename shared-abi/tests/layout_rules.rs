@@ -68,16 +68,56 @@ fn each_broken_rule_is_named() {
             }),
             "must be the last RAM cell",
         ),
+        (broken(|l| l.callgate_offset = 32 * KIB - 4), "the callgate lies outside the bootloader"),
+        (
+            broken(|l| l.programs = programs(&[(0x0801_0000, 64 * KIB); 255])),
+            "there must be 1 to 254 programs",
+        ),
+        (broken(|l| l.programs = programs(&[(0x0801_0000, 64 * KIB); 254])), "two programs overlap"),
+        (
+            broken(|l| {
+                l.ram.size -= 8;
+                l.handoff.base -= 2;
+            }),
+            "must be word-aligned",
+        ),
+        (broken(|l| l.warm_start.base += 2), "must be word-aligned"),
     ];
     for (message, rule) in cases {
         assert!(message.contains(rule), "expected {rule:?}, got {message:?}");
     }
 }
 
+#[test]
+fn no_region_is_empty_or_reaches_over_the_end_of_the_address_space() {
+    let regions: [fn(&mut Layout) -> &mut Region; 6] = [
+        |l| &mut l.bootloader,
+        |l| &mut l.parameters[0],
+        |l| &mut l.parameters[1],
+        |l| &mut l.ram,
+        |l| &mut l.handoff,
+        |l| &mut l.warm_start,
+    ];
+    for region in regions {
+        for wrong in [Region::new(region(&mut { LAYOUT }).base, 0), Region::new(0xFFFF_FF00, 0x101)] {
+            assert!(broken(|l| *region(l) = wrong).contains("a region is empty"));
+        }
+    }
+    for wrong in [(0x0802_0000, 0), (0xFFFF_FF00, 0x101)] {
+        let message = broken(|l| l.programs = programs(&[(0x0801_0000, 64 * 1024), wrong]));
+        assert!(message.contains("a region is empty"), "{message}");
+    }
+}
+
 /// The purpose of the check: the same values with one mistake each.
 #[test]
 fn a_geometry_that_no_chip_has_is_refused() {
-    let wrong: [(&str, Geometry); 6] = [
+    let wrong: [(&str, Geometry); 8] = [
+        (
+            "flash or SRAM of the chip is empty",
+            Geometry { flash: Region::new(0xFFFF_0000, 512 * 1024), ..STM32F446RE },
+        ),
+        ("flash or SRAM of the chip is empty", Geometry { sram: Region::new(0x2000_0000, 0), ..STM32F446RE }),
         (
             "the sectors do not add up",
             Geometry { flash: Region::new(0x0800_0000, 1024 * 1024), ..STM32F446RE },

@@ -15,6 +15,7 @@ const LONGER: &str =
     "It does more in one step, whose time the tests on the emulated chip bound (tests/tests/sealed.rs).";
 /// What stands in the code is what the change puts there.
 const BODY: &str = "It is the body of this function.";
+const ZERO_BITS: &str = "It moves by 0 bits.";
 const PREPARED: &str = "Constants that were not prepared are computed with the first signature.";
 const NO_ROOM: &str = "Without input and without room the decoder does nothing.";
 
@@ -99,6 +100,13 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("boot-core/src/unseal/image.rs", "replace + with * in Room::unpack", LONGER),
     ("boot-core/src/unseal/image.rs", "replace && with || in Room::unpack", NO_ROOM),
     ("boot-core/src/unseal/image.rs", "replace < with <= in Room::unpack", NO_ROOM),
+    ("shared-abi/src/callgate.rs", "replace << with >>", ZERO_BITS),
+    ("shared-abi/src/handoff.rs", "replace << with >>", ZERO_BITS),
+    (
+        "shared-abi/src/geometry.rs",
+        "replace > with < in Region::contains",
+        "Bytes of which all lie inside have their address inside, too.",
+    ),
     ("shared-abi/src/registers.rs", "replace | with ^ in request_reset", DISJOINT),
     ("shared-abi/src/registers.rs", "replace | with ^ in release_core", DISJOINT),
     ("shared-abi/src/bit_timing.rs", "replace | with ^ in BitTiming::register", DISJOINT),
@@ -158,5 +166,5 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("coboot-app/src/bootloader.rs", "replace - with / in Bootloader::program_crc", ON_CHIP),
     ("coboot-app/src/bootloader.rs", "replace | with ^ in Exit::ask", DISJOINT),
     ("coboot-app/src/responder.rs", "replace | with ^ in Responder::request", DISJOINT),
-    ("coboot-app/src/responder.rs", "replace << with >> in Responder::download", "It moves by 0 bits."),
+    ("coboot-app/src/responder.rs", "replace << with >> in Responder::download", ZERO_BITS),
 ];
