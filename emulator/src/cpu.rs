@@ -19,6 +19,8 @@
 mod accesses;
 mod traps;
 
+use std::collections::HashSet;
+
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
@@ -123,6 +125,9 @@ pub enum Entry {
     Lockup,
 }
 
+/// An address at which no chip of this emulator has anything: external memory (PM0214 section 2.2).
+const NOWHERE: u32 = 0x6000_0000;
+
 /// The data that the hooks leave for the caller.
 #[derive(Default)]
 struct Notes {
@@ -143,6 +148,11 @@ struct Notes {
     executed: Vec<bool>,
     /// Pages of flash that code was fetched from.
     flash_executed: Vec<bool>,
+    /// The pages that were asked for since the TLB was emptied, and how often one was asked for again.
+    asked: HashSet<u32>,
+    asked_again: u32,
+    /// The pages are asked for by [`Cpu::flush_tlb`].
+    balances: bool,
     /// The traps of CCR that [`on_instruction`] looks for, and its hook; none without a trap.
     traps: Traps,
     trap_hook: Option<UcHookId>,
@@ -469,9 +479,30 @@ impl Cpu {
         notes.flash_executed.fill(false);
         notes.blocks.clear();
         let _ = self.uc.ctl_flush_tb();
-        let _ = self.uc.ctl_flush_tlb();
+        self.flush_tlb();
         self.chip_mut().stale.clear();
         self.chip_mut().flush_tlb = false;
+    }
+
+    /// Empties the TLB.
+    ///
+    /// Unicorn adapts the size of its TLB then, from a count of used entries. It takes an entry off
+    /// twice if the page loses its place to another one and is asked for again, as it happens each time
+    /// to a peripheral beside RAM at the same offset (flags of such an entry keep the victim TLB from
+    /// finding it). Below 0, the count means that the TLB is full, and each flush doubles it, to millions
+    /// of entries that each translation goes through. So as many are added here: a page that was there
+    /// for loads alone and is asked for a store counts once more.
+    fn flush_tlb(&mut self) {
+        let notes = &mut self.uc.get_data_mut().notes;
+        notes.asked.clear();
+        let again = std::mem::take(&mut notes.asked_again);
+        notes.balances = true;
+        for number in 0..again {
+            let kind = if number % 2 == 0 { Prot::READ } else { Prot::WRITE };
+            let _ = self.uc.vmem_translate(u64::from(NOWHERE), kind);
+        }
+        self.uc.get_data_mut().notes.balances = false;
+        let _ = self.uc.ctl_flush_tlb();
     }
 
     // --- memory
@@ -741,7 +772,7 @@ impl Cpu {
             self.uc.get_data_mut().notes.blocks.clear();
         }
         if std::mem::take(&mut self.chip_mut().flush_tlb) {
-            let _ = self.uc.ctl_flush_tlb();
+            self.flush_tlb();
         }
         if std::mem::take(&mut self.chip_mut().breakpoints_changed) {
             let _ = self.uc.ctl_flush_tb();
@@ -1357,6 +1388,12 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     let chip = &mut state.chip;
     let geometry = chip.geometry;
     let entry = |paddr: u32, perms| Some(TlbEntry { paddr: u64::from(paddr), perms });
+    if state.notes.balances {
+        return entry(address, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ });
+    }
+    if !state.notes.asked.insert(address) {
+        state.notes.asked_again += 1;
+    }
     if is_flash(chip, address) {
         let paddr = if address < geometry.flash.size { geometry.flash.base + address } else { address };
         return match kind {
