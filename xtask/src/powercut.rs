@@ -18,9 +18,9 @@ program that would start, or a stored value that is gone.
 
 On the model of the flash it cuts every operation; of the real firmware it cuts a sample.
 
-  --full             every operation of an update with the real firmware, and a tenth of those of the
-                     other scenarios; with a tenth on the board of each other chip, and on the one with
-                     two programs
+  --full             every operation of an update with the real firmware, and a twentieth of those of
+                     the other scenarios; with a twentieth on the board of each other chip, and on the
+                     one with two programs
   --every-way        every way also for the second cut on the model; takes an hour
   --json             prints the counts as JSON, an object for each board
   --reproduce POINT  tells one point in words, as update:37:torn:12:after
@@ -62,7 +62,7 @@ pub fn run(mut args: Args) -> Outcome {
     if full && !chosen_board {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
-            cut(other, &["--tenth".to_owned()])?;
+            cut(other, &["--twentieth".to_owned()])?;
         }
     }
     evidence::record("powercut", &format!("{{\"full\": {full}, \"boards\": [{}]}}", boards.join(",\n")))?;

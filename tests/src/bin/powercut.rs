@@ -36,8 +36,8 @@ struct Wish {
     json: bool,
     /// Writes the counts as JSON to this file, too.
     evidence: Option<String>,
-    /// Level 2 alone, with a tenth of the cuts.
-    tenth: bool,
+    /// Level 2 alone, with a twentieth of the cuts.
+    twentieth: bool,
     point: Option<AnyPoint>,
 }
 
@@ -49,14 +49,14 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             "--every-way" => wish.every_way = true,
             "--json" => wish.json = true,
             "--evidence" => wish.evidence = Some(arguments.next().ok_or("--evidence wants a file.")?),
-            "--tenth" => wish.tenth = true,
+            "--twentieth" => wish.twentieth = true,
             "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
                 Some(point) => wish.point = Some(point?),
                 None => return Err("--reproduce wants a point, as update:37:torn.".into()),
             },
             other => {
                 return Err(format!(
-                    "{other:?} is no option; there are --full, --every-way, --tenth, --json, --evidence FILE and --reproduce POINT."
+                    "{other:?} is no option; there are --full, --every-way, --twentieth, --json, --evidence FILE and --reproduce POINT."
                 ))
             }
         }
@@ -104,7 +104,7 @@ fn main() -> ExitCode {
     let mut sum = Sum::default();
     let head =
         "scenario           operations    points   states  recoveries   bootloader  old program  new program  violations";
-    if !wish.tenth {
+    if !wish.twentieth {
         if !wish.json {
             println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
         }
@@ -123,9 +123,9 @@ fn main() -> ExitCode {
     }
     for scenario in board::SCENARIOS {
         // Every operation once; the other scenarios share most of them.
-        let effort = match (wish.full && scenario.name == "update", wish.full || wish.tenth) {
+        let effort = match (wish.full && scenario.name == "update", wish.full || wish.twentieth) {
             (true, _) => Effort::FULL,
-            (_, true) => Effort::TENTH,
+            (_, true) => Effort::TWENTIETH,
             _ => Effort::SAMPLE,
         };
         match board::run(scenario, effort) {

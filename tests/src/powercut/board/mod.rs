@@ -93,8 +93,8 @@ pub struct Effort {
 impl Effort {
     /// For every run of the tests.
     pub const SAMPLE: Self = Self { cut: (10, 128), recovered: (2, 1024), cut_again: (10, 1024) };
-    /// A tenth of all.
-    pub const TENTH: Self = Self { cut: (10, 10), recovered: (4, 256), cut_again: (10, 256) };
+    /// A twentieth of all.
+    pub const TWENTIETH: Self = Self { cut: (10, 20), recovered: (4, 256), cut_again: (10, 256) };
     /// Every operation.
     pub const FULL: Self = Self { cut: (10, 1), recovered: (10, 64), cut_again: (10, 64) };
 
