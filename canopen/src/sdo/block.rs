@@ -283,6 +283,18 @@ mod tests {
             assert_eq!(receiver.take(&other, false).map(|received| received.is_data), Ok(false));
             assert_eq!(receiver.is_within(), is_of_the_next, "{seqno}");
         }
+        // Behind segment 3 of the rest, another 3 is the next sub-block's.
+        let mut receiver = Receiver::new(false);
+        receiver.open(6);
+        assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
+        assert_eq!(receiver.take(&segment(false, 2), true), Ok(DATA));
+        assert_eq!(receiver.close(), 2);
+        receiver.open(6);
+        for (content, is_of_the_next) in [(0xEE, false), (0xDD, true)] {
+            let segment = BlockSegment { last: false, seqno: 3, data: [content; 7] }.emit();
+            assert_eq!(receiver.take(&segment, false), Ok(NOTHING));
+            assert_eq!(receiver.is_within(), is_of_the_next);
+        }
     }
 
     /// Behind a lost segment 30, number 32 reads as an initiate (20h), and follows 31.
