@@ -548,6 +548,19 @@ fn client_makes_a_block_upload() {
     hears(&mut client, 0, &[LAST_OF_14, END_OF_14]);
     ends(&mut client, 0, &[ENDED], Ok(()));
     assert_eq!((client.progress(), client.into_sink()), (14, (1..=14).collect()));
+    // A block has 1 to 127 segments, whatever the caller wants.
+    for (wanted, blksize) in [(0, 1), (128, 127), (255, 127)] {
+        let block = Block { blksize: wanted, pst: 0, ..BLOCK };
+        let mut client = Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, block);
+        sends(&mut client, 0, &[[0xA4, 0x00, 0x20, 0, blksize, 0, 0, 0]]);
+        hears(&mut client, 0, &[[0xC6, 0x00, 0x20, 0, 14, 0, 0, 0]]);
+        sends(&mut client, 0, &[START]);
+        hears(&mut client, 0, &[FIRST]);
+        if blksize > 1 {
+            hears(&mut client, 0, &[LAST_OF_14]);
+        }
+        sends(&mut client, 0, &[acked(if blksize > 1 { 2 } else { 1 }, blksize)]);
+    }
     // Without size and CRC, in sub-blocks of one.
     let mut client =
         Upload::as_blocks(node(), DOMAIN, Vec::new(), CONFIG, Block { blksize: 1, pst: 20, ..BLOCK });

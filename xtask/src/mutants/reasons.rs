@@ -123,6 +123,8 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("shared-abi/src/reentry.rs", "replace interrupts_off with ()", ON_CHIP),
     ("canopen/src/frame.rs", "replace | with ^ in <impl embedded_can::Frame for Frame>::new_remote", DISJOINT),
     ("canopen/src/frame.rs", "replace | with ^ in word", DISJOINT),
+    ("canopen/src/frame.rs", "replace | with ^", DISJOINT),
+    ("canopen/src/emcy.rs", "replace << with >>", ZERO_BITS),
     ("canopen/src/program.rs", "replace | with ^ in FlashStatus::to_word", DISJOINT),
     ("canopen/src/program.rs", "replace | with ^ in region_value", DISJOINT),
     ("canopen/src/sdo/wire.rs", "replace | with ^ in Payload::emit", DISJOINT),
