@@ -4,7 +4,8 @@
 //! Each file is one JSON object. It begins with `commit` (with `-dirty` behind it if the sources
 //! were changed since), `toolchain` (the line of `rustc --version`) and `date` (UTC, ISO 8601);
 //! the rest is the job's own. A job that has begun and not ended leaves `unfinished`. `reads` is how the
-//! paths begin of the files that the result depends on: without it, all but texts.
+//! paths begin of the files that the result depends on: without it, all but texts and the tests of a
+//! single crate.
 
 mod page;
 
@@ -31,6 +32,56 @@ and names the command.
 
 /// The folder of the results that are kept with the sources.
 const KEPT: &str = "docs/evidence/";
+/// The tests of a crate alone, what is built beside the workspace, and what only reads results.
+const APART: [&str; 11] = [
+    ".ci/",
+    ".github/",
+    "canopen/tests/",
+    "coflash/tests/",
+    "emulator/tests/",
+    "fuzz/",
+    "node/tests/",
+    "python/",
+    "seal/tests/",
+    "shared-abi/tests/",
+    "xtask/src/evidence/",
+];
+/// How the paths begin of what jobs depend on that read something else than most.
+const READS: [(&str, &[&str]); 4] = [
+    // They read the texts, too.
+    ("tests", &[""]),
+    (
+        "cpu",
+        &[
+            "Cargo.",
+            "app-template/",
+            "boot-core/",
+            "bootloader/",
+            "bsp/",
+            "canopen/src/",
+            "coboot-app/",
+            "coflash/src/",
+            "emulator/",
+            "linker/",
+            "shared-abi/src/",
+            "tests/",
+        ],
+    ),
+    (
+        "coverage",
+        &[
+            "Cargo.",
+            "boot-core/",
+            "canopen/",
+            "coboot-app/",
+            "coflash/src/",
+            "seal/",
+            "shared-abi/",
+            "tests/",
+        ],
+    ),
+    ("fuzz", &["boot-core/src/", "canopen/src/", "coflash/src/", "fuzz/", "seal/src/", "shared-abi/src/"]),
+];
 /// The inputs that the fuzzer has found.
 const SEEDS: &str = "fuzz/seeds/";
 
@@ -60,7 +111,8 @@ pub fn run(mut args: Args) -> Outcome {
 /// written.
 pub fn record(name: &str, facts: &str) -> Outcome<PathBuf> {
     let seconds = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let text = with_origin(facts, &commit(), &toolchain::line(), &date(seconds))?;
+    let reads = READS.iter().find(|(job, _)| *job == name).map(|(_, reads)| *reads);
+    let text = with_origin(facts, &commit(), &toolchain::line(), &date(seconds), reads.unwrap_or(&[]))?;
     let file = path(name);
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&file));
     fs::create_dir_all(file.parent().unwrap_or(&file)).map_err(unwritable)?;
@@ -121,7 +173,7 @@ fn path(name: &str) -> PathBuf {
 }
 
 /// The facts with where they come from in front of them.
-fn with_origin(facts: &str, commit: &str, toolchain: &str, date: &str) -> Outcome<String> {
+fn with_origin(facts: &str, commit: &str, toolchain: &str, date: &str, reads: &[&str]) -> Outcome<String> {
     let Value::Object(members) = Value::parse(facts)? else {
         return Err("what is recorded is no JSON object.".into());
     };
@@ -129,7 +181,12 @@ fn with_origin(facts: &str, commit: &str, toolchain: &str, date: &str) -> Outcom
     if let Some((name, _)) = own.iter().find(|(name, _)| members.contains_key(*name)) {
         return Err(format!("what is recorded has a \"{name}\" of its own."));
     }
-    let own = own.map(|(name, value)| format!("\"{name}\": \"{}\"", value.replace(['"', '\\'], "'")));
+    let mut own =
+        own.map(|(name, value)| format!("\"{name}\": \"{}\"", value.replace(['"', '\\'], "'"))).to_vec();
+    if !reads.is_empty() {
+        let reads: Vec<String> = reads.iter().map(|begin| format!("\"{begin}\"")).collect();
+        own.push(format!("\"reads\": [{}]", reads.join(", ")));
+    }
     let inner = facts.trim().trim_start_matches('{').trim_start();
     let comma = if members.is_empty() { "" } else { ",\n" };
     Ok(format!("{{{}{comma}{inner}\n", own.join(",\n")))
@@ -163,10 +220,12 @@ pub fn is_unchanged(since: &str, matters: impl Fn(&str) -> bool) -> bool {
 
 /// Whether a result that depends on these files may be another after a change of this one.
 fn matters(reads: &[Value], file: &str) -> bool {
-    let is_text = file.ends_with(".md") || file.starts_with("docs/");
+    let is_apart = file.ends_with(".md")
+        || file.starts_with("docs/")
+        || APART.iter().any(|folder| file.starts_with(folder));
     match reads {
         _ if is_result(file) => false,
-        [] => !is_text,
+        [] => !is_apart,
         reads => reads.iter().filter_map(Value::text).any(|begin| file.starts_with(begin)),
     }
 }
@@ -205,11 +264,12 @@ mod tests {
     #[test]
     fn facts_get_their_origin_in_front_and_stay_what_they_are() {
         for (facts, count) in [("{}", None), (" { \"count\": 3, \"more\": {} } ", Some("3"))] {
-            let text = with_origin(facts, "abc", "rustc 1 \"x\"", "2026-01-31T12:00:00Z").unwrap();
+            let text = with_origin(facts, "abc", "rustc 1 \"x\"", "2026-01-31T12:00:00Z", &["a/"]).unwrap();
             let value = Value::parse(&text).unwrap();
             assert_eq!(value.get("commit").text(), Some("abc"));
             assert_eq!(value.get("toolchain").text(), Some("rustc 1 'x'"));
             assert_eq!(value.get("date").text(), Some("2026-01-31T12:00:00Z"));
+            assert_eq!(value.get("reads").items()[0].text(), Some("a/"));
             assert_eq!(*value.get("count"), count.map_or(Value::Null, |count| Value::Number(count.into())));
         }
     }
@@ -227,6 +287,8 @@ mod tests {
             ("Cargo.lock", true, true, true),
             ("xtask/src/main.rs", true, false, true),
             ("docsy/a.rs", true, false, true),
+            ("canopen/tests/lss.rs", true, true, false),
+            ("boot-core/tests/model/mod.rs", true, false, true),
         ] {
             assert_eq!(matters(&all, file), is_in_all, "{file}");
             assert_eq!(matters(&some, file), is_in_some, "{file}");
@@ -235,6 +297,14 @@ mod tests {
         // No commits; among them an option for git.
         for of in ["unknown", "", "0123-dirty", "--output=x", &"0".repeat(40)] {
             assert!(!is_unchanged(of, |_| false), "{of}");
+        }
+    }
+
+    #[test]
+    fn the_folders_are_there() {
+        let named = READS.iter().flat_map(|(_, reads)| *reads).chain(&APART);
+        for folder in named.filter(|begin| begin.ends_with('/')) {
+            assert!(workspace::root().join(folder).is_dir(), "{folder}");
         }
     }
 
@@ -255,7 +325,7 @@ mod tests {
     #[test]
     fn what_is_no_object_or_hides_the_origin_is_refused() {
         for facts in ["", "[]", "{", "3", "{\"commit\": 1}", "{\"a\": 1, \"date\": 2}"] {
-            assert!(with_origin(facts, "", "", "").is_err(), "{facts}");
+            assert!(with_origin(facts, "", "", "", &[]).is_err(), "{facts}");
         }
     }
 
