@@ -33,7 +33,7 @@ and names the command.
 /// The folder of the results that are kept with the sources.
 const KEPT: &str = "docs/evidence/";
 /// The tests of a crate alone, what is built beside the workspace, and what only reads results.
-const APART: [&str; 11] = [
+const APART: [&str; 12] = [
     ".ci/",
     ".github/",
     "canopen/tests/",
@@ -45,6 +45,7 @@ const APART: [&str; 11] = [
     "seal/tests/",
     "shared-abi/tests/",
     "xtask/src/evidence/",
+    "xtask/src/mutants/",
 ];
 /// How the paths begin of what jobs depend on that read something else than most.
 const READS: [(&str, &[&str]); 4] = [
