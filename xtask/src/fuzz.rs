@@ -198,6 +198,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let folder = workspace::root().join("fuzz");
     let mut targets = targets(&folder)?;
+    let of = targets.len();
     if let Some(name) = only {
         if !targets.contains(&name) {
             return Err(format!("there is no target \"{name}\"; there is: {}.", targets.join(", ")));
@@ -256,7 +257,10 @@ pub fn run(mut args: Args) -> Outcome {
                 println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
                 let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
                 counts.add(target, [runs, seconds], [edges(&said).unwrap_or(0), files]);
-                evidence::record(EVIDENCE, &counts.to_string())?;
+                evidence::record(
+                    EVIDENCE,
+                    &format!("{{\"of\": {of}, {}", counts.to_string().trim_start_matches('{')),
+                )?;
                 if keep {
                     let mut least = fuzz("cmin", &["--features", features(target), target]);
                     process::output(least.arg(&corpus))?;

@@ -364,7 +364,14 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
         .collect();
     let head = ["target", "inputs", "seconds", "edges", "corpus", "since"];
     let verdict = format!("{} inputs without a fault, at least {} a target", of(inputs), of(fewest));
-    (if rows.is_empty() { Err("no target ran".into()) } else { Ok(verdict) }, table(&head, &rows))
+    // A target that never ran is no evidence.
+    let all = number(record, "of");
+    let verdict = if rows.len() as f64 == all {
+        Ok(verdict)
+    } else {
+        Err(format!("{verdict}; only {} of {} targets ran", rows.len(), shown(record.get("of"))))
+    };
+    (verdict, table(&head, &rows))
 }
 
 fn bench(record: &Value) -> (Result<String, String>, String) {
