@@ -272,24 +272,23 @@ mod tests {
     /// The other side sends segments 3 and 4 of the sub-block before it reads that 2 were acknowledged.
     #[test]
     fn the_rest_of_a_sub_block_that_was_closed_early_is_none_of_the_next() {
-        for (seqno, is_of_the_next) in [(2, true), (3, false), (4, false)] {
+        let behind_two_of = |blksize| {
             let mut receiver = Receiver::new(false);
-            receiver.open(4);
+            receiver.open(blksize);
             assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
             assert_eq!(receiver.take(&segment(false, 2), true), Ok(DATA));
             assert_eq!(receiver.close(), 2);
-            receiver.open(4);
+            receiver.open(blksize);
+            receiver
+        };
+        for (seqno, is_of_the_next) in [(2, true), (3, false), (4, false)] {
+            let mut receiver = behind_two_of(4);
             let other = BlockSegment { last: false, seqno, data: [0xEE; 7] }.emit();
             assert_eq!(receiver.take(&other, false).map(|received| received.is_data), Ok(false));
             assert_eq!(receiver.is_within(), is_of_the_next, "{seqno}");
         }
         // Behind segment 3 of the rest, another 3 is the next sub-block's.
-        let mut receiver = Receiver::new(false);
-        receiver.open(6);
-        assert_eq!(receiver.take(&segment(false, 1), true), Ok(DATA));
-        assert_eq!(receiver.take(&segment(false, 2), true), Ok(DATA));
-        assert_eq!(receiver.close(), 2);
-        receiver.open(6);
+        let mut receiver = behind_two_of(6);
         for (content, is_of_the_next) in [(0xEE, false), (0xDD, true)] {
             let segment = BlockSegment { last: false, seqno: 3, data: [content; 7] }.emit();
             assert_eq!(receiver.take(&segment, false), Ok(NOTHING));
