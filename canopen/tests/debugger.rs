@@ -19,9 +19,21 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 
 fn run(target: &mut Target, transfer: &mut impl Transfer) -> Result<(), SdoError> {
+    run_with(target, transfer, |_, _| ())
+}
+
+/// `before` is called with the number of each request, from 0 on.
+fn run_with(
+    target: &mut Target,
+    transfer: &mut impl Transfer,
+    before: impl Fn(&mut Target, u32),
+) -> Result<(), SdoError> {
+    let mut requests = 0;
     loop {
         match transfer.poll(at(0)) {
             Step::Send(frame) => {
+                before(target, requests);
+                requests += 1;
                 target.handle(&frame, 0);
                 while let Some(answer) = target.poll(0) {
                     transfer.handle(&answer, at(0));
@@ -177,6 +189,30 @@ fn a_locked_device_refuses_everything_also_what_was_allowed_before() {
         assert_eq!(write(&mut target, DATA, &[0; 4]), Err(AbortCode(0x0800_0022)));
     }
     assert_eq!(target.model().touched, []);
+}
+
+/// A program on the chip can set the protection at any moment; a transfer needs many pieces.
+#[test]
+fn a_device_that_is_locked_during_a_transfer_gives_and_takes_no_further_piece() {
+    const LEN: u16 = 3 * PIECE as u16;
+    fn locked_midway(target: &mut Target, transfer: &mut impl Transfer) {
+        // 20 requests, of which 19 carry or ask for 7 bytes: 133, of the second piece.
+        let outcome = run_with(target, transfer, |target, request| target.model().locked = request >= 20);
+        assert_eq!(aborted(outcome), Err(AbortCode(0x0800_0022)));
+        assert_eq!(status(target), 2);
+        target.model().locked = false;
+    }
+    let mut target = Target::new();
+    command(&mut target, Kind::Read, RAM, LEN).unwrap();
+    locked_midway(&mut target, &mut Upload::new(node(), DATA, Vec::new(), Config::default()));
+    let read = [RAM, RAM + PIECE as u32].map(|address| (Kind::Read, address, PIECE));
+    assert_eq!(target.model().touched, read);
+
+    target.model().touched.clear();
+    command(&mut target, Kind::Write, RAM, LEN).unwrap();
+    let data = [0; LEN as usize];
+    locked_midway(&mut target, &mut Download::new(node(), DATA, &data[..], Config::default()));
+    assert_eq!(target.model().touched, [(Kind::Write, RAM, PIECE)]);
 }
 
 /// A changing variable can be read repeatedly; a refusal of the memory is reported.

@@ -188,20 +188,20 @@ impl<M: Memory> Debugger<M> {
     }
 
     fn upload_start(&mut self) -> Result<u32, AbortCode> {
-        self.locked()?;
-        let State::Reading { len, .. } = self.state else { return Err(AbortCode::NO_DATA) };
-        self.fetch(0)?;
+        let len = self.fetch(0)?;
         self.status = status::REPLY;
         Ok(len)
     }
 
-    /// Reads the piece at this offset.
-    fn fetch(&mut self, offset: u32) -> Result<(), AbortCode> {
+    /// Reads the piece at this offset and returns the length of the whole. The device may have been
+    /// locked since the transfer began.
+    fn fetch(&mut self, offset: u32) -> Result<u32, AbortCode> {
+        self.locked()?;
         let State::Reading { address, len, held } = &mut self.state else { return Err(AbortCode::NO_DATA) };
         let left = (*len - offset) as usize;
         self.memory.read(address.wrapping_add(offset), &mut self.piece[..left.min(PIECE)])?;
         *held = offset;
-        Ok(())
+        Ok(*len)
     }
 
     fn upload_data(&mut self, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
@@ -256,8 +256,9 @@ impl<M: Memory> Debugger<M> {
         Ok(())
     }
 
-    /// Writes the piece that is in the buffer.
+    /// Writes the piece that is in the buffer, unless the device was locked since the transfer began.
     fn flush(&mut self) -> Result<(), AbortCode> {
+        self.locked()?;
         let State::Writing { address, received, .. } = self.state else {
             return Err(AbortCode::DEVICE_STATE);
         };
