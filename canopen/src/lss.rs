@@ -202,6 +202,8 @@ impl Lss {
     pub fn reset_communication(&mut self) -> Option<NodeId> {
         self.state = self.initial;
         self.active = self.pending;
+        // The owner starts the node now; a start that it was not told of yet is over.
+        self.assigned = None;
         self.active
     }
 

@@ -165,6 +165,19 @@ fn a_device_without_node_id_takes_one_and_starts() {
     bench.silent(&[[0x04, 1, 0, 0, 0, 0, 0, 0], [0x04, 0, 0, 0, 0, 0, 0, 0]]);
 }
 
+/// A reset that comes before the start was reported: the node must not start with the earlier node-ID
+/// behind it.
+#[test]
+fn a_reset_communication_takes_the_place_of_a_start_that_was_not_reported() {
+    let mut bench = Bench::in_configuration(0xFF);
+    bench.expect(&[([0x11, 42, 0, 0, 0, 0, 0, 0], [0x11, 0, 0, 0, 0, 0, 0, 0])]);
+    for unreported in [[0x04, 0], [0x04, 1], [0x11, 43]].map(|[a, b]| [a, b, 0, 0, 0, 0, 0, 0]) {
+        bench.lss.handle(&request(unreported), at(0), &mut bench.device);
+    }
+    assert_eq!(bench.lss.reset_communication(), NodeId::new(43));
+    assert_eq!(bench.outputs(), [response([0x11, 0, 0, 0, 0, 0, 0, 0])]);
+}
+
 #[test]
 fn a_device_with_node_id_takes_a_new_one_at_reset_communication() {
     let mut bench = Bench::in_configuration(5);

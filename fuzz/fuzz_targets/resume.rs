@@ -22,7 +22,7 @@ use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, St
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_fuzz::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
-use coboot_fuzz::Input;
+use coboot_fuzz::{is_eighth, Input};
 use coflash::file::block_file::{Block, CRC};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
@@ -357,7 +357,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
         }
     }
 
-    if bytes.iter().fold(0_u8, |sum, byte| sum.wrapping_add(*byte)) % 8 != 0 {
+    if !is_eighth(bytes) {
         return;
     }
     let file = &files()[0];

@@ -3,6 +3,8 @@
 //!
 //! Must hold: each request gets an answer, which is no fault of the server; what a wrong token or
 //! another origin asks for is refused; and what a JSON route answers is JSON.
+//!
+//! The server finds no program with which it would list the adapters of this computer.
 #![cfg_attr(fuzzing, no_main)]
 
 use std::cell::RefCell;
@@ -34,6 +36,7 @@ const GETS: [&str; 6] = ["", "adapters", "trace", "readback", "app.js", "nothing
 fn server() -> &'static (String, String) {
     static SERVER: OnceLock<(String, String)> = OnceLock::new();
     SERVER.get_or_init(|| {
+        std::env::set_var("PATH", "/nowhere");
         let server = Server::new(Options::default()).expect("a free port");
         let url = server.url();
         let mut parts = url.trim_start_matches("http://").split('/').map(str::to_owned);

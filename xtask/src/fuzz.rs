@@ -1,10 +1,12 @@
-//! `cargo xtask fuzz`: runs all fuzz targets, one after the other.
+//! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
-use std::{env, fmt, fs};
+use std::{env, fmt, fs, thread};
 
 use crate::args::Args;
 use crate::json::Value;
@@ -18,7 +20,8 @@ program download by blocks and in one piece,
 downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
 configuration files, requests to coflash ui, sealed images, as files and as they arrive, with their
-signatures and their compression. What they find in this run is built upon in the next one.
+signatures and their compression; as many at a time as there are cores. What they find in this run is
+built upon in the next one.
 The counts of all runs go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
@@ -42,6 +45,10 @@ const TOO_LONG: u32 = 10;
 /// behind it: many short lives find more than a few long ones.
 const LONGEST_INPUT: u32 = 4096;
 const SHORT_INPUTS: [(&str, u32); 2] = [("resume", 192), ("sealed_stream", 256)];
+/// The targets whose bytes are commands or numbers. To tell the fuzzer what each comparison
+/// compares, which finds the words of texts and files, would take three quarters of their time.
+const WITHOUT_COMPARES: [&str; 9] =
+    ["conform", "debugger", "download", "journal", "lzma", "resume", "sealed_stream", "signature", "streams"];
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
 
@@ -209,73 +216,49 @@ pub fn run(mut args: Args) -> Outcome {
         return replay_all(&folder, &targets);
     }
     toolchain()?;
-    let path = setup::tool("cargo-fuzz", CARGO_FUZZ)?;
-
-    let fuzz = |word: &str, words: &[&str]| {
-        let mut command = Command::new("rustup");
-        command.args(["run", "nightly", "cargo", "fuzz", word]);
-        // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
-        command.arg("--sanitizer=none").args(words).current_dir(workspace::root());
-        command.env("PATH", &path).env("CARGO_TARGET_DIR", target_dir()).env_remove("CARGO");
-        command
-    };
+    let tools = Tools { path: setup::tool("cargo-fuzz", CARGO_FUZZ)?, folder };
     println!("Building the fuzz targets ...");
-    process::run(&mut fuzz("build", &[]))?;
-    for target in SEALED_TARGETS {
-        process::run(&mut fuzz("build", &["--features", SEALED, target]))?;
-    }
-    let mut failed = Vec::new();
-    let mut counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
     for target in &targets {
-        let corpus = folder.join("corpus").join(target);
-        fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
-        let log = target_dir().join(target).with_extension("log");
-        let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
-        let mut command = fuzz("run", &["--features", features(target), target]);
-        command.arg(&corpus);
-        let seeds = folder.join("seeds").join(target);
-        if seeds.is_dir() {
-            command.arg(&seeds);
-        }
-        command.args(["--", "-print_final_stats=1"]);
-        match inputs.map(|inputs| inputs.saturating_sub(counts.tried(target))) {
-            Some(0) => continue,
-            Some(left) => command.arg(format!("-runs={left}")),
-            None => command.arg(format!("-max_total_time={seconds}")),
-        };
-        let short = SHORT_INPUTS.iter().find(|(name, _)| name == target);
-        let longest = short.map_or(LONGEST_INPUT, |(_, longest)| *longest);
-        command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
-        let started = Instant::now();
-        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
-        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
-        let said = fs::read(&log).unwrap_or_default();
-        let said = String::from_utf8_lossy(&said);
-        match (status.success(), runs(&said)) {
-            (true, Some(runs @ 1..)) => {
-                let seconds = started.elapsed().as_secs();
-                println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-                let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
-                counts.add(target, [runs, seconds], [edges(&said).unwrap_or(0), files]);
-                evidence::record(
-                    EVIDENCE,
-                    &format!("{{\"of\": {of}, {}", counts.to_string().trim_start_matches('{')),
-                )?;
-                if keep {
-                    let mut least = fuzz("cmin", &["--features", features(target), target]);
-                    process::output(least.arg(&corpus))?;
-                    put_by(&corpus, &folder.join("seeds").join(target))?;
-                    evidence::keep(EVIDENCE)?;
-                }
-            }
-            (good, _) => {
-                let words = if good { "ran no input" } else { "FAILED" };
-                println!("  {target:<16} {words}; all of it is in {}", workspace::shown(&log));
-                print!("{}", excerpt(&said));
-                failed.push(target.as_str());
-            }
-        }
+        process::run(&mut tools.command("build", target))?;
     }
+    let counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
+    let end = |target: &str| match inputs.map(|inputs| inputs.saturating_sub(counts.tried(target))) {
+        Some(0) => None,
+        Some(left) => Some(format!("-runs={left}")),
+        None => Some(format!("-max_total_time={seconds}")),
+    };
+    let queue: VecDeque<(String, String)> =
+        targets.into_iter().filter_map(|target| Some((end(&target)?, target))).collect();
+    let (queue, counts) = (Mutex::new(queue), Mutex::new(counts));
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+    let all = || {
+        let mut failed = Vec::new();
+        while let Some((end, target)) = next() {
+            let Some([runs, seconds, edges, corpus]) = tools.fuzz(&target, &end)? else {
+                failed.push(target);
+                continue;
+            };
+            println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+            let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
+            counts.add(&target, [runs, seconds], [edges, corpus]);
+            let text = counts.to_string();
+            evidence::record(EVIDENCE, &format!("{{\"of\": {of}, {}", text.trim_start_matches('{')))?;
+            if keep {
+                process::output(tools.command("cmin", &target).arg(tools.corpus(&target)))?;
+                put_by(&tools.corpus(&target), &tools.seeds(&target))?;
+                evidence::keep(EVIDENCE)?;
+            }
+        }
+        Outcome::Ok(failed)
+    };
+    // A target has one thread.
+    let cores = thread::available_parallelism().map_or(1, usize::from);
+    let failed = thread::scope(|scope| {
+        let workers: Vec<_> = (0..cores).map(|_| scope.spawn(all)).collect();
+        let broken_off = |_| "a part of the fuzzing broke off.".to_owned();
+        workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
+    })?
+    .concat();
     if failed.is_empty() {
         Ok(())
     } else {
@@ -284,6 +267,76 @@ pub fn run(mut args: Args) -> Outcome {
              it before you mend it.",
             failed.join(", ")
         ))
+    }
+}
+
+/// cargo-fuzz, and the folder of the targets.
+struct Tools {
+    path: OsString,
+    folder: PathBuf,
+}
+
+impl Tools {
+    fn command(&self, word: &str, target: &str) -> Command {
+        let mut command = Command::new("rustup");
+        command.args(["run", "nightly", "cargo", "fuzz", word]);
+        // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
+        command.arg("--sanitizer=none");
+        // Each of the two is built with options of its own.
+        let mut programs = target_dir();
+        if WITHOUT_COMPARES.contains(&target) {
+            command.arg("--no-trace-compares");
+            programs.push("without-compares");
+        }
+        command.args(["--features", features(target), target]).current_dir(workspace::root());
+        command.env("PATH", &self.path).env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
+        command
+    }
+
+    fn corpus(&self, target: &str) -> PathBuf {
+        self.folder.join("corpus").join(target)
+    }
+
+    fn seeds(&self, target: &str) -> PathBuf {
+        self.folder.join("seeds").join(target)
+    }
+
+    /// Runs a target until this end: an option of the fuzzer. Returns inputs, seconds, edges and the
+    /// files in the corpus; `None`, and prints why, if it failed.
+    fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
+        let (corpus, seeds) = (self.corpus(target), self.seeds(target));
+        fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
+        let log = target_dir().join(target).with_extension("log");
+        let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
+        let mut command = self.command("run", target);
+        command.arg(&corpus);
+        if seeds.is_dir() {
+            command.arg(&seeds);
+        }
+        let short = SHORT_INPUTS.iter().find(|(name, _)| *name == target);
+        let longest = short.map_or(LONGEST_INPUT, |(_, longest)| *longest);
+        command.args(["--", "-print_final_stats=1", end]);
+        command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
+        let started = Instant::now();
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
+        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
+        let said = fs::read(&log).unwrap_or_default();
+        let said = String::from_utf8_lossy(&said);
+        match (status.success(), runs(&said)) {
+            (true, Some(runs @ 1..)) => {
+                let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
+                Ok(Some([runs, started.elapsed().as_secs(), edges(&said).unwrap_or(0), files]))
+            }
+            (good, _) => {
+                let words = if good { "ran no input" } else { "FAILED" };
+                println!(
+                    "  {target:<16} {words}; all of it is in {}\n{}",
+                    workspace::shown(&log),
+                    excerpt(&said)
+                );
+                Ok(None)
+            }
+        }
     }
 }
 
@@ -387,6 +440,10 @@ mod tests {
             let declared = manifest.split("[[bin]]").find(|bin| bin.contains(&lines));
             let declared = declared.unwrap_or_else(|| panic!("{target} is not in Cargo.toml"));
             assert_eq!(declared.contains("required-features"), !features(&target).is_empty(), "{target}");
+        }
+        let special = SHORT_INPUTS.iter().map(|(name, _)| *name).chain(WITHOUT_COMPARES);
+        for name in special {
+            assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");
         }
     }
 
