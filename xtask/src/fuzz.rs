@@ -25,7 +25,8 @@ built upon in the next one.
 The counts of all runs go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
-  --inputs N      each target runs until N inputs were tried in all runs together
+  --inputs N      each target runs until N inputs were tried in all runs together; a target of which
+                  something has changed begins again
   --target NAME   this one alone
   --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
                   fuzz/seeds for the replay, and the counts into docs/evidence, where a fresh
@@ -51,6 +52,20 @@ const WITHOUT_COMPARES: [&str; 9] =
     ["conform", "debugger", "download", "journal", "lzma", "resume", "sealed_stream", "signature", "streams"];
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
+/// The least number of inputs of a target that counts as fuzzed.
+const LEAST: u64 = 10_000_000;
+/// What a target depends on that names this crate: the beginnings of paths.
+const READS: [(&str, &[&str]); 6] = [
+    ("boot_core", &["boot-core/src/", "canopen/src/", "seal/src/", "shared-abi/src/"]),
+    ("canopen", &["canopen/src/"]),
+    (
+        "coboot_fuzz",
+        &["fuzz/src/", "canopen/tests/common/", "canopen/tests/memory/", "boot-core/tests/model/"],
+    ),
+    ("coflash", &["coflash/src/", "canopen/src/", "seal/src/", "shared-abi/src/"]),
+    ("seal", &["seal/src/"]),
+    ("shared_abi", &["shared-abi/src/"]),
+];
 
 /// The feature for sealed images.
 const SEALED: &str = "sealed";
@@ -142,7 +157,8 @@ struct Row {
 }
 
 impl Counts {
-    fn read(recorded: &Value) -> Self {
+    /// Those of the record that hold for the sources as they are: with others, a target begins again.
+    fn read(recorded: &Value, holds: impl Fn(&str, &str) -> bool) -> Self {
         let Value::Object(targets) = recorded.get("targets") else { return Self(BTreeMap::new()) };
         let row = |counts: &Value| {
             let number = |key| match counts.get(key) {
@@ -155,7 +171,8 @@ impl Counts {
                 last: [number("edges")?, number("corpus")?],
             })
         };
-        Self(targets.iter().filter_map(|(name, counts)| Some((name.clone(), row(counts)?))).collect())
+        let rows = targets.iter().filter_map(|(name, counts)| Some((name.clone(), row(counts)?)));
+        Self(rows.filter(|(name, row)| holds(name, &row.since)).collect())
     }
 
     /// The inputs of all runs of a target.
@@ -221,7 +238,10 @@ pub fn run(mut args: Args) -> Outcome {
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null));
+    let holds = |target: &str, since: &str| {
+        evidence::is_unchanged(since, |file| is_read(&tools.folder, target, file))
+    };
+    let counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null), holds);
     let end = |target: &str| match inputs.map(|inputs| inputs.saturating_sub(counts.tried(target))) {
         Some(0) => None,
         Some(left) => Some(format!("-runs={left}")),
@@ -242,7 +262,8 @@ pub fn run(mut args: Args) -> Outcome {
             let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
             counts.add(&target, [runs, seconds], [edges, corpus]);
             let text = counts.to_string();
-            evidence::record(EVIDENCE, &format!("{{\"of\": {of}, {}", text.trim_start_matches('{')))?;
+            let text = text.trim_start_matches('{');
+            evidence::record(EVIDENCE, &format!("{{\"of\": {of}, \"least\": {LEAST}, {text}"))?;
             if keep {
                 process::output(tools.command("cmin", &target).arg(tools.corpus(&target)))?;
                 put_by(&tools.corpus(&target), &tools.seeds(&target))?;
@@ -372,6 +393,16 @@ fn targets(folder: &Path) -> Outcome<Vec<String>> {
     Ok(names)
 }
 
+/// Whether what a target has tried may end otherwise after a change of this file.
+fn is_read(folder: &Path, target: &str, file: &str) -> bool {
+    let source = folder.join("fuzz_targets").join(target).with_extension("rs");
+    let text = fs::read_to_string(source).unwrap_or_default();
+    let named = READS.iter().filter(|(name, _)| text.contains(&format!("{name}::")));
+    file.ends_with(&format!("/{target}.rs"))
+        || file.starts_with("fuzz/Cargo.")
+        || named.flat_map(|(_, begins)| *begins).any(|begin| file.starts_with(begin))
+}
+
 fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
 }
@@ -472,13 +503,35 @@ mod tests {
     }
 
     #[test]
+    fn counts_hold_until_a_file_changes_that_the_target_reads() {
+        let folder = workspace::root().join("fuzz");
+        for (target, file, expected) in [
+            ("candump", "coflash/src/bus/mod.rs", true),
+            ("candump", "canopen/src/lss.rs", true),
+            ("candump", "boot-core/src/crc.rs", false),
+            ("candump", "fuzz/src/lib.rs", true),
+            ("candump", "fuzz/fuzz_targets/candump.rs", true),
+            ("candump", "fuzz/fuzz_targets/lss.rs", false),
+            ("signature", "seal/src/ed25519.rs", true),
+            ("signature", "canopen/src/lss.rs", false),
+            ("resume", "fuzz/Cargo.lock", true),
+            ("resume", "boot-core/tests/model/mod.rs", true),
+            ("resume", "README.md", false),
+        ] {
+            assert_eq!(is_read(&folder, target, file), expected, "{target}: {file}");
+        }
+    }
+
+    #[test]
     fn counts_add_up_over_runs() {
-        let mut counts = Counts::read(&Value::Null);
+        let read = |text: &str| Counts::read(&Value::parse(text).unwrap(), |target, _| target != "old");
+        let mut counts = read("{}");
         counts.add("lss", [10, 2], [700, 30]);
-        let mut counts = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        counts.add("old", [10, 2], [700, 30]);
+        let mut counts = read(&counts.to_string());
         counts.add("lss", [u64::MAX, 3], [701, 29]);
         counts.add("lzma", [5, 1], [60, 7]);
-        let counts = Counts::read(&Value::parse(&counts.to_string()).unwrap());
+        let counts = read(&counts.to_string());
         assert_eq!((counts.tried("lzma"), counts.tried("none")), (5, 0));
         let Counts(rows) = counts;
         let lss = &rows["lss"];

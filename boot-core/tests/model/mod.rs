@@ -245,7 +245,7 @@ impl Flash for ModelFlash {
         if self.chip.flash.contains(address, buffer.len() as u32) {
             let at = self.index(address);
             let end = at + buffer.len();
-            if self.unstable.range(at..end).next().is_none() {
+            if self.unstable.is_empty() || self.unstable.range(at..end).next().is_none() {
                 buffer.copy_from_slice(&self.cells[at..end]);
                 return;
             }

@@ -81,7 +81,19 @@ const READS: [(&str, &[&str]); 4] = [
             "tests/",
         ],
     ),
-    ("fuzz", &["boot-core/src/", "canopen/src/", "coflash/src/", "fuzz/", "seal/src/", "shared-abi/src/"]),
+    (
+        "fuzz",
+        &[
+            "boot-core/src/",
+            "boot-core/tests/model/",
+            "canopen/src/",
+            "canopen/tests/",
+            "coflash/src/",
+            "fuzz/",
+            "seal/src/",
+            "shared-abi/src/",
+        ],
+    ),
 ];
 /// The inputs that the fuzzer has found.
 const SEEDS: &str = "fuzz/seeds/";

@@ -364,12 +364,13 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
         .collect();
     let head = ["target", "inputs", "seconds", "edges", "corpus", "since"];
     let verdict = format!("{} inputs without a fault, at least {} a target", of(inputs), of(fewest));
-    // A target that never ran is no evidence.
-    let all = number(record, "of");
-    let verdict = if rows.len() as f64 == all {
-        Ok(verdict)
-    } else {
+    // A target that never ran is no evidence, and one that hardly ran is not much.
+    let verdict = if rows.len() as f64 != number(record, "of") {
         Err(format!("{verdict}; only {} of {} targets ran", rows.len(), shown(record.get("of"))))
+    } else if fewest < number(record, "least") {
+        Err(format!("{verdict}, of {} that each should have", shown(record.get("least"))))
+    } else {
+        Ok(verdict)
     };
     (verdict, table(&head, &rows))
 }
