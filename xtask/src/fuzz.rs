@@ -13,7 +13,7 @@ use crate::json::Value;
 use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAME] [--keep | --replay]
+usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
 
 Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
 program download by blocks and in one piece,
@@ -27,7 +27,7 @@ The counts of all runs go to target/evidence/fuzz.json.
   --seconds N     how long each target runs (default: 30)
   --inputs N      each target runs until N inputs were tried in all runs together; a target of which
                   something has changed begins again
-  --target NAME   this one alone
+  --target NAMES  these alone, with commas between them
   --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
                   fuzz/seeds for the replay, and the counts into docs/evidence, where a fresh
                   clone goes on counting
@@ -223,11 +223,12 @@ pub fn run(mut args: Args) -> Outcome {
     let folder = workspace::root().join("fuzz");
     let mut targets = targets(&folder)?;
     let of = targets.len();
-    if let Some(name) = only {
-        if !targets.contains(&name) {
+    if let Some(only) = only {
+        let chosen: Vec<String> = only.split(',').map(str::to_owned).collect();
+        if let Some(name) = chosen.iter().find(|name| !targets.contains(name)) {
             return Err(format!("there is no target \"{name}\"; there is: {}.", targets.join(", ")));
         }
-        targets = vec![name];
+        targets = chosen;
     }
     if replay {
         return replay_all(&folder, &targets);
