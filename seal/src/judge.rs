@@ -3,7 +3,6 @@
 //!
 //! The order of the questions: Is it a sealed image? Is it for this device? Is it recent enough?
 //! Does the device have the keys?
-//! device, is it recent enough, does the device have the keys?
 
 use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
 use crate::wire::{
