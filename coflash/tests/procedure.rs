@@ -411,6 +411,22 @@ fn every_status_of_the_manual_has_its_number_and_words() {
     }
 }
 
+/// Behind the boot-up that ends a trial, the bootloader stores that the program came back. CLEAR is not
+/// repeated: what keeps the device busy may be the download of somebody else.
+#[test]
+fn a_command_is_repeated_while_the_device_is_still_storing() {
+    let busy = || Outcome::AbortStatus(0x0800_0022, 0x86);
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_command = script(0x83, 3, busy());
+    assert!(run(&mut fake, FlashOptions::default()).0.is_ok());
+    assert_eq!(fake.count("command 83"), 4);
+
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.on_command = script(0x03, 1, busy());
+    assert_eq!(fails(&mut fake).number(), 0x6000_0186);
+    assert_eq!(fake.writes(), ["command 03"]);
+}
+
 #[test]
 fn an_unknown_status_and_its_detail_are_shown() {
     let mut fake = Fake::new(BOOTLOADER);

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use canopen::program::{self, ProgramControl};
+use canopen::program::{self, FlashError, ProgramControl};
 use canopen::{AbortCode, Address};
 
 use super::event::{Event, Phase};
@@ -186,10 +186,13 @@ pub fn reset_status(session: &mut Session<'_>, number: u8) -> Result<(), Error> 
     execute(session, number, ProgramControl::ResetStat)
 }
 
-/// Sends a command that may be repeated, and waits until it is carried out.
+/// Sends a command that may be repeated, and waits until it is carried out. A device that has just
+/// started may still be storing something (86h): the command is repeated for as long as a start may
+/// take. CLEAR is not: the work may be another master's download, which it would end.
 fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
     let doing = Doing::Command(command);
     let mut attempt = 1;
+    let deadline = session.now() + session.timing().boot;
     loop {
         match session.command(number, command) {
             Ok(()) => break,
@@ -199,7 +202,14 @@ fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Re
                 // command out.
                 session.await_idle(number, doing)?;
             }
-            Err(Error::Refused { code, .. }) => return Err(explain(session, number, doing, code)),
+            Err(Error::Refused { code, .. }) => match explain(session, number, doing, code) {
+                Error::Failed { error: FlashError::Busy, .. }
+                    if command != ProgramControl::Clear && session.now() < deadline =>
+                {
+                    session.wait(session.timing().poll_most)?;
+                }
+                error => return Err(error),
+            },
             Err(error) => return Err(error),
         }
     }
