@@ -172,7 +172,7 @@ fn with_images(board: &Layout) -> Outcome<VecDeque<(Option<&Layout>, Vec<String>
     let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
     let board_too =
         |tests: &[String]| (Some(board), [&build::tests_args(board)[..], &sealed, tests].concat());
-    let rest = ["--lib", "--bins"].map(str::to_owned).into_iter().chain(names).collect::<Vec<_>>();
+    let rest = ["--lib".to_owned()].into_iter().chain(names).collect::<Vec<_>>();
     let slow = SLOW.iter().map(|name| board_too(&[format!("--test={name}")]));
     let tools = (None, vec![format!("--package={TOOLS}")]);
     Ok([board_too(&rest), tools].into_iter().chain(slow).collect())
