@@ -14,6 +14,7 @@ use bench::{Bench, CONFIG, CONTROL};
 use boot_core::bootloader::Config;
 use boot_core::control::{Policy, Step};
 use boot_core::flash::FlashFault;
+use boot_core::profile::Profile;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
@@ -50,6 +51,33 @@ fn read(rig: &mut Rig, index: u16, sub: u8) -> Result<Vec<u8>, AbortCode> {
 
 fn word(value: u32) -> Result<Vec<u8>, AbortCode> {
     Ok(value.to_le_bytes().to_vec())
+}
+
+// --- the profiles
+
+/// Port's Paulus, table 3: 08000000h for an unknown request; CiA 301: 05040001h. ESAcademy: 1000h is
+/// "BOOT", node-ID 64 at 125 kbit/s, 7F50h. CiA 417-1: profile 417 in the low half of 1000h; CiA 814-1:
+/// node-ID 126.
+#[test]
+fn each_profile_is_that_of_its_document() {
+    let of = |profile: Profile| {
+        let default_node = profile.default_node.map(|(id, rate)| (id.get(), rate));
+        (profile.device_type, profile.node_id.map(NodeId::get), default_node, profile.unknown_request.0)
+    };
+    assert_eq!(of(Profile::STANDARD), (0x1000_0000, None, None, 0x0504_0001));
+    assert_eq!(of(Profile::PAULUS), (0x1000_0000, None, None, 0x0800_0000));
+    let boot = u32::from_be_bytes(*b"BOOT");
+    assert_eq!(of(Profile::ESACADEMY), (boot, None, Some((64, BitRate::K125)), 0x0504_0001));
+    assert_eq!(of(Profile::LIFT), (0xFE00_0000 | 417, Some(126), None, 0x0504_0001));
+
+    // Whether a password comes first, a reset starts the program, and it starts by itself.
+    let rules = |profile: Profile| {
+        let Policy { locked, reset_starts, starts_by_itself, .. } = profile.download;
+        (locked, reset_starts, starts_by_itself)
+    };
+    assert_eq!(rules(Profile::STANDARD), (false, false, false));
+    assert_eq!(rules(Profile::ESACADEMY), (true, true, true));
+    assert_eq!(rules(Profile::LIFT), (true, true, false));
 }
 
 // --- the objects of a program
