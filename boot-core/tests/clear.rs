@@ -79,15 +79,22 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     // A debugger has written something to the last sector.
     rig.chip.model().poke(0x0800_43FC, &[0x7F]);
     assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
-    // An aborted download may have left more than the contents show.
+    // An aborted download may have left more than the contents show, also behind a program that was
+    // installed since.
     let image = raw(&STANDARD_1, 1, 3000);
-    rig.command(1, CLEAR).unwrap();
-    rig.settle();
-    rig.begin(1, Some(3000), &image[..2500]).unwrap();
-    rig.steps(60);
-    rig.reset();
-    assert_eq!(clear(&mut rig, 1), sectors(0x3C00));
-    assert_eq!(clear(&mut rig, 1), []);
+    for installed_since in [false, true] {
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.begin(1, Some(3000), &image[..2500]).unwrap();
+        rig.steps(60);
+        rig.reset();
+        if installed_since {
+            rig.install(1, &raw(&STANDARD_1, 1, 100));
+            rig.reset();
+        }
+        assert_eq!(clear(&mut rig, 1), sectors(0x3C00));
+        assert_eq!(clear(&mut rig, 1), []);
+    }
 }
 
 /// The same if CLEAR erases at once, and with a second program, which stays.

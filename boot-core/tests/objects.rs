@@ -70,14 +70,15 @@ fn each_profile_is_that_of_its_document() {
     assert_eq!(of(Profile::ESACADEMY), (boot, None, Some((64, BitRate::K125)), 0x0504_0001));
     assert_eq!(of(Profile::LIFT), (0xFE00_0000 | 417, Some(126), None, 0x0504_0001));
 
-    // Whether a password comes first, a reset starts the program, and it starts by itself.
+    // Whether a password comes first, a reset starts the program, it starts by itself, it needs a label,
+    // and 1F50h can be read.
     let rules = |profile: Profile| {
-        let Policy { locked, reset_starts, starts_by_itself, .. } = profile.download;
-        (locked, reset_starts, starts_by_itself)
+        let Policy { locked, reset_starts, starts_by_itself, wants_label, .. } = profile.download;
+        (locked, reset_starts, starts_by_itself, wants_label, profile.extras.read_back)
     };
-    assert_eq!(rules(Profile::STANDARD), (false, false, false));
-    assert_eq!(rules(Profile::ESACADEMY), (true, true, true));
-    assert_eq!(rules(Profile::LIFT), (true, true, false));
+    assert_eq!(rules(Profile::STANDARD), (false, false, false, false, false));
+    assert_eq!(rules(Profile::ESACADEMY), (true, true, true, false, false));
+    assert_eq!(rules(Profile::LIFT), (true, true, false, true, true));
 }
 
 // --- the objects of a program
