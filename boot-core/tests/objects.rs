@@ -81,6 +81,19 @@ fn each_profile_is_that_of_its_document() {
     assert_eq!(rules(Profile::LIFT), (true, true, false, true, true));
 }
 
+/// A stream leaves room of the queue for the client's segments while an answer is held back (ADR 9): 8 KiB,
+/// or a quarter of a smaller queue.
+#[test]
+fn a_stream_leaves_a_reserve_of_the_queue() {
+    for (queue, reserve) in [(65536, 8192), (16384, 4096), (4096, 1024)] {
+        let mut rig = Rig::new(&STANDARD_1, queue);
+        rig.begin(1, Some(3000), &raw(&STANDARD_1, 1, 3000)[..700]).unwrap();
+        let data = Address::new(0x1F50, 1);
+        let [room, with_reserve] = [false, true].map(|held| rig.node.download_space(data, held));
+        assert_eq!(with_reserve - room, reserve, "of {queue}");
+    }
+}
+
 // --- the objects of a program
 
 /// 2004h: address and size. 1F51h, 1F56h, 1F57h, 2005h: what is stored, of this program and no other.

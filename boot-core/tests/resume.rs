@@ -4,14 +4,16 @@
 mod bench;
 mod model;
 
-use bench::{block, block_file, last, program, Bench, CLEAR, LAYOUT, PROGRAM};
+use bench::{block, block_file, last, program, Bench, CLEAR, CONFIG, LAYOUT, PROGRAM};
+use boot_core::bootloader::Config;
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use canopen::od::{Address, Objects};
 use canopen::AbortCode;
 use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
-use shared_abi::geometry::Region;
+use shared_abi::geometry::{Geometry, Region, SectorRun};
+use shared_abi::layout::Layout;
 
 /// 2006h/1.
 const PARTIAL: Address = Address::new(0x2006, 1);
@@ -271,6 +273,36 @@ fn progress_is_stored_each_kib_and_ends_with_the_program() {
         }
         assert_eq!(told == (0, 0), sent == end, "{sent} blocks");
     }
+}
+
+/// Flash and program of the model, with larger sectors behind the first five.
+static LARGE_CHIP: Geometry = Geometry {
+    chip: "large-model",
+    flash: Region::new(0x0800_0000, 0x1_0C00),
+    sectors: &[
+        SectorRun { count: 4, size: 0x200 },
+        SectorRun { count: 1, size: 0x400 },
+        SectorRun { count: 16, size: 0x1000 },
+    ],
+    ..CHIP
+};
+static LARGE: Layout =
+    Layout { chip: &LARGE_CHIP, programs: &[Region::new(PROGRAM.base, 0x1_0400)], ..LAYOUT }.checked();
+
+/// Each record wears the journal: a large program has sixteen of them, not one for each KiB.
+#[test]
+fn the_progress_of_a_large_program_is_stored_sixteen_times() {
+    let mut flash = ModelFlash::new(&LARGE_CHIP);
+    let mut bench = Bench::with_config(&mut flash, Config { layout: &LARGE, ..CONFIG }, 256);
+    let file = named(&program(64 * 1024, 0x33));
+    for block in &file[..file.len() - 1] {
+        bench.good(block);
+    }
+    let in_journal = |at: &&Region| LAYOUT.parameters.iter().any(|own| own.contains(at.base, at.size));
+    let words = flash.touched.iter().filter(in_journal).filter(|at| at.size == 4).count();
+    // Six words each: the journal's header, and a record with the first data and behind each sixteenth
+    // part but the last, which the program fills only in part.
+    assert_eq!(words, (1 + 16) * 6);
 }
 
 /// CLEAR gives up what was there; a command of another kind does not.

@@ -7,6 +7,9 @@ const ON_CHIP: &str = "It stands for the chip alone, where the tests in the emul
 /// `boot_core::resume::HAS_ROOM` is a constant, and true in a bootloader without sealed images.
 const HAS_ROOM: &str = "A constant that is true where this code is built.";
 
+/// Its default exists only where sealed images do not.
+const EMPTY_UNSEALER: &str = "Without sealed images there is nothing in it; with them it has no default.";
+
 /// `Stream::close` in `boot-core/src/intake/stream.rs`: only data change the flash.
 const BEGINS: &str =
     "A stream that begins before its first piece, or begins again, changes nothing: it cannot go on behind a cut.";
@@ -22,6 +25,31 @@ const NO_ROOM: &str = "Without input and without room the decoder does nothing."
 /// The file, the change as cargo-mutants prints it behind the place, and the reason. A change that
 /// stands several times in one function has one entry.
 pub const REASONS: &[(&str, &str, &str)] = &[
+    (
+        "boot-core/src/bootloader.rs",
+        "replace + with - in entry_count",
+        "It subtracts 0, or more than there is, with which the table of entries does not compile.",
+    ),
+    (
+        "boot-core/src/control/mod.rs",
+        "replace Downloader<'b, P, PROGRAMS>::unsealer_mut -> &mut Unsealer<'b> with Box::leak(Box::new(Default::default()))",
+        EMPTY_UNSEALER,
+    ),
+    (
+        "boot-core/src/programmer/mod.rs",
+        "replace Programmer<'b>::unsealer_mut -> &mut Unsealer<'b> with Box::leak(Box::new(Default::default()))",
+        EMPTY_UNSEALER,
+    ),
+    (
+        "boot-core/src/control/transfer.rs",
+        "replace && with || in Downloader<'_, P, PROGRAMS>::take",
+        "Without an open session the queue is empty, and in one the refused download ends, which empties it.",
+    ),
+    (
+        "boot-core/src/stored_version.rs",
+        "replace < with <= in StoredVersion::step",
+        "A mark that begins behind the program has no text in it.",
+    ),
     (
         "boot-core/src/bootloader.rs",
         "replace && with || in <impl Objects for Bootloader<'_, F, P, PROGRAMS>>::second_server",
