@@ -2,7 +2,7 @@
 
 mod reasons;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::OsStr;
 use std::fmt::Write;
 use std::fs;
@@ -29,7 +29,7 @@ changes noticed, or if a change stays unnoticed that xtask/src/mutants/reasons.r
   --yes           install Debian's packages without asking
 
 All changes of a package stand in one build, and a variable turns one on (mutants/); what cannot stand
-there, and what no test has noticed, is then built one by one. cargo-mutants is installed into
+there, and what no test has noticed and has no reason, is then built one by one. cargo-mutants is installed into
 target/tools where it is missing, Debian's packages for the tests with signatures by apt-get.
 ";
 
@@ -204,7 +204,7 @@ pub fn run(mut args: Args) -> Outcome {
     };
     // What one run notices is noticed. First all runs in one build each, which are quick: only what
     // none of them has noticed is built one by one.
-    let mut ends = Ends::new();
+    let (mut ends, mut tried) = (Ends::new(), Vec::new());
     for (number, run) in runs.iter().enumerate() {
         let again: Vec<String> = match run.only {
             [] => Vec::new(),
@@ -217,10 +217,17 @@ pub fn run(mut args: Args) -> Outcome {
         selection.extend(file.iter().map(|glob| format!("--file={glob}")));
         selection.extend(shard.iter().map(|part| format!("--shard={part}")));
         selection.extend(again.into_iter().map(|name| format!("--re={name}")));
-        merge(&mut ends, run, in_one_build(run, &selection, &path, &out(number))?);
+        let found = in_one_build(run, &selection, &path, &out(number))?;
+        tried.push(found.keys().cloned().collect::<BTreeSet<String>>());
+        merge(&mut ends, run, found);
     }
     for (number, run) in runs.iter().enumerate() {
-        let left = unnoticed(&ends, run);
+        // With a reason it is known that no test notices it.
+        let left: Vec<String> = unnoticed(&ends, run)
+            .into_iter()
+            .filter(|line| tried[number].contains(line))
+            .filter(|line| parts(line).is_none_or(|(file, change)| reason(&file, change).is_none()))
+            .collect();
         if !left.is_empty() {
             println!("{}: {} changes are built one by one", run.package, left.len());
             let names = left.iter().map(|line| whole(line)).collect();
