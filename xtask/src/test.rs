@@ -83,7 +83,7 @@ pub fn run(mut args: Args) -> Outcome {
     };
     let mut suite;
     if is_whole {
-        suite = side_by_side(board, &others, images, programs, new_suite)?;
+        suite = side_by_side(board, &others, images, new_suite)?;
     } else {
         images()?;
         programs()?;
@@ -117,7 +117,6 @@ fn side_by_side(
     board: &Layout,
     others: &[&Layout],
     images: impl FnOnce() -> Outcome + Send,
-    programs: impl FnOnce() -> Outcome,
     new_suite: impl Fn() -> Suite,
 ) -> Outcome<Suite> {
     // The crate of the emulated tests has sealed images, without which a bootloader has more:
@@ -137,7 +136,9 @@ fn side_by_side(
     let (mut suite, beside) = (new_suite(), new_suite());
     std::thread::scope(|scope| {
         let images = scope.spawn(images);
-        programs()?;
+        // With the tests of a package, cargo builds its programs: host tool and node, too.
+        let build = [&["--no-run".to_owned(), "--quiet".to_owned()], &hosts[..]].concat();
+        process::run(process::cargo("test").current_dir(workspace::root()).args(build))?;
         let hosts = scope.spawn(|| suite.run(board, None, &hosts).map(|()| suite));
         images.join().map_err(broken_off)??;
         let beside = scope.spawn(|| all(beside));
