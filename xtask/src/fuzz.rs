@@ -42,14 +42,22 @@ where it is missing.
 const CARGO_FUZZ: &str = "0.13.2";
 /// The longest time for one input of a target, in seconds. They need microseconds.
 const TOO_LONG: u32 = 10;
-/// The longest input, in bytes, and that of targets in which each byte is a command with much work
-/// behind it: many short lives find more than a few long ones.
+/// The longest input, in bytes.
 const LONGEST_INPUT: u32 = 4096;
-const SHORT_INPUTS: [(&str, u32); 2] = [("resume", 192), ("sealed_stream", 256)];
-/// The targets whose bytes are commands or numbers. To tell the fuzzer what each comparison
-/// compares, which finds the words of texts and files, would take three quarters of their time.
-const WITHOUT_COMPARES: [&str; 9] =
-    ["conform", "debugger", "download", "journal", "lzma", "resume", "sealed_stream", "signature", "streams"];
+/// The targets whose bytes are commands or numbers, each with its longest input: many short lives find
+/// more than a few long ones. To tell the fuzzer what each comparison compares, which finds the words
+/// of texts and files, would take three quarters of their time.
+const COMMANDS: [(&str, u32); 9] = [
+    ("conform", 512),
+    ("debugger", 512),
+    ("download", 1024),
+    ("journal", 512),
+    ("lzma", 1024),
+    ("resume", 192),
+    ("sealed_stream", 256),
+    ("signature", 512),
+    ("streams", 1024),
+];
 /// The file of the counts.
 const EVIDENCE: &str = "fuzz";
 /// The least number of inputs of a target that counts as fuzzed.
@@ -82,6 +90,11 @@ fn features(target: &str) -> &'static str {
     } else {
         ""
     }
+}
+
+/// The longest input of a target whose bytes are commands.
+fn longest_commands(target: &str) -> Option<u32> {
+    COMMANDS.iter().find(|(name, _)| *name == target).map(|(_, longest)| *longest)
 }
 
 /// Runs every kept input once, without the fuzzer.
@@ -306,7 +319,7 @@ impl Tools {
         command.arg("--sanitizer=none");
         // Each of the two is built with options of its own.
         let mut programs = target_dir();
-        if WITHOUT_COMPARES.contains(&target) {
+        if longest_commands(target).is_some() {
             command.arg("--no-trace-compares");
             programs.push("without-compares");
         }
@@ -335,8 +348,7 @@ impl Tools {
         if seeds.is_dir() {
             command.arg(&seeds);
         }
-        let short = SHORT_INPUTS.iter().find(|(name, _)| *name == target);
-        let longest = short.map_or(LONGEST_INPUT, |(_, longest)| *longest);
+        let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
         command.args(["--", "-print_final_stats=1", end]);
         command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
         let started = Instant::now();
@@ -473,8 +485,7 @@ mod tests {
             let declared = declared.unwrap_or_else(|| panic!("{target} is not in Cargo.toml"));
             assert_eq!(declared.contains("required-features"), !features(&target).is_empty(), "{target}");
         }
-        let special = SHORT_INPUTS.iter().map(|(name, _)| *name).chain(WITHOUT_COMPARES);
-        for name in special {
+        for (name, _) in COMMANDS {
             assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");
         }
     }
