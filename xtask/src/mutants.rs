@@ -20,7 +20,8 @@ usage: cargo xtask mutants [--package NAME] [--file GLOB] [--shard K/N] [--yes]
 Changes the code of the crates that the device is made of, in one place at a time, as cargo-mutants
 does, and runs the tests of that crate: each change must make one fail. Prints what no test noticed,
 and counts; they go to target/evidence/mutants.json. It fails if a group of files has too few of its
-changes noticed, once all crates are measured, or if a change stays unnoticed that xtask/src/mutants/reasons.rs does not name.
+changes noticed, once all crates are measured, or if a change stays unnoticed that
+xtask/src/mutants/reasons.rs does not name.
 
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal;
                   what was measured of the others is kept, if nothing of theirs has changed since
