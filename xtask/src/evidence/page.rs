@@ -350,8 +350,10 @@ fn map(map: &Value) -> String {
 
 fn fuzz(record: &Value) -> (Result<String, String>, String) {
     let targets = record.get("targets");
-    let inputs: f64 = targets.members().map(|(_, target)| number(target, "inputs")).sum();
-    let fewest = targets.members().map(|(_, target)| number(target, "inputs")).fold(f64::INFINITY, f64::min);
+    // A target without a count has tried nothing.
+    let tried = || targets.members().map(|(_, target)| target.get("inputs").number().unwrap_or(0.0));
+    let inputs: f64 = tried().sum();
+    let fewest = tried().reduce(f64::min).unwrap_or(0.0);
     let of = |count: f64| shown(&Value::Number(format!("{count}")));
     let rows: Vec<Value> = targets
         .members()
@@ -367,7 +369,7 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
     // A target that never ran is no evidence, and one that hardly ran is not much.
     let verdict = if rows.len() as f64 != number(record, "of") {
         Err(format!("{verdict}; only {} of {} targets ran", rows.len(), shown(record.get("of"))))
-    } else if fewest < number(record, "least") {
+    } else if fewest.partial_cmp(&number(record, "least")).is_none_or(Ordering::is_lt) {
         Err(format!("{verdict}, of {} that each should have", shown(record.get("least"))))
     } else {
         Ok(verdict)
@@ -571,6 +573,21 @@ mod tests {
         // Sources that are no commit's give no green mark, whatever was measured of them.
         let record = |_: &str| Some(Value::parse(r#"{"failed": 0, "commit": "1-dirty"}"#).unwrap());
         assert!(!page("1-dirty", record, |_| false).contains("class=\"card good\""));
+    }
+
+    #[test]
+    fn fuzzing_is_good_with_enough_inputs_for_every_target() {
+        for (record, good) in [
+            (r#"{"of": 2, "least": 10, "targets": {"a": {"inputs": 10}, "b": {"inputs": 11}}}"#, true),
+            (r#"{"of": 2, "least": 10, "targets": {"a": {"inputs": 9}, "b": {"inputs": 99}}}"#, false),
+            (r#"{"of": 3, "least": 10, "targets": {"a": {"inputs": 10}, "b": {"inputs": 11}}}"#, false),
+            (r#"{"of": 2, "targets": {"a": {"inputs": 10}, "b": {"inputs": 11}}}"#, false),
+            (r#"{"of": 2, "least": 10, "targets": {"a": {"inputs": 10}, "b": {}}}"#, false),
+            (r#"{"of": 0, "least": 10, "targets": {}}"#, false),
+        ] {
+            let (verdict, _) = fuzz(&Value::parse(record).unwrap());
+            assert_eq!(verdict.is_ok(), good, "{record}: {verdict:?}");
+        }
     }
 
     #[test]
