@@ -330,17 +330,18 @@ fn one_by_one(run: &Run, names: Vec<String>, path: &OsStr, out: &Path) -> Outcom
     // debugs it.
     mutants.envs([("CARGO_INCREMENTAL", "1"), ("CARGO_PROFILE_DEV_DEBUG", "0")]);
     mutants.args(["mutants", "--package", run.package, "--output"]).arg(out);
-    mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2", "--timeout-multiplier", "3"]);
-    // The compiler computes the constants: a change can make it compute for ever.
-    mutants.arg("--build-timeout=180");
+    mutants.args(["--no-shuffle", "--colors", "never", "--jobs", "2"]);
     mutants.args(names.iter().flat_map(|name| ["--re", name]));
     if !run.features.is_empty() {
         mutants.args(["--features", run.features]);
     }
     if run.with_sealed_tests {
         // Without a change, cargo-mutants would look for these tests in the changed crate alone; they
-        // have passed in the one build.
-        mutants.args(["--baseline=skip", "--timeout=300"]);
+        // have passed in the one build. The first build compiles the emulator, too.
+        mutants.args(["--baseline=skip", "--timeout=300", "--build-timeout=1200"]);
+    } else {
+        // The compiler computes the constants: a change can make it compute for ever.
+        mutants.args(["--timeout-multiplier=3", "--build-timeout=180"]);
     }
     mutants.args(run.tests());
     // It fails if a change was missed, or a build took too long, which are results.
