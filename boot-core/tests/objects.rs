@@ -79,6 +79,11 @@ fn each_profile_is_that_of_its_document() {
     assert_eq!(rules(Profile::STANDARD), (false, false, false, false, false));
     assert_eq!(rules(Profile::ESACADEMY), (true, true, true, false, false));
     assert_eq!(rules(Profile::LIFT), (true, true, false, true, true));
+
+    // The number 494E4954h, the lowest byte first; the lift's is one of ours, as no document gives one.
+    let passwords =
+        [Profile::STANDARD, Profile::PAULUS, Profile::ESACADEMY, Profile::LIFT].map(|of| of.password);
+    assert_eq!(passwords, [&b""[..], b"", b"TINI", b"coboot"]);
 }
 
 /// A stream leaves room of the queue for the client's segments while an answer is held back (ADR 9): 8 KiB,

@@ -422,6 +422,12 @@ fn with_confirmation_the_counter_waits_for_it() {
         host.install(1, &of_counter(5, 1, &one));
         host.confirm(1);
     });
+    // Nor does such a program leave its counter behind when it is erased.
+    device.copy().run(|host| {
+        host.install(1, &of_counter(9, 2, &two));
+        host.erase(1);
+        host.install(1, &of_counter(5, 1, &one));
+    });
     refused(&device, 4, ROLLBACK);
     device.copy().run(|host| host.install(1, &of_counter(6, 1, &two)));
     device.run(|host| {

@@ -92,6 +92,7 @@ pub const REASONS: &[(&str, &str, &str)] = &[
         "No sector's size is a multiple of a slot's, so a slot never ends with its region.",
     ),
     ("boot-core/src/store/mod.rs", "replace | with ^ in Key::tag", DISJOINT),
+    ("boot-core/src/store/record.rs", "replace | with ^", DISJOINT),
     ("boot-core/src/store/record.rs", "replace | with ^ in ProgramRecord::from_value", DISJOINT),
     ("boot-core/src/store/record.rs", "replace | with ^ in ProgramRecord::value", DISJOINT),
     (
@@ -128,6 +129,32 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("boot-core/src/unseal/image.rs", "replace + with * in Room::unpack", LONGER),
     ("boot-core/src/unseal/image.rs", "replace && with || in Room::unpack", NO_ROOM),
     ("boot-core/src/unseal/image.rs", "replace < with <= in Room::unpack", NO_ROOM),
+    (
+        "boot-core/src/unseal/image.rs",
+        "replace < with > in Room::unpack",
+        "The decoder has refused before: with the last input it fills the room, or it fails.",
+    ),
+    (
+        "boot-core/src/unseal/image.rs",
+        "replace > with >= in Room::unpack",
+        "Without room the decoder does nothing; with room it leaves fewer than the 24 bytes, and behind the end of a \
+         signed image it makes no difference whether 24 bytes or 25 are too many.",
+    ),
+    (
+        "boot-core/src/unseal/image.rs",
+        "replace < with > in Room::advance",
+        "It asks for the size of the head after each piece, and gets the same answer until the piece is complete.",
+    ),
+    (
+        "boot-core/src/unseal/image.rs",
+        "replace + with * in Room::judge",
+        "The room for the keys is longer, and the zeros behind them are no key.",
+    ),
+    (
+        "boot-core/src/unseal/image.rs",
+        "replace + with *",
+        "The buffer is larger than needed, which the linker refuses on the chip.",
+    ),
     ("shared-abi/src/callgate.rs", "replace << with >>", ZERO_BITS),
     ("shared-abi/src/handoff.rs", "replace << with >>", ZERO_BITS),
     (
