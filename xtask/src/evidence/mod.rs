@@ -32,8 +32,9 @@ and names the command.
 
 /// The folder of the results that are kept with the sources.
 const KEPT: &str = "docs/evidence/";
-/// The tests of a crate alone, what is built beside the workspace, and what only reads results.
-const APART: [&str; 12] = [
+/// The tests of a crate alone, those that are no job of their own, what is built beside the workspace, and what
+/// only reads results.
+const APART: [&str; 14] = [
     ".ci/",
     ".github/",
     "canopen/tests/",
@@ -44,30 +45,34 @@ const APART: [&str; 12] = [
     "python/",
     "seal/tests/",
     "shared-abi/tests/",
+    "tests/src/attacker/",
+    "tests/tests/",
     "xtask/src/evidence/",
     "xtask/src/mutants/",
 ];
+/// What emulated boards and nodes are made of, and the tests.
+const DEVICES: &[&str] = &[
+    "Cargo.",
+    "app-template/",
+    "boot-core/",
+    "bootloader/",
+    "bsp/",
+    "canopen/src/",
+    "coboot-app/",
+    "coflash/src/",
+    "emulator/",
+    "linker/",
+    "node/src/",
+    "seal/src/",
+    "shared-abi/src/",
+    "tests/",
+];
 /// How the paths begin of what jobs depend on that read something else than most.
-const READS: [(&str, &[&str]); 4] = [
+const READS: [(&str, &[&str]); 5] = [
     // They read the texts, too.
     ("tests", &[""]),
-    (
-        "cpu",
-        &[
-            "Cargo.",
-            "app-template/",
-            "boot-core/",
-            "bootloader/",
-            "bsp/",
-            "canopen/src/",
-            "coboot-app/",
-            "coflash/src/",
-            "emulator/",
-            "linker/",
-            "shared-abi/src/",
-            "tests/",
-        ],
-    ),
+    ("attacker", DEVICES),
+    ("cpu", DEVICES),
     (
         "coverage",
         &[
