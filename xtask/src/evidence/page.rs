@@ -30,7 +30,9 @@ const PARTS: &[Part] = &[
         name: "powercut",
         title: "Power cuts",
         command: "cargo xtask powercut --full",
-        about: "The power fails in a flash operation; then the device answers or runs a whole program.",
+        about: "The power fails in a flash operation; then the device answers or runs a whole program. Level 1: \
+                boot-core on a model of the flash, at every point; level 2: the built firmware in the emulator, at every \
+                state of its flash.",
         show: powercut,
     },
     Part {
@@ -197,6 +199,7 @@ fn shown(value: &Value) -> String {
         Value::Bool(true) => "yes".into(),
         Value::Bool(false) => "no".into(),
         Value::Null => "–".into(),
+        Value::Array(items) if items.is_empty() => "none".into(),
         Value::Array(items) => items.iter().map(shown).collect::<Vec<_>>().join(", "),
         Value::Object(_) => value
             .members()
@@ -210,16 +213,25 @@ fn number(value: &Value, name: &str) -> f64 {
     value.get(name).number().unwrap_or(f64::NAN)
 }
 
+/// The member of a record that holds a sentence.
+const WHY: &str = "why";
+/// The class of what scrolls on a narrow screen.
+const WIDE: &str = "wide";
+/// The class of a table with sentences: on a narrow screen, the cells of a row stand one below the other.
+const LONG: &str = "wide long";
+
 /// A table of these members of objects.
 fn table(names: &[&str], rows: &[Value]) -> String {
-    let mut table = String::from("<div class=\"wide\"><table><tr>");
+    let class = if names.contains(&WHY) { LONG } else { WIDE };
+    let mut table = format!("<div class=\"{class}\"><table><tr>");
     for name in names {
         let _ = write!(table, "<th>{}</th>", text(&name.replace('_', " ")));
     }
     for row in rows {
         table += "</tr>\n<tr>";
         for name in names {
-            let _ = write!(table, "<td>{}</td>", shown(row.get(name)));
+            let title = text(&name.replace('_', " "));
+            let _ = write!(table, "<td data-name=\"{title}\">{}</td>", shown(row.get(name)));
         }
     }
     table + "</tr></table></div>\n"
@@ -262,6 +274,7 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
         let names = [
             "level",
             "scenario",
+            "violations",
             "operations",
             "points",
             "states",
@@ -269,7 +282,6 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
             "bootloader",
             "old_program",
             "new_program",
-            "violations",
         ];
         details += &table(&names, scenarios);
         for scenario in scenarios.iter().filter(|scenario| scenario.get("scenario").text() == Some("update"))
@@ -343,7 +355,7 @@ fn map(map: &Value) -> String {
         ("wrong", "violation"),
         ("uncut", "not cut"),
     ] {
-        let _ = write!(svg, "<i class=\"{class}\"></i> {words} ");
+        let _ = write!(svg, "<span><i class=\"{class}\"></i> {words}</span> ");
     }
     svg + "</p>\n"
 }
@@ -405,7 +417,7 @@ fn bench(record: &Value) -> (Result<String, String>, String) {
             number(row, "measured_us") / 1e6
         );
     }
-    svg += "</svg></div>\n<p class=\"key\"><i class=\"took\"></i> measured <i class=\"limit\"></i> limit of wire or flash, whichever is later</p>\n";
+    svg += "</svg></div>\n<p class=\"key\"><span><i class=\"took\"></i> measured</span> <span><i class=\"limit\"></i> limit of wire or flash, whichever is later</span></p>\n";
     let slowest = downloads
         .iter()
         .map(|row| number(row, "measured_us") / number(row, "wire_us").max(number(row, "flash_us")))
@@ -476,7 +488,8 @@ fn mutants(record: &Value) -> (Result<String, String>, String) {
     let of_files = ["file", "caught", "named", "missed", "unviable", "commit"];
     let files = record.get("files").items();
     let mut details = table(&names, groups) + &table(&of_files, files);
-    details += "<h3>What no test notices, and why</h3>\n<div class=\"wide\"><table>";
+    details += "<h3>What no test notices, and why</h3>\n";
+    let _ = write!(details, "<div class=\"{LONG}\"><table>");
     for file in files {
         let name = file.get("file").text().unwrap_or_default();
         for row in file.get("unnoticed").items() {
@@ -499,7 +512,9 @@ fn plain(record: &Value, counted: &str) -> (Result<String, String>, String) {
         let title = text(&name.replace('_', " "));
         match value.items() {
             [first @ Value::Object(_), ..] => {
-                let names: Vec<&str> = first.members().map(|(name, _)| name).collect();
+                let mut names: Vec<&str> = first.members().map(|(name, _)| name).collect();
+                // What it is stands before the numbers, and a sentence behind them.
+                names.sort_by_key(|&name| (name == WHY, first.get(name).text().is_none()));
                 let _ = writeln!(lists, "<h3>{title}</h3>");
                 lists += &table(&names, value.items());
             }
@@ -519,7 +534,7 @@ fn plain(record: &Value, counted: &str) -> (Result<String, String>, String) {
 const STYLE: &str = "
 :root{color-scheme:light dark;--fg:#1f2937;--bg:#fff;--line:#d1d5db;--good:#15803d;--bad:#b91c1c;--old:#b45309;--none:#6b7280}
 @media(prefers-color-scheme:dark){:root{--fg:#e5e7eb;--bg:#111827;--line:#374151;--good:#4ade80;--bad:#f87171;--old:#fbbf24;--none:#9ca3af}}
-body{font:16px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:60rem;margin:0 auto;padding:1rem}
+body{font:16px/1.5 system-ui,sans-serif;color:var(--fg);background:var(--bg);max-width:72rem;margin:0 auto;padding:1rem}
 code{font-family:ui-monospace,monospace;font-size:.9em;overflow-wrap:anywhere}
 nav{display:grid;grid-template-columns:repeat(auto-fill,minmax(13rem,1fr));gap:.75rem;margin:1.5rem 0}
 .card{display:flex;flex-direction:column;border:1px solid var(--line);border-left:.35rem solid var(--mark);border-radius:.4rem;padding:.6rem .8rem;color:inherit;text-decoration:none}
@@ -530,9 +545,10 @@ nav{display:grid;grid-template-columns:repeat(auto-fill,minmax(13rem,1fr));gap:.
 .wide{overflow-x:auto}
 table{border-collapse:collapse;margin-bottom:.8rem;font-variant-numeric:tabular-nums}
 th,td{border-bottom:1px solid var(--line);padding:.2rem .6rem;text-align:left;vertical-align:top}th{white-space:nowrap}
+@media(max-width:40rem){.long td{display:block;border:0;overflow-wrap:anywhere}.long th{display:none}.long td[data-name]::before{content:attr(data-name) \": \";color:var(--none)}.long tr{display:block;border-bottom:1px solid var(--line)}}
 svg{width:100%;min-width:34rem;font-size:12px}
 svg text{fill:var(--fg)}
-.key i{display:inline-block;width:.8rem;height:.8rem;margin:0 .2rem 0 .8rem}
+.key span{white-space:nowrap}.key i{display:inline-block;width:.8rem;height:.8rem;margin:0 .2rem 0 .8rem}
 .new{fill:#15803d;background:#15803d}.was{fill:#2563eb;background:#2563eb}.boot{fill:#d97706;background:#d97706}
 .same{fill:#c4b5fd;background:#c4b5fd}.wrong{fill:#dc2626;background:#dc2626}.uncut{fill:#9ca3af55;background:#9ca3af55}
 .took{fill:#2563eb;background:#2563eb}.limit{fill:#dc2626;background:#dc2626}
@@ -616,6 +632,16 @@ mod tests {
             assert!(page.ends_with("</html>\n") && !page.contains("<b>\"") && !page.contains("<i>,"));
             assert!(!page.contains("class=\"card good\""), "{record:?}");
         }
+    }
+
+    #[test]
+    fn a_sentence_stands_behind_the_numbers_of_a_list() {
+        let record =
+            r#"{"words": 1, "failed": 0, "explained": [{"a": 5, "why": "so", "z": "what"}], "found": []}"#;
+        let (verdict, details) = plain(&Value::parse(record).unwrap(), "words");
+        assert_eq!(verdict, Ok("1 words".into()));
+        assert!(details.contains("<th>z</th><th>a</th><th>why</th>"), "{details}");
+        assert!(details.contains("<th>found</th><td>none</td>"), "{details}");
     }
 
     #[test]
