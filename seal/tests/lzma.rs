@@ -135,6 +135,30 @@ fn each_stream_that_is_too_short_or_too_long_is_refused() {
     assert_eq!(unpack(&mut Decoder::new(), &other, &[], data.len(), 100, 100), Err(Corrupt));
 }
 
+/// All input is consumed and all expected bytes are there, and yet it is not the end.
+#[test]
+fn a_stream_that_does_not_end_where_it_should_is_refused() {
+    let data = &program()[..2_000];
+    let mut packed = pack(data, &[], EncodeMode::Normal);
+    // The lowest bits of the last number are 0, and decide on no symbol.
+    *packed.last_mut().unwrap() ^= 1;
+    assert_eq!(unpack(&mut Decoder::new(), &packed, &[], data.len(), 100, 100), Err(Corrupt));
+    // The last symbol is a copy, of which one byte is too many.
+    let run = [&b"start"[..], &[b'!'; 200]].concat();
+    let packed = pack(&run, &[], EncodeMode::Normal);
+    assert_eq!(unpack(&mut Decoder::new(), &packed, &[], run.len() - 1, 100, 300), Err(Corrupt));
+}
+
+#[test]
+fn with_24_bytes_of_input_it_goes_on() {
+    let packed = pack(&program()[..2_000], &[], EncodeMode::Normal);
+    for (have, goes_on) in [(23, false), (24, true)] {
+        let mut out = [0; 100];
+        let done = Decoder::new().decode(&packed[..have], false, 0, &|_| 0, &mut out).unwrap();
+        assert_eq!(done != (0, 0), goes_on, "{have}");
+    }
+}
+
 #[test]
 fn an_end_marker_is_no_part_of_a_stream() {
     let options = LzmaOptions { lc: 0, lp: 1, pb: 1, ..LzmaOptions::with_preset(6) };

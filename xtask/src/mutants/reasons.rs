@@ -224,4 +224,32 @@ pub const REASONS: &[(&str, &str, &str)] = &[
     ("coboot-app/src/bootloader.rs", "replace | with ^ in Exit::ask", DISJOINT),
     ("coboot-app/src/responder.rs", "replace | with ^ in Responder::request", DISJOINT),
     ("coboot-app/src/responder.rs", "replace << with >> in Responder::download", ZERO_BITS),
+    (
+        "seal/src/ed25519.rs",
+        "replace > with >= in Verification::go_on_with_power",
+        "It is about bit 7, which is a one in both exponents.",
+    ),
+    ("seal/src/ed25519.rs", "replace | with ^ in remainder", DISJOINT),
+    (
+        "seal/src/lzma.rs",
+        "replace == with != in Decoder::symbol",
+        "Two tables of the same size, and equal at the beginning, change places for the whole stream.",
+    ),
+    ("seal/src/lzma.rs", "replace | with ^ in Decoder::distance", DISJOINT),
+    ("seal/src/lzma.rs", "replace | with ^ in Decoder::shift", DISJOINT),
+    ("seal/src/sha512.rs", "replace ^= with |= in root", "The bit is not set before."),
+    ("seal/src/sha512.rs", "replace | with ^ in root", DISJOINT),
+    ("seal/src/sha512.rs", "replace | with ^ in constant", DISJOINT),
+    ("seal/src/sha512.rs", "replace | with ^ in Sha512::push", DISJOINT),
+    (
+        "seal/src/sha512.rs",
+        "replace | with ^ in Sha512::compress",
+        "Where both are set, the left side of the majority is set already.",
+    ),
+    ("seal/src/wire.rs", "replace | with ^ in word", DISJOINT),
+    (
+        "seal/src/wire.rs",
+        "replace Certificate<'a>::is_empty -> bool with false",
+        "A certificate is never empty; the question stands beside its length.",
+    ),
 ];
