@@ -341,13 +341,18 @@ impl Tools {
     fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
         let (corpus, seeds) = (self.corpus(target), self.seeds(target));
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
+        // The fuzzer puts only what is new into the corpus, and the smallest corpus is made of the
+        // corpus alone.
+        if let Ok(kept) = fs::read_dir(&seeds) {
+            for file in kept.flatten() {
+                let to = corpus.join(file.file_name());
+                fs::copy(file.path(), &to).map_err(|error| unwritable(&to, &error))?;
+            }
+        }
         let log = target_dir().join(target).with_extension("log");
         let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
         let mut command = self.command("run", target);
         command.arg(&corpus);
-        if seeds.is_dir() {
-            command.arg(&seeds);
-        }
         let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
         command.args(["--", "-print_final_stats=1", end]);
         command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);

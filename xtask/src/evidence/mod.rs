@@ -34,7 +34,7 @@ and names the command.
 const KEPT: &str = "docs/evidence/";
 /// The tests of a crate alone, those that are no job of their own, what is built beside the workspace, and what
 /// only reads results.
-const APART: [&str; 14] = [
+const APART: [&str; 15] = [
     ".ci/",
     ".github/",
     "canopen/tests/",
@@ -48,6 +48,7 @@ const APART: [&str; 14] = [
     "tests/src/attacker/",
     "tests/tests/",
     "xtask/src/evidence/",
+    "xtask/src/fuzz.rs",
     "xtask/src/mutants",
 ];
 /// What emulated boards and nodes are made of, and the tests.
