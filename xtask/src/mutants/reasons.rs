@@ -252,4 +252,14 @@ pub const REASONS: &[(&str, &str, &str)] = &[
         "replace Certificate<'a>::is_empty -> bool with false",
         "A certificate is never empty; the question stands beside its length.",
     ),
+    ("seal/src/access.rs", "replace << with >>", ZERO_BITS),
+    ("seal/src/wire.rs", "replace << with >>", ZERO_BITS),
+    ("seal/src/wire.rs", "replace | with ^", DISJOINT),
+    (
+        "seal/src/lzma.rs",
+        "replace + with *",
+        "The tables stand further apart, and none overlaps another: it is RAM that nothing uses.",
+    ),
+    ("seal/src/sha512.rs", "replace + with * in root", "The number has room for words that stay 0."),
+    ("seal/src/sha512.rs", "replace + with * in Sha512::compress", "The list of working variables is longer than needed."),
 ];
