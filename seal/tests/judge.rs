@@ -59,6 +59,9 @@ struct Certificate {
     root: u32,
 }
 
+/// What makes an accepted image one that is refused.
+type Change = fn(&mut Case);
+
 /// Signed by the first root.
 fn direct() -> Case {
     Case {
@@ -358,7 +361,7 @@ fn a_test_key_needs_a_device_for_tests() {
 /// one on, that one is told.
 #[test]
 fn the_first_fault_is_told() {
-    let faults: [(Fault, fn(&mut Case)); 8] = [
+    let faults: [(Fault, Change); 8] = [
         (Fault::Format, |case| case.chunk = 0),
         (Fault::WrongVendor, |case| case.vendor = 1),
         (Fault::WrongProduct, |case| case.product = 1),
