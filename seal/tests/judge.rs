@@ -25,7 +25,7 @@ const DICTIONARY: u8 = 0x08;
 const DATA: u8 = 0x10;
 const TEST: u8 = 0x40;
 
-/// An image that the device accepts, and the device. What a test changes is public.
+/// An image, and what of the device the tests change.
 struct Case {
     flags: u8,
     chunk: u8,
