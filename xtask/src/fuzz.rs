@@ -305,6 +305,16 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
+/// Adds the kept inputs to a corpus: the fuzzer puts only what is new into it, and the smallest corpus
+/// is made of it alone.
+fn add_kept(kept: &Path, corpus: &Path) -> Outcome {
+    for file in fs::read_dir(kept).into_iter().flatten().flatten() {
+        let to = corpus.join(file.file_name());
+        fs::copy(file.path(), &to).map_err(|error| unwritable(&to, &error))?;
+    }
+    Ok(())
+}
+
 /// cargo-fuzz, and the folder of the targets.
 struct Tools {
     path: OsString,
@@ -341,14 +351,7 @@ impl Tools {
     fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
         let (corpus, seeds) = (self.corpus(target), self.seeds(target));
         fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
-        // The fuzzer puts only what is new into the corpus, and the smallest corpus is made of the
-        // corpus alone.
-        if let Ok(kept) = fs::read_dir(&seeds) {
-            for file in kept.flatten() {
-                let to = corpus.join(file.file_name());
-                fs::copy(file.path(), &to).map_err(|error| unwritable(&to, &error))?;
-            }
-        }
+        add_kept(&seeds, &corpus)?;
         let log = target_dir().join(target).with_extension("log");
         let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
         let mut command = self.command("run", target);
@@ -556,6 +559,21 @@ mod tests {
         assert_eq!((lss.sums, lss.last), ([u64::MAX, 5], [701, 29]));
         assert_eq!((rows["lzma"].sums, rows.len()), ([5, 1], 2));
         assert!(!lss.since.is_empty());
+    }
+
+    #[test]
+    fn what_was_kept_takes_part_in_the_next_smallest_corpus() {
+        let folder = std::env::temp_dir().join(format!("coboot-fuzz-added-{}", std::process::id()));
+        let (corpus, seeds) = (folder.join("corpus"), folder.join("seeds"));
+        fs::create_dir_all(&corpus).unwrap();
+        add_kept(&seeds, &corpus).expect("a target without kept inputs");
+        fs::create_dir_all(&seeds).unwrap();
+        fs::write(seeds.join("a"), "kept").unwrap();
+        fs::write(corpus.join("b"), "new").unwrap();
+        add_kept(&seeds, &corpus).unwrap();
+        assert_eq!(fs::read(corpus.join("a")).unwrap(), b"kept");
+        assert_eq!(fs::read(corpus.join("b")).unwrap(), b"new");
+        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
