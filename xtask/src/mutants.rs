@@ -229,12 +229,7 @@ pub fn run(mut args: Args) -> Outcome {
         merge(&mut ends, run, found);
     }
     for (number, run) in runs.iter().enumerate() {
-        // With a reason it is known that no test notices it.
-        let left: Vec<String> = unnoticed(&ends, run)
-            .into_iter()
-            .filter(|line| tried[number].contains(line))
-            .filter(|line| parts(line).is_none_or(|(file, change)| reason(&file, change).is_none()))
-            .collect();
+        let left = to_build(&ends, run, &tried[number]);
         if !left.is_empty() {
             println!("{}: {} changes are built one by one", run.package, left.len());
             merge(&mut ends, run, one_by_one(run, &left, &path, &out(number))?);
@@ -309,6 +304,19 @@ fn unnoticed(ends: &Ends, run: &Run) -> Vec<String> {
         .iter()
         .filter(|((package, _), end)| *package == run.package && matches!(**end, "missed" | "alone"));
     left.map(|((_, line), _)| line.clone()).collect()
+}
+
+/// The changes of a run that are built one by one. With a reason it is known that no test notices it;
+/// but a reason is for all changes of a file with the same words, and those that could not stand in the
+/// one build have not been tried yet.
+fn to_build(ends: &Ends, run: &Run, selected: &BTreeSet<String>) -> Vec<String> {
+    let has_reason = |line: &str| parts(line).is_some_and(|(file, change)| reason(&file, change).is_some());
+    let is_left = |((package, line), end): &(&(&str, String), &&str)| {
+        *package == run.package
+            && selected.contains(line)
+            && (**end == "alone" || **end == "missed" && !has_reason(line))
+    };
+    ends.iter().filter(is_left).map(|((_, line), _)| line.clone()).collect()
 }
 
 /// Tries the changes that can stand side by side in one build (mutants/). Those that no test has
@@ -515,6 +523,22 @@ mod tests {
             found([("b", "caught"), ("c", "missed"), ("d", "unviable"), ("e", "unviable"), ("f", "timeout")]),
         );
         assert_eq!(unnoticed(&ends, &second), ["c", "e"], "what one run cannot build, another has missed");
+    }
+
+    #[test]
+    fn a_change_that_was_not_tried_is_built_although_its_words_have_a_reason() {
+        let (file, change, _) = reasons::REASONS[0];
+        let line = |number: u32| format!("{file}:{number}:1: {change}");
+        let other = format!("{file}:9:1: replace this with that");
+        let run = Run::of("coboot-core");
+        let ends: Ends =
+            [(line(1), "alone"), (line(2), "missed"), (line(3), "caught"), (other.clone(), "missed")]
+                .map(|(line, end)| ((run.package, line), end))
+                .into();
+        let selected = ends.keys().map(|(_, line)| line.clone()).collect();
+        assert_eq!(to_build(&ends, &run, &selected), [line(1), other]);
+        assert!(to_build(&ends, &run, &BTreeSet::new()).is_empty());
+        assert!(to_build(&ends, &Run::of("coboot-app"), &selected).is_empty());
     }
 
     #[test]
