@@ -1,10 +1,11 @@
 """An unmodified python-canopen that writes a sealed image, and knows nothing of what is in it.
 
-    sealed_client.py 127.0.0.1:29536 app.cbs [--block] [--as-it-comes]
+    sealed_client.py 127.0.0.1:29536 app.cbs [--block] [--as-it-comes FACTOR]
 """
 
 import sys
 
+from canopen.sdo import SdoClient
 from canopen.sdo.exceptions import SdoError
 
 import client
@@ -33,11 +34,17 @@ def update(device, image, block):
 
 def main():
     parser = client.image_arguments(__doc__, "a sealed image")
-    parser.add_argument("--as-it-comes", action="store_true", help="with the library's own SDO time-out")
+    parser.add_argument(
+        "--as-it-comes",
+        type=int,
+        metavar="FACTOR",
+        help="with the library's own SDO time-out, for a device that is so many times slower than real time",
+    )
     options = parser.parse_args()
     image = client.read(options.image)
     act = lambda node: update(Device(node, 60.0), image, options.block)
-    timeout = None if options.as_it_comes else 2.0
+    factor = options.as_it_comes
+    timeout = factor * SdoClient.RESPONSE_TIMEOUT if factor else 2.0
     return client.run(options.address, act, dictionary=object_dictionary(), timeout=timeout)
 
 

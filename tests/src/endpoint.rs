@@ -19,6 +19,7 @@ pub struct Endpoint {
     pub bench: Bench,
     server: Server,
     serial: Option<Serial>,
+    speed: f64,
 }
 
 impl Endpoint {
@@ -29,7 +30,17 @@ impl Endpoint {
     #[must_use]
     pub fn new(bench: Bench) -> Self {
         let server = Server::bind("127.0.0.1:0", "can0").expect("a free port");
-        Self { bench, server, serial: None }
+        Self { bench, server, serial: None, speed: 1.0 }
+    }
+
+    /// The same, in which the board runs so many times slower than real time. A client whose time-outs
+    /// are longer by the same factor meets the same device, and the host may be slower by that factor.
+    ///
+    /// # Panics
+    /// If no port is free.
+    #[must_use]
+    pub fn slower(bench: Bench, factor: u32) -> Self {
+        Self { speed: f64::from(factor).recip(), ..Self::new(bench) }
     }
 
     /// The same for a board that uses its UART, which is connected to a pseudo-terminal.
@@ -69,7 +80,7 @@ impl Endpoint {
         // Other threads read its output, so that it never waits for a full pipe.
         let [out, err] = readers(&mut child);
         let began = Instant::now();
-        let mut pacer = Pacer::new(Speed::Times(1.0), began, self.bench.time());
+        let mut pacer = Pacer::new(Speed::Times(self.speed), began, self.bench.time());
         let status = loop {
             if let Some(status) = child.try_wait().expect("the child can be asked") {
                 break status;
