@@ -19,6 +19,7 @@ pub struct Endpoint {
     pub bench: Bench,
     server: Server,
     serial: Option<Serial>,
+    /// Virtual seconds in a second of the wall clock.
     speed: f64,
 }
 
