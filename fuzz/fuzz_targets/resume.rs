@@ -264,8 +264,9 @@ fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool 
                 let Some([which, number]) = input.array() else { break };
                 let file = &files()[usize::from(which & 1)];
                 let block = &file.blocks[usize::from(number) % file.blocks.len()];
-                let _ = world.write(second, DATA, block, blocks, u32::MAX);
+                // Before the block: the power may be cut in it.
                 (host.honest, host.file) = (false, None);
+                let _ = world.write(second, DATA, block, blocks, u32::MAX);
             }
             // The next block, left in the middle.
             160..=179 => {
