@@ -34,7 +34,7 @@ and names the command.
 const KEPT: &str = "docs/evidence/";
 /// The tests of a crate alone, those that are no job of their own, what is built beside the workspace, and what
 /// only reads results.
-const APART: [&str; 15] = [
+const APART: [&str; 16] = [
     ".ci/",
     ".github/",
     "canopen/tests/",
@@ -45,6 +45,7 @@ const APART: [&str; 15] = [
     "python/",
     "seal/tests/",
     "shared-abi/tests/",
+    "tests/python/",
     "tests/src/attacker/",
     "tests/tests/",
     "xtask/src/evidence/",
@@ -309,6 +310,7 @@ mod tests {
             ("canopen/tests/lss.rs", true, true, false),
             ("boot-core/tests/model/mod.rs", true, false, true),
             ("tests/tests/sealed_model.rs", true, false, false),
+            ("tests/python/client.py", true, false, false),
             ("tests/src/attacker/mod.rs", true, false, false),
             ("xtask/src/mutants.rs", true, false, false),
             ("tests/src/powercut.rs", true, false, true),
