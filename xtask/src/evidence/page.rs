@@ -289,10 +289,12 @@ fn powercut(record: &Value) -> (Result<String, String>, String) {
             details += &map(scenario.get("map"));
         }
     }
-    (
-        if violations == 0.0 { Ok(verdict) } else { Err(format!("{verdict}, {violations} violations")) },
-        details,
-    )
+    let verdict = if states > 0.0 && violations == 0.0 {
+        Ok(verdict)
+    } else {
+        Err(format!("{verdict}, {violations} violations"))
+    };
+    (verdict, details)
 }
 
 /// What was found behind a cut, by operation and way. A column is as many operations as it takes;
@@ -389,6 +391,17 @@ fn fuzz(record: &Value) -> (Result<String, String>, String) {
     (verdict, table(&head, &rows))
 }
 
+/// The time that wire or flash takes at least for a download, whichever is later; not a number if one
+/// of them is missing.
+fn limit_us(row: &Value) -> f64 {
+    let (wire, flash) = (number(row, "wire_limit_us"), number(row, "flash_limit_us"));
+    if wire.is_nan() || flash.is_nan() {
+        f64::NAN
+    } else {
+        wire.max(flash)
+    }
+}
+
 fn bench(record: &Value) -> (Result<String, String>, String) {
     let downloads = record.get("downloads").items();
     let longest = downloads.iter().map(|row| number(row, "measured_us")).fold(1.0, f64::max);
@@ -397,8 +410,8 @@ fn bench(record: &Value) -> (Result<String, String>, String) {
         downloads.len() * 20 + 4
     );
     for (n, row) in downloads.iter().enumerate() {
-        let length = |name| number(row, name) / longest * 480.0;
-        let y = n * 20;
+        let length = |us: f64| us / longest * 480.0;
+        let (measured, y) = (length(number(row, "measured_us")), n * 20);
         let _ = write!(
             svg,
             "<text x=\"0\" y=\"{}\">{} kbit/s, {} KiB</text>\
@@ -409,26 +422,24 @@ fn bench(record: &Value) -> (Result<String, String>, String) {
             number(row, "bit_rate") / 1000.0,
             shown(row.get("kib")),
             y + 2,
-            length("measured_us"),
-            150.0 + length("wire_us").max(length("flash_us")),
+            measured,
+            150.0 + length(limit_us(row)),
             y,
-            156.0 + length("measured_us"),
+            156.0 + measured,
             y + 13,
             number(row, "measured_us") / 1e6
         );
     }
     svg += "</svg></div>\n<p class=\"key\"><span><i class=\"took\"></i> measured</span> <span><i class=\"limit\"></i> limit of wire or flash, whichever is later</span></p>\n";
-    let slowest = downloads
-        .iter()
-        .map(|row| number(row, "measured_us") / number(row, "wire_us").max(number(row, "flash_us")))
-        .fold(0.0, f64::max);
-    let verdict = format!("at most {slowest:.2} times what wire or flash takes");
-    let fleets = record.get("fleets").items();
+    let ratios = || downloads.iter().map(|row| number(row, "measured_us") / limit_us(row));
+    let slowest = ratios().fold(0.0, f64::max);
+    let verdict = if downloads.is_empty() || !ratios().all(f64::is_finite) {
+        Err("the record has a download without its duration or its limits, or none".into())
+    } else {
+        Ok(format!("at most {slowest:.2} times what wire or flash takes"))
+    };
     let names = ["boards", "way", "block_size", "lost_one_in", "measured_us"];
-    if downloads.is_empty() {
-        return (Err("no row".into()), String::new());
-    }
-    (Ok(verdict), svg + "<h3>Several boards</h3>\n" + &table(&names, fleets))
+    (verdict, svg + "<h3>Several boards</h3>\n" + &table(&names, record.get("fleets").items()))
 }
 
 fn size(record: &Value) -> (Result<String, String>, String) {
@@ -607,6 +618,40 @@ mod tests {
     }
 
     #[test]
+    fn speed_is_good_if_each_download_has_its_limits() {
+        let rows = [
+            (r#"{"measured_us": 30, "wire_limit_us": 20, "flash_limit_us": 9}"#, Some("1.50")),
+            (r#"{"measured_us": 30, "wire_limit_us": 9, "flash_limit_us": 24}"#, Some("1.25")),
+            (r#"{"measured_us": 30, "wire_limit_us": 20}"#, None),
+            (r#"{"measured_us": 30, "flash_limit_us": 20}"#, None),
+            (r#"{"wire_limit_us": 20, "flash_limit_us": 20}"#, None),
+            (r#"{"measured_us": 30, "wire_limit_us": 0, "flash_limit_us": 0}"#, None),
+        ];
+        for (row, times) in rows {
+            let good = rows[0].0;
+            let (verdict, _) = bench(&Value::parse(&format!(r#"{{"downloads": [{row}, {row}]}}"#)).unwrap());
+            let expected = times.map(|times| format!("at most {times} times what wire or flash takes"));
+            assert_eq!(verdict.ok(), expected, "{row}");
+            let (verdict, _) = bench(&Value::parse(&format!(r#"{{"downloads": [{good}, {row}]}}"#)).unwrap());
+            assert_eq!(verdict.is_ok(), times.is_some(), "{row}");
+        }
+    }
+
+    /// What a job writes and what the page reads are the same names.
+    #[test]
+    fn of_the_kept_results_no_number_is_missing() {
+        let kept = |name: &str| {
+            let file = crate::workspace::root().join("docs/evidence").join(name).with_extension("json");
+            Value::parse(&std::fs::read_to_string(file).ok()?).ok()
+        };
+        assert!(names().all(|name| kept(name).is_some()));
+        let page = page(COMMIT, kept, |_| true);
+        for missing in ["NaN", "inf ", "the record", ">–<", "– "] {
+            assert!(!page.contains(missing), "{missing}: {}", page.split(missing).next().unwrap_or_default());
+        }
+    }
+
+    #[test]
     fn a_result_of_another_commit_is_green_while_it_holds() {
         let old = |_: &str| Some(Value::parse(r#"{"frames": 5, "failed": 0, "commit": "4567"}"#).unwrap());
         let green = |holds: bool| page(COMMIT, old, |_| holds).matches("class=\"card good").count();
@@ -626,6 +671,9 @@ mod tests {
             r#"{"targets": {"a": 3}}"#,
             r#"{"downloads": [{}], "images": [{}]}"#,
             r#"{"a": "<b>", "commit": "<i>"}"#,
+            r#"{"commit": "0123abcd"}"#,
+            r#"{"commit": "0123abcd", "boards": [], "targets": {}, "downloads": [], "images": [], "groups": []}"#,
+            r#"{"commit": "0123abcd", "boards": [{}], "targets": {"a": {}}, "downloads": [{}], "images": [{}], "groups": [{}]}"#,
         ] {
             let record = Value::parse(record).unwrap();
             let page = page(COMMIT, |_| Some(record.clone()), |_| false);
