@@ -37,7 +37,7 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware])?;
-    let flash = tables(board, one.as_deref().unwrap_or("bootloader"))?;
+    let (flash, parts) = tables(board, one.as_deref().unwrap_or("bootloader"))?;
     if one.is_some() {
         return Ok(());
     }
@@ -73,13 +73,20 @@ pub fn run(mut args: Args) -> Outcome {
         keep("bootloader-sealed", board, flash.used, room.size);
         within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
-    evidence::record("size", &format!("{{\"images\": [{}]}}", images.join(",\n")))?;
+    let parts: Vec<String> = parts.iter().map(Share::json).collect();
+    let facts = format!(
+        "{{\"images\": [{}], \"parts_of\": \"{}\", \"parts\": [{}]}}",
+        images.join(",\n"),
+        board.board,
+        parts.join(",\n")
+    );
+    evidence::record("size", &facts)?;
     toolchain::notice();
     within
 }
 
 /// Builds an image and prints its flash by section and by part.
-fn tables(board: &Layout, name: &str) -> Outcome<Flash> {
+fn tables(board: &Layout, name: &str) -> Outcome<(Flash, Vec<Share>)> {
     let path = build::images(board, &[name])?.join(name).with_extension("elf");
     let elf = read(&path)?;
     let flash = Flash::of(&elf, board.bootloader)?;
@@ -88,8 +95,12 @@ fn tables(board: &Layout, name: &str) -> Outcome<Flash> {
     let image = image.ok_or_else(|| format!("{name} is no bootloader: it has no RAM image."))?;
     let file = fs::read(&path).map_err(|error| format!("{}: {error}.", workspace::shown(&path)))?;
     let contents = &file[image.offset as usize..][..image.size as usize];
-    print!("\n{}", by_part(&elf, parts::of(&path, image.address, contents)?));
-    Ok(flash)
+    let parts = by_part(&elf, parts::of(&path, image.address, contents)?);
+    println!("\npart                               raw  packed (share)");
+    for Share { part, raw, packed } in &parts {
+        println!("{part:<31} {raw:>6}  {packed:>6}");
+    }
+    Ok((flash, parts))
 }
 
 /// Reads an ELF file.
@@ -223,9 +234,23 @@ fn by_variant(board: &Layout) -> Outcome<String> {
     Ok(text)
 }
 
-/// Flash by part: raw, and the share of the packed bytes. `image` has the parts of the RAM image;
-/// code that runs from flash is listed by its section.
-fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
+/// What a part of the bootloader takes, in bytes.
+struct Share {
+    part: String,
+    raw: u32,
+    packed: u32,
+}
+
+impl Share {
+    fn json(&self) -> String {
+        let Self { part, raw, packed } = self;
+        format!("{{\"part\": \"{part}\", \"raw\": {raw}, \"packed\": {packed}}}")
+    }
+}
+
+/// Flash by part: raw, and the share of the packed bytes, the largest first. `image` has the parts
+/// of the RAM image; code that runs from flash is listed by its section.
+fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> Vec<Share> {
     let packed = Packed::of(elf);
     let zeros = image.get(parts::ZEROS).copied().unwrap_or(0);
     let share = |part: &str, raw| match packed {
@@ -235,20 +260,18 @@ fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> String {
     };
     let plain = elf.sections.iter().filter(|section| section.loaded);
     let plain = plain.filter(|section| section.name != pack::PACKED && section.name != pack::IMAGE);
-    let plain = plain.map(|section| (format!("{} (in flash)", section.name), section.size, section.size));
-    let row = |(part, raw): (String, u32)| {
-        let share = share(&part, raw);
-        (part, raw, share)
-    };
+    let plain = plain.map(|section| Share {
+        part: format!("{} (in flash)", section.name),
+        raw: section.size,
+        packed: section.size,
+    });
+    let row = |(part, raw): (String, u32)| Share { packed: share(&part, raw), part, raw };
     let mut rows: Vec<_> = image.into_iter().map(row).chain(plain).collect();
-    let all = rows.iter().fold((0, 0), |all, (_, raw, share)| (all.0 + raw, all.1 + share));
-    rows.push(("(all)".to_owned(), all.0, all.1));
-    rows.sort_by_key(|(_, raw, _)| cmp::Reverse(*raw));
-    let mut text = String::from("part                               raw  packed (share)\n");
-    for (name, raw, share) in rows {
-        let _ = writeln!(text, "{name:<31} {raw:>6}  {share:>6}");
-    }
-    text
+    let sum = |of: fn(&Share) -> u32| rows.iter().map(of).sum();
+    let all = Share { part: "(all)".to_owned(), raw: sum(|row| row.raw), packed: sum(|row| row.packed) };
+    rows.push(all);
+    rows.sort_by_key(|row| cmp::Reverse(row.raw));
+    rows
 }
 
 /// A number of bytes, in KiB if it is a whole number of them.
@@ -319,13 +342,26 @@ mod tests {
         let mut stored = elf.sections[1].clone();
         (stored.name, stored.size) = (pack::PACKED.into(), 4);
         elf.sections.push(stored);
-        let table = by_part(&elf, [("a/b".to_owned(), 6), ("core".to_owned(), 2)].into());
-        assert!(table.contains("a/b                                  6       3\n"), "{table}");
-        assert!(table.contains("core                                 2       1\n"), "{table}");
-        assert!(table.contains(".vectors (in flash)                 32      32\n"), "{table}");
-        assert!(table.contains("(all)                               40      36\n"), "{table}");
-        let table = by_part(&elf, [("a/b".to_owned(), 4), (parts::ZEROS.to_owned(), 4)].into());
-        assert!(table.contains("a/b                                  4       4\n"), "{table}");
-        assert!(table.contains("(zeros)                              4       0\n"), "{table}");
+        let rows = |image: &[(&str, u32)]| {
+            let image = image.iter().map(|(part, raw)| ((*part).to_owned(), *raw)).collect();
+            by_part(&elf, image).iter().map(Share::json).collect::<Vec<_>>()
+        };
+        let of_a = rows(&[("a/b", 6), ("core", 2)]);
+        let expected = [
+            r#"{"part": "(all)", "raw": 40, "packed": 36}"#,
+            r#"{"part": ".vectors (in flash)", "raw": 32, "packed": 32}"#,
+            r#"{"part": "a/b", "raw": 6, "packed": 3}"#,
+            r#"{"part": "core", "raw": 2, "packed": 1}"#,
+        ];
+        assert_eq!(of_a, expected);
+        let with_zeros = rows(&[("a/b", 4), (parts::ZEROS, 4)]);
+        assert!(
+            with_zeros.contains(&r#"{"part": "a/b", "raw": 4, "packed": 4}"#.to_owned()),
+            "{with_zeros:?}"
+        );
+        assert!(
+            with_zeros.contains(&r#"{"part": "(zeros)", "raw": 4, "packed": 0}"#.to_owned()),
+            "{with_zeros:?}"
+        );
     }
 }

@@ -34,7 +34,7 @@ and names the command.
 const KEPT: &str = "docs/evidence/";
 /// The tests of a crate alone, those that are no job of their own, what is built beside the workspace, and what
 /// only reads results.
-const APART: [&str; 16] = [
+const APART: [&str; 17] = [
     ".ci/",
     ".github/",
     "canopen/tests/",
@@ -51,6 +51,7 @@ const APART: [&str; 16] = [
     "xtask/src/evidence/",
     "xtask/src/fuzz.rs",
     "xtask/src/mutants",
+    "xtask/src/size.rs",
 ];
 /// What emulated boards and nodes are made of, and the tests.
 const DEVICES: &[&str] = &[
@@ -70,9 +71,23 @@ const DEVICES: &[&str] = &[
     "tests/",
 ];
 /// How the paths begin of what jobs depend on that read something else than most.
-const READS: [(&str, &[&str]); 5] = [
+const READS: [(&str, &[&str]); 6] = [
     // They read the texts, too.
     ("tests", &[""]),
+    (
+        "size",
+        &[
+            "Cargo.",
+            "boot-core/src/",
+            "bootloader/",
+            "bsp/",
+            "canopen/src/",
+            "linker/",
+            "seal/src/",
+            "shared-abi/src/",
+            "xtask/src/",
+        ],
+    ),
     ("attacker", DEVICES),
     ("cpu", DEVICES),
     (
