@@ -43,9 +43,15 @@ fn main() {
 /// `OUT_DIR/resident.bin`.
 fn resident(package: &Path, out: &Path, layout: &Layout) {
     let workspace = package.join("..");
-    for used in
-        ["bootloader/src", "boot-core/src", "bsp/src", "canopen/src", "seal/src", "shared-abi/src", ".cargo"]
-    {
+    for used in [
+        "bootloader/src",
+        "core/boot-core/src",
+        "bsp/src",
+        "core/canopen/src",
+        "core/seal/src",
+        "shared-abi/src",
+        ".cargo",
+    ] {
         println!("cargo:rerun-if-changed={}", workspace.join(used).display());
     }
     let features = env::vars().filter_map(|(name, _)| {

@@ -1,5 +1,5 @@
 //! The agent against a server with faults, over real sockets, with devices that only note what they
-//! are given. Devices on a bus: node/tests/agent.rs.
+//! are given. Devices on a bus: sim/node/tests/agent.rs.
 
 mod hawkbit;
 

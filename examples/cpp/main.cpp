@@ -1,5 +1,5 @@
-// A small CANopen node in C++17 under coboot. What it does for its bootloader is in app-c/coboot/, which is C; the other
-// files of app-c/ are its CAN controller, its SDO server and its board.
+// A small CANopen node in C++17 under coboot. What it does for its bootloader is in examples/c/coboot/, which is C; the other
+// files of examples/c/ are its CAN controller, its SDO server and its board.
 #include BOARD
 
 #include "board.h"

@@ -59,13 +59,13 @@ impl Drop for Told<'_> {
 }
 
 /// The devices and the wire of the tests in `canopen`.
-#[path = "../../canopen/tests/common/mod.rs"]
+#[path = "../../core/canopen/tests/common/mod.rs"]
 pub mod device;
 /// The memory of the debugger interface's tests in `canopen`.
-#[path = "../../canopen/tests/memory/mod.rs"]
+#[path = "../../core/canopen/tests/memory/mod.rs"]
 pub mod memory;
 /// The strict flash of the tests in `boot-core`.
-#[path = "../../boot-core/tests/model/mod.rs"]
+#[path = "../../core/boot-core/tests/model/mod.rs"]
 pub mod model;
 
 use canopen::node::Node;

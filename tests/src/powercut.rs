@@ -13,7 +13,7 @@
 
 pub mod board;
 mod device;
-#[path = "../../boot-core/tests/model/mod.rs"]
+#[path = "../../core/boot-core/tests/model/mod.rs"]
 #[allow(missing_docs, reason = "it is the tests' own")]
 pub mod model;
 mod point;

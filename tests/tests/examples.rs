@@ -19,7 +19,7 @@ const CRC: Address = Address::new(0x1F56, 1);
 
 /// Each program as version 1, and as version 2, which another compiler may have built.
 const EXAMPLES: [[&str; 2]; 5] = [
-    ["example-c-cmake.elf", "example-c-cmake-v2.elf"],
+    ["example-c.elf", "example-c-v2.elf"],
     ["example-cpp.elf", "example-cpp-v2.elf"],
     ["example-no-stack.elf", "example-no-stack-v2.elf"],
     ["example-embassy.elf", "example-embassy-v2.elf"],
@@ -133,9 +133,7 @@ impl Project {
         let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("c-mistakes").join(name);
         let _ = fs::remove_dir_all(&root);
         let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-        for folder in ["app-c", "examples/c-cmake"] {
-            copy(&house.join(folder), &root.join(folder));
-        }
+        copy(&house.join("examples/c"), &root);
         Self(root)
     }
 
@@ -153,10 +151,10 @@ impl Project {
     /// # Errors
     /// The tools' messages if they refuse it.
     fn build(&self, options: &[&str]) -> Result<PathBuf, String> {
-        let (source, build) = (self.0.join("examples/c-cmake"), self.0.join("build"));
-        let toolchain = self.0.join("app-c/cmake/arm-none-eabi-gcc.cmake");
+        let build = self.0.join("build");
+        let toolchain = self.0.join("cmake/arm-none-eabi-gcc.cmake");
         let mut configure = Command::new("cmake");
-        configure.arg("-S").arg(source).arg("-B").arg(&build).args(options);
+        configure.arg("-S").arg(&self.0).arg("-B").arg(&build).args(options);
         configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
         for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
             let output = command.output().expect("`cargo xtask setup` installs cmake");
@@ -210,7 +208,7 @@ fn another_number_of_vectors_than_the_chips_does_not_link() {
 #[test]
 fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     let project =
-        Project::new("label").edit("app-c/main.c", "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n", "");
+        Project::new("label").edit("main.c", "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n", "");
     let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
     let (good, told) = judged(&["inspect"], &elf);
     assert!(good && told.contains("can be a program") && !told.contains("  label "), "{told}");
@@ -223,7 +221,7 @@ fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     // A second label is an error.
     let again = "COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);\n";
     let project = Project::new("label").edit(
-        "app-c/board.c",
+        "board.c",
         "#include \"registers.h\"\n",
         &format!("#include \"registers.h\"\n#include \"coboot/coboot.h\"\n#define VERSION 1\n{again}"),
     );
@@ -235,7 +233,7 @@ fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
 /// another program.
 #[test]
 fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
-    let layout = "examples/c-cmake/layout.x";
+    let layout = "layout.x";
     let at_the_beginning = |name: &str| {
         Project::new(name).edit(layout, "0x08010000, LENGTH = 0xf0000", "0x08000000, LENGTH = 0x100000")
     };
@@ -243,7 +241,7 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     assert!(refused.contains("ERROR(coboot): the program lies over the bootloader's callgate"), "{refused}");
 
     // With a linker script without the parts for coboot.
-    let project = at_the_beginning("address").edit("app-c/app.x", "  INCLUDE coboot.x\n", "");
+    let project = at_the_beginning("address").edit("app.x", "  INCLUDE coboot.x\n", "");
     let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
     for words in [&["convert"][..], &FLASH] {
         let (good, told) = judged(words, &elf);
@@ -269,7 +267,7 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
 #[test]
 fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     let project = Project::new("vtor").edit(
-        "app-c/startup.c",
+        "startup.c",
         "SCB_VTOR = (uint32_t)(uintptr_t)vectors;",
         "SCB_VTOR = 0x08000000;",
     );
@@ -308,13 +306,13 @@ fn the_blocks_of_the_page_for_cube_link_and_compile() {
     let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let page = fs::read_to_string(house.join("docs/cube.md")).expect("the page");
     let project = Project::new("cube")
-        .edit("app-c/startup.c", "section(\".vector_table\")", "section(\".isr_vector\")")
-        .edit("app-c/startup.c", "    [1] = reset,", "    [1] = Reset_Handler,")
-        .edit("app-c/startup.c", "void reset(void);", "void Reset_Handler(void);")
-        .edit("app-c/startup.c", "void reset(void)\n{", "void Reset_Handler(void)\n{")
-        .edit("app-c/startup.c", "extern uint32_t _stack_start,", "extern uint32_t _estack,")
-        .edit("app-c/startup.c", "&_stack_start", "&_estack");
-    let script = project.0.join("app-c/app.x");
+        .edit("startup.c", "section(\".vector_table\")", "section(\".isr_vector\")")
+        .edit("startup.c", "    [1] = reset,", "    [1] = Reset_Handler,")
+        .edit("startup.c", "void reset(void);", "void Reset_Handler(void);")
+        .edit("startup.c", "void reset(void)\n{", "void Reset_Handler(void)\n{")
+        .edit("startup.c", "extern uint32_t _stack_start,", "extern uint32_t _estack,")
+        .edit("startup.c", "&_stack_start", "&_estack");
+    let script = project.0.join("app.x");
     let before = fs::read_to_string(&script).unwrap();
     let (_, as_it_was) = before.split_once("  INCLUDE coboot.x\n").expect("the sample's script");
     fs::write(&script, format!("{}{as_it_was}", block(&page, "ld"))).unwrap();
@@ -332,7 +330,7 @@ fn the_blocks_of_the_page_for_cube_link_and_compile() {
     fs::write(folder.join("main.c"), block(&page, "c")).unwrap();
     let mut gcc = Command::new("arm-none-eabi-gcc");
     gcc.args(["-mcpu=cortex-m4", "-mthumb", "-std=gnu11", "-ffreestanding", "-Wall", "-Wextra", "-Werror"]);
-    gcc.arg("-I").arg(house.join("app-c")).arg("-c").arg(folder.join("main.c"));
+    gcc.arg("-I").arg(house.join("examples/c")).arg("-c").arg(folder.join("main.c"));
     let output = gcc.arg("-o").arg(folder.join("main.o")).output().expect("it can be started");
     assert!(output.status.success(), "{}", text(&output));
 }

@@ -1,6 +1,6 @@
 //! How long a request waits for its answer on a hostile bus, with the built firmware in virtual
 //! time: while a flood lasts, behind it, and behind bus-off. The limits are counted in bits of ISO
-//! 11898-1 and in the waits of the device (`canopen/src/line.rs`).
+//! 11898-1 and in the waits of the device (`core/canopen/src/line.rs`).
 
 use coboot_tests::bench::{Bench, BIT_RATE, NODE, REQUEST, RESPONSE};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};

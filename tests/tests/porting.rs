@@ -117,8 +117,11 @@ fn a_board_is_made_as_the_guide_says() {
     let copy = Copy::new();
     let before = files(&copy.root);
     copy.xtask(&["new-board", "my-board", "--chip", "STM32F405RGT6"]);
-    let new =
-        ["app-c/boards/my-board.h", "bsp/src/boards/my_board.rs", "shared-abi/src/layout/boards/my_board.rs"];
+    let new = [
+        "examples/c/boards/my-board.h",
+        "bsp/src/boards/my_board.rs",
+        "shared-abi/src/layout/boards/my_board.rs",
+    ];
     let after = files(&copy.root);
     assert!(before.iter().all(|file| after.contains(file)), "a file changed");
     let added: Vec<_> = after.iter().filter(|file| !before.contains(file)).map(|(name, _)| &**name).collect();

@@ -1,4 +1,4 @@
-//! The Python package (`python/`): its wheel is built and installed like a user's, its own tests
+//! The Python package (`coflash/python/`): its wheel is built and installed like a user's, its own tests
 //! run against `coboot-node` over TCP, and it updates the emulated sealed board.
 
 use std::path::{Path, PathBuf};
@@ -64,7 +64,7 @@ fn root() -> &'static Path {
 }
 
 fn source() -> PathBuf {
-    root().join("python")
+    root().join("coflash/python")
 }
 
 /// A Python with the package.

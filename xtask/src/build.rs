@@ -217,14 +217,14 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
 }
 
 /// Builds the application in C for each program of a board, and the same with the tests' object
-/// 2100h. A board without a header in app-c/boards has none.
+/// 2100h. A board without a header in examples/c/boards has none.
 ///
 /// # Errors
 /// When it does not build, or is not an image of this board.
 pub fn c_applications(board: &Layout) -> Outcome {
-    let sources = workspace::root().join("app-c");
+    let sources = workspace::root().join("examples/c");
     if !sources.join("boards").join(board.board).with_extension("h").exists() {
-        eprintln!("  app-c/boards has no {}.h: no application in C", board.board);
+        eprintln!("  examples/c/boards has no {}.h: no application in C", board.board);
         return Ok(());
     }
     for (number, region) in (1..).zip(board.programs) {
@@ -240,7 +240,7 @@ pub fn c_applications(board: &Layout) -> Outcome {
 /// Builds the application in C for a program of a board, from its sources and an additional one;
 /// returns the ELF file.
 fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> Outcome<PathBuf> {
-    let sources = workspace::root().join("app-c");
+    let sources = workspace::root().join("examples/c");
     let dir = workspace::firmware_dir(board);
     let work = dir.join("c").join(name);
     fs::create_dir_all(&work)
@@ -274,7 +274,7 @@ pub const C_APPLICATION: &str = "app-c";
 const C_SOURCES: [&str; 8] =
     ["startup.c", "board.c", "can.c", "coboot/reentry.c", "coboot/program.c", "objects.c", "sdo.c", "main.c"];
 /// The source of the tests' objects.
-const PROBE: &str = "../tests/c/probe.c";
+const PROBE: &str = "../../tests/c/probe.c";
 /// The compiler's arguments. The application does not use the FPU, so it is compiled for a chip
 /// without one; the functions of the bootloader that it calls have no floating-point arguments or
 /// results.
@@ -289,7 +289,7 @@ const C_FLAGS: &[&str] = &[
     "-fdata-sections",
     "-Os",
     "-g",
-    "-fdebug-compilation-dir=app-c",
+    "-fdebug-compilation-dir=examples/c",
     "-I.",
     "-Wall",
     "-Wextra",

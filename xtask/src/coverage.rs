@@ -29,10 +29,10 @@ const VERSION: &str = "0.9.1";
 /// The crates, by package and by folder.
 const CRATES: [(&str, &str); 5] = [
     ("coboot-abi", "shared-abi"),
-    ("coboot-canopen", "canopen"),
-    ("coboot-core", "boot-core"),
+    ("coboot-canopen", "core/canopen"),
+    ("coboot-core", "core/boot-core"),
     ("coboot-app", "coboot-app"),
-    ("coboot-seal", "seal"),
+    ("coboot-seal", "core/seal"),
 ];
 /// The tests of sealed images that need no built firmware.
 pub const SEALED_TESTS: [&str; 4] = ["sealed_access", "sealed_dictionary", "sealed_model", "sealed_pieces"];
@@ -126,16 +126,16 @@ mod tests {
             )
         };
         let files = [
-            file("/x/canopen/src/a.rs", 10, 9),
-            file("/x/canopen/src/b/c.rs", 30, 21),
-            file("/x/canopen/tests/d.rs", 100, 100),
-            file("/x/seal/src/lib.rs", 5, 5),
-            file("/y/seal/src/lib.rs", 50, 50),
+            file("/x/core/canopen/src/a.rs", 10, 9),
+            file("/x/core/canopen/src/b/c.rs", 30, 21),
+            file("/x/core/canopen/tests/d.rs", 100, 100),
+            file("/x/core/seal/src/lib.rs", 5, 5),
+            file("/y/core/seal/src/lib.rs", 50, 50),
             file("/x/coflash/src/main.rs", 70, 0),
         ];
         let report = Value::parse(&format!("{{\"data\": [{{\"files\": [{}]}}]}}", files.join(","))).unwrap();
         let counts = by_crate(&report, Path::new("/x"));
-        assert_eq!(counts, BTreeMap::from([("canopen", [40, 30]), ("seal", [5, 5])]));
+        assert_eq!(counts, BTreeMap::from([("core/canopen", [40, 30]), ("core/seal", [5, 5])]));
         let record = Value::parse(&as_json(&counts)).unwrap();
         assert_eq!(record.get("reached").number(), Some(35.0));
         assert_eq!(record.get("crates").items()[0].get("percent").number(), Some(75.0));

@@ -144,10 +144,12 @@ pub fn check(shown: &Shown) -> Option<String> {
 
 /// Whether a folder of the workspace contains the package of this name.
 fn is_package(name: &str) -> bool {
-    let folders = fs::read_dir(workspace::root()).expect("the workspace can be read");
+    let workspace = fs::read_to_string(workspace::root().join("Cargo.toml")).expect("the workspace has one");
     let named = format!("name = \"{name}\"");
-    folders.flatten().any(|folder| {
-        let manifest = fs::read_to_string(folder.path().join("Cargo.toml")).unwrap_or_default();
+    // The members, and what else is in quotes: no package has such a folder.
+    workspace.split('"').any(|folder| {
+        let manifest =
+            fs::read_to_string(workspace::root().join(folder).join("Cargo.toml")).unwrap_or_default();
         let package = manifest.split("\n[").next().unwrap_or_default();
         package.starts_with("[package]") && package.lines().any(|line| line == named)
     })
@@ -183,7 +185,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
                 let name = words.next().unwrap_or_default();
                 let is_test =
                     |krate: &&str| workspace::root().join(krate).join(format!("tests/{name}.rs")).exists();
-                if !["tests", "coflash", "node", "canopen", "boot-core"].iter().any(is_test) {
+                if !["tests", "coflash", "sim/node", "core/canopen", "core/boot-core"].iter().any(is_test) {
                     return Some(format!("there is no test {name}"));
                 }
             }

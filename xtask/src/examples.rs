@@ -18,8 +18,8 @@ usage: cargo xtask examples [NAME...] [--yes]
 Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
 target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all of them:
 
-  c-cmake       C by CMake, with arm-none-eabi-gcc
-  c-cmake-v2    the same as version 2, with clang
+  c       C by CMake, with arm-none-eabi-gcc
+  c-v2    the same as version 2, with clang
   cpp           C++17 by CMake, with arm-none-eabi-g++
   cpp-v2        the same as version 2, with clang++
   no-stack      Rust without a CANopen stack: a main loop
@@ -49,7 +49,7 @@ struct Example {
 /// The build tool of an example.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tools {
-    /// CMake with a toolchain file of `app-c/cmake/`; the version is for the program's label.
+    /// CMake with a toolchain file of `examples/c/cmake/`; the version is for the program's label.
     Cmake { toolchain: &'static str, version: u32 },
     /// Cargo: the program of this name, with features of its package.
     Cargo { program: &'static str, features: &'static str },
@@ -58,12 +58,8 @@ enum Tools {
 }
 
 const EXAMPLES: &[Example] = &[
-    Example {
-        name: "c-cmake",
-        folder: "c-cmake",
-        tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
-    },
-    Example { name: "c-cmake-v2", folder: "c-cmake", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
+    Example { name: "c", folder: "c", tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 } },
+    Example { name: "c-v2", folder: "c", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
     Example {
         name: "cpp",
         folder: "cpp",
@@ -147,7 +143,7 @@ fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<P
         fs::remove_dir_all(work)
             .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(work)))?;
     }
-    let toolchain = workspace::root().join("app-c/cmake").join(toolchain).with_extension("cmake");
+    let toolchain = workspace::root().join("examples/c/cmake").join(toolchain).with_extension("cmake");
     let mut configure = Command::new("cmake");
     configure.arg("-S").arg(folder).arg("-B").arg(work);
     configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
@@ -282,8 +278,6 @@ mod tests {
             assert!(by_name(example.name).is_ok_and(|found| found.folder == example.folder));
         }
         let unknown = by_name("cmake");
-        assert!(
-            unknown.is_err_and(|problem| problem.contains("there are: c-cmake, c-cmake-v2, cpp, cpp-v2, "))
-        );
+        assert!(unknown.is_err_and(|problem| problem.contains("there are: c, c-v2, cpp, cpp-v2, ")));
     }
 }

@@ -64,14 +64,19 @@ const EVIDENCE: &str = "fuzz";
 const LEAST: u64 = 10_000_000;
 /// What a target depends on that names this crate: the beginnings of paths.
 const READS: [(&str, &[&str]); 6] = [
-    ("boot_core", &["boot-core/src/", "canopen/src/", "seal/src/", "shared-abi/src/"]),
-    ("canopen", &["canopen/src/"]),
+    ("boot_core", &["core/boot-core/src/", "core/canopen/src/", "core/seal/src/", "shared-abi/src/"]),
+    ("canopen", &["core/canopen/src/"]),
     (
         "coboot_fuzz",
-        &["fuzz/src/", "canopen/tests/common/", "canopen/tests/memory/", "boot-core/tests/model/"],
+        &[
+            "fuzz/src/",
+            "core/canopen/tests/common/",
+            "core/canopen/tests/memory/",
+            "core/boot-core/tests/model/",
+        ],
     ),
-    ("coflash", &["coflash/src/", "canopen/src/", "seal/src/", "shared-abi/src/"]),
-    ("seal", &["seal/src/"]),
+    ("coflash", &["coflash/src/", "core/canopen/src/", "core/seal/src/", "shared-abi/src/"]),
+    ("seal", &["core/seal/src/"]),
     ("shared_abi", &["shared-abi/src/"]),
 ];
 
@@ -527,16 +532,16 @@ mod tests {
         let folder = workspace::root().join("fuzz");
         for (target, file, expected) in [
             ("candump", "coflash/src/bus/mod.rs", true),
-            ("candump", "canopen/src/lss.rs", true),
-            ("candump", "boot-core/src/crc.rs", false),
+            ("candump", "core/canopen/src/lss.rs", true),
+            ("candump", "core/boot-core/src/crc.rs", false),
             ("candump", "fuzz/src/lib.rs", true),
             ("candump", "fuzz/fuzz_targets/candump.rs", true),
             ("candump", "fuzz/fuzz_targets/lss.rs", false),
-            ("signature", "seal/src/ed25519.rs", true),
-            ("signature", "canopen/src/lss.rs", false),
+            ("signature", "core/seal/src/ed25519.rs", true),
+            ("signature", "core/canopen/src/lss.rs", false),
             ("resume", "fuzz/Cargo.lock", true),
-            ("resume", "boot-core/tests/model/mod.rs", true),
-            ("resume", "boot-core/tests/resume.rs", false),
+            ("resume", "core/boot-core/tests/model/mod.rs", true),
+            ("resume", "core/boot-core/tests/resume.rs", false),
             ("resume", "README.md", false),
         ] {
             assert_eq!(is_read(&folder, target, file), expected, "{target}: {file}");

@@ -19,9 +19,9 @@ usage: cargo xtask header
 
 Prints the C header of the ABI between bootloader and application, made from shared-abi: warm-start cell,
 handoff, callgate and label. It is the same for every board; addresses come from the linker, by the symbols that
-`cargo xtask layout --ld program-1` prints. app-c/coboot/coboot.h is a copy of it:
+`cargo xtask layout --ld program-1` prints. examples/c/coboot/coboot.h is a copy of it:
 
-    cargo xtask header > app-c/coboot/coboot.h
+    cargo xtask header > examples/c/coboot/coboot.h
 ";
 
 /// The text of the header around its numbers.
@@ -251,8 +251,11 @@ mod tests {
 
     #[test]
     fn the_copy_in_the_c_application_is_up_to_date() {
-        let copy = fs::read_to_string(workspace::root().join("app-c/coboot/coboot.h")).unwrap();
-        assert!(copy == header(), "app-c/coboot/coboot.h is old: cargo xtask header > app-c/coboot/coboot.h");
+        let copy = fs::read_to_string(workspace::root().join("examples/c/coboot/coboot.h")).unwrap();
+        assert!(
+            copy == header(),
+            "examples/c/coboot/coboot.h is old: cargo xtask header > examples/c/coboot/coboot.h"
+        );
     }
 
     #[test]

@@ -8,7 +8,7 @@ use crate::{workspace, Outcome};
 
 /// The pages outside `docs/` and `examples/`.
 pub const ELSEWHERE: [&str; 5] =
-    ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md", "python/README.md"];
+    ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md", "coflash/python/README.md"];
 
 /// A link within the repository.
 #[derive(Clone, Debug, PartialEq, Eq)]

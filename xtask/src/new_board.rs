@@ -91,7 +91,7 @@ fn files(name: &str, chip: &'static Geometry) -> Outcome<[(String, String); 3]> 
     Ok([
         (format!("shared-abi/src/layout/boards/{module}.rs"), layout_file(name, chip)),
         (format!("bsp/src/boards/{module}.rs"), board_file(name, chip)),
-        (format!("app-c/boards/{name}.h"), c_header(name, chip)),
+        (format!("examples/c/boards/{name}.h"), c_header(name, chip)),
     ])
 }
 

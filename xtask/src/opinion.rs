@@ -11,7 +11,7 @@ use crate::{build, evidence, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json] [--yes]
 
-Runs the programs of emulator/tests/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
+Runs the programs of sim/emulator/tests/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
 (mps2-an386), and compares their results word for word. A difference that is not explained in the
 table of the programs is a failure. Then updates the bootloader with CAN over UART through the serial
 port of the emulated board and of QEMU's STM32F405 (netduinoplus2), and compares every sector of the

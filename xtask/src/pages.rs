@@ -27,7 +27,8 @@ const FOREIGN: [&str; 4] = ["target", ".git", "corpus", "node_modules"];
 
 /// The commands of all pages.
 pub fn commands() -> Vec<Shown> {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("a crate lies in the workspace");
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().find(|folder| folder.join("docs").is_dir());
+    let root = root.expect("a crate lies in the workspace");
     let mut pages = Vec::new();
     find(root, &mut pages);
     pages.sort();

@@ -52,9 +52,10 @@ fn part(files: &[String], root: &Path) -> String {
     let ours = files.iter().find_map(|file| {
         // The firmware's debug information may name files relative to the workspace.
         let file = Path::new(file).strip_prefix(root).unwrap_or(Path::new(file));
-        let mut names = file.iter().filter_map(|name| name.to_str());
-        let (krate, src, module) = (names.next()?, names.next()?, names.next()?);
-        (src == "src").then(|| format!("{krate}/{}", module.trim_end_matches(".rs")))
+        let names: Vec<&str> = file.iter().filter_map(|name| name.to_str()).collect();
+        let src = names.iter().position(|name| *name == "src").filter(|_| file.is_relative())?;
+        let (krate, module) = (names.get(src.checked_sub(1)?)?, names.get(src + 1)?);
+        Some(format!("{krate}/{}", module.trim_end_matches(".rs")))
     });
     let theirs = || {
         let file = files.last()?;
@@ -82,7 +83,7 @@ mod tests {
         assert_eq!(part(&["/rustc/1/library/core/src/option.rs", bxcan]), "bxcan");
         let files = [bxcan, "/house/bsp/src/can.rs", "/house/bootloader/src/main.rs"];
         assert_eq!(part(&files), "bsp/can");
-        assert_eq!(part(&["/house/boot-core/src/intake/ihex.rs"]), "boot-core/intake");
-        assert_eq!(part(&["canopen/src/lss.rs"]), "canopen/lss");
+        assert_eq!(part(&["/house/core/boot-core/src/intake/ihex.rs"]), "boot-core/intake");
+        assert_eq!(part(&["core/canopen/src/lss.rs"]), "canopen/lss");
     }
 }

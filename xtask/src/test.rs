@@ -158,7 +158,7 @@ fn side_by_side(
 /// take minutes one by one.
 fn with_images(board: &Layout) -> Outcome<VecDeque<(Option<&Layout>, Vec<String>)>> {
     let mut names = Vec::new();
-    for folder in ["tests/tests", "boot-core/tests", "canopen/tests"] {
+    for folder in ["tests/tests", "core/boot-core/tests", "core/canopen/tests"] {
         let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
         for entry in fs::read_dir(workspace::root().join(folder)).map_err(unreadable)? {
             let path = entry.map_err(unreadable)?.path();

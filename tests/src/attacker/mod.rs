@@ -18,7 +18,7 @@
 //! | [`setup`] | the firmware and the images |
 //! | `masters` | what the masters send |
 //!
-//! The attackers below the bus are in `boot-core/tests`: `attacker.rs` drives the object dictionary
+//! The attackers below the bus are in `core/boot-core/tests`: `attacker.rs` drives the object dictionary
 //! on the strict flash model, with faults of the flash, and `masters.rs` the slave; sealed devices
 //! have `tests/tests/sealed_attacker.rs`.
 
@@ -55,7 +55,7 @@ const START_US: u64 = 700_000;
 const WORK_US: u64 = 40_000_000;
 
 /// A device with a password waits with a reset until no wrong password delays the next attempt
-/// (`canopen/src/password.rs`), in us.
+/// (`core/canopen/src/password.rs`), in us.
 const PASSWORD_US: u64 = 33_000_000;
 
 /// A broken rule, with details.

@@ -39,7 +39,7 @@ pub fn wheel(release: &Release) -> Outcome {
     }
     let mut maturin = Command::new(setup::python());
     maturin.args(["-m", "maturin", "build", "--profile", PROFILE, "--locked", "--quiet", "--manifest-path"]);
-    maturin.arg(workspace::root().join("python/Cargo.toml")).arg("--out").arg(&release.dist);
+    maturin.arg(workspace::root().join("coflash/python/Cargo.toml")).arg("--out").arg(&release.dist);
     maturin.arg("--target-dir").arg(&release.build).env("SOURCE_DATE_EPOCH", &release.epoch);
     process::run(reproducible(&mut maturin, workspace::root()))
 }

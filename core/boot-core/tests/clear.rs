@@ -1,0 +1,212 @@
+//! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
+
+#[path = "../../../tests/src/ihex.rs"]
+#[allow(dead_code, reason = "the rig needs its records")]
+mod ihex;
+mod model;
+mod rig;
+
+use canopen::AbortCode;
+use model::{quiet_power_cuts, until_power_cut, Cut};
+use rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
+use shared_abi::geometry::Region;
+
+const CLEAR: u8 = 0x03;
+const BUSY: u32 = 1;
+const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
+
+fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
+    program(setup.region(number), PRODUCT_CODE, len, number)
+}
+
+/// The sectors of a program that were erased since the last call, by their addresses, each once.
+fn erased(rig: &Rig, number: u8) -> Vec<u32> {
+    let region = rig.setup.region(number);
+    let touched = std::mem::take(&mut rig.chip.model().touched);
+    let of_program = |at: &Region| region.contains(at.base, at.size) && at.size > 4;
+    let sectors: Vec<u32> = touched.into_iter().filter(of_program).map(|at| at.base).collect();
+    assert!(sectors.is_sorted_by(|a, b| a < b), "{sectors:x?}");
+    sectors
+}
+
+/// The sectors of the first `bytes` bytes of program 1 of the model: one of 400h bytes at 800h,
+/// then sectors of 800h bytes (from the F407's 64 and 128 KiB).
+fn sectors(bytes: u32) -> Vec<u32> {
+    let all = [0x0800_0800, 0x0800_0C00, 0x0800_1400, 0x0800_1C00, 0x0800_2400, 0x0800_2C00, 0x0800_3400];
+    let all = all.into_iter().chain([0x0800_3C00]);
+    all.filter(|base| *base < 0x0800_0800 + bytes).collect()
+}
+
+/// CLEAR twice; returns the erased sectors.
+fn clear(rig: &mut Rig, number: u8) -> Vec<u32> {
+    rig.chip.model().touched.clear();
+    for _ in 0..2 {
+        rig.command(number, CLEAR).expect("CLEAR is taken");
+        rig.settle();
+        assert_eq!(rig.status(number), 0);
+    }
+    assert!(rig.cells(number).iter().all(|byte| *byte == 0xFF), "something is left");
+    erased(rig, number)
+}
+
+#[test]
+fn a_second_clear_erases_what_was_written_since_the_last_one() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    assert_eq!(clear(&mut rig, 1), [], "a new device");
+    rig.install(1, &raw(&STANDARD_1, 1, 100));
+    assert_eq!(clear(&mut rig, 1), sectors(100));
+    assert_eq!(clear(&mut rig, 1), []);
+    // Across resets.
+    rig.install(1, &raw(&STANDARD_1, 1, 3000));
+    rig.reset();
+    assert_eq!(clear(&mut rig, 1), sectors(3000));
+    rig.reset();
+    assert_eq!(clear(&mut rig, 1), []);
+    // After a smaller program, the rest of the larger one is still in flash; released and
+    // confirmed.
+    rig.install(1, &raw(&STANDARD_1, 1, 5000));
+    rig.install(1, &raw(&STANDARD_1, 1, 600));
+    rig.command(1, 0x83).unwrap();
+    rig.settle();
+    rig.reset();
+    assert_eq!(clear(&mut rig, 1), sectors(5000));
+    // Sectors that were erased for the program, but not written, are still erased.
+    let mut holey = raw(&STANDARD_1, 1, 9000);
+    holey[1000..].fill(0xFF);
+    rig.install(1, &holey);
+    assert_eq!(clear(&mut rig, 1), sectors(1000));
+    assert_eq!(clear(&mut rig, 1), []);
+    // A debugger has written something to the last sector.
+    rig.chip.model().poke(0x0800_43FC, &[0x7F]);
+    assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
+    // An aborted download may have left more than the contents show, also behind a program that was
+    // installed since.
+    let image = raw(&STANDARD_1, 1, 3000);
+    for installed_since in [false, true] {
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.begin(1, Some(3000), &image[..2500]).unwrap();
+        rig.steps(60);
+        rig.reset();
+        if installed_since {
+            rig.install(1, &raw(&STANDARD_1, 1, 100));
+            rig.reset();
+        }
+        assert_eq!(clear(&mut rig, 1), sectors(0x3C00));
+        assert_eq!(clear(&mut rig, 1), []);
+    }
+}
+
+/// The same if CLEAR erases at once, and with a second program, which stays.
+#[test]
+fn every_clear_that_erases_does_so() {
+    let mut rig = Rig::new(&STANDARD_2, 1024);
+    rig.install(1, &raw(&STANDARD_2, 1, 1500));
+    rig.install(2, &raw(&STANDARD_2, 2, 1500));
+    assert_eq!(clear(&mut rig, 2), [0x0800_2400]);
+    assert_eq!((rig.state(1), rig.state(2)), (0, 3));
+    assert_eq!(clear(&mut rig, 2), []);
+    assert_eq!(clear(&mut rig, 1), sectors(1500));
+    let mut rig = Rig::new(&AT_ONCE_2, 1024);
+    rig.install(1, &raw(&STANDARD_2, 1, 1500));
+    rig.chip.model().touched.clear();
+    rig.command(1, CLEAR).unwrap();
+    assert_eq!(rig.status(1) & BUSY, BUSY);
+    rig.settle();
+    assert_eq!(erased(&rig, 1), sectors(1500));
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    assert_eq!(erased(&rig, 1), []);
+}
+
+/// The task that answers the bus waits for a step.
+#[test]
+fn to_look_for_what_is_written_takes_many_small_steps() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    for _ in 0..2 {
+        rig.command(1, CLEAR).unwrap();
+        loop {
+            rig.chip.model().bytes_read.set(0);
+            if rig.node.is_idle_after_step() {
+                break;
+            }
+            // A step of the CRC is as long, and the journal of the model has 512 bytes.
+            let read = rig.chip.model().bytes_read.get();
+            assert!(read <= 1024 + 512, "{read} bytes in one step");
+        }
+    }
+}
+
+/// The power is cut in any operation of a large program's download. Then a small program is
+/// installed or not, and removed by two CLEARs: all of the flash is erased completely.
+#[test]
+fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
+    quiet_power_cuts();
+    let mut cuts = 0;
+    for small in [false, true] {
+        for seed in 0..12 {
+            let cut = if seed % 2 == 0 { Cut::Unstable(seed / 2) } else { Cut::Torn(seed / 2) };
+            // Erase operations occur between some hundred words.
+            for number in (1..).step_by(7) {
+                let mut rig = Rig::new(&STANDARD_1, 1024);
+                rig.install(1, &raw(&STANDARD_1, 1, 9000));
+                rig.chip.model().power_on();
+                rig.reset();
+                rig.chip.model().cut = Some((number, cut));
+                let was_cut = until_power_cut(|| {
+                    rig.command(1, CLEAR).unwrap();
+                    rig.settle();
+                    if seed < 6 {
+                        rig.command(1, CLEAR).unwrap();
+                    } else {
+                        rig.send(1, &raw(&STANDARD_1, 1, 8000)).unwrap();
+                    }
+                    rig.settle();
+                });
+                if !was_cut {
+                    break;
+                }
+                cuts += 1;
+                rig.reset();
+                if small {
+                    rig.install(1, &raw(&STANDARD_1, 1, 100));
+                    rig.reset();
+                }
+                clear(&mut rig, 1);
+                assert!(rig.chip.model().is_stable(STANDARD_1.region(1)), "{cut:?} in operation {number}");
+                rig.reset();
+                assert_eq!(clear(&mut rig, 1), []);
+            }
+        }
+    }
+    assert!(cuts > 200, "{cuts}");
+}
+
+/// An aborted raw image leaves a running erase, and records that are being stored. While a command
+/// is refused for this reason, the status is busy.
+#[test]
+fn a_command_is_refused_as_untimely_only_while_the_status_says_busy() {
+    for setup in [&STANDARD_1, &STANDARD_2] {
+        for sent in [8, 700, 1100, 2100] {
+            for steps in 0..120 {
+                for command in [0x01, 0x02, 0x83, 0x84] {
+                    let mut rig = Rig::new(setup, 4096);
+                    rig.install(1, &raw(setup, 1, 3000));
+                    rig.command(1, CLEAR).unwrap();
+                    rig.settle();
+                    rig.begin(1, Some(3000), &raw(setup, 1, 3000)[..sent]).unwrap();
+                    rig.steps(steps);
+                    rig.cancel(1);
+                    // Program 2 must wait for the same flash.
+                    let number = setup.programs();
+                    let busy = rig.status(number) & BUSY != 0;
+                    let taken = rig.command(number, command);
+                    let expected = if busy { Err(MAN_BUSY) } else { Ok(()) };
+                    assert_eq!(taken, expected, "{command:02X} for {number}, {sent} sent, {steps} steps");
+                    rig.settle();
+                    assert_eq!(rig.status(1) & BUSY, 0);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,1056 @@
+//! What the objects say, and what the device does beside a download: each object of each program,
+//! emergencies, layer setting services, the second server, and commands in each other's way.
+
+mod bench;
+#[path = "../../../tests/src/ihex.rs"]
+#[allow(dead_code, reason = "the rig needs its records")]
+mod ihex;
+mod model;
+mod rig;
+
+use std::task::Poll;
+
+use bench::{Bench, CONFIG, CONTROL};
+use boot_core::bootloader::Config;
+use boot_core::control::{Policy, Step};
+use boot_core::flash::FlashFault;
+use boot_core::profile::Profile;
+use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
+use canopen::line::LineEvent;
+use canopen::lss::{LssDevice, StoreError};
+use canopen::od::{Address, Objects};
+use canopen::slave::SlaveDevice;
+use canopen::{AbortCode, BitRate, NodeId};
+use model::{ModelFlash, CHIP};
+use rig::{
+    crc32, program, Rig, Setup, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
+};
+use shared_abi::label;
+use shared_abi::warm_start::BootRequest;
+
+const START: u8 = 0x01;
+const CLEAR: u8 = 0x03;
+const SET_SIGNATURE: u8 = 0x83;
+const CLR_SIGNATURE: u8 = 0x84;
+/// 1F57h: the flash works, and nothing has failed.
+const BUSY: u32 = 1;
+
+/// CiA 301, abort codes of SDO: not now, the device is in another state.
+const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
+const NO_SUB_INDEX: AbortCode = AbortCode(0x0609_0011);
+
+fn raw(setup: &'static Setup, number: u8, len: usize) -> Vec<u8> {
+    program(setup.region(number), PRODUCT_CODE, len, number)
+}
+
+fn read(rig: &mut Rig, index: u16, sub: u8) -> Result<Vec<u8>, AbortCode> {
+    let mut bytes = [0; 64];
+    let len = rig.node.read(Address::new(index, sub), &mut bytes)?;
+    Ok(bytes[..len].to_vec())
+}
+
+fn word(value: u32) -> Result<Vec<u8>, AbortCode> {
+    Ok(value.to_le_bytes().to_vec())
+}
+
+// --- the profiles
+
+/// Port's Paulus, table 3: 08000000h for an unknown request; CiA 301: 05040001h. ESAcademy: 1000h is
+/// "BOOT", node-ID 64 at 125 kbit/s, 7F50h. CiA 417-1: profile 417 in the low half of 1000h; CiA 814-1:
+/// node-ID 126.
+#[test]
+fn each_profile_is_that_of_its_document() {
+    let of = |profile: Profile| {
+        let default_node = profile.default_node.map(|(id, rate)| (id.get(), rate));
+        (profile.device_type, profile.node_id.map(NodeId::get), default_node, profile.unknown_request.0)
+    };
+    assert_eq!(of(Profile::STANDARD), (0x1000_0000, None, None, 0x0504_0001));
+    assert_eq!(of(Profile::PAULUS), (0x1000_0000, None, None, 0x0800_0000));
+    let boot = u32::from_be_bytes(*b"BOOT");
+    assert_eq!(of(Profile::ESACADEMY), (boot, None, Some((64, BitRate::K125)), 0x0504_0001));
+    assert_eq!(of(Profile::LIFT), (0xFE00_0000 | 417, Some(126), None, 0x0504_0001));
+
+    // Whether a password comes first, a reset starts the program, it starts by itself, it needs a label,
+    // and 1F50h can be read.
+    let rules = |profile: Profile| {
+        let Policy { locked, reset_starts, starts_by_itself, wants_label, .. } = profile.download;
+        (locked, reset_starts, starts_by_itself, wants_label, profile.extras.read_back)
+    };
+    assert_eq!(rules(Profile::STANDARD), (false, false, false, false, false));
+    assert_eq!(rules(Profile::ESACADEMY), (true, true, true, false, false));
+    assert_eq!(rules(Profile::LIFT), (true, true, false, true, true));
+
+    // The number 494E4954h, the lowest byte first; the lift's is one of ours, as no document gives one.
+    let passwords =
+        [Profile::STANDARD, Profile::PAULUS, Profile::ESACADEMY, Profile::LIFT].map(|of| of.password);
+    assert_eq!(passwords, [&b""[..], b"", b"TINI", b"coboot"]);
+}
+
+/// A stream leaves room of the queue for the client's segments while an answer is held back (ADR 9): 8 KiB,
+/// or a quarter of a smaller queue.
+#[test]
+fn a_stream_leaves_a_reserve_of_the_queue() {
+    for (queue, reserve) in [(65536, 8192), (16384, 4096), (4096, 1024)] {
+        let mut rig = Rig::new(&STANDARD_1, queue);
+        rig.begin(1, Some(3000), &raw(&STANDARD_1, 1, 3000)[..700]).unwrap();
+        let data = Address::new(0x1F50, 1);
+        let [room, with_reserve] = [false, true].map(|held| rig.node.download_space(data, held));
+        assert_eq!(with_reserve - room, reserve, "of {queue}");
+    }
+}
+
+// --- the objects of a program
+
+/// 2004h: address and size. 1F51h, 1F56h, 1F57h, 2005h: what is stored, of this program and no other.
+#[test]
+fn each_program_has_its_own_values_and_no_other_exists() {
+    let mut rig = Rig::new(&STANDARD_2, 1024);
+    let empty = |rig: &mut Rig, number| {
+        assert_eq!((rig.state(number), rig.identification(number), rig.status(number)), (3, 0, 0));
+        assert_eq!(rig.word(0x2005, number), 0);
+    };
+    empty(&mut rig, 1);
+    empty(&mut rig, 2);
+    let images = [raw(&STANDARD_2, 1, 700), raw(&STANDARD_2, 2, 900)];
+    rig.install(2, &images[1]);
+    empty(&mut rig, 1);
+    rig.install(1, &images[0]);
+    for _ in 0..2 {
+        for (number, image) in (1..).zip(&images) {
+            assert_eq!(rig.state(number), 0);
+            assert_eq!(rig.identification(number), crc32(image));
+            // The label of an image has its number as version.
+            assert_eq!(rig.word(0x2005, number), number.into());
+            let region = STANDARD_2.region(number);
+            let value = [region.base.to_le_bytes(), region.size.to_le_bytes()].concat();
+            assert_eq!(read(&mut rig, 0x2004, number), Ok(value));
+        }
+        rig.reset();
+    }
+    for number in [0, 3, 254, 255] {
+        assert_eq!(rig.command(number, START), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!(rig.begin(number, None, &[]), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!(rig.node.upload_start(Address::new(0x1F50, number)), Err(NO_SUB_INDEX), "{number}");
+        assert_eq!((rig.state(number), rig.word(0x2005, number)), (3, 0), "{number}");
+        assert_eq!(read(&mut rig, 0x2004, number), Ok(vec![0; 8]), "{number}");
+    }
+}
+
+/// The label must lie inside the program: bytes behind it are none of its own.
+#[test]
+fn a_label_counts_from_the_first_size_that_holds_it() {
+    let whole = (label::OFFSET as usize) + label::SIZE;
+    for (size, version) in [(whole - 1, 0), (whole, 1), (whole + 1, 1)] {
+        let mut rig = Rig::new(&STANDARD_1, 1024);
+        let image = raw(&STANDARD_1, 1, whole + 4);
+        rig.install(1, &image[..size]);
+        assert_eq!(rig.word(0x2005, 1), version, "{size}");
+        assert_eq!(rig.identification(1), crc32(&image[..size]));
+    }
+}
+
+/// The version in a control block takes precedence over that of the label.
+#[test]
+fn a_control_block_names_the_version() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let image = raw(&STANDARD_1, 1, 600);
+    for (told, version) in [(0, 1), (77, 77)] {
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        // Manual L-1112d_10, figure 13: size, vendor-ID, product code, version, date.
+        let control = rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
+        let mut last = 600_u32.to_le_bytes().to_vec();
+        last.extend(crc32(&image).to_le_bytes());
+        for block in [
+            rig::block(0, 0, &control),
+            rig::block(1, STANDARD_1.region(1).base, &image),
+            rig::block(u32::MAX, 0, &last),
+        ] {
+            rig.send(1, &block).unwrap();
+            rig.settle();
+        }
+        assert_eq!((rig.state(1), rig.status(1)), (0, 0));
+        assert_eq!(rig.word(0x2005, 1), version);
+    }
+}
+
+/// Flash that is not written reads FFh, and belongs to the program: it is erased for it, too.
+#[test]
+fn a_hole_in_a_program_is_erased_with_it() {
+    let region = STANDARD_1.region(1);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 0x2C00));
+    let (first, last) = (raw(&STANDARD_1, 1, 256), [0x5A; 16]);
+    // The record of the end is cut off from the first data, and the end from the second.
+    let head = String::from_utf8(rig::hex(region.base, &first)).unwrap();
+    let tail = String::from_utf8(rig::hex(region.base + 0x2800, &last)).unwrap();
+    let text = head.lines().take(17).chain(tail.lines()).collect::<Vec<_>>().join("\n") + "\n";
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, text.as_bytes()).unwrap();
+    rig.settle();
+    assert_eq!((rig.state(1), rig.status(1)), (0, 0));
+    let mut whole = vec![0xFF; 0x2810];
+    whole[..256].copy_from_slice(&first);
+    whole[0x2800..].copy_from_slice(&last);
+    assert_eq!(rig.cells(1)[..whole.len()], whole);
+    assert_eq!(rig.identification(1), crc32(&whole));
+}
+
+// --- commands in each other's way
+
+/// While a program is programmed or checked, the other one is not touched and does not start.
+#[test]
+fn a_command_for_the_other_program_waits_for_the_end_of_a_download() {
+    let image = raw(&STANDARD_2, 1, 3000);
+    let mut installed = Rig::new(&STANDARD_2, 1024);
+    installed.install(2, &raw(&STANDARD_2, 2, 600));
+    let before = installed.cells(2);
+    for steps in 0..60 {
+        for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+            let mut rig = Rig::on(&STANDARD_2, 4096, installed.chip.model().clone());
+            rig.command(1, CLEAR).unwrap();
+            rig.settle();
+            rig.send(1, &image).unwrap();
+            rig.steps(steps);
+            let what = format!("{command:#x} after {steps} steps");
+            assert_eq!(rig.command(2, command), Err(MAN_BUSY), "{what}");
+            rig.settle();
+            // The refusal stays visible, and nothing else came of it.
+            assert_eq!(rig.status(2), 0x86, "{what}");
+            assert_eq!(rig.node.take_boot_request(), None, "{what}");
+            assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&image)), "{what}");
+            assert_eq!((rig.state(2), rig.cells(2)), (0, before.clone()), "{what}");
+        }
+    }
+}
+
+/// A request to leave the bootloader ends everything else.
+#[test]
+fn whoever_leaves_takes_no_further_order() {
+    let mut rig = Rig::new(&STANDARD_2, 1024);
+    rig.install(1, &raw(&STANDARD_2, 1, 600));
+    rig.install(2, &raw(&STANDARD_2, 2, 600));
+    rig.command(1, SET_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, START).unwrap();
+    for number in [1, 2] {
+        for command in [START, CLEAR, SET_SIGNATURE, CLR_SIGNATURE] {
+            assert_eq!(rig.command(number, command), Err(MAN_BUSY));
+        }
+        assert_eq!(rig.begin(number, None, &[]), Err(MAN_BUSY));
+    }
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Failed)));
+    assert_eq!(rig.node.take_boot_request(), Some(BootRequest::Start(1)));
+    assert_eq!(rig.node.take_boot_request(), None);
+    rig.settle();
+    assert_eq!((rig.state(1), rig.state(2)), (0, 0));
+}
+
+/// A reset would undo what is acknowledged: the device says so until it is done.
+#[test]
+fn an_acknowledged_order_is_finishing_until_it_is_stored() {
+    let mut rig = Rig::new(&STANDARD_1, 4096);
+    let image = raw(&STANDARD_1, 1, 900);
+    assert!(!rig.node.is_finishing());
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.begin(1, None, &image).unwrap();
+    rig.settle();
+    assert!(!rig.node.is_finishing(), "half a program is none");
+    rig.node.download_end(Address::new(0x1F50, 1)).unwrap();
+    let mut steps = 0;
+    while rig.node.is_finishing() {
+        assert!(rig.stored().records[0].is_none(), "step {steps}");
+        assert!(!rig.node.is_idle_after_step());
+        steps += 1;
+    }
+    assert!(steps > 10 && rig.stored().records[0].is_some());
+    rig.settle();
+    rig.command(1, SET_SIGNATURE).unwrap();
+    assert!(rig.node.is_finishing());
+    rig.settle();
+    assert!(!rig.node.is_finishing());
+    assert!(rig.stored().records[0].unwrap().2);
+}
+
+// --- layer setting services
+
+#[test]
+fn node_id_and_bit_rate_are_stored_one_after_the_other_and_kept() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let board = rig.stored().node;
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())), "nothing was asked for");
+    assert_eq!(rig.node.store(NodeId::new(9), Some(BitRate::K500)), Poll::Pending);
+    assert_eq!((rig.node.stored(), rig.stored().node), (Poll::Pending, board));
+    assert_eq!(rig.node.store(NodeId::new(10), None), Poll::Ready(Err(StoreError::Failed)), "one at a time");
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
+    assert_eq!(rig.stored().node, NodeParameters { id: NodeId::new(9), bit_rate: BitRate::K500 });
+    // Without a bit rate the one before is kept; without a node-ID the device has none.
+    assert_eq!(rig.node.store(None, None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.stored().node, NodeParameters { id: None, bit_rate: BitRate::K500 });
+    rig.reset();
+    assert_eq!(rig.node.store(NodeId::new(11), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.stored().node, NodeParameters { id: NodeId::new(11), bit_rate: BitRate::K500 });
+}
+
+/// The flash does one thing at a time. What is refused is told, and changes nothing.
+#[test]
+fn a_store_while_the_flash_works_is_refused() {
+    let image = raw(&STANDARD_1, 1, 900);
+    for steps in 0..40 {
+        let mut rig = Rig::new(&STANDARD_1, 4096);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let board = rig.stored().node;
+        rig.send(1, &image).unwrap();
+        rig.steps(steps);
+        assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Failed)), "{steps}");
+        rig.settle();
+        assert_eq!((rig.state(1), rig.stored().node), (0, board), "{steps}");
+    }
+}
+
+#[test]
+fn a_store_that_the_flash_refuses_is_told_and_the_old_values_stay() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    let board = rig.stored().node;
+    let next = rig.chip.model().operations + 1;
+    rig.chip.model().fail = Some((next, FlashFault::Protected));
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Err(StoreError::Failed)));
+    assert_eq!(rig.stored().node, board);
+    // The next one is not held up by it.
+    assert_eq!(rig.node.store(NodeId::new(9), None), Poll::Pending);
+    rig.settle();
+    assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
+}
+
+#[test]
+fn a_device_that_stores_nothing_says_so() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_config(&mut flash, Config { lss_store: false, ..CONFIG }, 256);
+    assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Unsupported)));
+    assert!(bench.node.supports(BitRate::K125) && !bench.node.supports(BitRate::K800));
+    assert!(flash.touched.is_empty());
+}
+
+// --- emergencies, identity, the second server
+
+/// CiA 301 table 26: 5000h hardware, 6300h data set; then the code of 1F57h, and the program.
+#[test]
+fn the_end_of_work_is_told_by_an_emergency() {
+    let emergency = |rig: &mut Rig| rig.node.next_emergency();
+    // Operation 12 is one of the store, 20 one of the data.
+    for (fault, operation, code) in
+        [(FlashFault::Failed, 12, 0x10), (FlashFault::Failed, 20, 0x0A), (FlashFault::Protected, 20, 0x0E)]
+    {
+        let mut rig = Rig::new(&STANDARD_2, 1024);
+        let image = raw(&STANDARD_2, 2, 600);
+        rig.command(2, CLEAR).unwrap();
+        rig.settle();
+        rig.begin(2, None, &image).unwrap();
+        assert_eq!(emergency(&mut rig), None);
+        let before = rig.chip.model().operations;
+        rig.chip.model().fail = Some((before + operation, fault));
+        rig.settle();
+        // Bits 0 and 7 of the error register: generic, manufacturer specific.
+        assert_eq!(emergency(&mut rig), Some([0x00, 0x50, 0x81, code, 2, 0, 0, 0]));
+        assert_eq!((emergency(&mut rig), read(&mut rig, 0x1001, 0)), (None, Ok(vec![0x81])));
+        rig.cancel(2);
+        rig.install(2, &image);
+        assert_eq!(emergency(&mut rig), Some([0; 8]), "error reset");
+        assert_eq!((emergency(&mut rig), read(&mut rig, 0x1001, 0)), (None, Ok(vec![0])));
+    }
+    // A block with a wrong CRC.
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let mut bad = rig::block(0, 0, &[0; 8]);
+    *bad.last_mut().unwrap() ^= 1;
+    assert!(rig.send(1, &bad).is_err());
+    rig.settle();
+    assert_eq!(emergency(&mut rig), Some([0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]));
+    assert_eq!(read(&mut rig, 0x1003, 1), word(0x0106_6300));
+}
+
+/// Why the device stayed: a fault and a crash loop are errors; with `boot_up_emergency`, each
+/// boot-up message is followed by the reason.
+#[test]
+fn a_device_tells_why_it_stayed() {
+    let messages = |reason: u8, boot_up_emergency| {
+        let mut flash = ModelFlash::new(&CHIP);
+        let journal = Journal::open(&flash, bench::LAYOUT.parameters);
+        let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
+        let buffer = Box::leak(vec![0; 256].into_boxed_slice());
+        let unsealer = Box::leak(Box::<boot_core::unseal::Room>::default()).unsealer();
+        let mut node = boot_core::bootloader::Bootloader::<_, _, 1>::new(
+            config,
+            0x1234_5678,
+            bench::node(),
+            reason,
+            journal,
+            &mut flash,
+            buffer,
+            unsealer,
+        );
+        assert_eq!(node.node_id(), NodeId::new(5));
+        assert_eq!(node.lss_address().serial_number, 0x1234_5678);
+        let mut bytes = [0; 4];
+        assert_eq!(node.read(Address::new(0x1018, 4), &mut bytes), Ok(4));
+        assert_eq!(bytes, 0x1234_5678_u32.to_le_bytes());
+        // Vendor-ID, product code and revision are those of the configuration.
+        for sub in 1..4 {
+            assert_eq!(node.read(Address::new(0x1018, sub), &mut bytes), Ok(4));
+            assert_eq!(bytes, [0; 4]);
+        }
+        node.node_id_changed(None);
+        let before = [node.next_emergency(), node.next_emergency()];
+        node.node_id_changed(NodeId::new(5));
+        [before[0], before[1], node.next_emergency(), node.next_emergency()]
+    };
+    let boot = |reason| Some([0x00, 0xFF, 0, b'B', b'O', b'O', b'T', reason]);
+    assert_eq!(messages(0, false), [None; 4]);
+    assert_eq!(messages(0, true), [None, None, boot(0), None]);
+    assert_eq!(messages(8, true), [None, None, boot(8), None]);
+    for reason in [2, 7] {
+        let error = Some([0x00, 0x60, 0x01, reason, 0, 0, 0, 0]);
+        assert_eq!(messages(reason, false), [error, None, None, None]);
+    }
+}
+
+/// 1201h: written by a master, back to nothing with the next reset of the communication (CiA 301
+/// clause 7.3.2.2.1).
+#[cfg(not(feature = "sealed"))]
+#[test]
+fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_reset() {
+    use boot_core::bootloader::Bootloader;
+    type Device<'f> = Bootloader<'static, &'f mut ModelFlash, Journal, 1>;
+    assert!(<Device<'_> as Objects>::has_second_server());
+    for there in [true, false] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::with_config(&mut flash, Config { second_server: there, ..CONFIG }, 256);
+        let fresh = bench.node.second_server();
+        let at = |sub| Address::new(0x1201, sub);
+        let written = bench
+            .node
+            .write(at(1), &0x0000_06A0_u32.to_le_bytes())
+            .and_then(|()| bench.node.write(at(2), &0x0000_01A0_u32.to_le_bytes()));
+        if !there {
+            assert!(written.is_err());
+            assert_eq!(bench.node.second_server(), fresh);
+            let mut bytes = [0; 4];
+            assert!(bench.node.read(at(1), &mut bytes).is_err());
+            continue;
+        }
+        written.unwrap();
+        assert_eq!((bench.word(at(1)), bench.word(at(2))), (0x6A0, 0x1A0));
+        assert_ne!(bench.node.second_server(), fresh);
+        bench.node.node_id_changed(NodeId::new(5));
+        assert_eq!(bench.node.second_server(), fresh);
+        assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
+    }
+}
+
+// --- the lift profile: a stored program can be read
+
+#[test]
+fn a_stored_program_can_be_read_by_who_has_the_password() {
+    let mut rig = Rig::new(&LIFT_1, 1024);
+    let at = Address::new(0x1F50, 1);
+    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY), "locked");
+    rig.unlock(1).unwrap();
+    rig.settle();
+    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0800_0024)), "no data");
+    let mut image = raw(&LIFT_1, 1, 1500);
+    image[600..630].copy_from_slice(b"$CANopenSoftwareVersion\x004.7.1\0");
+    rig.install(1, &image);
+    assert_eq!(read(&mut rig, 0x100A, 0), Ok(b"4.7.1".to_vec()), "CiA 814-1 clause 6.5");
+    assert_eq!(rig.node.upload_start(at), Ok(Some(1500)));
+    for (offset, len, expected) in [
+        (0, 7, &image[..7]),
+        (7, 889, &image[7..896]),
+        (1490, 64, &image[1490..]),
+        (1500, 7, &[]),
+        (9000, 7, &[]),
+    ] {
+        let mut bytes = vec![0; len];
+        assert_eq!(rig.node.upload_data(at, offset, &mut bytes), Ok(expected.len()), "{offset}");
+        assert_eq!(bytes[..expected.len()], *expected, "{offset}");
+    }
+    // Not while the flash works.
+    rig.begin(1, None, &image).unwrap();
+    rig.steps(1);
+    assert_eq!(rig.node.upload_start(at), Err(MAN_BUSY));
+    // The standard profile has no such thing.
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 300));
+    assert_eq!(rig.node.upload_start(at), Err(AbortCode(0x0601_0001)), "write only");
+}
+
+/// Program 2 of a lift is a set of parameters: any bytes, and 1F51h does not start it.
+#[test]
+fn data_of_the_application_are_any_bytes() {
+    let mut rig = Rig::new(&LIFT_2, 1024);
+    for data in [&b"x"[..], b"0123456789", &[0xFF; 100]] {
+        rig.install(2, data);
+        assert_eq!((rig.state(2), rig.identification(2)), (0, crc32(data)));
+        rig.command(2, START).unwrap();
+        rig.settle();
+        assert_eq!((rig.status(2), rig.node.take_boot_request()), (0x02, None), "NOVALPROG");
+    }
+}
+
+/// The steps of a device that has nothing to do.
+#[test]
+fn an_idle_device_stays_idle() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, Policy { read_back: true, ..Policy::DEFAULT });
+    assert_eq!(bench.node.step(), Step::Idle);
+    assert!(!bench.node.busy() && !bench.node.is_finishing());
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    bench.settle();
+    assert!(!bench.node.busy());
+    bench.node.write(CONTROL, &[CLEAR]).unwrap();
+    assert!(bench.node.busy());
+    assert_eq!(bench.status() & BUSY, BUSY);
+    bench.settle();
+    let journal = Journal::open(bench.node.flash(), bench::LAYOUT.parameters);
+    assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
+}
+
+// --- confirmation, the queue's room, and where a block may lie
+
+/// Only the confirmation marks a program that has returned the device; it is stored once.
+#[test]
+fn a_program_that_came_back_is_confirmed_once() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    let confirmed = |bench: &mut Bench<'_>| {
+        let flash = bench.node.flash();
+        let journal = Journal::open(flash, bench::LAYOUT.parameters);
+        ProgramRecord::load(&journal, flash, 1).map(|record| record.confirmed)
+    };
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(confirmed(&mut bench), None, "there is no program");
+    bench.install(&bench::program(200, 0x11));
+    for nobody in [0, 2, 255] {
+        bench.node.confirm(nobody);
+        bench.settle();
+    }
+    assert_eq!(confirmed(&mut bench), Some(false));
+    // A store that fails costs a rescue window, and no emergency.
+    let next = bench.node.flash().operations + 1;
+    bench.node.flash().fail = Some((next, FlashFault::Protected));
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!((confirmed(&mut bench), bench.node.next_emergency(), bench.status()), (Some(false), None, 0));
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(confirmed(&mut bench), Some(true));
+    bench.node.flash().touched.clear();
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(bench.node.flash().touched, []);
+}
+
+/// A confirmation does not come between the operations of other work.
+#[test]
+fn a_busy_device_confirms_nothing() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&bench::program(200, 0x11));
+    assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Pending);
+    bench.node.confirm(1);
+    bench.settle();
+    assert_eq!(bench.node.stored(), Poll::Ready(Ok(())));
+    let flash = bench.node.flash();
+    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    assert_eq!(journal.get(flash, Key::Node).map(|[id, ..]| id), Some(9));
+    assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
+}
+
+/// Both change the record: the second would be written from what the first has replaced. To start
+/// the program changes nothing.
+#[test]
+fn a_signature_waits_for_a_confirmation() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.install(&bench::program(200, 0x11));
+    for command in [SET_SIGNATURE, CLR_SIGNATURE] {
+        bench.node.confirm(1);
+        assert_eq!(bench.node.write(CONTROL, &[command]), Err(MAN_BUSY));
+    }
+    assert_eq!(bench.node.write(CONTROL, &[START]), Ok(()));
+    bench.settle();
+    assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
+    assert_eq!(bench.command(SET_SIGNATURE), 0);
+    let flash = bench.node.flash();
+    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    let record = ProgramRecord::load(&journal, flash, 1).unwrap();
+    assert!(record.confirmed && record.signed);
+}
+
+/// CiA 301 table 26: 8120h, error passive.
+#[test]
+fn an_event_of_the_line_is_told() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    bench.node.line_event(LineEvent::Passive);
+    assert_eq!(bench.node.next_emergency(), Some([0x20, 0x81, 0x11, 0, 0, 0, 0, 0]));
+}
+
+/// 1F57h is busy from the end of the transfer until the record is stored: a host that starts the
+/// program earlier would start the old one.
+#[test]
+fn the_status_is_busy_until_the_program_is_one() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &raw(&STANDARD_2, 1, 900)).unwrap();
+    while rig.stored().records[0].is_none() {
+        assert_eq!(rig.status(1) & BUSY, BUSY);
+        assert!(rig.node.is_finishing());
+        rig.steps(1);
+    }
+    rig.settle();
+    assert_eq!((rig.status(1), rig.status(2)), (0, 0));
+    rig.command(1, SET_SIGNATURE).unwrap();
+    while !rig.stored().records[0].unwrap().2 {
+        assert_eq!((rig.status(1) & BUSY, rig.status(2) & BUSY), (BUSY, 0));
+        rig.steps(1);
+    }
+}
+
+/// A queue that has no room for another block takes none; one that has takes the next block while
+/// the flash works, of this program and of no other.
+#[test]
+fn the_next_block_is_taken_while_the_flash_works_if_there_is_room() {
+    let region = STANDARD_2.region(1);
+    let image = raw(&STANDARD_2, 1, 600);
+    for (buffer, room) in [(1024, false), (64 * 1024, true)] {
+        let mut rig = Rig::new(&STANDARD_2, buffer);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.send(1, &rig::block(0, 0, &rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        assert_eq!(rig.status(1) & BUSY, u32::from(!room));
+        let next = rig.node.download_start(Address::new(0x1F50, 1), None);
+        assert_eq!(next, if room { Ok(()) } else { Err(MAN_BUSY) }, "{buffer}");
+        rig.cancel(1);
+        assert_eq!(rig.node.download_start(Address::new(0x1F50, 2), None), Err(MAN_BUSY), "{buffer}");
+    }
+}
+
+/// The end of a program may be flash that no block has: it must be erased all the same.
+#[test]
+fn what_no_block_has_belongs_to_the_program_and_is_erased() {
+    let region = STANDARD_1.region(1);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 0x2800));
+    let data = raw(&STANDARD_1, 1, 600);
+    let mut whole = vec![0xFF; 0x2400];
+    whole[..600].copy_from_slice(&data);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    for block in [
+        rig::block(0, 0, &[0; 8]),
+        rig::block(1, region.base, &data),
+        rig::block(u32::MAX, 0, &rig::words(&[0x2400, crc32(&whole)])),
+    ] {
+        rig.send(1, &block).unwrap();
+        rig.settle();
+    }
+    assert_eq!((rig.state(1), rig.status(1), rig.identification(1)), (0, 0, crc32(&whole)));
+    assert_eq!(rig.cells(1)[..whole.len()], whole);
+}
+
+/// A password is no way around other work.
+#[test]
+fn a_password_waits_for_what_is_acknowledged() {
+    let image = raw(&ESACADEMY_1, 1, 900);
+    let mut rig = Rig::new(&ESACADEMY_1, 4096);
+    rig.unlock(1).unwrap();
+    rig.settle();
+    rig.send(1, &image).unwrap();
+    while rig.stored().records[0].is_none() {
+        assert_eq!(rig.unlock(1), Err(MAN_BUSY));
+        rig.steps(1);
+    }
+    rig.settle();
+    // The program is about to start.
+    assert_eq!(rig.unlock(1), Err(MAN_BUSY));
+    assert!(rig.node.take_boot_request().is_some());
+    rig.unlock(1).unwrap();
+}
+
+/// A lift takes another program without CLEAR, the others do not.
+#[test]
+fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
+    for (setup, replaces) in [(&LIFT_1, true), (&STANDARD_1, false)] {
+        let mut rig = Rig::new(setup, 4096);
+        rig.install(1, &raw(setup, 1, 600));
+        rig.reset();
+        rig.unlock(1).unwrap();
+        rig.settle();
+        rig.send(1, &raw(setup, 1, 700)).map_or_else(|_| assert!(!replaces), |()| assert!(replaces));
+        rig.settle();
+        let size = if replaces { 700 } else { 600 };
+        assert_eq!(rig.stored().records[0].map(|record| record.0), Some(size));
+        // Once more in the same session, also behind a download that broke off.
+        if replaces {
+            rig.begin(1, None, &raw(setup, 1, 800)[..700]).unwrap();
+            rig.settle();
+            rig.cancel(1);
+            rig.send(1, &raw(setup, 1, 800)).unwrap();
+            rig.settle();
+            assert_eq!(rig.stored().records[0].map(|record| record.0), Some(800));
+        }
+    }
+}
+
+/// Programming may be forbidden after CLEAR: then no block is taken, and nothing is lost.
+#[test]
+fn a_block_is_refused_while_programming_is_not_allowed() {
+    use std::sync::atomic::{AtomicBool, Ordering};
+    static ALLOWED: AtomicBool = AtomicBool::new(true);
+    let policy = Policy { allowed: || ALLOWED.load(Ordering::Relaxed), ..Policy::DEFAULT };
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, policy);
+    bench.install(&bench::program(200, 0x11));
+    assert_eq!(bench.command(CLEAR), 0);
+    ALLOWED.store(false, Ordering::Relaxed);
+    bench.node.flash().touched.clear();
+    assert_eq!(bench.block(&bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
+    assert_eq!(bench.node.flash().touched, []);
+    ALLOWED.store(true, Ordering::Relaxed);
+    bench.install(&bench::program(300, 0x22));
+}
+
+/// SYS TEC manual, table 3: SECURED for what belongs to the bootloader, ADDRESS for all else.
+#[test]
+fn a_block_outside_the_program_is_refused_with_the_reason() {
+    let layout = STANDARD_1.layout;
+    let (boot, own) = (layout.bootloader, STANDARD_1.region(1));
+    let parameters = layout.parameters;
+    assert_eq!(parameters[1].end(), own.base, "the program follows the parameters");
+    const SECURED: u32 = 0x0E;
+    const ADDRESS: u32 = 0x0C;
+    for (base, size, status) in [
+        (boot.base, 4, SECURED),
+        (boot.end() - 1, 1, SECURED),
+        (boot.base - 4, 4, ADDRESS),
+        (boot.base - 4, 5, SECURED),
+        (boot.base - 4, 12, SECURED),
+        (parameters[0].base, 16, SECURED),
+        (parameters[1].end() - 1, 1, SECURED),
+        (own.base - 1, 2, SECURED),
+        (own.base - 1, 64, SECURED),
+        (own.base, own.size as usize + 1, ADDRESS),
+        (own.end(), 1, ADDRESS),
+        (own.end() - 1, 2, ADDRESS),
+        (0, 4, ADDRESS),
+        (u32::MAX - 3, 4, ADDRESS),
+        (u32::MAX, 1, ADDRESS),
+    ] {
+        let mut rig = Rig::new(&STANDARD_1, 32 * 1024);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+        rig.settle();
+        rig.chip.model().touched.clear();
+        assert!(rig.send(1, &rig::block(1, base, &vec![0; size])).is_err(), "{base:#x}, {size}");
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{base:#x}, {size}");
+        assert_eq!(rig.chip.model().touched, [], "{base:#x}, {size}");
+    }
+}
+
+// --- the limits of a block, and what is seen of work by another client
+
+/// SYS TEC manual, table 3, shifted by the bit for busy: FORMAT, ADDRESS and SEQUENCE.
+const FORMAT: u32 = 0x04;
+const ADDRESS: u32 = 0x0C;
+const SEQUENCE: u32 = 0x88;
+const LENGTH: AbortCode = AbortCode(0x0607_0010);
+const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
+const LENGTH_TOO_LOW: AbortCode = AbortCode(0x0607_0013);
+
+/// A device behind CLEAR and a control block, with this buffer.
+fn open(setup: &'static Setup, buffer: usize) -> Rig {
+    let mut rig = Rig::new(setup, buffer);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.settle();
+    rig
+}
+
+/// A block is 12 bytes in front of its data and 4 behind them (SYS TEC manual, figure 5).
+#[test]
+fn a_block_that_is_no_block_is_told_how() {
+    let base = STANDARD_1.region(1).base;
+    let whole = rig::block(1, base, &raw(&STANDARD_1, 1, 64));
+    for (len, abort) in [
+        (4, LENGTH_TOO_LOW),
+        (11, LENGTH_TOO_LOW),
+        (12, LENGTH),
+        (15, LENGTH),
+        (whole.len() - 1, LENGTH),
+        (whole.len() + 1, LENGTH),
+    ] {
+        let mut rig = open(&STANDARD_1, 1024);
+        let mut bytes = whole.clone();
+        bytes.resize(len, 0);
+        rig.begin(1, None, &bytes).unwrap();
+        assert_eq!(rig.node.download_end(Address::new(0x1F50, 1)), Err(abort), "{len}");
+        assert_eq!(rig.status(1), FORMAT, "{len}");
+    }
+}
+
+/// The buffer is the limit: for the size that is announced, for the size in the header, and for what
+/// comes without either.
+#[test]
+fn a_block_is_as_large_as_the_buffer_and_no_larger() {
+    let base = STANDARD_1.region(1).base;
+    let block = |size: usize| rig::block(1, base, &raw(&STANDARD_1, 1, size));
+    for (buffer, largest) in [(1024, 1024), (16 * 1024, 16_384), (64 * 1024, 16_384)] {
+        let largest = largest - 16;
+        // The program has less flash than the largest block.
+        let fits = largest <= STANDARD_1.region(1).size as usize;
+        for announced in [true, false] {
+            let mut rig = open(&STANDARD_1, buffer);
+            let size = |bytes: &[u8]| announced.then_some(bytes.len() as u32);
+            let (good, large) = (block(largest), block(largest + 1));
+            // So few bytes that the header is not complete, and so many that it is.
+            rig.begin(1, size(&good), &good[..8]).unwrap();
+            rig.cancel(1);
+            let first = rig.begin(1, size(&large), &large[..8]);
+            assert_eq!(first, if announced { Err(LENGTH_TOO_HIGH) } else { Ok(()) }, "{buffer}");
+            rig.cancel(1);
+            assert_eq!(rig.begin(1, size(&large), &large[..12]), Err(LENGTH_TOO_HIGH), "{buffer}");
+            // What the header does not tell.
+            let mut hidden = block(largest + 2);
+            hidden[8..12].copy_from_slice(&4_u32.to_le_bytes());
+            rig.begin(1, None, &hidden[..largest + 16]).unwrap();
+            rig.cancel(1);
+            assert_eq!(rig.begin(1, None, &hidden[..largest + 17]), Err(LENGTH_TOO_HIGH), "{buffer}");
+            if fits {
+                assert_eq!(rig.begin(1, size(&good), &good), Ok(()), "{buffer}");
+            }
+        }
+    }
+}
+
+/// No flash has 65536 blocks: a larger number begins something else.
+#[test]
+fn the_first_number_tells_a_block() {
+    let base = STANDARD_1.region(1).base;
+    for (number, status) in [(0xFFFF, SEQUENCE), (0x1_0000, FORMAT)] {
+        let mut rig = Rig::new(&STANDARD_1, 1024);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        assert!(rig.send(1, &rig::block(number, base, &[0; 64])).is_err());
+        assert_eq!(rig.status(1), status, "{number:X}");
+    }
+}
+
+/// The last block of the manual of 2008 has 32 bytes more than its header says, and no other has.
+#[test]
+fn only_the_last_block_may_be_longer_than_it_says() {
+    let region = STANDARD_1.region(1);
+    let image = raw(&STANDARD_1, 1, 64);
+    let old = |number: u32, address: u32, data: &[u8; 40], told: u32| {
+        let mut bytes = rig::words(&[number, address, told]);
+        bytes.extend(data);
+        bytes.extend(crc32(&bytes).to_le_bytes());
+        bytes
+    };
+    let mut last = [0; 40];
+    last[32..36].copy_from_slice(&64_u32.to_le_bytes());
+    last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
+    for (number, told, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
+        let mut rig = open(&STANDARD_1, 1024);
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.settle();
+        let sent = rig.send(1, &old(number, region.base + 64, &last, told));
+        assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {told}");
+        rig.settle();
+        assert_eq!(rig.state(1), if good { 0 } else { 3 });
+    }
+}
+
+/// The two first vectors are the least that can be started, and less is no program.
+#[test]
+fn a_program_is_its_first_two_vectors_at_least() {
+    let region = STANDARD_1.region(1);
+    for (size, status) in [(7, FORMAT), (8, 0)] {
+        let image = raw(&STANDARD_1, 1, 8);
+        let mut rig = open(&STANDARD_1, 1024);
+        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.settle();
+        let last = rig::block(u32::MAX, 0, &rig::words(&[size, crc32(&image[..size as usize])]));
+        assert_eq!(rig.send(1, &last).is_ok(), status == 0, "{size}");
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{size}");
+    }
+}
+
+/// Intel HEX with segments reaches 64 KiB from the base of the segment. What lies below is at a place
+/// that is no program's; what goes beyond is not Intel HEX.
+#[test]
+fn a_record_stays_in_its_segment() {
+    let segment = ihex::record(0, 2, &[0x10, 0x00]);
+    for (offset, status) in [(0x2000, ADDRESS), (0xFFF0, ADDRESS), (0xFFF1, FORMAT)] {
+        let mut rig = Rig::new(&STANDARD_1, 4096);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let text = format!("{segment}\n{}\n", ihex::record(offset, 0, &[0; 16]));
+        assert!(rig.send(1, text.as_bytes()).is_err());
+        rig.settle();
+        assert_eq!(rig.status(1), status, "{offset:X}");
+    }
+}
+
+/// A raw image with a size: all its flash is erased while it comes, not only what it has reached.
+#[test]
+fn a_size_that_is_told_is_erased_ahead() {
+    let image = raw(&STANDARD_1, 1, 0x3000);
+    for told in [true, false] {
+        let mut rig = Rig::new(&STANDARD_1, 8 * 1024);
+        rig.install(1, &image);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let next = raw(&STANDARD_1, 1, 0x2800);
+        rig.begin(1, told.then_some(next.len() as u32), &next[..1600]).unwrap();
+        rig.settle();
+        assert_eq!(rig.cells(1)[0x2000..0x2800].iter().all(|byte| *byte == 0xFF), told, "told: {told}");
+    }
+}
+
+/// CLEAR of the program that is being downloaded begins it anew, at any time; the other one waits.
+#[test]
+fn clear_ends_the_download_of_its_own_program() {
+    let image = raw(&STANDARD_2, 1, 600);
+    let mut rig = open(&STANDARD_2, 1024);
+    rig.send(1, &rig::block(1, STANDARD_2.region(1).base, &image)).unwrap();
+    assert_eq!(rig.status(1) & BUSY, BUSY);
+    assert_eq!(rig.command(2, CLEAR), Err(MAN_BUSY));
+    assert_eq!(rig.command(1, CLEAR), Ok(()));
+    rig.settle();
+    rig.install(1, &image);
+}
+
+/// A command for one program fails beside an open block of the other one, which goes on.
+#[test]
+fn a_block_goes_on_beside_a_command_that_fails() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    let (one, two) = (raw(&STANDARD_2, 1, 600), raw(&STANDARD_2, 2, 600));
+    rig.install(2, &two);
+    rig.command(2, CLR_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let base = STANDARD_2.region(1).base;
+    let last = rig::words(&[600, crc32(&one)]);
+    for block in [rig::block(0, 0, &[0; 8]), rig::block(1, base, &one), rig::block(u32::MAX, 0, &last)] {
+        rig.begin(1, None, &block[..10]).unwrap();
+        let next = rig.chip.model().operations + 1;
+        rig.chip.model().fail = Some((next, FlashFault::Protected));
+        rig.command(2, SET_SIGNATURE).unwrap();
+        rig.settle();
+        assert_eq!(rig.status(2), 0x10, "NVDATA");
+        let at = Address::new(0x1F50, 1);
+        assert_eq!(rig.node.download_data(at, &block[10..]), Ok(()));
+        assert_eq!(rig.node.download_end(at), Ok(()));
+        rig.settle();
+    }
+    assert_eq!((rig.state(1), rig.identification(1)), (0, crc32(&one)));
+}
+
+/// An emergency tells of work that has ended: a block that is refused has its answer.
+#[test]
+fn a_refused_block_is_no_emergency() {
+    let mut rig = open(&STANDARD_1, 1024);
+    let base = STANDARD_1.region(1).base;
+    assert!(rig.send(1, &rig::block(7, base + 0x400, &[0; 64])).is_err());
+    rig.settle();
+    assert_eq!((rig.status(1), rig.node.next_emergency()), (SEQUENCE, None));
+}
+
+/// A release that is stored does not end the download that has begun, and has changed nothing yet.
+#[test]
+fn a_release_beside_an_open_download_leaves_it_open() {
+    let (old, new) = (raw(&STANDARD_1, 1, 600), raw(&STANDARD_1, 1, 900));
+    let mut rig = Rig::new(&STANDARD_1, 4096);
+    rig.install(1, &old);
+    rig.command(1, CLR_SIGNATURE).unwrap();
+    rig.settle();
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.command(1, SET_SIGNATURE).unwrap();
+    rig.settle();
+    assert_eq!(rig.stored().records[0].map(|record| record.2), Some(true), "it is released");
+    let base = STANDARD_1.region(1).base;
+    let last = rig::words(&[900, crc32(&new)]);
+    for block in [rig::block(1, base, &new), rig::block(u32::MAX, 0, &last)] {
+        assert_eq!(rig.send(1, &block), Ok(()));
+        rig.settle();
+    }
+    assert_eq!((rig.status(1), rig.identification(1)), (0, crc32(&new)));
+}
+
+/// One piece of a stream may begin the program and be refused: then nothing waits for the flash.
+#[test]
+fn a_stream_that_is_refused_as_it_begins_leaves_nothing() {
+    let image = raw(&STANDARD_1, 1, 600);
+    let text = ihex::intel_hex(STANDARD_1.region(1).base, &image);
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    let at = Address::new(0x1F50, 1);
+    rig.node.download_start(at, None).unwrap();
+    // More than a piece of 128 bytes, and behind it no record.
+    let bad = format!("{}\n:X", text.lines().take(12).collect::<Vec<_>>().join("\n"));
+    assert!(rig.node.download_data(at, bad.as_bytes()).is_err());
+    rig.cancel(1);
+    rig.settle();
+    assert_eq!(rig.status(1), FORMAT);
+    rig.install(1, &image);
+}
+
+/// A record waits beside the piece that it belongs to in half of the buffer.
+#[test]
+fn a_record_fits_into_half_of_the_buffer() {
+    let image = raw(&STANDARD_1, 1, 640);
+    let base = STANDARD_1.region(1).base;
+    // Half of it is a record of 16 bytes and 4 headers of 8, exactly, or a byte less.
+    for (buffer, fits) in [(96, true), (95, false)] {
+        let mut rig = Rig::new(&STANDARD_1, buffer);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        let sent = rig.send(1, ihex::intel_hex(base, &image).as_bytes());
+        assert_eq!(sent.is_ok(), fits, "{buffer}: {sent:?}");
+        rig.settle();
+        assert_eq!(rig.state(1) == 0, fits, "{buffer}");
+    }
+}
+
+/// While the flash erases, a quarter of the buffer is kept for answers that are held back.
+#[test]
+fn a_quarter_of_the_buffer_is_for_held_answers() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.command(1, CLEAR).unwrap();
+    rig.settle();
+    rig.begin(1, None, &raw(&STANDARD_1, 1, 600)[..7]).unwrap();
+    let at = Address::new(0x1F50, 1);
+    let (free, held) = (rig.node.download_space(at, false), rig.node.download_space(at, true));
+    // The open piece has a header of 8 bytes; another one, and its end, may follow.
+    assert_eq!((free, held), (1024 - 8 - 7 - 2 * 8 - 256, 1024 - 8 - 7 - 2 * 8));
+}

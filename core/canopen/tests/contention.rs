@@ -1,0 +1,299 @@
+//! Events between the segments of a block download: requests of another client or of a client that
+//! has aborted, silence, a reset. Frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3.
+
+mod common;
+#[path = "../../../tests/src/random.rs"]
+#[allow(dead_code, reason = "the tests need some of it")]
+mod random;
+
+use canopen::od::Objects;
+use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
+use canopen::sdo::server::Config;
+use canopen::{Address, Frame};
+use common::{at, node, response, Bench, Device, Event};
+use random::Random;
+
+/// The clock, and the beginning of a download.
+trait Scene {
+    fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)>;
+    fn begin(&mut self, segments: u8);
+}
+
+impl Scene for Bench {
+    /// Advances the time by one millisecond after another; returns the frames sent meanwhile, and
+    /// their times.
+    fn wait(&mut self, ms: u32) -> Vec<(u32, Frame)> {
+        let mut sent = Vec::new();
+        for _ in 0..ms {
+            self.now += 1;
+            let now = self.now;
+            sent.extend(self.sent().into_iter().map(|frame| (now, frame)));
+        }
+        sent
+    }
+
+    /// Opens a block download of 1F50h/1 and sends its first segments.
+    #[track_caller]
+    fn begin(&mut self, segments: u8) {
+        assert_eq!(self.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(GRANTED)]);
+        for seqno in 1..=segments {
+            assert_eq!(self.ask([seqno, 1, 2, 3, 4, 5, 6, 7]), []);
+        }
+    }
+}
+
+const GRANTED: [u8; 8] = [0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0];
+const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+const IS_1000: [u8; 8] = [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10];
+const TIMED_OUT: [u8; 8] = [0x80, 0x50, 0x1F, 1, 0x00, 0x00, 0x04, 0x05];
+
+fn acked(ackseq: u8) -> [u8; 8] {
+    [0xA2, ackseq, 127, 0, 0, 0, 0, 0]
+}
+
+/// Time-outs of clients: 0.3 s (python-canopen) to 0.5 s.
+#[test]
+fn a_lost_last_segment_is_acknowledged_after_50_ms() {
+    let mut bench = Bench::with(Config::DEFAULT);
+    bench.begin(126);
+    assert_eq!(bench.server.next_deadline(), Some(at(50)));
+    assert_eq!(bench.wait(300), [(50, response(acked(126)))]);
+    // The client repeats the missing part. The end of the transfer may be lost as well.
+    assert_eq!(bench.ask([1, 1, 2, 3, 4, 5, 6, 7]), []);
+    assert_eq!(bench.wait(300), [(350, response(acked(1)))]);
+    // On a bus at 10 or 20 kbit/s the time is doubled.
+    let mut bench = Bench::with(Config { slow_bus: true, ..Config::DEFAULT });
+    bench.begin(3);
+    assert_eq!(bench.wait(300), [(100, response(acked(3)))]);
+}
+
+/// A client with a pause longer than the server's limit continues, and reads the acknowledgement
+/// after its sub-block: the segments in between are neither data nor a reason for another
+/// acknowledgement.
+#[test]
+fn the_rest_of_a_sub_block_that_was_acknowledged_early_is_passed_over() {
+    let mut bench = Bench::with(Config::DEFAULT);
+    bench.begin(40);
+    assert_eq!(bench.wait(60), [(50, response(acked(40)))]);
+    for seqno in 41..=127 {
+        assert_eq!(bench.ask([seqno, 9, 9, 9, 9, 9, 9, 9]), [], "{seqno}");
+    }
+    // The same with every frame twice, as CAN may deliver it.
+    assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), []);
+    assert_eq!(bench.wait(60), []);
+    assert_eq!(bench.ask([1, 8, 8, 8, 8, 8, 8, 8]), []);
+    assert_eq!(bench.ask([0x82, 7, 7, 7, 7, 7, 7, 7]), [response(acked(2))]);
+    assert_eq!(
+        bench.ask([0xC1, 0, 0, 0, 0, 0, 0, 0]),
+        [response([0x80, 0x50, 0x1F, 1, 0x10, 0, 0x07, 0x06])]
+    );
+    let mut expected = [1, 2, 3, 4, 5, 6, 7].repeat(40);
+    expected.extend([[8; 7], [7; 7]].concat());
+    assert_eq!(bench.device.taken, expected);
+    // A client that begins again at the acknowledgement, and loses its first segment.
+    let mut bench = Bench::with(Config::DEFAULT);
+    bench.begin(40);
+    assert_eq!(bench.wait(60), [(50, response(acked(40)))]);
+    for seqno in 2..=126 {
+        assert_eq!(bench.ask([seqno, 9, 9, 9, 9, 9, 9, 9]), []);
+    }
+    assert_eq!(bench.ask([127, 9, 9, 9, 9, 9, 9, 9]), [response(acked(0))]);
+}
+
+/// The client of a download was switched off. Another client repeats its request: it gets the first
+/// answer after 50 ms without a frame of the download.
+#[test]
+fn a_request_ends_a_download_that_stands_still() {
+    for (segments, every) in [(0, 100), (0, 2200), (3, 100), (3, 2200), (3, 20), (126, 300)] {
+        let mut bench = Bench::with(Config::DEFAULT);
+        bench.begin(segments);
+        bench.now = 10;
+        let mut answers = bench.ask(READ_1000).into_iter().map(|frame| (10, frame)).collect::<Vec<_>>();
+        while bench.now < 4000 {
+            answers.extend(bench.wait(every));
+            let now = bench.now;
+            answers.extend(bench.ask(READ_1000).into_iter().map(|frame| (now, frame)));
+        }
+        assert_eq!(answers[0], (60, response(IS_1000)), "{segments} segments, every {every} ms");
+        assert!(answers.iter().all(|(_, frame)| *frame == response(IS_1000)), "{answers:?}");
+        assert_eq!(bench.device.events, [Event::Start(Some(4096)), Event::Cancel]);
+        assert!(bench.server.is_idle());
+    }
+}
+
+#[test]
+fn each_kind_of_request_ends_a_download() {
+    for (asked, answered) in [
+        ([0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+        ([0x22, 0x51, 0x1F, 1, 3, 0, 0, 0], [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0]),
+        ([0x23, 0x02, 0x20, 0, 1, 2, 3, 4], [0x60, 0x02, 0x20, 0, 0, 0, 0, 0]),
+        ([0x2B, 0x17, 0x10, 0, 100, 0, 0, 0], [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]),
+        ([0x21, 0x01, 0x20, 0, 9, 0, 0, 0], [0x60, 0x01, 0x20, 0, 0, 0, 0, 0]),
+        ([0x20, 0x50, 0x1F, 1, 0, 0, 0, 0], [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]),
+        ([0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x43, 0x18, 0x10, 1, 4, 3, 2, 1]),
+        ([0x40, 0x50, 0x1F, 1, 0, 0, 0, 0], [0x80, 0x50, 0x1F, 1, 0x01, 0x00, 0x01, 0x06]),
+        ([0xA0, 0x08, 0x10, 0, 127, 0, 0, 0], [0xC6, 0x08, 0x10, 0, 17, 0, 0, 0]),
+        ([0xA4, 0x00, 0x10, 0, 127, 4, 0, 0], [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10]),
+        ([0xC0, 0x50, 0x1F, 1, 0, 0, 0, 0], GRANTED),
+        ([0xC6, 0x50, 0x1F, 1, 9, 0, 0, 0], GRANTED),
+    ] {
+        for segments in [0, 3] {
+            let mut bench = Bench::with(Config::DEFAULT);
+            bench.begin(segments);
+            assert_eq!(bench.ask(asked), []);
+            assert_eq!(bench.wait(50), [(50, response(answered))], "{asked:02X?} behind {segments}");
+            assert_eq!(bench.device.events[..2], [Event::Start(Some(4096)), Event::Cancel]);
+        }
+        // The server delays its acknowledgement, because there is no room.
+        let mut bench = Bench::with(Config { blksize: 2, ..Config::DEFAULT });
+        bench.device.space = Some(14);
+        let granted = [0xA4, 0x50, 0x1F, 1, 2, 0, 0, 0];
+        assert_eq!(bench.ask([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]), [response(granted)]);
+        assert_eq!(bench.ask([1, 1, 2, 3, 4, 5, 6, 7]), []);
+        assert_eq!(bench.ask([2, 1, 2, 3, 4, 5, 6, 7]), []);
+        assert_eq!(bench.wait(10), []);
+        assert_eq!(bench.ask(asked), []);
+        bench.device.space = Some(0);
+        let sent = bench.wait(60);
+        // Another download finds no room either; it is granted when there is room.
+        let held = matches!(asked[0], 0x20 | 0xC0 | 0xC6) && asked[1] == 0x50;
+        assert_eq!(sent.is_empty(), held, "{asked:02X?}: {sent:?}");
+        assert_eq!(bench.device.events[..2], [Event::Start(Some(4096)), Event::Cancel]);
+    }
+    // An abort takes effect at once, and is not answered.
+    let mut bench = Bench::with(Config::DEFAULT);
+    bench.begin(3);
+    assert_eq!(bench.ask([0x80, 0, 0, 0, 0, 0, 0, 8]), []);
+    assert_eq!(bench.ask(READ_1000), [response(IS_1000)]);
+}
+
+/// Data that read as a request are data if they are in order, repeated, or after a gap while the
+/// client continues.
+#[test]
+fn segments_that_read_as_requests_are_data() {
+    let mut data = vec![[9; 7]; 127];
+    for (seqno, bytes) in [
+        (0x21, [0x50, 0x1F, 1, 9, 0, 0, 0]),
+        (0x2F, [0x51, 0x1F, 1, 3, 0, 0, 0]),
+        (0x40, [0x00, 0x10, 0, 0, 0, 0, 0]),
+        (0x41, [0x00, 0x10, 0, 0, 0, 0, 0]),
+        (0x7F, [0x51, 0x1F, 1, 3, 0, 0, 0]),
+    ] {
+        data[seqno - 1] = bytes;
+    }
+    let segment = |seqno: u8| {
+        let [a, b, c, d, e, f, g] = data[usize::from(seqno) - 1];
+        [seqno, a, b, c, d, e, f, g]
+    };
+    for lost in [None, Some(0x20), Some(0x2E), Some(0x3F), Some(0x40)] {
+        for pause in [0, 49] {
+            let mut bench = Bench::with(Config::DEFAULT);
+            bench.begin(0);
+            for seqno in (1..=126).filter(|seqno| Some(*seqno) != lost) {
+                bench.wait(if [0x2F, 0x40, 0x41, 0x42].contains(&seqno) { pause } else { 1 });
+                assert_eq!(bench.ask(segment(seqno)), [], "{seqno:02X}");
+                assert_eq!(bench.ask(segment(seqno)), [], "{seqno:02X} twice");
+            }
+            let arrived = lost.map_or(127, |lost| lost - 1);
+            assert_eq!(bench.ask(segment(127)), [response(acked(arrived))]);
+            assert_eq!(bench.device.taken, data[..usize::from(arrived)].concat());
+            assert_eq!(bench.device.events, [Event::Start(Some(4096))]);
+        }
+    }
+}
+
+/// The time counts from the last accepted segment, whatever else arrives.
+#[test]
+fn a_download_that_makes_no_progress_times_out() {
+    // A segment out of order, and a request for an object that the device does not have.
+    for noise in [[0x7E, 0, 0, 0, 0, 0, 0, 0], [0x40, 0x34, 0x12, 0, 0, 0, 0, 0]] {
+        for (segments, every) in [(0, 10), (0, 100), (2, 10), (2, 100), (2, 700)] {
+            let mut bench = Bench::with(Config::DEFAULT);
+            bench.begin(segments);
+            let mut sent = Vec::new();
+            let mut noise = noise;
+            while bench.now < 6000 && !sent.iter().any(|(_, frame)| *frame == response(TIMED_OUT)) {
+                sent.extend(bench.wait(every));
+                noise[7] ^= 1;
+                bench.ask(noise);
+                // A frame that was examined is not examined again.
+                let wakes = bench.server.next_deadline();
+                assert!(wakes.is_none_or(|wakes| !at(bench.now).has_reached(wakes)), "{noise:02X?}");
+            }
+            let (when, last) = sent.last().unwrap();
+            assert_eq!(*last, response(TIMED_OUT));
+            // 2 s after the last segment, or after its acknowledgement if that came later.
+            assert!((2000..=2200).contains(when), "{when} ms, every {every} ms, {noise:02X?}");
+            assert_eq!(bench.device.events, [Event::Start(Some(4096)), Event::Cancel]);
+        }
+    }
+    // The last segment repeated, where the end is expected.
+    let mut bench = Bench::with(Config::DEFAULT);
+    bench.begin(0);
+    let mut sent =
+        bench.ask([0x81, 1, 2, 3, 4, 5, 6, 7]).into_iter().map(|frame| (0, frame)).collect::<Vec<_>>();
+    for _ in 0..40 {
+        sent.extend(bench.wait(100));
+        bench.ask([0x81, 1, 2, 3, 4, 5, 6, 7]);
+    }
+    assert_eq!(sent[..2], [(0, response(acked(1))), (2000, response(TIMED_OUT))]);
+}
+
+/// Downloads with lost and repeated segments, and with data in which many segments read as requests
+/// for existing objects: none is disturbed. The client makes pauses like one on a busy machine.
+#[test]
+fn no_lost_or_doubled_segment_makes_a_request_of_data() {
+    let device = Device::default();
+    let objects: Vec<Address> = device.entries().iter().map(|entry| entry.at).collect();
+    for seed in 0..400 {
+        let mut random = Random(seed);
+        let segments = 1 + random.below(500);
+        let tells_request = random.below(4);
+        let mut data = Vec::new();
+        for _ in 0..segments {
+            let at = random.pick(&objects);
+            let [low, high] = at.index.to_le_bytes();
+            let mut bytes = [low, high, at.sub, 0, 0, 0, 0];
+            if random.below(4) < tells_request {
+                bytes[3] = random.below(128) as u8;
+            } else {
+                bytes.iter_mut().for_each(|byte| *byte = random.below(256) as u8);
+            }
+            data.extend(bytes);
+        }
+        // The last segment of the transfer does not read as a request: see below.
+        let len = data.len();
+        data[len - 7..].fill(0xEE);
+        let per_mille = random.pick(&[0, 5, 50]);
+        let block = Block { fallback: false, ..Block::default() };
+        let mut client =
+            Download::as_blocks(node(), Address::new(0x1F50, 1), &data, ClientConfig::default(), block);
+        let mut bench = Bench::with(Config { blksize: 1 + random.below(127) as u8, ..Config::DEFAULT });
+        let (mut good, mut outcome) = (0, None);
+        while outcome.is_none() {
+            match client.poll(at(bench.now)) {
+                Step::Send(frame) => {
+                    let [first, rest @ ..] = *frame.exactly::<8>().unwrap();
+                    // If no segment of a sub-block arrives, its beginning is unknown.
+                    let is_segment = (first < 0x80 || rest == [0xEE; 7]) && first & 0x7F != 1;
+                    // Two segments follow each missing one: see the server's rule.
+                    let lost = is_segment && good >= 2 && random.below(1000) < per_mille;
+                    good = if lost { 0 } else { good + 1 };
+                    let doubled = is_segment && random.below(1000) < per_mille;
+                    let times = if lost { 0 } else { 1 + u32::from(doubled) };
+                    for _ in 0..times {
+                        bench.server.handle(&frame, at(bench.now), &mut bench.device);
+                    }
+                    bench.now += if random.below(100) == 0 { random.below(45) as u32 } else { 0 };
+                }
+                Step::Wait(_) => bench.now += 1,
+                Step::Done(result) => outcome = Some(result),
+            }
+            for answer in bench.sent() {
+                client.handle(&answer, at(bench.now));
+            }
+        }
+        assert_eq!(outcome, Some(Ok(())), "seed {seed}");
+        assert_eq!(bench.device.domain, data, "seed {seed}");
+    }
+}

@@ -1,0 +1,343 @@
+//! `coboot-node`: bootloader nodes on a bus of the host.
+#![forbid(unsafe_code)]
+
+use std::error::Error;
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use boot_core::bootloader::{self, entries, entry_count, Extras};
+use boot_core::canopen::device;
+use boot_core::canopen::od::Entry;
+use boot_core::canopen::{BitRate, Instant, NodeId};
+use boot_core::control::Policy;
+use boot_core::crc::CrcKind;
+use boot_core::profile::Profile;
+use boot_core::store::NodeParameters;
+use clap::{Parser, ValueEnum};
+use coboot_node::device::{Device, Event, Setup, BUFFER};
+use coboot_node::file_flash::{FileFlash, Speed};
+use coboot_node::server::Server;
+use coboot_node::stand_in::StandIn;
+use coboot_node::supports;
+use coflash::bus::{self, Adapter};
+use shared_abi::layout::{self, Layout};
+
+/// The interval between two time steps of the nodes while nothing happens.
+const TICK: Duration = Duration::from_millis(2);
+
+/// Bootloader nodes on a CAN bus of the host, each with a file in place of its flash.
+///
+/// The nodes run the bootloader of the firmware and accept programs like it. They have no CPU for a
+/// program: after the start of a program a node is silent, or a stand-in answers. Ctrl-C cuts the
+/// power: everything that a node has reported as stored is in its file.
+#[derive(Debug, Parser)]
+#[command(name = "coboot-node", version)]
+struct Args {
+    /// An existing bus: socketcand://HOST:PORT/BUS, or another of coflash's adapters
+    #[arg(long, value_name = "URL", required_unless_present = "listen")]
+    bus: Option<String>,
+
+    /// Offer a bus `can0` to socketcand clients at this address, for example 127.0.0.1:29536
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "bus")]
+    listen: Option<String>,
+
+    /// Node-ID of the first node
+    #[arg(long, value_name = "ID", default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
+    node: u8,
+
+    /// Start the nodes without a node-ID: they wait for layer setting services
+    #[arg(long, conflicts_with = "node")]
+    unconfigured: bool,
+
+    /// Number of nodes; node-ID and serial number count up
+    #[arg(long, default_value = "1", value_parser = clap::value_parser!(u8).range(1..=127))]
+    count: u8,
+
+    /// Serial number of the first node
+    #[arg(long, default_value = "1", value_parser = number)]
+    serial: u32,
+
+    /// Folder of the files, SERIAL.flash for each node, with the raw contents of the flash. A
+    /// missing file is created with erased flash
+    #[arg(long, default_value = ".", value_name = "DIR")]
+    folder: PathBuf,
+
+    /// The board with the sectors and programs of the nodes
+    #[arg(long, default_value = layout::DEFAULT.board, value_parser = board)]
+    board: &'static Layout,
+
+    /// Vendor-ID; with vendor-ID and product code both 0 the nodes accept programs for any product
+    #[arg(long, default_value = "0", value_parser = number)]
+    vendor_id: u32,
+
+    /// Product code
+    #[arg(long, default_value = "0", value_parser = number)]
+    product_code: u32,
+
+    /// Revision number
+    #[arg(long, default_value = "0x10000", value_parser = number)]
+    revision: u32,
+
+    /// Period of the heartbeat in ms, 0 for none
+    #[arg(long, default_value = "1000", value_name = "MS")]
+    heartbeat: u16,
+
+    /// Duration of erase and program operations of the flash
+    #[arg(long, value_enum, default_value = "typical")]
+    flash: FlashSpeed,
+
+    /// The dialect of the nodes where dialects contradict each other
+    #[arg(long, value_enum, default_value = "standard")]
+    profile: Dialect,
+
+    /// Protect blocks and programs with a CRC-16, as in a product with `CrcKind::Crc16`; `coflash
+    /// convert --crc16` makes such files
+    #[arg(long)]
+    crc16: bool,
+
+    /// Keep the nodes in the bootloader, also with a program, as with the entry strap set
+    #[arg(long)]
+    stay: bool,
+
+    /// Answer in place of a started program the requests that a host sends to a running application
+    #[arg(long)]
+    stand_in: bool,
+}
+
+/// The dialects of docs/dialects.md.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Dialect {
+    /// Block files, raw images and Intel HEX: the default of the firmware
+    Standard,
+    /// port's Paulus
+    Paulus,
+    /// The boot loader of ESAcademy: 7F50h unlocks 1F50h
+    Esacademy,
+    /// CiA 417 lifts: 6005h unlocks 1F50h, node-ID 126
+    Lift,
+}
+
+impl From<Dialect> for Profile {
+    fn from(dialect: Dialect) -> Self {
+        match dialect {
+            Dialect::Standard => Self::STANDARD,
+            Dialect::Paulus => Self::PAULUS,
+            Dialect::Esacademy => Self::ESACADEMY,
+            Dialect::Lift => Self::LIFT,
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum FlashSpeed {
+    /// No time
+    Instant,
+    /// The typical times of the STM32F405/407
+    Typical,
+}
+
+impl From<FlashSpeed> for Speed {
+    fn from(speed: FlashSpeed) -> Self {
+        match speed {
+            FlashSpeed::Instant => Self::Instant,
+            FlashSpeed::Typical => Self::Typical,
+        }
+    }
+}
+
+fn board(name: &str) -> Result<&'static Layout, String> {
+    let names = || layout::BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
+    layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))
+}
+
+fn number(text: &str) -> Result<u32, String> {
+    let parsed = match text.strip_prefix("0x") {
+        // `from_str_radix` would accept a sign.
+        Some(digits) if digits.starts_with('+') => None,
+        Some(digits) => u32::from_str_radix(digits, 16).ok(),
+        None => text.parse().ok().filter(|_| !text.starts_with('+')),
+    };
+    parsed.ok_or_else(|| "it is not a number of 32 bits (4096 or 0x1000)".to_owned())
+}
+
+fn main() -> ExitCode {
+    let args = Args::parse();
+    let result = match args.board.programs.len() {
+        1 => run::<1>(&args),
+        2 => run::<2>(&args),
+        programs => Err(format!("a board with {programs} programs is not known here").into()),
+    };
+    match result {
+        Ok(never) => match never {},
+        Err(error) => {
+            // If this fails, too, only the exit code remains.
+            let _ = writeln!(io::stderr(), "coboot-node: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The object dictionary of a device with this many programs.
+fn table_of(programs: usize, extras: Extras) -> &'static [Entry] {
+    macro_rules! one_of {
+        ($($programs:literal $extras:expr),*) => {
+            match (programs, extras) {
+                $((_, _) if programs == $programs && extras == $extras => {
+                    const LEN: usize = entry_count($programs, $extras);
+                    static ENTRIES: [Entry; LEN] = entries($programs, $extras).entries();
+                    &ENTRIES
+                })*
+                _ => unreachable!("one or two programs, and one of the profiles"),
+            }
+        };
+    }
+    one_of!(
+        1 Profile::STANDARD.extras, 1 Profile::ESACADEMY.extras, 1 Profile::LIFT.extras,
+        2 Profile::STANDARD.extras, 2 Profile::ESACADEMY.extras, 2 Profile::LIFT.extras
+    )
+}
+
+fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, Box<dyn Error>> {
+    let setups = setups(args, PROGRAMS)?;
+    let mut flashes = Vec::new();
+    for setup in &setups {
+        let path = args.folder.join(format!("{}.flash", setup.serial_number));
+        let flash = FileFlash::open(&path, args.board, args.flash.into())
+            .map_err(|error| format!("{}: {error}", path.display()))?;
+        flashes.push(flash);
+    }
+    let mut bus: Box<dyn Adapter> = match (&args.bus, &args.listen) {
+        (Some(url), _) => bus::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
+        (None, Some(address)) => {
+            let server =
+                Server::bind(address, "can0").map_err(|error| format!("listening at {address}: {error}"))?;
+            print_line(&format!("bus: socketcand://{}/can0", server.address()));
+            Box::new(server)
+        }
+        (None, None) => return Err("no bus is named: give --bus URL or --listen HOST:PORT".into()),
+    };
+
+    let mut buffers = vec![[0; BUFFER]; setups.len()];
+    let mut devices = Vec::new();
+    for ((setup, flash), buffer) in setups.into_iter().zip(flashes).zip(&mut buffers) {
+        let (device, event) = Device::<PROGRAMS>::new(setup, flash, buffer);
+        log_event(setup.serial_number, event);
+        devices.push((setup.serial_number, device));
+    }
+    let mut more = true;
+    loop {
+        // The nodes are slaves: the frames of one node do not concern the others.
+        let frame = bus.receive(if more { Duration::ZERO } else { TICK })?;
+        // Wraps after 49 days, as on the chip.
+        let now = Instant::from_millis(bus.now().as_millis() as u32);
+        more = frame.is_some();
+        for (serial, device) in &mut devices {
+            if let Some(frame) = &frame {
+                device.handle(frame, now);
+            }
+            let mut sent = Ok(());
+            let mut send = |frame| {
+                if sent.is_ok() {
+                    sent = bus.send(&frame);
+                }
+            };
+            more |= device
+                .work(now, &mut send, &mut |event| log_event(*serial, event))
+                .map_err(|error| format!("the file of serial number {serial} cannot be written: {error}"))?;
+            sent?;
+        }
+    }
+}
+
+/// The setups of the nodes, which live as long as the process.
+fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
+    let profile: Profile = args.profile.into();
+    let config: &'static bootloader::Config = Box::leak(Box::new(bootloader::Config {
+        entries: table_of(programs, profile.extras),
+        device: device::Device {
+            device_type: profile.device_type,
+            name: "coboot-node",
+            hardware_version: "none",
+            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            heartbeat_ms: args.heartbeat,
+            vendor_id: args.vendor_id,
+            product_code: args.product_code,
+            revision: args.revision,
+            serial_number: 0,
+        },
+        node_id: profile.node_id,
+        layout: args.board,
+        supports,
+        boot_up_emergency: true,
+        lss_store: true,
+        second_server: true,
+        download: Policy {
+            identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
+            crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },
+            ..profile.download
+        },
+        password: profile.password,
+    }));
+    let stand_in: Option<&'static [Entry]> =
+        args.stand_in.then(|| &*Vec::leak(StandIn::entries(programs as u8)));
+    let setup = |n: u8| -> Option<Setup> {
+        let id = match args.unconfigured {
+            true => None,
+            false => Some(NodeId::new(args.node.checked_add(n)?)?),
+        };
+        Some(Setup {
+            config,
+            stand_in,
+            serial_number: args.serial.checked_add(n.into())?,
+            node: NodeParameters { id, bit_rate: BitRate::K125 },
+            strap: args.stay,
+        })
+    };
+    let setups: Option<Vec<Setup>> = (0..args.count).map(setup).collect();
+    Ok(setups.ok_or("with this first number and count, the nodes exceed the node-IDs (1 to 127) or the serial numbers (32 bits)")?)
+}
+
+/// Prints the result of a reset.
+fn log_event(serial: u32, event: Event) {
+    let (node, what) = match event {
+        Event::NodeId(node) => (Some(node), "node-ID set by LSS".to_owned()),
+        Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
+        Event::Program { number, trial, node } => {
+            let trial = if trial { ", on trial" } else { "" };
+            (node, format!("would start program {number}{trial}"))
+        }
+    };
+    let node = node.map_or("no node-ID".to_owned(), |node| format!("node {}", node.get()));
+    print_line(&format!("serial {serial}, {node}: {what}"));
+}
+
+fn print_line(line: &str) {
+    // An error of standard output is ignored.
+    let _ = writeln!(io::stdout(), "{line}");
+}
+
+#[cfg(test)]
+#[path = "../../../xtask/src/pages.rs"]
+mod pages;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every call of this program on every page is parsed by the command line's own parser.
+    #[test]
+    fn what_the_pages_show_is_understood() {
+        let mut count = 0;
+        for shown in pages::commands() {
+            let Some(words) = pages::call_of(&shown.words, "coboot-node") else { continue };
+            count += 1;
+            let words = std::iter::once("coboot-node").chain(words.iter().map(String::as_str));
+            if let Err(error) = Args::try_parse_from(words) {
+                panic!("{}: {:?}: {error}", shown.place, shown.words);
+            }
+        }
+        assert!(count > 0);
+    }
+}
