@@ -351,8 +351,10 @@ pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
 pub fn pinned_tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
     let program = workspace::target_dir().join("tools/bin").join(name);
     let program = program.with_extension(env::consts::EXE_EXTENSION);
-    let said = process::output(Command::new(&program).arg("--version")).unwrap_or_default();
-    if !said.trim_end().ends_with(version) {
+    // Some subcommands of cargo print their version only as one.
+    let words = [name.strip_prefix("cargo-"), None].map(|word| word.into_iter().chain(["--version"]));
+    let mut said = words.into_iter().map(|words| process::output(Command::new(&program).args(words)));
+    if !said.any(|said| said.is_ok_and(|said| said.trim_end().ends_with(version))) {
         install(name, version, options)?;
     }
     Ok(program)
