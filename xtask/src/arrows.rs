@@ -12,8 +12,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::args::Args;
-use crate::json::Value;
 use crate::{process, rooms, workspace, Outcome};
+use serde_json::Value;
 
 pub const HELP: &str = "\
 usage: cargo xtask arrows
@@ -83,7 +83,7 @@ const COMMAND_LINE: &str = "src/bin";
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     let metadata = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
-    let packages = packages(&Value::parse(&metadata)?)?;
+    let packages = packages(&process::json(&metadata)?)?;
     let mut broken = broken_arrows(&packages);
     let Some(emulator) = packages.iter().find(|package| package.name == "emulator") else {
         return Err("the workspace has no crate \"emulator\".".into());
@@ -144,36 +144,40 @@ struct Package {
 /// Reads the output of `cargo metadata --no-deps`.
 fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
     let mut libraries = BTreeMap::new();
-    for package in metadata.get("packages").items() {
+    for package in metadata["packages"].as_array().into_iter().flatten() {
         let is_library = |target: &&Value| {
-            target.get("kind").items().iter().any(|kind| kind.text() != Some("custom-build"))
-                && target.get("crate_types").items().iter().any(|kind| kind.text() != Some("bin"))
+            target["kind"].as_array().into_iter().flatten().any(|kind| kind.as_str() != Some("custom-build"))
+                && target["crate_types"]
+                    .as_array()
+                    .into_iter()
+                    .flatten()
+                    .any(|kind| kind.as_str() != Some("bin"))
         };
-        let library = package.get("targets").items().iter().find(is_library);
-        if let (Some(name), Some(library)) = (package.get("name").text(), library) {
-            let library = library.get("name").text().unwrap_or_default().replace('_', "-");
+        let library = package["targets"].as_array().into_iter().flatten().find(is_library);
+        if let (Some(name), Some(library)) = (package["name"].as_str(), library) {
+            let library = library["name"].as_str().unwrap_or_default().replace('_', "-");
             libraries.insert(name.to_owned(), library);
         }
     }
     let called = |package: &str| libraries.get(package).map_or(package, String::as_str).to_owned();
     let package = |value: &Value| -> Option<Package> {
         let mut dependencies = Vec::new();
-        for dependency in value.get("dependencies").items() {
-            let kind = match dependency.get("kind").text() {
+        for dependency in value["dependencies"].as_array().into_iter().flatten() {
+            let kind = match dependency["kind"].as_str() {
                 None => "normal",
                 Some("dev") => "dev",
                 Some(_) => "build",
             };
-            dependencies.push((called(dependency.get("name").text()?), kind));
+            dependencies.push((called(dependency["name"].as_str()?), kind));
         }
-        let manifest = Path::new(value.get("manifest_path").text()?);
+        let manifest = Path::new(value["manifest_path"].as_str()?);
         Some(Package {
-            name: called(value.get("name").text()?),
+            name: called(value["name"].as_str()?),
             folder: manifest.parent()?.to_owned(),
             dependencies,
         })
     };
-    let found: Option<Vec<_>> = metadata.get("packages").items().iter().map(package).collect();
+    let found: Option<Vec<_>> = metadata["packages"].as_array().into_iter().flatten().map(package).collect();
     found
         .filter(|packages| !packages.is_empty())
         .ok_or_else(|| "cargo metadata printed something unexpected.".into())
@@ -394,7 +398,7 @@ mod tests {
         ]},{"name":"coboot-core","manifest_path":"/x/boot-core/Cargo.toml","targets":[
             {"kind":["lib"],"crate_types":["lib"],"name":"boot_core"}
         ],"dependencies":[]}],"workspace_members":[]}"#;
-        let packages = packages(&Value::parse(text).unwrap()).unwrap();
+        let packages = packages(&process::json(text).unwrap()).unwrap();
         assert_eq!(
             packages,
             [
@@ -411,8 +415,8 @@ mod tests {
             ]
         );
         assert_eq!(broken_arrows(&packages).len(), 1);
-        assert!(super::packages(&Value::parse("{}").unwrap()).is_err());
-        assert!(super::packages(&Value::parse(r#"{"packages":[{"name":1}]}"#).unwrap()).is_err());
+        assert!(super::packages(&process::json("{}").unwrap()).is_err());
+        assert!(super::packages(&process::json(r#"{"packages":[{"name":1}]}"#).unwrap()).is_err());
     }
 
     #[test]

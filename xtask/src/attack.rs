@@ -58,6 +58,6 @@ pub fn run(mut args: Args) -> Outcome {
     // A rule that was broken is a result, too.
     let ended = process::run(&mut attack);
     let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
-    evidence::record("attacker", &fs::read_to_string(&counts).map_err(unread)?)?;
+    evidence::record_text("attacker", &fs::read_to_string(&counts).map_err(unread)?)?;
     ended
 }

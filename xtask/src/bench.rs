@@ -1,5 +1,7 @@
 //! `cargo xtask bench`: measures how fast a program is downloaded, and the load on the host.
 
+use serde_json::{json, Value};
+
 use crate::args::Args;
 use crate::setup::{Part, Setup};
 use crate::{build, evidence, process, workspace, Outcome};
@@ -38,16 +40,52 @@ pub fn run(mut args: Args) -> Outcome {
         Ok::<_, String>(cost)
     };
     if json {
-        let emulated = process::output(bench.args(["--", "--json"]))?;
-        let host = process::output(cost()?.args(["--", "--json"]))?;
-        // The first result is an object; the second one is added to it.
-        let emulated =
-            emulated.trim_end().strip_suffix('}').ok_or("the bench printed something unexpected.")?;
-        let rows = format!("{emulated},\n\"host\": {}}}", host.trim_end());
-        println!("{rows}");
-        return evidence::record("bench", &rows).map(drop);
+        let mut facts = process::json(&process::output(bench.args(["--", "--json"]))?)?;
+        facts["host"] = process::json(&process::output(cost()?.args(["--", "--json"]))?)?;
+        println!("{facts:#}");
+        (facts["percent"], facts["failed"]) = verdict(&facts);
+        return evidence::record("bench", facts);
     }
     process::run(&mut bench)?;
     println!();
     process::run(&mut cost()?)
+}
+
+/// The least share of what wire and flash allow, in percent, and how many downloads have no measure
+/// or no limit.
+fn verdict(facts: &Value) -> (Value, Value) {
+    let downloads = facts["downloads"].as_array().map_or(&[][..], Vec::as_slice);
+    let names = ["percent", "measured_us", "wire_limit_us", "flash_limit_us"];
+    let is_whole =
+        |row: &&Value| names.iter().all(|name| row[name].as_f64().is_some_and(|number| number > 0.0));
+    let failed = downloads.iter().filter(|row| !is_whole(row)).count();
+    let least = downloads.iter().filter_map(|row| row["percent"].as_u64()).min();
+    (json!(least), json!(failed))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn speed_is_good_if_each_download_has_its_limits() {
+        let good = json!({"measured_us": 30, "wire_limit_us": 20, "flash_limit_us": 9, "percent": 66});
+        for (row, expected) in [
+            (good.clone(), (json!(66), json!(0))),
+            (
+                json!({"measured_us": 30, "wire_limit_us": 9, "flash_limit_us": 24, "percent": 50}),
+                (json!(50), json!(0)),
+            ),
+            (json!({"measured_us": 30, "wire_limit_us": 20, "percent": 60}), (json!(60), json!(1))),
+            (json!({"measured_us": 30, "flash_limit_us": 20, "percent": 66}), (json!(66), json!(1))),
+            (json!({"wire_limit_us": 20, "flash_limit_us": 20, "percent": 66}), (json!(66), json!(1))),
+            (
+                json!({"measured_us": 30, "wire_limit_us": 0, "flash_limit_us": 0, "percent": 66}),
+                (json!(66), json!(1)),
+            ),
+        ] {
+            assert_eq!(verdict(&json!({"downloads": [good, row]})), expected, "{row}");
+        }
+        assert_eq!(verdict(&json!({"downloads": []})), (json!(null), json!(0)));
+    }
 }

@@ -6,9 +6,9 @@ use std::process::Command;
 use std::{env, fs};
 
 use crate::args::Args;
-use crate::json::{quoted, Value};
 use crate::setup::{self, Part, Setup};
 use crate::{evidence, process, workspace, Outcome};
+use serde_json::{json, Value};
 
 pub const HELP: &str = "\
 usage: cargo xtask coverage [--yes]
@@ -62,30 +62,35 @@ pub fn run(mut args: Args) -> Outcome {
     let report = process::output(&mut llvm_cov(&["report", "--json", "--summary-only"]))?;
     let missing = process::output(&mut llvm_cov(&["report", "--show-missing-lines"]))?;
     fs::write(folder.join("missing.txt"), missing).map_err(unwritable)?;
-    let counts = by_crate(&Value::parse(&report)?, workspace::root());
+    let counts = by_crate(&process::json(&report)?, workspace::root());
     for (name, [lines, covered]) in &counts {
         println!("  {name:<12} {covered:>6} of {lines:>6} lines, {:.1} %", percent(*lines, *covered));
     }
     if counts.is_empty() {
         return Err("cargo-llvm-cov has counted no line of these crates.".into());
     }
-    evidence::record("coverage", &as_json(&counts)).map(drop)
+    evidence::record("coverage", as_json(&counts))
 }
 
 /// Lines and reached lines, by the folder of the crate.
 fn by_crate(report: &Value, root: &Path) -> BTreeMap<&'static str, [u64; 2]> {
     let mut counts = BTreeMap::<_, [u64; 2]>::new();
-    for file in report.get("data").items().iter().flat_map(|part| part.get("files").items()) {
-        let Some(path) = file.get("filename").text().and_then(|path| Path::new(path).strip_prefix(root).ok())
+    for file in report["data"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .flat_map(|part| part["files"].as_array().into_iter().flatten())
+    {
+        let Some(path) = file["filename"].as_str().and_then(|path| Path::new(path).strip_prefix(root).ok())
         else {
             continue;
         };
         let is_of = |(_, folder): &&(&str, &str)| path.starts_with(Path::new(folder).join("src"));
         let Some((_, folder)) = CRATES.iter().find(is_of) else { continue };
-        let lines = file.get("summary").get("lines");
+        let lines = &file["summary"]["lines"];
         let sums = counts.entry(*folder).or_default();
         for (sum, name) in sums.iter_mut().zip(["count", "covered"]) {
-            *sum += lines.get(name).number().unwrap_or_default() as u64;
+            *sum += lines[name].as_u64().unwrap_or_default();
         }
     }
     counts
@@ -95,22 +100,20 @@ fn percent(lines: u64, covered: u64) -> f64 {
     covered as f64 / lines.max(1) as f64 * 100.0
 }
 
-fn as_json(counts: &BTreeMap<&str, [u64; 2]>) -> String {
-    let rows = counts.iter().map(|(name, [lines, reached])| {
-        let percent = percent(*lines, *reached);
-        format!(
-            "\n{{\"crate\": {}, \"lines\": {lines}, \"reached\": {reached}, \"percent\": {percent:.1}}}",
-            quoted(name)
-        )
+fn as_json(counts: &BTreeMap<&str, [u64; 2]>) -> Value {
+    let row = |[lines, reached]: [u64; 2]| {
+        let percent = (percent(lines, reached) * 10.0).round() / 10.0;
+        json!({"lines": lines, "reached": reached, "percent": percent})
+    };
+    let crates = counts.iter().map(|(name, counts)| {
+        let mut row = row(*counts);
+        row["crate"] = json!(name);
+        row
     });
-    let rows = rows.collect::<Vec<_>>().join(",");
     let sum = |which: usize| counts.values().map(|counts| counts[which]).sum::<u64>();
-    let percent = percent(sum(0), sum(1));
-    format!(
-        "{{\"lines\": {}, \"reached\": {}, \"percent\": {percent:.1}, \"crates\": [{rows}]}}",
-        sum(0),
-        sum(1)
-    )
+    let mut record = row([sum(0), sum(1)]);
+    record["crates"] = crates.collect();
+    record
 }
 
 #[cfg(test)]
@@ -120,11 +123,7 @@ mod tests {
     /// The form of llvm-cov's export.
     #[test]
     fn lines_are_summed_by_crate_and_those_of_others_do_not_count() {
-        let file = |name: &str, count, covered| {
-            format!(
-                "{{\"filename\": \"{name}\", \"summary\": {{\"lines\": {{\"count\": {count}, \"covered\": {covered}}}}}}}"
-            )
-        };
+        let file = |name: &str, count, covered| json!({"filename": name, "summary": {"lines": {"count": count, "covered": covered}}});
         let files = [
             file("/x/core/canopen/src/a.rs", 10, 9),
             file("/x/core/canopen/src/b/c.rs", 30, 21),
@@ -133,12 +132,12 @@ mod tests {
             file("/y/core/seal/src/lib.rs", 50, 50),
             file("/x/coflash/src/main.rs", 70, 0),
         ];
-        let report = Value::parse(&format!("{{\"data\": [{{\"files\": [{}]}}]}}", files.join(","))).unwrap();
+        let report = json!({"data": [{"files": files}]});
         let counts = by_crate(&report, Path::new("/x"));
         assert_eq!(counts, BTreeMap::from([("core/canopen", [40, 30]), ("core/seal", [5, 5])]));
-        let record = Value::parse(&as_json(&counts)).unwrap();
-        assert_eq!(record.get("reached").number(), Some(35.0));
-        assert_eq!(record.get("crates").items()[0].get("percent").number(), Some(75.0));
+        let record = as_json(&counts);
+        assert_eq!(record["reached"].as_f64(), Some(35.0));
+        assert_eq!(record["crates"][0]["percent"].as_f64(), Some(75.0));
     }
 
     #[test]

@@ -1,15 +1,16 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
-use std::{env, fmt, fs, thread};
+use std::{env, fs, thread};
+
+use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::json::Value;
 use crate::{evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
@@ -22,15 +23,13 @@ parameter journal, firmware files, candump logs, the text of SLCAN and socketcan
 configuration files, requests to coflash ui, sealed images, as files and as they arrive, with their
 signatures and their compression; as many at a time as there are cores. What they find in this run is
 built upon in the next one.
-The counts of all runs go to target/evidence/fuzz.json.
+The counts of a run of all targets go to target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
-  --inputs N      each target runs until N inputs were tried in all runs together; a target of which
-                  something has changed begins again
+  --inputs N      how many inputs each target tries, in place of a time
   --target NAMES  these alone, with commas between them
   --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
-                  fuzz/seeds for the replay, and the counts into docs/evidence, where a fresh
-                  clone goes on counting
+                  fuzz/seeds for the replay
   --replay        runs no fuzzer: every input of fuzz/seeds and fuzz/corpus once, with the Rust that
                   builds the rest; it needs no nightly toolchain, and about a minute
 
@@ -58,28 +57,6 @@ const COMMANDS: [(&str, u32); 9] = [
     ("signature", 512),
     ("streams", 1024),
 ];
-/// The file of the counts.
-const EVIDENCE: &str = "fuzz";
-/// The least number of inputs of a target that counts as fuzzed.
-const LEAST: u64 = 10_000_000;
-/// What a target depends on that names this crate: the beginnings of paths.
-const READS: [(&str, &[&str]); 6] = [
-    ("boot_core", &["core/boot-core/src/", "core/canopen/src/", "core/seal/src/", "shared-abi/src/"]),
-    ("canopen", &["core/canopen/src/"]),
-    (
-        "coboot_fuzz",
-        &[
-            "fuzz/src/",
-            "core/canopen/tests/common/",
-            "core/canopen/tests/memory/",
-            "core/boot-core/tests/model/",
-        ],
-    ),
-    ("coflash", &["coflash/src/", "core/canopen/src/", "core/seal/src/", "shared-abi/src/"]),
-    ("seal", &["core/seal/src/"]),
-    ("shared_abi", &["shared-abi/src/"]),
-];
-
 /// The feature for sealed images.
 const SEALED: &str = "sealed";
 /// The targets that need it.
@@ -161,71 +138,6 @@ fn put_by(corpus: &Path, seeds: &Path) -> Outcome {
     Ok(())
 }
 
-/// The counts of all runs without a fault.
-struct Counts(BTreeMap<String, Row>);
-
-/// The counts of one target.
-struct Row {
-    /// The commit of the first run that is counted.
-    since: String,
-    /// Inputs and seconds, of all runs together.
-    sums: [u64; 2],
-    /// The edges that the last run covered, and the files in its corpus.
-    last: [u64; 2],
-}
-
-impl Counts {
-    /// Those of the record that hold for the sources as they are: with others, a target begins again.
-    fn read(recorded: &Value, holds: impl Fn(&str, &str) -> bool) -> Self {
-        let Value::Object(targets) = recorded.get("targets") else { return Self(BTreeMap::new()) };
-        let row = |counts: &Value| {
-            let number = |key| match counts.get(key) {
-                Value::Number(text) => text.parse::<u64>().ok(),
-                _ => None,
-            };
-            Some(Row {
-                since: counts.get("since").text()?.to_owned(),
-                sums: [number("inputs")?, number("seconds")?],
-                last: [number("edges")?, number("corpus")?],
-            })
-        };
-        let rows = targets.iter().filter_map(|(name, counts)| Some((name.clone(), row(counts)?)));
-        Self(rows.filter(|(name, row)| holds(name, &row.since)).collect())
-    }
-
-    /// The inputs of all runs of a target.
-    fn tried(&self, target: &str) -> u64 {
-        self.0.get(target).map_or(0, |row| row.sums[0])
-    }
-
-    fn add(&mut self, target: &str, more: [u64; 2], last: [u64; 2]) {
-        let row = self.0.entry(target.to_owned()).or_insert_with(|| Row {
-            since: evidence::commit(),
-            sums: [0; 2],
-            last,
-        });
-        row.sums = [row.sums[0].saturating_add(more[0]), row.sums[1].saturating_add(more[1])];
-        row.last = last;
-    }
-}
-
-impl fmt::Display for Counts {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{{\"targets\": {{")?;
-        for (n, (target, Row { since, sums: [inputs, seconds], last: [edges, corpus] })) in
-            self.0.iter().enumerate()
-        {
-            let comma = if n == 0 { "" } else { "," };
-            write!(
-                f,
-                "{comma}\n  \"{target}\": {{\"inputs\": {inputs}, \"seconds\": {seconds}, \"edges\": {edges}, \
-                 \"corpus\": {corpus}, \"since\": \"{since}\"}}"
-            )?;
-        }
-        write!(f, "\n}}}}")
-    }
-}
-
 pub fn run(mut args: Args) -> Outcome {
     let (seconds, inputs) = (args.value("--seconds")?, args.value("--inputs")?);
     if seconds.is_some() && inputs.is_some() {
@@ -240,7 +152,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let folder = workspace::root().join("fuzz");
     let mut targets = targets(&folder)?;
-    let of = targets.len();
+    let is_whole = only.is_none();
     if let Some(only) = only {
         let chosen: Vec<String> = only.split(',').map(str::to_owned).collect();
         if let Some(name) = chosen.iter().find(|name| !targets.contains(name)) {
@@ -257,48 +169,44 @@ pub fn run(mut args: Args) -> Outcome {
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let holds = |target: &str, since: &str| {
-        evidence::is_unchanged(since, |file| is_read(&tools.folder, target, file))
+    let end = match inputs {
+        Some(inputs) => format!("-runs={inputs}"),
+        None => format!("-max_total_time={seconds}"),
     };
-    let counts = Counts::read(&evidence::recorded(EVIDENCE).unwrap_or(Value::Null), holds);
-    let end = |target: &str| match inputs.map(|inputs| inputs.saturating_sub(counts.tried(target))) {
-        Some(0) => None,
-        Some(left) => Some(format!("-runs={left}")),
-        None => Some(format!("-max_total_time={seconds}")),
-    };
-    let queue: VecDeque<(String, String)> =
-        targets.into_iter().filter_map(|target| Some((end(&target)?, target))).collect();
-    let (queue, counts) = (Mutex::new(queue), Mutex::new(counts));
+    let queue = Mutex::new(VecDeque::from(targets));
     let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
     let all = || {
-        let mut failed = Vec::new();
-        while let Some((end, target)) = next() {
-            let Some([runs, seconds, edges, corpus]) = tools.fuzz(&target, &end)? else {
-                failed.push(target);
-                continue;
-            };
-            println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-            let mut counts = counts.lock().unwrap_or_else(PoisonError::into_inner);
-            counts.add(&target, [runs, seconds], [edges, corpus]);
-            let text = counts.to_string();
-            let text = text.trim_start_matches('{');
-            evidence::record(EVIDENCE, &format!("{{\"of\": {of}, \"least\": {LEAST}, {text}"))?;
-            if keep {
-                process::output(tools.command("cmin", &target).arg(tools.corpus(&target)))?;
-                put_by(&tools.corpus(&target), &tools.seeds(&target))?;
-                evidence::keep(EVIDENCE)?;
+        let mut ended = Vec::new();
+        while let Some(target) = next() {
+            let counts = tools.fuzz(&target, &end)?;
+            if let Some([runs, seconds, ..]) = counts {
+                println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+                if keep {
+                    process::output(tools.command("cmin", &target).arg(tools.corpus(&target)))?;
+                    put_by(&tools.corpus(&target), &tools.seeds(&target))?;
+                }
             }
+            ended.push((target, counts));
         }
-        Outcome::Ok(failed)
+        Outcome::Ok(ended)
     };
+    if is_whole {
+        evidence::begin("fuzz")?;
+    }
     // A target has one thread.
     let cores = thread::available_parallelism().map_or(1, usize::from);
-    let failed = thread::scope(|scope| {
+    let mut ended = thread::scope(|scope| {
         let workers: Vec<_> = (0..cores).map(|_| scope.spawn(all)).collect();
         let broken_off = |_| "a part of the fuzzing broke off.".to_owned();
         workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
     })?
     .concat();
+    ended.sort();
+    let is_failed = |(target, counts): &(String, Option<_>)| counts.is_none().then(|| target.clone());
+    let failed: Vec<String> = ended.iter().filter_map(is_failed).collect();
+    if is_whole {
+        evidence::record("fuzz", counted(&ended, failed.len()))?;
+    }
     if failed.is_empty() {
         Ok(())
     } else {
@@ -308,6 +216,23 @@ pub fn run(mut args: Args) -> Outcome {
             failed.join(", ")
         ))
     }
+}
+
+/// What a run has counted: the facts of the evidence.
+fn counted(ended: &[(String, Option<[u64; 4]>)], failed: usize) -> Value {
+    let rows = ended.iter().filter_map(|(target, counts)| {
+        let [inputs, seconds, edges, corpus] = (*counts)?;
+        Some(
+            json!({"target": target, "inputs": inputs, "seconds": seconds, "edges": edges, "corpus": corpus}),
+        )
+    });
+    let inputs: Vec<u64> = ended.iter().filter_map(|(_, counts)| Some((*counts)?[0])).collect();
+    json!({
+        "inputs": inputs.iter().sum::<u64>(),
+        "fewest_of_a_target": inputs.iter().min(),
+        "failed": failed,
+        "targets": rows.collect::<Vec<_>>(),
+    })
 }
 
 /// Adds the kept inputs to a corpus: the fuzzer puts only what is new into it, and the smallest corpus
@@ -419,16 +344,6 @@ fn targets(folder: &Path) -> Outcome<Vec<String>> {
     Ok(names)
 }
 
-/// Whether what a target has tried may end otherwise after a change of this file.
-fn is_read(folder: &Path, target: &str, file: &str) -> bool {
-    let source = folder.join("fuzz_targets").join(target).with_extension("rs");
-    let text = fs::read_to_string(source).unwrap_or_default();
-    let named = READS.iter().filter(|(name, _)| text.contains(&format!("{name}::")));
-    file == format!("fuzz/fuzz_targets/{target}.rs")
-        || file.starts_with("fuzz/Cargo.")
-        || named.flat_map(|(_, begins)| *begins).any(|begin| file.starts_with(begin))
-}
-
 fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
 }
@@ -528,42 +443,12 @@ mod tests {
     }
 
     #[test]
-    fn counts_hold_until_a_file_changes_that_the_target_reads() {
-        let folder = workspace::root().join("fuzz");
-        for (target, file, expected) in [
-            ("candump", "coflash/src/bus/mod.rs", true),
-            ("candump", "core/canopen/src/lss.rs", true),
-            ("candump", "core/boot-core/src/crc.rs", false),
-            ("candump", "fuzz/src/lib.rs", true),
-            ("candump", "fuzz/fuzz_targets/candump.rs", true),
-            ("candump", "fuzz/fuzz_targets/lss.rs", false),
-            ("signature", "core/seal/src/ed25519.rs", true),
-            ("signature", "core/canopen/src/lss.rs", false),
-            ("resume", "fuzz/Cargo.lock", true),
-            ("resume", "core/boot-core/tests/model/mod.rs", true),
-            ("resume", "core/boot-core/tests/resume.rs", false),
-            ("resume", "README.md", false),
-        ] {
-            assert_eq!(is_read(&folder, target, file), expected, "{target}: {file}");
-        }
-    }
-
-    #[test]
-    fn counts_add_up_over_runs() {
-        let read = |text: &str| Counts::read(&Value::parse(text).unwrap(), |target, _| target != "old");
-        let mut counts = read("{}");
-        counts.add("lss", [10, 2], [700, 30]);
-        counts.add("old", [10, 2], [700, 30]);
-        let mut counts = read(&counts.to_string());
-        counts.add("lss", [u64::MAX, 3], [701, 29]);
-        counts.add("lzma", [5, 1], [60, 7]);
-        let counts = read(&counts.to_string());
-        assert_eq!((counts.tried("lzma"), counts.tried("none")), (5, 0));
-        let Counts(rows) = counts;
-        let lss = &rows["lss"];
-        assert_eq!((lss.sums, lss.last), ([u64::MAX, 5], [701, 29]));
-        assert_eq!((rows["lzma"].sums, rows.len()), ([5, 1], 2));
-        assert!(!lss.since.is_empty());
+    fn counts_add_up_over_the_targets() {
+        let of = |target: &str, counts| (target.to_owned(), counts);
+        let ended = [of("lss", Some([10, 2, 700, 30])), of("lzma", None), of("ui", Some([5, 1, 60, 7]))];
+        let facts = counted(&ended, 1);
+        assert_eq!((&facts["inputs"], &facts["fewest_of_a_target"]), (&json!(15), &json!(5)));
+        assert_eq!((&facts["failed"], &facts["targets"][1]["edges"]), (&json!(1), &json!(60)));
     }
 
     #[test]

@@ -57,7 +57,7 @@ struct Bench {
     /// The CRC of the last program that went into the device to its end, as text.
     installed: Option<String>,
     /// The document that `coflash conform` wrote.
-    conform: Option<String>,
+    conform: Option<serde_json::Value>,
 }
 
 pub fn run(mut args: Args) -> Outcome {
@@ -96,7 +96,8 @@ pub fn run(mut args: Args) -> Outcome {
     report.conform = bench.conform;
     print!("{}", report.summary());
     if let Some(file) = json {
-        fs::write(&file, report.json()).map_err(|error| format!("{file} cannot be written: {error}."))?;
+        fs::write(&file, format!("{:#}\n", report.json()))
+            .map_err(|error| format!("{file} cannot be written: {error}."))?;
     }
     report.outcome()
 }

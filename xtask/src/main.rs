@@ -29,7 +29,6 @@ mod fleet;
 mod fuzz;
 mod header;
 mod hil;
-mod json;
 mod layout;
 mod links;
 mod lint;

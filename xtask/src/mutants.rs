@@ -3,12 +3,14 @@
 use std::fs;
 use std::process::Command;
 
+use serde_json::json;
+
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
-use crate::{coverage, process, workspace, Outcome};
+use crate::{coverage, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--yes] [OPTIONS]
+usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [--yes] [OPTIONS]
 
 Changes the code of the device's crates in one place at a time with cargo-mutants, and runs the
 crate's tests: each change must make one fail. Fails if a change stays unnoticed that
@@ -16,8 +18,9 @@ crate's tests: each change must make one fail. Fails if a change stays unnoticed
 
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal
   --in-diff BASE  the changes alone in lines that differ from this commit
+  --shard K/N     the K-th of N parts, from 0
   --yes           installs what is missing with sudo
-  OPTIONS         for cargo-mutants, as --shard 0/8 or --file '**/store/*.rs' or --list
+  OPTIONS         for cargo-mutants, as --file '**/store/*.rs' or --list
 
 It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed into target/tools.
 ";
@@ -34,7 +37,7 @@ const WITH_SEALED: &str =
                            --timeout=300 --build-timeout=1200 --cargo-arg=--test=objects";
 
 pub fn run(mut args: Args) -> Outcome {
-    let (package, base) = (args.value("--package")?, args.value("--in-diff")?);
+    let (package, base, shard) = (args.value("--package")?, args.value("--in-diff")?, args.value("--shard")?);
     if let Some(name) = package.as_deref().filter(|name| !PACKAGES.contains(name)) {
         return Err(format!("there is no crate \"{name}\"; there is: {}.", PACKAGES.join(", ")));
     }
@@ -45,6 +48,9 @@ pub fn run(mut args: Args) -> Outcome {
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&folder));
     fs::create_dir_all(&folder).map_err(unwritable)?;
     let mut options = args.rest();
+    // A choice of files or lines is no result of a commit.
+    let is_result = options.is_empty() && base.is_none();
+    options.extend(shard.iter().map(|shard| format!("--shard={shard}")));
     if let Some(base) = base {
         let diff = process::output(
             Command::new("git").current_dir(workspace::root()).args(["diff", &base, "--", "*.rs"]),
@@ -52,8 +58,9 @@ pub fn run(mut args: Args) -> Outcome {
         fs::write(folder.join("change.diff"), diff).map_err(unwritable)?;
         options.push(format!("--in-diff={}", folder.join("change.diff").display()));
     }
-    // Runs cargo-mutants; returns the changes that no test has noticed.
-    let mutants = |package: &str, name: &str, words: &[String]| -> Outcome<Vec<String>> {
+    // Runs cargo-mutants; counts the changes that a test has noticed, and returns the others.
+    let mut caught = 0;
+    let mut mutants = |package: &str, name: &str, words: &[String]| -> Outcome<Vec<String>> {
         // What an earlier run has left would count.
         let _ = fs::remove_dir_all(folder.join(name));
         let mut mutants = Command::new(&program);
@@ -66,8 +73,13 @@ pub fn run(mut args: Args) -> Outcome {
             Some(0 | 2 | 3) => {}
             _ => return Err("cargo-mutants failed; what it printed above says why.".into()),
         }
-        let missed = folder.join(name).join("mutants.out/missed.txt");
-        Ok(fs::read_to_string(missed).unwrap_or_default().lines().map(str::to_owned).collect())
+        let list = |end: &str| {
+            let list = folder.join(name).join("mutants.out").join(end);
+            let list = fs::read_to_string(list).unwrap_or_default();
+            list.lines().map(str::to_owned).collect::<Vec<_>>()
+        };
+        caught += list("caught.txt").len() + list("timeout.txt").len();
+        Ok(list("missed.txt"))
     };
     let mut missed = Vec::new();
     for name in PACKAGES.iter().filter(|name| package.as_deref().is_none_or(|package| package == **name)) {
@@ -86,6 +98,12 @@ pub fn run(mut args: Args) -> Outcome {
         }
         let within = [&options[..], &sealed, &[format!("--re={SEALED}")]].concat();
         missed.extend(mutants(name, "sealed", &within)?);
+    }
+    if is_result {
+        let parts =
+            ["mutants".into(), package.unwrap_or_default(), shard.unwrap_or_default().replace('/', "-")];
+        let facts = json!({"tried": caught + missed.len(), "failed": missed.len(), "missed": missed});
+        evidence::record(parts.join("-").trim_end_matches('-'), facts)?;
     }
     match missed.len() {
         0 => Ok(()),

@@ -44,7 +44,7 @@ fn cpu(json: bool) -> Outcome {
     // A difference is a result, too.
     let ended = process::run(test.env("COBOOT_CPU_EVIDENCE", &result));
     let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&result));
-    evidence::record("cpu", &fs::read_to_string(&result).map_err(unread)?)?;
+    evidence::record_text("cpu", &fs::read_to_string(&result).map_err(unread)?)?;
     ended
 }
 

@@ -3,6 +3,7 @@
 use std::fs;
 use std::process::Command;
 
+use serde_json::json;
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
@@ -55,7 +56,7 @@ pub fn run(mut args: Args) -> Outcome {
             process::run(powercut.args(json.then_some("--json")).arg("--evidence").arg(&counts)).err(),
         );
         let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
-        boards.push(fs::read_to_string(&counts).map_err(unread)?);
+        boards.push(process::json(&fs::read_to_string(&counts).map_err(unread)?)?);
         Ok(())
     };
     cut(board, &only)?;
@@ -65,7 +66,12 @@ pub fn run(mut args: Args) -> Outcome {
             cut(other, &["--twentieth".to_owned()])?;
         }
     }
-    evidence::record("powercut", &format!("{{\"full\": {full}, \"boards\": [{}]}}", boards.join(",\n")))?;
+    let sum = |name: &str| boards.iter().filter_map(|board| board[name].as_u64()).sum::<u64>();
+    let (states, failed) = (sum("states"), sum("violations"));
+    evidence::record(
+        "powercut",
+        json!({"full": full, "states": states, "failed": failed, "boards": boards}),
+    )?;
     problems.into_iter().next().map_or(Ok(()), Err)
 }
 

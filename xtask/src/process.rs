@@ -5,6 +5,8 @@ use std::ffi::OsStr;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
+use serde_json::Value;
+
 use crate::workspace;
 use crate::Outcome;
 
@@ -53,6 +55,14 @@ pub fn output(command: &mut Command) -> Outcome<String> {
         return Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()));
     }
     String::from_utf8(output.stdout).map_err(|_| format!("`{}` printed what is no text.", line(command)))
+}
+
+/// Reads JSON that a program has printed.
+///
+/// # Errors
+/// When it is none.
+pub fn json(text: &str) -> Outcome<Value> {
+    serde_json::from_str(text).map_err(|error| format!("a program printed what is no JSON: {error}."))
 }
 
 /// Runs a program to its end and returns its standard error.

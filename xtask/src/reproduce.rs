@@ -5,6 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use serde_json::json;
+
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::setup::{Part, Setup};
@@ -61,15 +63,10 @@ pub fn run(mut args: Args) -> Outcome {
             Some(address) => println!("  {image:<18} DIFFERS from {address:#010x} on"),
         }
         failed += usize::from(differs.is_some());
-        rows.push(format!("{{\"image\": \"{image}\", \"bytes\": {bytes}, \"same\": {}}}", differs.is_none()));
+        rows.push(json!({"image": image, "bytes": bytes, "same": differs.is_none()}));
     }
-    let facts = format!(
-        "{{\"board\": \"{}\", \"compared\": {}, \"failed\": {failed}, \"images\": [{}]}}",
-        board.board,
-        IMAGES.len(),
-        rows.join(", ")
-    );
-    evidence::record("reproduce", &facts)?;
+    let facts = json!({"board": board.board, "compared": IMAGES.len(), "failed": failed, "images": rows});
+    evidence::record("reproduce", facts)?;
     if failed > 0 {
         return Err(format!("{failed} images differ; both builds are in {}.", workspace::shown(&base)));
     }

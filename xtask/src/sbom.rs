@@ -13,8 +13,8 @@ use std::{env, fs, process as std_process};
 use sha2::{Digest, Sha512_256};
 
 use crate::args::Args;
-use crate::json::{quoted, Value};
 use crate::{build, evidence, process, setup, workspace, Outcome};
+use serde_json::{json, Value};
 
 pub const HELP: &str = "\
 usage: cargo xtask sbom [--board BOARD]
@@ -59,7 +59,7 @@ pub fn run(mut args: Args) -> Outcome {
     let mut rows = Vec::new();
     for released in &all {
         let text = tidy(&generate(released, &path)?, &workspace::root().display().to_string());
-        let faults = faults(&Value::parse(&text)?, &closure(released)?);
+        let faults = faults(&process::json(&text)?, &closure(released)?);
         if !faults.is_empty() {
             return Err(format!(
                 "the bill of materials of {} is not as it has to be:\n    {}",
@@ -72,15 +72,11 @@ pub fn run(mut args: Args) -> Outcome {
         fs::write(&file, &text).map_err(|error| unwritable(&file, &error))?;
         let hash: String = Sha512_256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
         println!("{}\n  SHA-512/256 {hash}", workspace::shown(&file));
-        let components = Value::parse(&text)?.get("components").items().len();
-        rows.push(format!(
-            "{{\"program\": {}, \"components\": {components}, \"sha_512_256\": {}}}",
-            quoted(&format!("{}, {name}", released.package)),
-            quoted(&hash)
-        ));
+        let components = process::json(&text)?["components"].as_array().map_or(0, Vec::len);
+        let program = format!("{}, {name}", released.package);
+        rows.push(json!({"program": program, "components": components, "sha_512_256": hash}));
     }
-    let facts = format!("{{\"bills\": {}, \"failed\": 0, \"of\": [{}]}}", rows.len(), rows.join(", "));
-    evidence::record("sbom", &facts).map(drop)
+    evidence::record("sbom", json!({"bills": rows.len(), "failed": 0, "of": rows}))
 }
 
 fn unwritable(path: &std::path::Path, error: &std::io::Error) -> String {
@@ -117,10 +113,10 @@ fn manifest(released: &Released) -> PathBuf {
 fn members() -> Outcome<Vec<(String, PathBuf)>> {
     let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
     let member = |package: &Value| {
-        let manifest = PathBuf::from(package.get("manifest_path").text()?);
-        Some((package.get("name").text()?.to_owned(), manifest.parent()?.to_owned()))
+        let manifest = PathBuf::from(package["manifest_path"].as_str()?);
+        Some((package["name"].as_str()?.to_owned(), manifest.parent()?.to_owned()))
     };
-    Ok(Value::parse(&said)?.get("packages").items().iter().filter_map(member).collect())
+    Ok(process::json(&said)?["packages"].as_array().into_iter().flatten().filter_map(member).collect())
 }
 
 /// Removes all that differs between runs and machines from a bill of materials: the time, the
@@ -160,15 +156,15 @@ fn crates(tree: &str) -> BTreeSet<Crate> {
 fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
     let mut faults = Vec::new();
     for (name, wanted) in [("bomFormat", "CycloneDX"), ("specVersion", "1.5")] {
-        if sbom.get(name).text() != Some(wanted) {
+        if sbom[name].as_str() != Some(wanted) {
             faults.push(format!("{name} is not \"{wanted}\""));
         }
     }
-    let main = sbom.get("metadata").get("component");
+    let main = &sbom["metadata"]["component"];
     let mut listed = BTreeSet::new();
     let mut refs = BTreeMap::new();
-    for component in [main].into_iter().chain(sbom.get("components").items()) {
-        let text = |name: &str| component.get(name).text().unwrap_or_default().to_owned();
+    for component in [main].into_iter().chain(sbom["components"].as_array().into_iter().flatten()) {
+        let text = |name: &str| component[name].as_str().unwrap_or_default().to_owned();
         let (name, version) = (text("name"), text("version"));
         // `version` is optional there, but a bill without it is of no use.
         for needed in ["type", "name", "version", "bom-ref", "purl"] {
@@ -182,9 +178,10 @@ fn faults(sbom: &Value, crates: &BTreeSet<Crate>) -> Vec<String> {
     faults.extend(
         refs.iter().filter(|(_, count)| **count > 1).map(|(name, _)| format!("{name} is there twice")),
     );
-    for dependency in sbom.get("dependencies").items() {
-        let all = [dependency.get("ref")].into_iter().chain(dependency.get("dependsOn").items());
-        let unknown = all.filter_map(Value::text).filter(|name| !refs.contains_key(*name));
+    for dependency in sbom["dependencies"].as_array().into_iter().flatten() {
+        let all =
+            [&dependency["ref"]].into_iter().chain(dependency["dependsOn"].as_array().into_iter().flatten());
+        let unknown = all.filter_map(Value::as_str).filter(|name| !refs.contains_key(*name));
         faults.extend(unknown.map(|name| format!("a dependency on {name}, which is not listed")));
     }
     let missing = crates.difference(&listed);
@@ -233,7 +230,7 @@ mod tests {
     const TREE: &str = "bootloader v0.1.0 (/home/me/coboot/bootloader)\ncrc v3.4.0\ncrc v3.4.0\n\n";
 
     fn faults_of(text: &str, tree: &str) -> Vec<String> {
-        faults(&Value::parse(&tidy(text, "/home/me/coboot")).unwrap(), &crates(tree))
+        faults(&process::json(&tidy(text, "/home/me/coboot")).unwrap(), &crates(tree))
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 use std::{cmp, fs};
 
+use serde_json::{json, Value};
 use shared_abi::geometry::Region;
 use shared_abi::layout::{Layout, BOARDS};
 
@@ -50,12 +51,10 @@ pub fn run(mut args: Args) -> Outcome {
 
     println!("\nboard                            bytes  of {BUDGET}");
     let mut within = Ok(());
-    let mut images = Vec::new();
+    let (mut images, mut over) = (Vec::new(), 0);
     let mut keep = |image: &str, board: &Layout, bytes: u32, budget: u32| {
-        images.push(format!(
-            "{{\"image\": \"{image}\", \"board\": \"{}\", \"bytes\": {bytes}, \"budget\": {budget}}}",
-            board.board
-        ));
+        over += u32::from(bytes > budget);
+        images.push(json!({"image": image, "board": board.board, "bytes": bytes, "budget": budget}));
     };
     for board in BOARDS {
         let path = build::images(board, &["bootloader"])?.join("bootloader.elf");
@@ -73,14 +72,15 @@ pub fn run(mut args: Args) -> Outcome {
         keep("bootloader-sealed", board, flash.used, room.size);
         within = within.and(flash.within(room.size).map_err(|problem| format!("{}: {problem}", board.board)));
     }
-    let parts: Vec<String> = parts.iter().map(Share::json).collect();
-    let facts = format!(
-        "{{\"images\": [{}], \"parts_of\": \"{}\", \"parts\": [{}]}}",
-        images.join(",\n"),
-        board.board,
-        parts.join(",\n")
-    );
-    evidence::record("size", &facts)?;
+    let parts: Vec<Value> = parts.iter().map(Share::json).collect();
+    let facts = json!({
+        "bootloaders": images.len(),
+        "failed": over,
+        "images": images,
+        "parts_of": board.board,
+        "parts": parts,
+    });
+    evidence::record("size", facts)?;
     toolchain::notice();
     within
 }
@@ -242,9 +242,8 @@ struct Share {
 }
 
 impl Share {
-    fn json(&self) -> String {
-        let Self { part, raw, packed } = self;
-        format!("{{\"part\": \"{part}\", \"raw\": {raw}, \"packed\": {packed}}}")
+    fn json(&self) -> Value {
+        json!({"part": self.part, "raw": self.raw, "packed": self.packed})
     }
 }
 
@@ -348,20 +347,14 @@ mod tests {
         };
         let of_a = rows(&[("a/b", 6), ("core", 2)]);
         let expected = [
-            r#"{"part": "(all)", "raw": 40, "packed": 36}"#,
-            r#"{"part": ".vectors (in flash)", "raw": 32, "packed": 32}"#,
-            r#"{"part": "a/b", "raw": 6, "packed": 3}"#,
-            r#"{"part": "core", "raw": 2, "packed": 1}"#,
+            json!({"part": "(all)", "raw": 40, "packed": 36}),
+            json!({"part": ".vectors (in flash)", "raw": 32, "packed": 32}),
+            json!({"part": "a/b", "raw": 6, "packed": 3}),
+            json!({"part": "core", "raw": 2, "packed": 1}),
         ];
         assert_eq!(of_a, expected);
         let with_zeros = rows(&[("a/b", 4), (parts::ZEROS, 4)]);
-        assert!(
-            with_zeros.contains(&r#"{"part": "a/b", "raw": 4, "packed": 4}"#.to_owned()),
-            "{with_zeros:?}"
-        );
-        assert!(
-            with_zeros.contains(&r#"{"part": "(zeros)", "raw": 4, "packed": 0}"#.to_owned()),
-            "{with_zeros:?}"
-        );
+        assert!(with_zeros.contains(&json!({"part": "a/b", "raw": 4, "packed": 4})), "{with_zeros:?}");
+        assert!(with_zeros.contains(&json!({"part": "(zeros)", "raw": 4, "packed": 0})), "{with_zeros:?}");
     }
 }

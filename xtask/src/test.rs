@@ -7,10 +7,10 @@ use std::io::{BufRead, BufReader, IsTerminal, Write};
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
+use serde_json::{json, Value};
 use shared_abi::layout::{stm32f407g_disc1_can2, Layout, BOARDS};
 
 use crate::args::Args;
-use crate::json::quoted;
 use crate::setup::{self, Part, Setup};
 use crate::{build, evidence, examples, process, workspace, Outcome};
 
@@ -94,7 +94,7 @@ pub fn run(mut args: Args) -> Outcome {
     let summary = suite.summary;
 
     if is_whole {
-        evidence::record("tests", &summary.as_json(started.elapsed().as_secs()))?;
+        evidence::record("tests", summary.as_json(started.elapsed().as_secs()))?;
     }
     println!();
     for name in &summary.names_of_failed {
@@ -252,11 +252,18 @@ impl Counts {
         self.skipped += other.skipped;
     }
 
-    fn as_json(self, named: &[(&str, &str)]) -> String {
-        let named: String =
-            named.iter().map(|(name, text)| format!("\"{name}\": {}, ", quoted(text))).collect();
+    fn as_json(self) -> Value {
         let Self { programs, passed, failed, skipped } = self;
-        format!("{{{named}\"programs\": {programs}, \"passed\": {passed}, \"failed\": {failed}, \"skipped\": {skipped}}}")
+        json!({"programs": programs, "passed": passed, "failed": failed, "skipped": skipped})
+    }
+
+    /// The same with names.
+    fn named(self, names: &[(&str, &str)]) -> Value {
+        let mut row = self.as_json();
+        for (name, text) in names {
+            row[*name] = json!(text);
+        }
+        row
     }
 }
 
@@ -387,7 +394,7 @@ impl Summary {
     }
 
     /// The record of a whole run.
-    fn as_json(&self, seconds: u64) -> String {
+    fn as_json(&self, seconds: u64) -> Value {
         let mut levels: Vec<&Level> = self.counts.keys().map(|(level, _)| level).collect();
         levels.dedup();
         let of_levels = levels.iter().map(|level| {
@@ -397,28 +404,25 @@ impl Summary {
                 Level::Documentation => "documentation",
                 Level::Board(board) => &format!("firmware of {board}"),
             };
-            self.sum(|of, _| of == *level).as_json(&[("level", name)])
+            self.sum(|of, _| of == *level).named(&[("level", name)])
         });
         let foreign = FOREIGN.iter().filter_map(|(name, others)| {
             let counts = self.sum(|level, of| matches!(level, Level::Board(_)) && of == *name);
-            (counts.programs > 0).then(|| counts.as_json(&[("tests", *name), ("with", *others)]))
+            (counts.programs > 0).then(|| counts.named(&[("tests", *name), ("with", *others)]))
         });
         let conform = levels.iter().filter_map(|level| match level {
             Level::Board(board) => {
                 let counts = self.sum(|of, name| of == *level && name == CONFORM);
-                (counts.programs > 0).then(|| counts.as_json(&[("board", board)]))
+                (counts.programs > 0).then(|| counts.named(&[("board", board)]))
             }
             _ => None,
         });
-        let list = |items: &mut dyn Iterator<Item = String>| items.collect::<Vec<_>>().join(",\n");
-        let Counts { programs, passed, failed, skipped } = self.total();
-        format!(
-            "{{\"passed\": {passed}, \"failed\": {failed}, \"skipped\": {skipped}, \"programs\": {programs}, \
-             \"seconds\": {seconds},\n\"levels\": [{}],\n\"foreign\": [{}],\n\"conformance\": [{}]}}",
-            list(&mut of_levels.into_iter()),
-            list(&mut foreign.into_iter()),
-            list(&mut conform.into_iter())
-        )
+        let mut record = self.total().as_json();
+        record["seconds"] = json!(seconds);
+        record["levels"] = of_levels.collect();
+        record["foreign"] = foreign.collect();
+        record["conformance"] = conform.collect();
+        record
     }
 }
 
@@ -451,7 +455,6 @@ fn without_colours(line: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::json::Value;
 
     /// Lines in libtest's format.
     #[test]
@@ -505,12 +508,11 @@ mod tests {
         take(Some("a-board"), "     Running tests/conform.rs (target/debug/deps/conform-05)\n", 10, 0);
         take(Some("b-board"), "     Running tests/conform.rs (target/debug/deps/conform-05)\n", 11, 2);
         summary.broken = 1;
-        let record = Value::parse(&summary.as_json(60)).unwrap();
+        let record = summary.as_json(60);
         let rows = |list: &str, name: &str, count: &str| -> Vec<(String, u32)> {
-            let row = |row: &Value| {
-                (row.get(name).text().unwrap().to_owned(), row.get(count).number().unwrap() as u32)
-            };
-            record.get(list).items().iter().map(row).collect()
+            let row =
+                |row: &Value| (row[name].as_str().unwrap().to_owned(), row[count].as_f64().unwrap() as u32);
+            record[list].as_array().into_iter().flatten().map(row).collect()
         };
         let of = |rows: &[(&str, u32)]| {
             rows.iter().map(|(name, count)| ((*name).to_owned(), *count)).collect::<Vec<_>>()
@@ -525,8 +527,8 @@ mod tests {
         assert_eq!(rows("levels", "level", "passed"), of(&levels));
         assert_eq!(rows("foreign", "tests", "failed"), of(&[("clients", 1)]));
         assert_eq!(rows("conformance", "board", "failed"), of(&[("a-board", 0), ("b-board", 2)]));
-        assert_eq!(record.get("passed").number(), Some(56.0));
-        assert_eq!(record.get("failed").number(), Some(4.0), "with what broke off");
+        assert_eq!(record["passed"].as_f64(), Some(56.0));
+        assert_eq!(record["failed"].as_f64(), Some(4.0), "with what broke off");
     }
 
     #[test]

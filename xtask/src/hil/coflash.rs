@@ -7,8 +7,8 @@ use std::thread;
 use std::time::Duration;
 
 use super::command::{Ended, Running};
-use crate::json::Value;
 use crate::{process, workspace, Outcome};
+use serde_json::Value;
 
 /// The time for any call. The longest one is a download in segments at 10 kbit/s.
 const LIMIT: Duration = Duration::from_secs(600);
@@ -45,8 +45,8 @@ impl Answer {
 
     /// The message of coflash, with its advice.
     pub fn problem(&self) -> String {
-        let error = self.value.get("error");
-        match (error.get("what").text(), error.get("advice").text()) {
+        let error = &self.value["error"];
+        match (error["what"].as_str(), error["advice"].as_str()) {
             (Some(what), Some(advice)) => format!("{what}. What to do: {advice}."),
             (Some(what), None) => format!("{what}."),
             _ => format!("coflash ended with {:?}: {}", self.code, self.errors.trim()),
@@ -105,7 +105,7 @@ impl Coflash {
         let (mut act, mut said) = (Some(act), String::new());
         // The lines end with the program, and coflash itself gives up a silent device.
         while let Ok(line) = lines.recv_timeout(LIMIT) {
-            let value = Value::parse(&line)?;
+            let value = process::json(&line)?;
             said += &line;
             said.push('\n');
             if is_middle(&value) {
@@ -129,11 +129,8 @@ impl Coflash {
 
 /// Whether an event tells that more than a third is in the device, and not all of it.
 fn is_middle(event: &Value) -> bool {
-    let number = |key: &str| match event.get(key) {
-        Value::Number(text) => text.parse::<u64>().ok(),
-        _ => None,
-    };
-    let is_progress = event.get("event").text() == Some("progress");
+    let number = |key: &str| event[key].as_u64();
+    let is_progress = event["event"].as_str() == Some("progress");
     match (number("done"), number("total")) {
         (Some(done), Some(total)) => is_progress && done < total && done >= total / 3,
         _ => false,
@@ -141,8 +138,8 @@ fn is_middle(event: &Value) -> bool {
 }
 
 fn answer(Ended { code, said, errors }: Ended) -> Answer {
-    let whole = Value::parse(&said).ok();
-    let last = || said.lines().rev().find_map(|line| Value::parse(line).ok());
+    let whole = process::json(&said).ok();
+    let last = || said.lines().rev().find_map(|line| process::json(line).ok());
     let value = whole.or_else(last).unwrap_or(Value::Null);
     Answer { code, value, said, errors }
 }
@@ -153,7 +150,7 @@ mod tests {
 
     #[test]
     fn the_middle_is_a_third_and_never_the_end() {
-        let event = |text: &str| Value::parse(text).unwrap();
+        let event = |text: &str| process::json(text).unwrap();
         assert!(is_middle(&event(r#"{"event":"progress","done":4,"total":12}"#)));
         assert!(!is_middle(&event(r#"{"event":"progress","done":3,"total":12}"#)));
         assert!(!is_middle(&event(r#"{"event":"progress","done":12,"total":12}"#)));

@@ -2,8 +2,8 @@
 
 use std::fmt::Write as _;
 
-use crate::json::quoted;
 use crate::Outcome;
+use serde_json::{json, Value};
 
 /// The outcome of a step.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,7 +44,7 @@ pub struct Report {
     node: u8,
     lines: Vec<Line>,
     /// The document of `coflash conform`, if it ran.
-    pub conform: Option<String>,
+    pub conform: Option<Value>,
 }
 
 impl Report {
@@ -89,38 +89,26 @@ impl Report {
     }
 
     /// The report as JSON.
-    pub fn json(&self) -> String {
-        let lines: Vec<String> = self
-            .lines
-            .iter()
-            .map(|line| {
-                let (word, text) = line.verdict.parts();
-                format!(
-                    "    {{ \"step\": {}, \"outcome\": {}, \"text\": {}, \"seconds\": {:.1} }}",
-                    quoted(line.name),
-                    quoted(&word.to_ascii_lowercase()),
-                    quoted(text),
-                    line.seconds
-                )
-            })
-            .collect();
-        format!(
-            "{{\n  \"board\": {},\n  \"bus\": {},\n  \"node\": {},\n  \"passed\": {},\n  \"steps\": [\n{}\n  ],\n  \
-             \"conform\": {}\n}}\n",
-            quoted(&self.board),
-            quoted(&self.bus),
-            self.node,
-            self.outcome().is_ok(),
-            lines.join(",\n"),
-            self.conform.as_deref().unwrap_or("null").trim()
-        )
+    pub fn json(&self) -> Value {
+        let steps = self.lines.iter().map(|line| {
+            let (word, text) = line.verdict.parts();
+            let seconds = (line.seconds * 10.0).round() / 10.0;
+            json!({"step": line.name, "outcome": word.to_ascii_lowercase(), "text": text, "seconds": seconds})
+        });
+        json!({
+            "board": self.board,
+            "bus": self.bus,
+            "node": self.node,
+            "passed": self.outcome().is_ok(),
+            "steps": steps.collect::<Vec<_>>(),
+            "conform": self.conform,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::json::Value;
 
     #[test]
     fn the_report_is_json_whatever_a_program_says_and_one_failure_fails_it() {
@@ -133,11 +121,15 @@ mod tests {
         report.take(Line { name: "three", verdict: Verdict::Failed(said.into()), seconds: 0.0 });
         assert!(report.outcome().is_err());
         assert!(report.summary().ends_with("1 passed, 1 failed, 1 left out\n"), "{}", report.summary());
-        let value = Value::parse(&report.json()).unwrap();
-        let words: Vec<_> =
-            value.get("steps").items().iter().map(|step| step.get("outcome").text().unwrap()).collect();
+        let value = report.json();
+        let words: Vec<_> = value["steps"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .map(|step| step["outcome"].as_str().unwrap())
+            .collect();
         assert_eq!(words, ["passed", "left out", "failed"]);
-        assert_eq!(value.get("passed"), &Value::Bool(false));
-        assert_eq!(value.get("steps").items()[2].get("text").text(), Some(said));
+        assert_eq!(value["passed"], json!(false));
+        assert_eq!(value["steps"][2]["text"].as_str(), Some(said));
     }
 }

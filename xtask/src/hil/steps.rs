@@ -10,8 +10,8 @@ use super::coflash::{Answer, Coflash};
 use super::command::{self, Running};
 use super::report::Verdict;
 use super::Bench;
-use crate::json::Value;
 use crate::Outcome;
+use serde_json::Value;
 
 /// A step.
 pub struct Step {
@@ -93,7 +93,7 @@ fn device_answers(bench: &mut Bench) -> Outcome<Verdict> {
     let info = info_after_start(bench).map_err(|error| {
         format!("{error} The probe has flashed the bootloader: look at bit rate, termination and node-ID.")
     })?;
-    let word = |key: &str| info.get(key).text().unwrap_or("?").to_owned();
+    let word = |key: &str| info[key].as_str().unwrap_or("?").to_owned();
     passed(format!("\"{}\", version \"{}\"", word("name"), word("software_version")))
 }
 
@@ -103,10 +103,10 @@ fn conform(bench: &mut Bench) -> Outcome<Verdict> {
         return Ok(Verdict::LeftOut("this coflash has no command conform".into()));
     }
     let answer = bench.coflash.call(&["conform"])?;
-    bench.conform = Value::parse(&answer.said).is_ok().then(|| answer.said.clone());
+    bench.conform = crate::process::json(&answer.said).ok();
     match (answer.code, &bench.conform) {
         (Some(0), _) => passed(""),
-        (_, Some(_)) if answer.value.get("error") == &Value::Null => {
+        (_, Some(_)) if answer.value["error"].is_null() => {
             Err("checks failed: `coflash conform` tells which, and so does the report of --json.".into())
         }
         _ => Err(answer.problem()),
@@ -116,10 +116,10 @@ fn conform(bench: &mut Bench) -> Outcome<Verdict> {
 /// Flashes a program, compares its CRC with the file, and sees it run.
 fn install(bench: &mut Bench, image: &str, options: &[&str]) -> Outcome<Verdict> {
     let answer = flash(bench, image, options)?.good()?;
-    let crc = number(answer.value.get("crc")).ok_or("coflash told no CRC of the program.")?;
+    let crc = number(&answer.value["crc"]).ok_or("coflash told no CRC of the program.")?;
     bench.installed = Some(crc);
     runs_installed(bench)?;
-    let seconds = number(answer.value.get("seconds")).unwrap_or_default();
+    let seconds = number(&answer.value["seconds"]).unwrap_or_default();
     passed(format!("{image} in {seconds} s"))
 }
 
@@ -137,7 +137,7 @@ fn flash_words(bench: &Bench, image: &str) -> [String; 5] {
 /// Checks that the application runs, and that it is the last one that was installed.
 fn runs_installed(bench: &Bench) -> Outcome {
     let info = info_after_start(bench)?;
-    if info.get("bootloader") != &Value::Bool(false) {
+    if info["bootloader"] != Value::Bool(false) {
         return Err("the bootloader answers where the application should run.".into());
     }
     holds_installed(bench, &info)
@@ -146,7 +146,7 @@ fn runs_installed(bench: &Bench) -> Outcome {
 /// Checks that the device holds the last program that was installed.
 fn holds_installed(bench: &Bench, info: &Value) -> Outcome {
     let Some(wanted) = &bench.installed else { return Ok(()) };
-    let held = info.get("programs").items().first().and_then(|program| number(program.get("crc")));
+    let held = info["programs"].get(0).and_then(|program| number(&program["crc"]));
     if held.as_ref() == Some(wanted) {
         return Ok(());
     }
@@ -157,7 +157,7 @@ fn holds_installed(bench: &Bench, info: &Value) -> Outcome {
 fn call_back(bench: &mut Bench) -> Outcome<Verdict> {
     bench.coflash.call(&["enter", "--within", "10000"])?.good()?;
     let info = bench.coflash.call(&["info"])?.good()?.value;
-    if info.get("bootloader") != &Value::Bool(true) {
+    if info["bootloader"] != Value::Bool(true) {
         return Err("the application still answers: it has not gone back to the bootloader.".into());
     }
     passed("")
@@ -182,7 +182,7 @@ fn power_cut(bench: &mut Bench) -> Outcome<Verdict> {
         return Err("the update ended well without power: --power-command does not reach this board.".into());
     }
     let info = info_after_start(bench)?;
-    if info.get("bootloader") != &Value::Bool(true) {
+    if info["bootloader"] != Value::Bool(true) {
         return Err("after a cut update an application runs, where the bootloader should wait.".into());
     }
     install(bench, V1, &[])
@@ -222,7 +222,7 @@ fn refused(bench: &Bench, answer: &Answer, code: i32) -> Outcome<Verdict> {
         _ => return Err(format!("it ended for another reason: {}", answer.problem())),
     }
     holds_installed(bench, &bench.coflash.call(&["info"])?.good()?.value)?;
-    passed(answer.value.get("error").get("what").text().unwrap_or_default())
+    passed(answer.value["error"]["what"].as_str().unwrap_or_default())
 }
 
 fn interrupted(bench: &mut Bench) -> Outcome<Verdict> {
@@ -239,7 +239,7 @@ fn interrupted(bench: &mut Bench) -> Outcome<Verdict> {
         return Err(format!("Ctrl-C did not cancel the update: {}", answer.problem()));
     }
     let again = flash(bench, V2, &[])?.good()?;
-    bench.installed = number(again.value.get("crc"));
+    bench.installed = number(&again.value["crc"]);
     runs_installed(bench)?;
     passed("")
 }
@@ -258,8 +258,5 @@ fn info_after_start(bench: &Bench) -> Outcome<Value> {
 
 /// A number as its text.
 fn number(value: &Value) -> Option<String> {
-    match value {
-        Value::Number(text) => Some(text.clone()),
-        _ => None,
-    }
+    value.as_number().map(ToString::to_string)
 }

@@ -16,9 +16,9 @@ use std::{fs, io};
 use sha2::{Digest, Sha256};
 
 use crate::args::Args;
-use crate::json::Value;
 use crate::setup::{self, Setup};
 use crate::{process, sbom, toolchain, workspace, Outcome};
+use serde_json::Value;
 
 pub const HELP: &str = "\
 usage: cargo xtask package [--check] [--draft] [--yes] [PART ...]
@@ -238,7 +238,7 @@ fn package_crates(release: &Release) -> Outcome<Command> {
     let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
     let mut command = process::cargo("package");
     command.args(["--locked", "--target-dir"]).arg(&release.build);
-    for name in published(&Value::parse(&said)?) {
+    for name in published(&process::json(&said)?) {
         command.args(["--package", &name]);
     }
     if release.draft {
@@ -249,9 +249,9 @@ fn package_crates(release: &Release) -> Outcome<Command> {
 
 /// The packages without `publish = false`.
 fn published(metadata: &Value) -> Vec<String> {
-    let packages = metadata.get("packages").items().iter();
-    let published = packages.filter(|package| *package.get("publish") == Value::Null);
-    published.filter_map(|package| package.get("name").text().map(str::to_owned)).collect()
+    let packages = metadata["packages"].as_array().into_iter().flatten();
+    let published = packages.filter(|package| package["publish"].is_null());
+    published.filter_map(|package| package["name"].as_str().map(str::to_owned)).collect()
 }
 
 /// Writes SHA256SUMS in the form for `sha256sum --check`.
@@ -356,7 +356,7 @@ mod tests {
     #[test]
     fn what_is_not_for_the_registry_stays_here() {
         let text = r#"{"packages":[{"name":"a","publish":null},{"name":"b","publish":[]}]}"#;
-        assert_eq!(published(&Value::parse(text).unwrap()), ["a"]);
+        assert_eq!(published(&process::json(text).unwrap()), ["a"]);
     }
 
     /// Each adapter that the tool supports has a rule, and the rules name no other.

@@ -7,8 +7,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::unreadable;
-use crate::json::Value;
 use crate::{process, workspace, Outcome};
+use serde_json::Value;
 
 /// Parts that are not crates, by name, with the file of the licence.
 const OTHERS: [(&str, &str); 1] =
@@ -25,7 +25,7 @@ pub fn text() -> Outcome<String> {
     let linked: BTreeSet<String> = tree.lines().filter_map(name_and_version).collect();
     let metadata = process::output(process::cargo("metadata").args(["--locked", "--format-version", "1"]))?;
     let mut crates = BTreeMap::new();
-    for package in Value::parse(&metadata)?.get("packages").items() {
+    for package in process::json(&metadata)?["packages"].as_array().into_iter().flatten() {
         if let Some((line, folder)) = of(package, &linked) {
             crates.insert(line, notices_in(&folder)?);
         }
@@ -46,11 +46,11 @@ fn name_and_version(line: &str) -> Option<String> {
 
 /// The entry of another author's crate that is linked, and its folder.
 fn of(package: &Value, linked: &BTreeSet<String>) -> Option<(String, PathBuf)> {
-    package.get("source").text()?;
-    let name = format!("{} {}", package.get("name").text()?, package.get("version").text()?);
-    let folder = Path::new(package.get("manifest_path").text()?).parent()?.to_owned();
-    let licence = package.get("license").text().unwrap_or("its own, see below");
-    let home = package.get("repository").text().map(|home| format!(" ({home})")).unwrap_or_default();
+    package["source"].as_str()?;
+    let name = format!("{} {}", package["name"].as_str()?, package["version"].as_str()?);
+    let folder = Path::new(package["manifest_path"].as_str()?).parent()?.to_owned();
+    let licence = package["license"].as_str().unwrap_or("its own, see below");
+    let home = package["repository"].as_str().map(|home| format!(" ({home})")).unwrap_or_default();
     linked.contains(&name).then(|| (format!("{name}: {licence}{home}"), folder))
 }
 
