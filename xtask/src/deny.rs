@@ -9,7 +9,7 @@ pub const HELP: &str = "\
 usage: cargo xtask deny [--advisories]
 
 Checks the crates of others against deny.toml, in the workspace with the Python package, and in
-fuzz/: their licences, where they come from, and that no crate comes twice without a reason.
+tests/fuzz: their licences, where they come from, and that no crate comes twice without a reason.
 
   --advisories    checks for known vulnerabilities in their place (needs the network)
 
@@ -19,7 +19,7 @@ cargo-deny is installed into target/tools where it is missing, which takes some 
 /// The version to install if there is none.
 const VERSION: &str = "0.20.2";
 /// The packages that are a workspace, by their folders.
-const WORKSPACES: [&str; 2] = ["", "fuzz"];
+const WORKSPACES: [&str; 2] = ["", "tests/fuzz"];
 
 pub fn run(mut args: Args) -> Outcome {
     let advisories = args.flag("--advisories");

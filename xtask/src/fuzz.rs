@@ -11,12 +11,12 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{evidence, process, setup, workspace, Outcome};
+use crate::{corpus, evidence, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
 
-Runs the fuzz targets of fuzz/: SDO server, SDO client, the wire between them, LSS, debugger interface,
+Runs the fuzz targets of tests/fuzz: SDO server, SDO client, the wire between them, LSS, debugger interface,
 program download by blocks and in one piece,
 downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
 parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
@@ -28,10 +28,10 @@ The counts of a run of all targets go to target/evidence/fuzz.json.
   --seconds N     how long each target runs (default: 30)
   --inputs N      how many inputs each target tries, in place of a time
   --target NAMES  these alone, with commas between them
-  --keep          afterwards, makes the smallest corpus that covers as much, and puts it into
-                  fuzz/seeds for the replay
-  --replay        runs no fuzzer: every input of fuzz/seeds and fuzz/corpus once, with the Rust that
-                  builds the rest; it needs no nightly toolchain, and about a minute
+  --keep          afterwards, makes the smallest corpus that covers as much, and puts the shortest
+                  inputs of it into tests/fuzz/corpus, one file for each target
+  --replay        runs no fuzzer: every input of tests/fuzz/corpus and target/fuzz/corpus once, with
+                  the Rust that builds the rest; it needs no nightly toolchain, and about a minute
 
 Without --replay, it needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
 where it is missing.
@@ -61,10 +61,6 @@ const COMMANDS: [(&str, u32); 9] = [
 const SEALED: &str = "sealed";
 /// The targets that need it.
 const SEALED_TARGETS: [&str; 1] = ["sealed_stream"];
-/// The most bytes that are kept for a target in fuzz/seeds, and of one input there.
-const KEPT: u64 = 96 * 1024;
-const LONGEST: u64 = 4 * 1024;
-
 /// The features of a target.
 fn features(target: &str) -> &'static str {
     if SEALED_TARGETS.contains(&target) {
@@ -94,48 +90,31 @@ fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
     process::run(build().args(["--features", SEALED]).args(sealed))?;
     for target in targets {
         let mut program = Command::new(programs.join("debug").join(target));
-        for kept in ["seeds", "corpus"] {
-            let inputs = folder.join(kept).join(target);
-            if inputs.is_dir() {
-                program.arg(inputs);
-            }
-        }
+        // They are unpacked anew: a name may have gone.
+        let kept = target_dir().join("kept").join(target);
+        let _ = fs::remove_dir_all(&kept);
+        program.arg(corpus::unpack(&kept_file(target), kept)?);
+        let found = found(target);
+        program.args(found.is_dir().then_some(found));
         let said = process::output(&mut program)?;
         println!("  {target:<16} {:>10} inputs, no fault", said.trim());
     }
     Ok(())
 }
 
-/// Puts the inputs of a corpus into a folder of the repository, the shortest first, as many as
-/// [`KEPT`] allows. Inputs with other names stay there: a person has written them.
-fn put_by(corpus: &Path, seeds: &Path) -> Outcome {
-    let failed = |error: std::io::Error| format!("{}: {error}.", workspace::shown(seeds));
-    let is_found = |path: &Path| {
-        let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-        name.len() == 40 && name.bytes().all(|byte| byte.is_ascii_hexdigit())
-    };
-    fs::create_dir_all(seeds).map_err(failed)?;
-    for old in fs::read_dir(seeds).map_err(failed)?.flatten().map(|entry| entry.path()) {
-        if is_found(&old) {
-            fs::remove_file(old).map_err(failed)?;
-        }
-    }
-    let mut inputs: Vec<(u64, PathBuf)> = fs::read_dir(corpus)
-        .map_err(failed)?
-        .flatten()
-        .filter_map(|entry| Some((entry.metadata().ok()?.len(), entry.path())))
-        .filter(|(len, path)| *len <= LONGEST && is_found(path))
-        .collect();
-    inputs.sort();
-    let mut kept = 0;
-    for (len, path) in inputs {
-        kept += len;
-        if kept > KEPT {
-            break;
-        }
-        fs::copy(&path, seeds.join(path.file_name().unwrap_or_default())).map_err(failed)?;
-    }
-    Ok(())
+/// The file with the kept inputs of a target.
+fn kept_file(target: &str) -> PathBuf {
+    folder().join("corpus").join(target)
+}
+
+/// The folder of what the fuzzer has found in this clone, and of what it has begun with.
+fn found(target: &str) -> PathBuf {
+    target_dir().join("corpus").join(target)
+}
+
+/// The folder of the targets.
+fn folder() -> PathBuf {
+    workspace::root().join("tests/fuzz")
 }
 
 pub fn run(mut args: Args) -> Outcome {
@@ -150,7 +129,7 @@ pub fn run(mut args: Args) -> Outcome {
     if keep && replay {
         return Err("--keep and --replay do not go together.".into());
     }
-    let folder = workspace::root().join("fuzz");
+    let folder = folder();
     let mut targets = targets(&folder)?;
     let is_whole = only.is_none();
     if let Some(only) = only {
@@ -164,7 +143,7 @@ pub fn run(mut args: Args) -> Outcome {
         return replay_all(&folder, &targets);
     }
     toolchain()?;
-    let tools = Tools { path: setup::tool("cargo-fuzz", CARGO_FUZZ)?, folder };
+    let tools = Tools { path: setup::tool("cargo-fuzz", CARGO_FUZZ)? };
     println!("Building the fuzz targets ...");
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
@@ -182,8 +161,8 @@ pub fn run(mut args: Args) -> Outcome {
             if let Some([runs, seconds, ..]) = counts {
                 println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
                 if keep {
-                    process::output(tools.command("cmin", &target).arg(tools.corpus(&target)))?;
-                    put_by(&tools.corpus(&target), &tools.seeds(&target))?;
+                    process::output(tools.command("cmin", &target).arg(found(&target)))?;
+                    corpus::keep(&found(&target), &kept_file(&target))?;
                 }
             }
             ended.push((target, counts));
@@ -211,7 +190,7 @@ pub fn run(mut args: Args) -> Outcome {
         Ok(())
     } else {
         Err(format!(
-            "{} failed. `cargo +nightly fuzz run TARGET FILE` repeats one with the file named above; make a test of \
+            "{} failed. `cargo +nightly fuzz run --fuzz-dir tests/fuzz TARGET FILE` repeats one with the file named above; make a test of \
              it before you mend it.",
             failed.join(", ")
         ))
@@ -235,20 +214,9 @@ fn counted(ended: &[(String, Option<[u64; 4]>)], failed: usize) -> Value {
     })
 }
 
-/// Adds the kept inputs to a corpus: the fuzzer puts only what is new into it, and the smallest corpus
-/// is made of it alone.
-fn add_kept(kept: &Path, corpus: &Path) -> Outcome {
-    for file in fs::read_dir(kept).into_iter().flatten().flatten() {
-        let to = corpus.join(file.file_name());
-        fs::copy(file.path(), &to).map_err(|error| unwritable(&to, &error))?;
-    }
-    Ok(())
-}
-
-/// cargo-fuzz, and the folder of the targets.
+/// The PATH with cargo-fuzz.
 struct Tools {
     path: OsString,
-    folder: PathBuf,
 }
 
 impl Tools {
@@ -256,7 +224,7 @@ impl Tools {
         let mut command = Command::new("rustup");
         command.args(["run", "nightly", "cargo", "fuzz", word]);
         // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
-        command.arg("--sanitizer=none");
+        command.arg("--sanitizer=none").arg("--fuzz-dir").arg(folder());
         // Each of the two is built with options of its own.
         let mut programs = target_dir();
         if longest_commands(target).is_some() {
@@ -268,20 +236,11 @@ impl Tools {
         command
     }
 
-    fn corpus(&self, target: &str) -> PathBuf {
-        self.folder.join("corpus").join(target)
-    }
-
-    fn seeds(&self, target: &str) -> PathBuf {
-        self.folder.join("seeds").join(target)
-    }
-
     /// Runs a target until this end: an option of the fuzzer. Returns inputs, seconds, edges and the
     /// files in the corpus; `None`, and prints why, if it failed.
     fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
-        let (corpus, seeds) = (self.corpus(target), self.seeds(target));
-        fs::create_dir_all(&corpus).map_err(|error| unwritable(&corpus, &error))?;
-        add_kept(&seeds, &corpus)?;
+        // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
+        let corpus = corpus::unpack(&kept_file(target), found(target))?;
         let log = target_dir().join(target).with_extension("log");
         let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
         let mut command = self.command("run", target);
@@ -403,7 +362,7 @@ mod tests {
 
     #[test]
     fn every_target_is_declared() {
-        let folder = workspace::root().join("fuzz");
+        let folder = folder();
         let manifest = fs::read_to_string(folder.join("Cargo.toml")).unwrap();
         let targets = targets(&folder).unwrap();
         assert!(targets.iter().any(|target| target == "lss"), "{targets:?}");
@@ -449,44 +408,5 @@ mod tests {
         let facts = counted(&ended, 1);
         assert_eq!((&facts["inputs"], &facts["fewest_of_a_target"]), (&json!(15), &json!(5)));
         assert_eq!((&facts["failed"], &facts["targets"][1]["edges"]), (&json!(1), &json!(60)));
-    }
-
-    #[test]
-    fn what_was_kept_takes_part_in_the_next_smallest_corpus() {
-        let folder = std::env::temp_dir().join(format!("coboot-fuzz-added-{}", std::process::id()));
-        let (corpus, seeds) = (folder.join("corpus"), folder.join("seeds"));
-        fs::create_dir_all(&corpus).unwrap();
-        add_kept(&seeds, &corpus).expect("a target without kept inputs");
-        fs::create_dir_all(&seeds).unwrap();
-        fs::write(seeds.join("a"), "kept").unwrap();
-        fs::write(corpus.join("b"), "new").unwrap();
-        add_kept(&seeds, &corpus).unwrap();
-        assert_eq!(fs::read(corpus.join("a")).unwrap(), b"kept");
-        assert_eq!(fs::read(corpus.join("b")).unwrap(), b"new");
-        fs::remove_dir_all(folder).unwrap();
-    }
-
-    #[test]
-    fn what_is_kept_is_short_and_a_persons_seeds_stay() {
-        let folder = std::env::temp_dir().join(format!("coboot-fuzz-kept-{}", std::process::id()));
-        let (corpus, seeds) = (folder.join("corpus"), folder.join("seeds"));
-        let name = |letter: &str| letter.repeat(40);
-        for place in [&corpus, &seeds] {
-            fs::create_dir_all(place).unwrap();
-        }
-        fs::write(seeds.join("by-hand"), "x").unwrap();
-        fs::write(seeds.join(name("0")), "an earlier one").unwrap();
-        fs::write(corpus.join(name("a")), vec![0; 100]).unwrap();
-        fs::write(corpus.join(name("b")), vec![0; LONGEST as usize + 1]).unwrap();
-        for number in 0..30 {
-            fs::write(corpus.join(format!("{number:040x}")), vec![1; LONGEST as usize]).unwrap();
-        }
-        put_by(&corpus, &seeds).unwrap();
-        let files: Vec<_> = fs::read_dir(&seeds).unwrap().flatten().collect();
-        let bytes: u64 = files.iter().map(|file| file.metadata().unwrap().len()).sum();
-        assert!((KEPT - LONGEST..=KEPT + 1).contains(&bytes), "{bytes}");
-        assert!(seeds.join("by-hand").exists() && seeds.join(name("a")).exists());
-        assert!(!seeds.join(name("b")).exists());
-        fs::remove_dir_all(folder).unwrap();
     }
 }

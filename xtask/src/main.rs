@@ -14,6 +14,7 @@ mod bench;
 mod book;
 mod build;
 mod chips;
+mod corpus;
 mod coverage;
 mod demo;
 mod deny;
