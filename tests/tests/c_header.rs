@@ -1,4 +1,4 @@
-//! The generated C header, compiled as C and as C++: what they make of it is what Rust has.
+//! The C header, compiled as C and as C++: what they make of it is what Rust has.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -28,7 +28,6 @@ mod evidence;
 mod examples;
 mod fleet;
 mod fuzz;
-mod header;
 mod hil;
 mod layout;
 mod links;
@@ -119,12 +118,6 @@ const JOBS: &[Job] = &[
         about: "a board for every chip, built and updated in the emulator",
         help: chips::HELP,
         run: chips::run,
-    },
-    Job {
-        name: "header",
-        about: "the C header of the ABI between bootloader and application",
-        help: header::HELP,
-        run: header::run,
     },
     Job {
         name: "examples",

@@ -1,4 +1,4 @@
-/* What coboot and an application in C must agree on. Made from shared-abi by `cargo xtask header`: change it there.
+/* What coboot and an application in C must agree on. A test holds its numbers against the library for Rust, shared-abi.
  *
  * C11 or C++17, freestanding, no library. Addresses come from the linker: `cargo xtask layout --ld program-1` prints the
  * symbols __handoff, __warm_start and __callgate_table of a board. The functions that need the chip are there when
