@@ -1,62 +1,42 @@
-//! `cargo xtask diagrams`: draws the pictures of the documents from text.
+//! `cargo xtask diagrams`: draws the graphs of the documents from text.
 
-use std::fmt::Write;
 use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
 
-use shared_abi::geometry::Region;
-use shared_abi::layout::{stm32f407g_disc1, Layout};
-
 use crate::args::Args;
-use crate::{fleet, process, timing, workspace, Outcome};
+use crate::{process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask diagrams
 
-Draws the pictures in docs/diagrams/: each FILE.dot there by Graphviz, each FILE.timing as a timing
-diagram (xtask/src/timing.rs), the memory map of the stm32f407g-disc1 from its layout, and the
-durations of docs/fleet.md from their model (xtask/src/fleet.rs) and docs/bench.md. Needs
-`dot` (Debian's package graphviz). The SVG files are checked in; a test tells when one is older than
-what it is drawn from.
+Draws each FILE.dot in docs/diagrams as FILE.svg by Graphviz (Debian's package graphviz). The SVG
+files are checked in; a test fails if one is older than what it is drawn from. The other pictures are
+drawn by hand, and tests compare their numbers.
 ";
 
-/// The names of the sources with this ending, without the ending.
-fn sources(ending: &str) -> Outcome<Vec<String>> {
+/// The names of the sources, without the ending.
+fn sources() -> Outcome<Vec<String>> {
     let folder = path("");
     let entries = fs::read_dir(&folder)
         .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
-    let name = |path: PathBuf| {
-        let is_source = path.extension().is_some_and(|extension| extension == ending);
-        is_source.then(|| path.file_stem().unwrap_or_default().to_string_lossy().into_owned())
-    };
-    let mut names: Vec<_> = entries.flatten().filter_map(|entry| name(entry.path())).collect();
+    let files = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
+    let mut names: Vec<_> = files.filter_map(|file| Some(file.strip_suffix(".dot")?.to_owned())).collect();
     names.sort();
     Ok(names)
 }
 
 /// The text of a source.
-fn source(name: &str, ending: &str) -> Outcome<String> {
-    let source = path(&format!("{name}.{ending}"));
+fn source(name: &str) -> Outcome<String> {
+    let source = path(&format!("{name}.dot"));
     fs::read_to_string(&source)
         .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&source)))
 }
 
-/// A timing diagram.
-fn timing_diagram(name: &str) -> Outcome<String> {
-    timing::drawn(&source(name, "timing")?).map_err(|problem| format!("{name}.timing: {problem}"))
-}
-
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    // The pictures that need no tool come first.
-    write(&path("memory.svg"), &memory_map(&stm32f407g_disc1::LAYOUT))?;
-    write(&path("fleet.svg"), &fleet::picture()?)?;
-    for name in sources("timing")? {
-        write(&path(&format!("{name}.svg")), &timing_diagram(&name)?)?;
-    }
-    for name in sources("dot")? {
-        let text = source(&name, "dot")?;
+    for name in sources()? {
+        let text = source(&name)?;
         let drawn = process::output(Command::new("dot").arg("-Tsvg").arg(path(&format!("{name}.dot"))))
             .map_err(|problem| format!("{problem} Graphviz is needed: sudo apt-get install -y graphviz"))?;
         write(&path(&format!("{name}.svg")), &marked(&drawn, &text)?)?;
@@ -88,108 +68,28 @@ fn mark(source: &str) -> String {
     format!("<!-- drawn by `cargo xtask diagrams` from {hash:016x} -->")
 }
 
-/// Widths and heights of the memory map, in pixels.
-const BAR: u32 = 150;
-const COLUMN: u32 = 440;
-const TOP: u32 = 56;
-
-/// Flash and RAM of a board as an SVG, each in the order of its addresses from bottom to top, as in
-/// manuals. The heights are not to scale: 16 bytes beside 960 KiB would be invisible.
-fn memory_map(layout: &Layout) -> String {
-    let programs = (1..).zip(layout.programs).map(|(number, region)| (format!("program {number}"), *region));
-    let mut flash = vec![
-        ("bootloader".to_owned(), layout.bootloader),
-        ("parameters A".to_owned(), layout.parameters[0]),
-        ("parameters B".to_owned(), layout.parameters[1]),
-    ];
-    flash.extend(programs);
-    let ram = vec![
-        ("code and data".to_owned(), layout.ram),
-        ("handoff".to_owned(), layout.handoff),
-        ("warm-start cell".to_owned(), layout.warm_start),
-    ];
-    let mut svg = String::new();
-    let columns = [("flash", flash, "#dbeafe"), ("RAM", ram, "#dcfce7")];
-    let height = |region: &Region| 36 + 3 * region.size.ilog2();
-    let bottom = TOP
-        + columns
-            .iter()
-            .map(|(_, regions, _)| regions.iter().map(|(_, r)| height(r)).sum())
-            .max()
-            .unwrap_or(0);
-    for (column, (title, mut regions, colour)) in (0..).zip(columns) {
-        let x = 20 + column * COLUMN;
-        let mut y = bottom;
-        text(&mut svg, x, 40, "bold", &format!("{title} of the {}", layout.board));
-        regions.sort_by_key(|(_, region)| region.base);
-        for (name, region) in regions {
-            let tall = height(&region);
-            y -= tall;
-            // Writing to a string cannot fail.
-            let _ = writeln!(
-                svg,
-                r##"<rect x="{x}" y="{y}" width="{BAR}" height="{tall}" fill="{colour}" stroke="#4b5563"/>"##
-            );
-            let middle = y + tall / 2 + 5;
-            text(&mut svg, x + 10, middle, "normal", &name);
-            text(&mut svg, x + BAR + 10, y + tall - 6, "normal", &format!("{:08X}h", region.base));
-            text(&mut svg, x + BAR + 110, middle, "normal", &remark(layout, &region));
-        }
-    }
-    let (width, height) = (2 * COLUMN + 20, bottom + 20);
-    format!(
-        "<!-- drawn by `cargo xtask diagrams` from shared-abi/src/layout -->\n\
-         <svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\" \
-         font-family=\"Helvetica,Arial,sans-serif\" font-size=\"14\">\n\
-         <rect width=\"{width}\" height=\"{height}\" fill=\"white\"/>\n{svg}</svg>\n"
-    )
-}
-
-fn text(svg: &mut String, x: u32, y: u32, weight: &str, words: &str) {
-    let _ = writeln!(svg, r#"<text x="{x}" y="{y}" font-weight="{weight}">{words}</text>"#);
-}
-
-/// Size and sectors.
-fn remark(layout: &Layout, region: &Region) -> String {
-    let size = match region.size {
-        size if size.is_multiple_of(1024) => format!("{} KiB", size / 1024),
-        size => format!("{size} B"),
-    };
-    match (layout.chip.sector_at(region.base), layout.chip.sector_at(region.end() - 1)) {
-        (Some(a), Some(b)) if a.number == b.number => format!("{size}, sector {}", a.number),
-        (Some(a), Some(b)) => format!("{size}, sectors {} to {}", a.number, b.number),
-        _ => size,
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use shared_abi::geometry::Region;
+    use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
     use super::*;
+
+    fn picture(file: &str) -> String {
+        fs::read_to_string(workspace::root().join("docs").join(file)).unwrap()
+    }
 
     #[test]
     fn the_pictures_are_those_of_their_sources() {
-        let timings = sources("timing").unwrap();
-        for name in &timings {
-            let picture = fs::read_to_string(path(&format!("{name}.svg"))).unwrap();
+        let drawn = sources().unwrap();
+        assert!(drawn.len() > 5, "{drawn:?}");
+        for name in drawn {
+            let picture = picture(&format!("diagrams/{name}.svg"));
             assert!(
-                picture == timing_diagram(name).unwrap(),
+                picture.starts_with(&mark(&source(&name).unwrap())),
                 "{name}.svg is old: run `cargo xtask diagrams`"
             );
         }
-        let drawn = sources("dot").unwrap();
-        assert!(drawn.len() > 5 && !timings.is_empty(), "{drawn:?} {timings:?}");
-        for name in drawn {
-            let source = source(&name, "dot").unwrap();
-            let picture = fs::read_to_string(path(&format!("{name}.svg"))).unwrap();
-            assert!(picture.starts_with(&mark(&source)), "{name}.svg is old: run `cargo xtask diagrams`");
-        }
-        let picture = fs::read_to_string(path("fleet.svg")).unwrap();
-        assert!(picture == fleet::picture().unwrap(), "fleet.svg is old: run `cargo xtask diagrams`");
-        let picture = fs::read_to_string(path("memory.svg")).unwrap();
-        assert!(
-            picture == memory_map(&stm32f407g_disc1::LAYOUT),
-            "memory.svg is old: run `cargo xtask diagrams`"
-        );
     }
 
     /// Test vectors of FNV's authors for "" and "foobar".
@@ -199,12 +99,86 @@ mod tests {
         assert!(mark("foobar").contains("85944171f73967e8"));
     }
 
-    /// Addresses and sectors from the design's table.
+    /// Name, address, size and sectors of each region, and no other region.
     #[test]
     fn the_memory_map_shows_every_region() {
-        let map = memory_map(&stm32f407g_disc1::LAYOUT);
-        for words in ["08010000h", "960 KiB, sectors 4 to 11", "2001FFF0h", "16 B", "16 KiB, sector 3"] {
-            assert!(map.contains(&format!(">{words}<")), "{words}");
+        let map = picture("diagrams/memory.svg");
+        let mut texts =
+            map.lines().filter_map(|line| line.split_once("weight=\"normal\">")?.1.split('<').next());
+        let remark = |region: &Region| {
+            let size = match region.size {
+                size if size.is_multiple_of(1024) => format!("{} KiB", size / 1024),
+                size => format!("{size} B"),
+            };
+            match (LAYOUT.chip.sector_at(region.base), LAYOUT.chip.sector_at(region.end() - 1)) {
+                (Some(a), Some(b)) if a.number == b.number => format!("{size}, sector {}", a.number),
+                (Some(a), Some(b)) => format!("{size}, sectors {} to {}", a.number, b.number),
+                _ => size,
+            }
+        };
+        let [a, b] = LAYOUT.parameters;
+        for (name, region) in [
+            ("bootloader", LAYOUT.bootloader),
+            ("parameters A", a),
+            ("parameters B", b),
+            ("program 1", LAYOUT.programs[0]),
+            ("code and data", LAYOUT.ram),
+            ("handoff", LAYOUT.handoff),
+            ("warm-start cell", LAYOUT.warm_start),
+        ] {
+            let expected = [name.to_owned(), format!("{:08X}h", region.base), remark(&region)];
+            assert_eq!(texts.by_ref().take(3).collect::<Vec<_>>(), expected);
         }
+        assert_eq!(texts.next(), None);
+    }
+
+    #[test]
+    fn the_windows_in_the_picture_are_those_of_the_text() {
+        let text = picture("pictures/two-windows.txt");
+        let line = |line: &str| {
+            let text = line.strip_prefix("<text")?.split_once('>')?.1.strip_suffix("</text>")?;
+            let title = if line.contains("middle") { "== " } else { "" };
+            Some(format!("{title}{}", text.replace("&lt;", "<").replace("&amp;", "&")))
+        };
+        let drawn: Vec<_> = picture("pictures/two-windows.svg").lines().filter_map(line).collect();
+        assert_eq!(drawn, text.lines().collect::<Vec<_>>());
+    }
+
+    /// The times in the remark of the picture: 640 pixels for 24 ms, from -2 ms on, after 96 pixels of
+    /// names.
+    #[test]
+    fn the_way_back_has_its_times_in_their_places() {
+        let picture = picture("diagrams/way-back.svg");
+        let x =
+            |time: &str| ((96.0 + (time.parse::<f64>().unwrap() + 2.0) / 24.0 * 640.0) * 10.0).round() / 10.0;
+        let panels: Vec<&str> = picture.split("\npanel ").skip(1).collect();
+        let titles: Vec<&str> = picture.split("font-size=\"13\">").skip(1).collect();
+        assert_eq!((panels.len(), titles.len()), (2, 2));
+        let mut count = 0;
+        for (panel, drawn) in panels.iter().zip(titles) {
+            for words in panel.lines().skip(1).map(|line| line.splitn(4, ' ').collect::<Vec<_>>()) {
+                match words[..] {
+                    ["frame", from, to, words] => {
+                        let width = ((x(to) - x(from)) * 10.0).round() / 10.0;
+                        assert!(drawn.contains(&format!("<rect x=\"{}\" y", x(from))), "{words}");
+                        assert!(drawn.contains(&format!("width=\"{width}\" height=\"16\"")), "{words}");
+                        assert!(drawn.contains(&format!(">{words}</text>")), "{words}");
+                    }
+                    ["bar", from, to, lane] => {
+                        let width = ((x(to) - x(from)) * 10.0).round() / 10.0;
+                        let part = format!("width=\"{width}\" height=\"38\"");
+                        let is_bar = |line: &str| line.starts_with(&format!("<rect x=\"{}\"", x(from)));
+                        assert!(
+                            drawn.lines().any(|line| is_bar(line) && line.contains(&part)),
+                            "{lane} {from}"
+                        );
+                    }
+                    ["mark", at, ..] => assert!(drawn.contains(&format!("<line x1=\"{}\"", x(at))), "{at}"),
+                    _ => break,
+                }
+                count += 1;
+            }
+        }
+        assert_eq!(count, 16);
     }
 }

@@ -26,6 +26,7 @@ mod elf;
 mod emulate;
 mod evidence;
 mod examples;
+#[cfg(test)]
 mod fleet;
 mod fuzz;
 mod hil;
@@ -45,14 +46,12 @@ mod parts;
 mod portable;
 mod powercut;
 mod process;
-mod record;
 mod reproduce;
 mod rooms;
 mod sbom;
 mod setup;
 mod size;
 mod test;
-mod timing;
 mod toolchain;
 mod workspace;
 mod zx0;
@@ -127,15 +126,9 @@ const JOBS: &[Job] = &[
     },
     Job {
         name: "diagrams",
-        about: "the pictures of the documents, from text",
+        about: "the graphs of the documents, from text",
         help: diagrams::HELP,
         run: diagrams::run,
-    },
-    Job {
-        name: "record",
-        about: "the picture of the two windows, out of what the programs print",
-        help: record::HELP,
-        run: record::run,
     },
     Job { name: "docs", about: "the pages as a site, its links checked", help: book::HELP, run: book::run },
     Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
