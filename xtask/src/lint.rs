@@ -15,6 +15,9 @@ with warnings denied.
   --yes           installs what is missing with sudo
 ";
 
+/// What selects the host crates and their tests for clippy.
+pub const HOST_CRATES: &[&str] = &["--all-targets", "--keep-going"];
+
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
@@ -22,6 +25,32 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
 
     // All checks run, so that one run shows all problems.
+    let mut problems = formatting()?;
+    problems.extend(clippy(HOST_CRATES));
+    // The library without the command line; and the package for Python, which is not a default
+    // member.
+    problems.extend(clippy(&["--package", "coflash", "--lib", "--no-default-features"]));
+    problems.extend(clippy(&["--package", "coflash-python"]));
+    // Without sealed images, which the crate of the emulated tests gives it above.
+    problems.extend(clippy(&["--package", "coboot-core", "--all-targets"]));
+    problems.extend(clippy(&build::firmware_args("bsp", board, "")));
+    for variant in build::Variant::of(board) {
+        problems.extend(clippy(&build::firmware_args(variant.package, board, variant.features)));
+    }
+    let mut resident = build::firmware_args("bootloader", board, "resident");
+    resident.push("--bin=resident".to_owned());
+    problems.extend(clippy(&resident));
+    let mut doc = process::cargo("doc");
+    doc.current_dir(workspace::root()).args(["--quiet", "--no-deps", "--keep-going"]);
+    problems.extend(process::run(doc.env("RUSTDOCFLAGS", "--deny=warnings")).err());
+    all_good(&problems)
+}
+
+/// Checks the formatting of all files; returns the problems.
+///
+/// # Errors
+/// When the folders of the boards cannot be read.
+pub fn formatting() -> Outcome<Vec<String>> {
     let mut problems = Vec::new();
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
         problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
@@ -34,28 +63,21 @@ pub fn run(mut args: Args) -> Outcome {
             problems.push(format!("a board in {folder} is not formatted; `rustfmt` on the file does it."));
         }
     }
-    let mut clippy = |args: &[String]| {
-        let mut clippy = process::cargo("clippy");
-        clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);
-        problems.extend(process::run(&mut clippy).err());
-    };
-    clippy(&["--all-targets", "--keep-going"].map(str::to_owned));
-    // The library without the command line; and the package for Python, which is not a default
-    // member.
-    clippy(&["--package", "coflash", "--lib", "--no-default-features"].map(str::to_owned));
-    clippy(&["--package", "coflash-python"].map(str::to_owned));
-    // Without sealed images, which the crate of the emulated tests gives it above.
-    clippy(&["--package", "coboot-core", "--all-targets"].map(str::to_owned));
-    clippy(&build::firmware_args("bsp", board, ""));
-    for variant in build::Variant::of(board) {
-        clippy(&build::firmware_args(variant.package, board, variant.features));
-    }
-    let mut resident = build::firmware_args("bootloader", board, "resident");
-    resident.push("--bin=resident".to_owned());
-    clippy(&resident);
-    let mut doc = process::cargo("doc");
-    doc.current_dir(workspace::root()).args(["--quiet", "--no-deps", "--keep-going"]);
-    problems.extend(process::run(doc.env("RUSTDOCFLAGS", "--deny=warnings")).err());
+    Ok(problems)
+}
+
+/// Runs clippy, warnings denied; returns the problem if there is one.
+pub fn clippy(args: &[impl AsRef<std::ffi::OsStr>]) -> Option<String> {
+    let mut clippy = process::cargo("clippy");
+    clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);
+    process::run(&mut clippy).err()
+}
+
+/// The outcome of several checks.
+///
+/// # Errors
+/// When there is a problem; the message has all.
+pub fn all_good(problems: &[String]) -> Outcome {
     if problems.is_empty() {
         Ok(())
     } else {

@@ -13,6 +13,7 @@ mod attack;
 mod bench;
 mod book;
 mod build;
+mod check;
 mod chips;
 mod corpus;
 mod coverage;
@@ -81,7 +82,18 @@ const JOBS: &[Job] = &[
         help: demo::HELP,
         run: demo::run,
     },
-    Job { name: "test", about: "every test, with one summary at the end", help: test::HELP, run: test::run },
+    Job {
+        name: "check",
+        about: "before each commit: formatting, clippy, arrows, unit tests; two minutes",
+        help: check::HELP,
+        run: check::run,
+    },
+    Job {
+        name: "test",
+        about: "the tests of the product, with one summary at the end; --all for all",
+        help: test::HELP,
+        run: test::run,
+    },
     Job {
         name: "build",
         about: "the firmware of a board: bootloader and both versions of the application",
@@ -243,6 +255,14 @@ const JOBS: &[Job] = &[
 ];
 
 fn main() -> ExitCode {
+    // The programs that a job has started get the signal from the terminal, too.
+    let interrupted = ctrlc::set_handler(|| {
+        eprintln!("\nxtask: interrupted. What is built so far is kept; the same command goes on from there.");
+        std::process::exit(130);
+    });
+    if let Err(problem) = interrupted {
+        eprintln!("xtask: Ctrl-C ends this without a word: {problem}.");
+    }
     let mut words = std::env::args().skip(1);
     let outcome = match words.next().as_deref() {
         None | Some("help" | "--help" | "-h") => {

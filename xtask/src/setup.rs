@@ -91,6 +91,9 @@ impl Setup {
     /// to run.
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
+        if parts.contains(&Part::Emulator) {
+            renew_cmake(&workspace::target_dir());
+        }
         if parts.contains(&Part::Firmware) {
             rust_target(TARGET)?;
         }
@@ -284,6 +287,23 @@ fn libclang_is_there() -> bool {
     library && headers.iter().any(|home| exists(&format!("{home}/*/include/stdbool.h")))
 }
 
+/// Removes what CMake has noted about Unicorn in another folder: after `target/` was copied or moved,
+/// as the caches of CI do, CMake would refuse to go on. What is built already stays.
+fn renew_cmake(target: &Path) {
+    for profile in ["debug", "release"] {
+        for package in fs::read_dir(target.join(profile).join("build")).into_iter().flatten().flatten() {
+            let notes = package.path().join("out/build");
+            let cache = fs::read_to_string(notes.join("CMakeCache.txt")).unwrap_or_default();
+            let of = cache.lines().find_map(|line| line.strip_prefix("CMAKE_CACHEFILE_DIR:INTERNAL="));
+            let is_here = |of: &str| fs::canonicalize(of).ok() == fs::canonicalize(&notes).ok();
+            if of.is_some_and(|of| !is_here(of)) {
+                // If it cannot be removed, CMake says why.
+                let _ = fs::remove_dir_all(&notes);
+            }
+        }
+    }
+}
+
 /// Whether a path exists; a component may contain one `*`.
 fn exists(pattern: &str) -> bool {
     fn below(folder: &Path, parts: &[&str]) -> bool {
@@ -474,6 +494,23 @@ mod tests {
         assert_eq!(missing_packages(&[Part::Browser], nothing), ["chromium"]);
         assert_eq!(missing_packages(&[Part::Windows, Part::Deb], nothing), ["dpkg", "gcc-mingw-w64-x86-64"]);
         assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
+    }
+
+    /// The line is CMake's.
+    #[test]
+    fn what_cmake_noted_in_another_folder_is_removed_and_nothing_else() {
+        let target = workspace::target_dir().join(format!("tmp/cmake-{}", std::process::id()));
+        let notes = |package: &str| target.join("debug/build").join(package).join("out/build");
+        for (package, of) in [("here", notes("here")), ("moved", "/another/clone/out/build".into())] {
+            fs::create_dir_all(notes(package)).unwrap();
+            let line = format!("# a comment\nCMAKE_CACHEFILE_DIR:INTERNAL={}\n", of.display());
+            fs::write(notes(package).join("CMakeCache.txt"), line).unwrap();
+            fs::write(notes(package).with_file_name("library"), "").unwrap();
+        }
+        renew_cmake(&target);
+        assert!(notes("here").exists() && !notes("moved").exists());
+        assert!(notes("moved").with_file_name("library").exists());
+        fs::remove_dir_all(&target).unwrap();
     }
 
     #[test]

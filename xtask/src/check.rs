@@ -1,0 +1,34 @@
+//! `cargo xtask check`: what to run before each commit.
+
+use crate::args::Args;
+use crate::setup::{Part, Setup};
+use crate::{arrows, lint, process, workspace, Outcome};
+
+pub const HELP: &str = "\
+usage: cargo xtask check [--yes]
+
+What to run before each commit, some two minutes on two cores when the crates of others are compiled: formatting,
+clippy over the host crates with their tests, who depends on whom, and the unit tests of the crates
+without hardware.
+
+  --yes           installs what is missing with sudo
+";
+
+/// The crates that need neither a chip nor an emulator to be tested.
+const PURE: [&str; 6] =
+    ["coboot-abi", "coboot-canopen", "coboot-seal", "coboot-core", "coboot-app", "coboot-linker"];
+
+pub fn run(mut args: Args) -> Outcome {
+    let setup = Setup::from(&mut args);
+    args.none_left()?;
+    setup.prepare(&[Part::Lint, Part::Emulator])?;
+    // All checks run, so that one run shows all problems.
+    let mut problems = lint::formatting()?;
+    problems.extend(lint::clippy(lint::HOST_CRATES));
+    problems.extend(arrows::run(Args::new(std::iter::empty())).err());
+    let mut tests = process::cargo("test");
+    tests.current_dir(workspace::root()).args(["--quiet", "--lib"]);
+    tests.args(PURE.iter().flat_map(|package| ["--package", package]));
+    problems.extend(process::run(&mut tests).err());
+    lint::all_good(&problems)
+}

@@ -1,0 +1,415 @@
+//! `cargo xtask test`: runs the tests of a tier, with one summary at the end.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `plan.rs` | the table: which test runs when, and with which images |
+//! | `programs.rs` | builds the test programs and lists their tests |
+//! | `runner.rs` | runs them, and sums up |
+
+use std::fs::File;
+use std::time::Instant;
+
+use shared_abi::layout::{Layout, BOARDS, DEFAULT};
+
+use self::plan::{Tier, IMAGES, OF_EACH_CHIP};
+use self::programs::Program;
+use self::runner::{Job, Summary, Variables};
+use crate::args::Args;
+use crate::setup::{self, Setup};
+use crate::{
+    attack, build, chips, evidence, examples, fuzz, opinion, powercut, process, reproduce, workspace, Outcome,
+};
+
+mod plan;
+mod programs;
+mod runner;
+
+pub const HELP: &str = "\
+usage: cargo xtask test [--ci | --all [--part K/N] | --board BOARD | WORDS] [--yes]
+
+Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
+board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
+
+  --ci            what .ci/run adds: Chromium, tools of others, the other chips, the pages
+  --all           everything: the two above, the tests that take minutes, and the jobs of the night
+                  that end by themselves
+  --part K/N      with --all: the K-th of N parts that take about the same time
+  --board BOARD   every test that runs firmware, with that of this board
+  --yes           installs what is missing with sudo
+  WORDS           go to cargo test, for one kind of test:
+                  `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
+
+The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
+app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool), COBOOT_NODE (the node
+without hardware) and COBOOT_PYTHON (an interpreter with tests/python/requirements.txt installed).
+";
+
+/// A stage of a run.
+struct Stage {
+    name: &'static str,
+    about: &'static str,
+    /// How long it takes, in minutes on two cores.
+    minutes: u32,
+    tier: Tier,
+    run: fn(&mut Summary) -> Outcome,
+}
+
+/// All stages, in the order in which they run.
+const STAGES: &[Stage] = &[
+    Stage {
+        name: "product",
+        about: "the default board, device and tool",
+        minutes: 12,
+        tier: Tier::Product,
+        run: product,
+    },
+    Stage {
+        name: "ci",
+        about: "Chromium, tools of others, other chips, pages",
+        minutes: 8,
+        tier: Tier::Ci,
+        run: ci,
+    },
+    Stage { name: "slow", about: "tests that take minutes", minutes: 25, tier: Tier::All, run: slow },
+    Stage {
+        name: "boards",
+        about: "every test with firmware, for each other chip",
+        minutes: 25,
+        tier: Tier::All,
+        run: boards,
+    },
+    Stage {
+        name: "jobs",
+        about: "power cuts, attacker, QEMU, replay, chips, two builds",
+        minutes: 45,
+        tier: Tier::All,
+        run: jobs,
+    },
+];
+
+/// What `--all` does not run, since it goes on for hours.
+const NOT_RUN: &str =
+    "not run, for they take hours: cargo xtask mutants, cargo xtask fuzz, cargo xtask coverage";
+
+/// The least free space for a run from an empty folder, in KiB.
+const ROOM: u64 = 5 << 20;
+
+pub fn run(mut args: Args) -> Outcome {
+    let chosen_board = args.has("--board");
+    let board = workspace::board(&mut args)?;
+    let setup = Setup::from(&mut args);
+    let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
+    let part = args.value("--part")?;
+    let words = args.rest();
+    if for_ci && all || (for_ci || all) && (chosen_board || !words.is_empty()) {
+        return Err("--ci, --all, --board and words for cargo test do not go together.".into());
+    }
+    if part.is_some() && !all {
+        return Err("--part goes with --all.".into());
+    }
+    let stages: Vec<&Stage> = match part {
+        Some(part) => share(&part)?,
+        None if all => STAGES.iter().collect(),
+        None => STAGES.iter().filter(|stage| stage.name == if for_ci { "ci" } else { "product" }).collect(),
+    };
+    if all {
+        for stage in STAGES {
+            let chosen = stages.iter().any(|other| other.name == stage.name);
+            let word = if chosen { "runs" } else { "in another part" };
+            println!("{:<8} {:>3} min  {:<54} {word}", stage.name, stage.minutes, stage.about);
+        }
+        println!("{NOT_RUN}\n");
+    }
+
+    // Before anything takes time: what is missing on this machine.
+    let tier = stages.iter().map(|stage| stage.tier).max().unwrap_or(Tier::Product);
+    setup.prepare(tier.needs())?;
+    room()?;
+    let _alone = alone()?;
+    if !words.is_empty() {
+        build_images(Tier::Product)?;
+        programs_of_ours()?;
+        let mut cargo = process::cargo("test");
+        cargo.current_dir(workspace::root()).args(words).envs(variables(board));
+        return process::run(&mut cargo);
+    }
+
+    let started = Instant::now();
+    let name = if all {
+        "tests-all"
+    } else if for_ci {
+        "tests-ci"
+    } else {
+        "tests"
+    };
+    evidence::begin(name)?;
+    let mut summary = Summary::default();
+    if chosen_board {
+        on_board(board, Tier::All, &mut summary, |_, _| true)?;
+    } else {
+        for stage in &stages {
+            println!("== {}: {}", stage.name, stage.about);
+            if let Err(problem) = (stage.run)(&mut summary) {
+                println!("{problem}");
+                summary.broken(format!("{}: something did not build or broke off", stage.name));
+            }
+        }
+    }
+    evidence::record(name, summary.as_json())?;
+    println!();
+    for name in summary.failed() {
+        println!("FAILED: {name}");
+    }
+    if all {
+        println!("{NOT_RUN}");
+    }
+    println!("{} min", started.elapsed().as_secs().div_ceil(60));
+    println!("{}", summary.line());
+    match summary.failed().len() {
+        0 if summary.is_empty() => Err("no test ran.".into()),
+        0 => Ok(()),
+        1 => Err("1 test failed; its output is above.".into()),
+        failed => Err(format!("{failed} tests failed; their output is above.")),
+    }
+}
+
+/// The stages of one part of several: consecutive ones, by their minutes.
+fn share(part: &str) -> Outcome<Vec<&'static Stage>> {
+    let wrong = || format!("--part takes K/N with K from 1 to N and N from 1 to {}, as 2/4.", STAGES.len());
+    let (which, of) = part.split_once('/').ok_or_else(wrong)?;
+    let (which, of): (u32, u32) = (which.parse().map_err(|_| wrong())?, of.parse().map_err(|_| wrong())?);
+    if which == 0 || which > of || of as usize > STAGES.len() {
+        return Err(wrong());
+    }
+    let total: u32 = STAGES.iter().map(|stage| stage.minutes).sum();
+    let mut before = 0;
+    let mut chosen = Vec::new();
+    for (number, stage) in (0..).zip(STAGES) {
+        // By the middle of the stage; each of the last parts has a stage left.
+        let part =
+            ((before + stage.minutes / 2) * of / total).max(of.saturating_sub(STAGES.len() as u32 - number));
+        if part + 1 == which {
+            chosen.push(stage);
+        }
+        before += stage.minutes;
+    }
+    Ok(chosen)
+}
+
+/// Waits until no other run uses the build results of this clone.
+fn alone() -> Outcome<File> {
+    let path = workspace::target_dir().join("tests.lock");
+    let wrong = |error: std::io::Error| format!("{} cannot be locked: {error}.", workspace::shown(&path));
+    std::fs::create_dir_all(workspace::target_dir()).map_err(wrong)?;
+    let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(wrong)?;
+    if file.try_lock().is_err() {
+        println!(
+            "Another `cargo xtask test` runs in this clone. This one waits for its end; Ctrl-C gives up."
+        );
+        file.lock().map_err(wrong)?;
+    }
+    Ok(file)
+}
+
+/// Checks that the disk has room for a run from an empty folder, unless there are results already.
+fn room() -> Outcome {
+    let folder = workspace::target_dir();
+    std::fs::create_dir_all(&folder)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
+    // POSIX: the fourth column of the second line is the free space in units of 1024 bytes.
+    let said = process::output(std::process::Command::new("df").arg("-kP").arg(&folder)).unwrap_or_default();
+    let free = said.lines().nth(1).and_then(|line| line.split_whitespace().nth(3)?.parse::<u64>().ok());
+    let needed = if folder.join("debug/deps").exists() { ROOM / 8 } else { ROOM };
+    match free {
+        Some(free) if free < needed => Err(format!(
+            "the disk of {} has {} MiB left, and the tests need {} MiB. Make room (`cargo clean` removes what older \
+             runs have built), or name a folder on another disk in CARGO_TARGET_DIR.",
+            workspace::shown(&folder),
+            free >> 10,
+            needed >> 10
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// The packages that are built for a chip, or by another tool.
+const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
+
+/// The test programs that need no firmware.
+fn host_programs() -> Outcome<Vec<Program>> {
+    // coboot-tests has sealed images, without which a bootloader has more: together, all would be
+    // tested with them. The jobs of the repository are tested in .ci/run.
+    let others = NOT_ON_HOST.iter().chain(&["coboot-tests", "xtask"]);
+    let without = others.flat_map(|package| ["--exclude", package]).map(str::to_owned);
+    programs::build(&["--workspace".to_owned()].into_iter().chain(without).collect::<Vec<_>>())
+}
+
+/// The test programs that run the firmware of a board; and the crates with sealed images.
+fn board_programs(board: &Layout) -> Outcome<Vec<Program>> {
+    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
+    programs::build(&[&build::tests_args(board)[..], &sealed].concat())
+}
+
+/// Builds the programs that tests start: the host tool and the node.
+fn programs_of_ours() -> Outcome {
+    let packages = ["--package", "coflash", "--package", "coboot-node"];
+    process::run(process::cargo("build").current_dir(workspace::root()).args(packages))
+}
+
+/// Builds the images of a tier, and of those before it.
+fn build_images(tier: Tier) -> Outcome {
+    let rows: Vec<_> =
+        IMAGES.iter().filter(|row| row.tier <= tier).map(|row| (row.board, row.names)).collect();
+    build::boards(&rows)
+}
+
+fn variables(board: &Layout) -> Variables {
+    let built = |name: &str| {
+        let path = workspace::target_dir().join("debug").join(name);
+        path.with_extension(std::env::consts::EXE_EXTENSION).into_os_string()
+    };
+    vec![
+        ("COBOOT_BOARD", board.board.into()),
+        ("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board).into()),
+        ("COBOOT_COFLASH", built("coflash")),
+        ("COBOOT_NODE", built("coboot-node")),
+        ("COBOOT_PYTHON", setup::python().into()),
+    ]
+}
+
+/// Adds the tests of programs that run now; `place` names what is special about them.
+fn add(
+    jobs: &mut Vec<Job>,
+    summary: &mut Summary,
+    programs: &[Program],
+    place: Option<&str>,
+    board: &Layout,
+    chosen: impl Fn(&str, &str) -> bool,
+) -> Outcome {
+    for program in programs {
+        let (more, skipped) =
+            runner::jobs(program, place, &variables(board), |test| chosen(&program.name, test))?;
+        summary.skipped += if more.is_empty() { 0 } else { skipped };
+        jobs.extend(more);
+    }
+    Ok(())
+}
+
+/// The tests of the product on its default board.
+fn product(summary: &mut Summary) -> Outcome {
+    let mut jobs = Vec::new();
+    std::thread::scope(|scope| {
+        // The link of an image uses one core, and so does much of what cargo builds beside it.
+        let images = scope.spawn(|| build_images(Tier::Product));
+        let hosts = host_programs()?;
+        let with_board = board_programs(DEFAULT)?;
+        images.join().map_err(|_| "a build broke off.".to_owned())??;
+        let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
+        add(&mut jobs, summary, &hosts, None, DEFAULT, chosen)?;
+        let (own, sealed): (Vec<_>, Vec<_>) =
+            with_board.into_iter().partition(|program| program.package == "coboot-tests");
+        add(&mut jobs, summary, &own, None, DEFAULT, chosen)?;
+        add(&mut jobs, summary, &sealed, Some("sealed"), DEFAULT, chosen)
+    })?;
+    runner::run(jobs, summary);
+    Ok(())
+}
+
+/// Tests of the default board that run from a tier on.
+fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
+    let mut jobs = Vec::new();
+    let programs =
+        [host_programs()?, board_programs(DEFAULT)?, programs::build(&["--package=xtask".to_owned()])?];
+    let chosen = |program: &str, test: &str| Tier::of(program, test) == tier;
+    add(&mut jobs, summary, &programs.concat(), None, DEFAULT, chosen)?;
+    Ok(jobs)
+}
+
+/// What `.ci/run` adds.
+fn ci(summary: &mut Summary) -> Outcome {
+    build_images(Tier::Ci)?;
+    runner::run(later(Tier::Ci, summary)?, summary);
+    let mut doc = process::cargo("test");
+    let without = NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
+    doc.current_dir(workspace::root()).args(["--doc", "--workspace", "--quiet"]).args(without);
+    runner::count("documentation", process::run(&mut doc), summary);
+    for other in other_chips() {
+        on_board(other, Tier::Ci, summary, |program, test| {
+            OF_EACH_CHIP.iter().any(|(of, tests)| *of == program && test.starts_with(tests))
+        })?;
+    }
+    Ok(())
+}
+
+/// The tests that take minutes.
+fn slow(summary: &mut Summary) -> Outcome {
+    build_images(Tier::Ci)?;
+    examples::all()?;
+    runner::run(later(Tier::All, summary)?, summary);
+    Ok(())
+}
+
+/// Every test that runs firmware, for each other chip.
+fn boards(summary: &mut Summary) -> Outcome {
+    other_chips().try_for_each(|board| on_board(board, Tier::All, summary, |_, _| true))
+}
+
+/// A board of each other chip.
+fn other_chips() -> impl Iterator<Item = &'static Layout> {
+    BOARDS.iter().copied().filter(|other| other.chip.chip != DEFAULT.chip.chip)
+}
+
+/// Tests that run firmware, with that of a board. The programs are compiled for it.
+fn on_board(
+    board: &'static Layout,
+    tier: Tier,
+    summary: &mut Summary,
+    chosen: impl Fn(&str, &str) -> bool,
+) -> Outcome {
+    if tier == Tier::All {
+        build::boards(&[(board, &[])])?;
+    }
+    let mut programs = board_programs(board)?;
+    programs.retain(|program| program.package == "coboot-tests");
+    let mut jobs = Vec::new();
+    add(&mut jobs, summary, &programs, Some(board.board), board, chosen)?;
+    runner::run(jobs, summary);
+    Ok(())
+}
+
+/// Jobs of the night that end by themselves.
+fn jobs(summary: &mut Summary) -> Outcome {
+    type Run = fn(Args) -> Outcome;
+    let all: [(&str, Run, &[&str]); 6] = [
+        ("fuzz --replay", fuzz::run, &["--replay"]),
+        ("powercut", powercut::run, &[]),
+        ("attack", attack::run, &[]),
+        ("opinion", opinion::run, &[]),
+        ("reproduce", reproduce::run, &[]),
+        ("chips", chips::run, &[]),
+    ];
+    for (name, run, words) in all {
+        println!("== cargo xtask {name}");
+        let words = words.iter().map(|word| (*word).to_owned());
+        runner::count(&format!("cargo xtask {name}"), run(Args::new(words)), summary);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_stage_is_in_one_part_and_no_part_is_empty() {
+        for of in 1..=STAGES.len() {
+            let parts: Vec<_> = (1..=of).map(|which| share(&format!("{which}/{of}")).ok().unwrap()).collect();
+            assert!(parts.iter().all(|part| !part.is_empty()), "{of}");
+            let names: Vec<_> = parts.concat().iter().map(|stage| stage.name).collect();
+            assert_eq!(names, STAGES.iter().map(|stage| stage.name).collect::<Vec<_>>(), "{of}");
+        }
+        for wrong in ["", "1", "0/2", "3/2", "1/99", "a/b", "1/2/3"] {
+            assert!(share(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! Which test runs when: a table of what does not run in every `cargo xtask test`, with the reason.
+
+use shared_abi::layout::{
+    nucleo_f446re, stm32f407g_disc1, stm32f407g_disc1_can2, stm32f407g_disc1_two, stm32f429i_disc1, Layout,
+};
+
+use crate::setup::Part;
+
+/// When a test runs. Each tier contains the ones before it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Tier {
+    /// `cargo xtask test`: the product on its default board, device and tool.
+    Product,
+    /// `.ci/run`: what needs a browser, tools of others, the other chips or the repository's pages.
+    Ci,
+    /// `cargo xtask test --all`: what takes minutes, or builds programs of its own.
+    All,
+}
+
+/// Tests that do not run in every `cargo xtask test`.
+pub struct Later {
+    /// A test program of the package `coboot-tests`, or a package.
+    pub program: &'static str,
+    /// The beginning of the tests' paths in it; empty for all of them.
+    pub tests: &'static str,
+    /// The first tier in which they run.
+    pub tier: Tier,
+    /// Why not earlier.
+    pub why: &'static str,
+}
+
+const fn later(program: &'static str, tests: &'static str, tier: Tier, why: &'static str) -> Later {
+    Later { program, tests, tier, why }
+}
+
+/// The reason of tests on a board whose images `cargo xtask test` does not build.
+const TWO: &str = "images of the board with two programs";
+
+/// What runs later, in the order of the programs.
+pub const LATER: &[Later] = &[
+    later("foreign", "ui::", Tier::Ci, "Chromium"),
+    later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
+    later("port", "porting::", Tier::All, "builds a copy of the repository"),
+    later("update", "two_programs::", Tier::Ci, TWO),
+    later("xtask", "", Tier::Ci, "the repository and its pages, not the product"),
+];
+
+/// Test modules that take longest, the slowest first: they begin first, so that no core waits for
+/// one of them at the end.
+pub const SLOW: &[&str] = &["powercut::", "fleet::", "conform::", "clients::"];
+
+/// The images of a board that the tests of a tier need.
+pub struct Images {
+    /// The first tier that needs them.
+    pub tier: Tier,
+    /// Their board.
+    pub board: &'static Layout,
+    /// Their names; empty for all of the board, and the applications in C.
+    pub names: &'static [&'static str],
+}
+
+/// The images for a board of another chip.
+const OF_A_CHIP: &[&str] = &["bootloader", "bootloader-paulus", "app-v1", "app-v2"];
+
+/// The images by tier.
+pub const IMAGES: &[Images] = &[
+    Images { tier: Tier::Product, board: &stm32f407g_disc1::LAYOUT, names: &[] },
+    Images {
+        tier: Tier::Product,
+        board: &stm32f407g_disc1_can2::LAYOUT,
+        names: &["bootloader", "app-v1", "app-v2"],
+    },
+    Images { tier: Tier::Ci, board: &stm32f407g_disc1_two::LAYOUT, names: &[] },
+    Images { tier: Tier::Ci, board: &nucleo_f446re::LAYOUT, names: OF_A_CHIP },
+    Images { tier: Tier::Ci, board: &stm32f429i_disc1::LAYOUT, names: OF_A_CHIP },
+];
+
+/// Tests that run for a board of each chip in [`Tier::Ci`]: they show the mistakes that a port can
+/// have. The rest is the same on all chips; in [`Tier::All`] every test of these programs runs.
+pub const OF_EACH_CHIP: &[(&str, &str)] = &[
+    ("device", "device::"),
+    ("device", "watchdog::"),
+    ("device", "boot_time::"),
+    ("device", "abi::"),
+    ("device", "handover::"),
+    ("update", "main_job::"),
+    ("update", "conform::"),
+];
+
+impl Tier {
+    /// What the tests up to this tier need on the machine.
+    pub fn needs(self) -> &'static [Part] {
+        use Part::{Browser, Emulator, Examples, Firmware, Gdb, Python, Qemu, C};
+        match self {
+            Self::Product => &[Firmware, C, Emulator, Python],
+            Self::Ci => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples],
+            Self::All => &[Firmware, C, Emulator, Python, Gdb, Browser, Examples, Qemu],
+        }
+    }
+
+    /// The first tier in which a test runs.
+    pub fn of(program: &str, test: &str) -> Self {
+        let row = LATER.iter().find(|row| row.program == program && test.starts_with(row.tests));
+        row.map_or(Self::Product, |row| row.tier)
+    }
+}
