@@ -25,7 +25,7 @@ mod programs;
 mod runner;
 
 pub const HELP: &str = "\
-usage: cargo xtask test [--ci | --all [--part K/N] | --board BOARD | WORDS] [--yes]
+usage: cargo xtask test [--ci | --all [--part K/N] | --board BOARD | --list | WORDS] [--yes]
 
 Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
@@ -34,6 +34,7 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --all           everything: the two above, the tests that take minutes, and the jobs of the night
                   that end by themselves
   --part K/N      with --all: the K-th of N parts that take about the same time
+  --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board
   --yes           installs what is missing with sudo
   WORDS           go to cargo test, for one kind of test:
@@ -98,6 +99,10 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
+    if args.flag("--list") {
+        print!("{}", plan::table());
+        return args.none_left();
+    }
     let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
     let part = args.value("--part")?;
     let words = args.rest();

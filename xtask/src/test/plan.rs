@@ -87,6 +87,21 @@ pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("update", "conform::"),
 ];
 
+/// The table [`LATER`], as a page has it.
+pub fn table() -> String {
+    let mut table = String::from("| tests | first run by | why not earlier |\n|---|---|---|\n");
+    for Later { program, tests, tier, why } in LATER {
+        let colons = if tests.is_empty() { "" } else { "::" };
+        let by = match tier {
+            Tier::Product => "`cargo xtask test`",
+            Tier::Ci => "`.ci/run`",
+            Tier::All => "`--all`",
+        };
+        table += &format!("| `{program}{colons}{}` | {by} | {why} |\n", tests.trim_end_matches("::"));
+    }
+    table
+}
+
 impl Tier {
     /// What the tests up to this tier need on the machine.
     pub fn needs(self) -> &'static [Part] {
@@ -102,5 +117,29 @@ impl Tier {
     pub fn of(program: &str, test: &str) -> Self {
         let row = LATER.iter().find(|row| row.program == program && test.starts_with(row.tests));
         row.map_or(Self::Product, |row| row.tier)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::workspace;
+
+    #[test]
+    fn the_page_has_the_table() {
+        let page = std::fs::read_to_string(workspace::root().join("docs/testing.md")).unwrap();
+        assert!(page.contains(&table()), "docs/testing.md needs this table:\n{}", table());
+    }
+
+    #[test]
+    fn each_test_has_one_tier() {
+        for (number, row) in LATER.iter().enumerate() {
+            for other in &LATER[..number] {
+                let overlap = row.program == other.program && row.tests.starts_with(other.tests);
+                assert!(!overlap, "{}::{} is hidden by {}", row.program, row.tests, other.tests);
+            }
+        }
+        assert_eq!(Tier::of("foreign", "ui::a_test"), Tier::Ci);
+        assert_eq!(Tier::of("device", "line::a_test"), Tier::Product);
     }
 }
