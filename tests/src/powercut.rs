@@ -13,9 +13,6 @@
 
 pub mod board;
 mod device;
-#[path = "../../core/boot-core/tests/model/mod.rs"]
-#[allow(missing_docs, reason = "it is the tests' own")]
-pub mod model;
 mod point;
 mod points;
 mod scenario;

@@ -36,7 +36,7 @@ use shared_abi::layout::Layout;
 
 use crate::bench::Bench;
 use crate::firmware;
-use crate::ihex::intel_hex;
+use kit::ihex::intel_hex;
 
 const DATA: Address = Address::new(0x1F50, 1);
 /// The longest time for an answer of the device.

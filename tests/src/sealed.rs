@@ -25,8 +25,9 @@ use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
-use crate::powercut::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 use crate::powercut::DECISION;
+use kit::boot::Boot;
+use kit::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 
 // --- setups
 
@@ -465,14 +466,10 @@ impl Device {
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let mut buffer = vec![0; self.buffer];
         let mut room = Box::<Room>::default();
-        let (config, buffer, unsealer) = (&self.setup.config, &mut buffer[..], room.unsealer());
+        let boot = Boot::new(&self.setup.config, node);
         let node: Box<dyn Node + '_> = match self.setup.programs() {
-            1 => {
-                Box::new(Bootloader::<_, _, 1>::new(config, 0, node, 0, parameters, flash, buffer, unsealer))
-            }
-            _ => {
-                Box::new(Bootloader::<_, _, 2>::new(config, 0, node, 0, parameters, flash, buffer, unsealer))
-            }
+            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, &mut room)),
+            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, &mut room)),
         };
         let result = talk(&mut Host { device: self, node, now: 0 });
         self.chip.model().power_on();

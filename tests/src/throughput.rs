@@ -16,8 +16,8 @@ use emulator::frame::Frame;
 
 use crate::bench::{Bench, NODE};
 use crate::firmware;
-use crate::random::Random;
 use crate::sealed_board;
+use kit::random::Random;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);

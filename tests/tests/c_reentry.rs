@@ -7,7 +7,7 @@ use std::process::Command;
 use std::{env, fs};
 
 use coboot_app::departure::{Departure, Next};
-use coboot_tests::random::Random;
+use kit::random::Random;
 
 /// Reads a script of events, and prints what the program does about each: for `b REQUEST NOW`, a command
 /// that was taken, whether it is possible; for `p QUIET NOW`, the next step, and in the end the request.

@@ -5,7 +5,6 @@
 use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::ihex::intel_hex;
 use coboot_tests::listener::Listener;
 use coboot_tests::script::{play_on, Wire};
 use coboot_tests::serial::TextBus;
@@ -15,6 +14,7 @@ use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::read;
 use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
+use kit::ihex::intel_hex;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
 /// A dialect: the names of its images, its session, and the node-ID of its device.

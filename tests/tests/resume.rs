@@ -9,7 +9,6 @@ use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::file;
-use coboot_tests::random::Random;
 use coflash::bus::{Adapter, AdapterError};
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
@@ -18,6 +17,7 @@ use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Error;
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cut, FlashCut};
+use kit::random::Random;
 
 /// The data of a block of the file.
 const BLOCK: usize = 1008;

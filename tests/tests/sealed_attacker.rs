@@ -10,10 +10,6 @@
 //! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-tests --test sealed_attacker          # one, told
 //! ```
 
-#[path = "../src/random.rs"]
-#[allow(dead_code, reason = "the tests need some of it")]
-mod random;
-
 use std::panic::{catch_unwind, AssertUnwindSafe};
 use std::sync::{Once, OnceLock};
 use std::task::Poll;
@@ -22,14 +18,14 @@ use boot_core::bootloader::PasswordObject;
 use boot_core::canopen::od::Address;
 use boot_core::canopen::{BitRate, Instant, NodeId};
 use boot_core::flash::FlashFault;
-use coboot_tests::ihex::intel_hex;
-use coboot_tests::powercut::model::{quiet_power_cuts, Cut, PowerCut};
 use coboot_tests::sealed::{
     block, certificate, crc32, image, keys, seal, sealer, Device, Host, Parts, Setup, CONFIRMED_2,
     ESACADEMY_2, FORMS, LIFT_2, STANDARD_1, STANDARD_2,
 };
 use coflash::file::sealed::{Certificate, Sealer};
-use random::Random;
+use kit::ihex::intel_hex;
+use kit::model::{quiet_power_cuts, Cut, PowerCut};
+use kit::random::Random;
 use seal::access::right;
 
 /// An image that the owner of the key has sealed for a program.

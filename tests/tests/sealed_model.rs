@@ -3,12 +3,12 @@
 
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::program::Invalid;
-use coboot_tests::ihex::intel_hex;
 use coboot_tests::sealed::{
     block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
     CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2, START,
 };
 use coflash::file::sealed::{key_block, Certificate, Sealer};
+use kit::ihex::intel_hex;
 
 /// Statuses in 1F57h.
 const NOT_CLEARED: u32 = 0x08;

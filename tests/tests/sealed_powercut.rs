@@ -4,9 +4,9 @@
 
 use std::sync::Once;
 
-use coboot_tests::powercut::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1, STANDARD_1, STANDARD_2};
 use coflash::file::sealed::Sealer;
+use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::Region;
 
 /// The number of checks: bits between 0 and 1 read differently each time.

@@ -2,17 +2,13 @@
 //! field. Each is refused with the code of the reason, and nothing is erased or written before the
 //! signatures are found good.
 
-#[path = "../src/random.rs"]
-#[allow(dead_code, reason = "the tests need some of it")]
-mod random;
-
 use boot_core::canopen::{AbortCode, Instant};
 use coboot_tests::sealed::{
     certificate, image, keys, seal, sealer, Device, Parts, EPOCH, FORMS, HIGHEST, PRODUCT_CODE, REVISION,
     STANDARD_1, UNIQUE_ID, VENDOR_ID,
 };
 use coflash::file::sealed::{key_block, Certificate, Kek, Role, Sealer};
-use random::Random;
+use kit::random::Random;
 
 /// Statuses in 1F57h.
 const FORMAT: u32 = 0x04;

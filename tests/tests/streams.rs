@@ -3,11 +3,11 @@
 
 use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
-use coboot_tests::ihex::intel_hex;
 use coboot_tests::{firmware, throughput};
 use coflash::device::{Doing, Transfers};
 use emulator::machine::{FlashTimes, Options};
 use emulator::time::{Span, Time};
+use kit::ihex::intel_hex;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);

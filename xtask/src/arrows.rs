@@ -35,9 +35,9 @@ struct Rule {
 /// The permitted dependencies. A new crate needs a row.
 const RULES: &[Rule] = &[
     Rule { name: "shared-abi", may_use: &[] },
-    Rule { name: "canopen", may_use: &[] },
+    Rule { name: "canopen", may_use: &[KIT] },
     Rule { name: "seal", may_use: &[] },
-    Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi"] },
+    Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi", KIT] },
     Rule { name: "coboot-app", may_use: &["canopen", "shared-abi"] },
     // Only on the host: build scripts and tools.
     Rule { name: "coboot-linker", may_use: &["shared-abi"] },
@@ -47,8 +47,12 @@ const RULES: &[Rule] = &[
     Rule { name: "vendor-can", may_use: &[] },
     Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can"] },
     Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
-    Rule { name: "coboot-node", may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi"] },
+    Rule {
+        name: "coboot-node",
+        may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi", KIT],
+    },
     Rule { name: "emulator", may_use: &["shared-abi"] },
+    Rule { name: KIT, may_use: &["boot-core", "canopen", "shared-abi"] },
     Rule {
         name: "coboot-tests",
         may_use: &[
@@ -61,10 +65,16 @@ const RULES: &[Rule] = &[
             "emulator",
             "seal",
             "shared-abi",
+            KIT,
         ],
     },
     Rule { name: "xtask", may_use: &["shared-abi"] },
 ];
+
+/// What the tests share: in no package, and so a dev-dependency, of crates that have tests with it.
+const KIT: &str = "kit";
+/// The crates that consist of tests and checks, and may use the kit like any other crate.
+const MAY_CONTAIN_KIT: &[&str] = &["coboot-tests", "xtask"];
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
 const PURE: &[&str] = &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "xtask"];
@@ -201,6 +211,11 @@ fn broken_arrows(packages: &[Package]) -> Vec<String> {
             let itself = dependency == name && *kind == "dev";
             if ours && !itself && !may_use.contains(&dependency) {
                 broken.push(format!("{name} -> {dependency} ({kind}): not among its arrows ({may_use:?})"));
+            }
+            if dependency == KIT && *kind != "dev" && !MAY_CONTAIN_KIT.contains(&name) {
+                broken.push(format!(
+                    "{name} -> {dependency} ({kind}): it is in no package, and for tests alone"
+                ));
             }
             if dependency.starts_with("unicorn") && !MAY_LINK_UNICORN.contains(&name) {
                 broken.push(format!(
@@ -342,6 +357,11 @@ mod tests {
             "xtask -> shared-abi",
             "shared-abi dev proptest",
             "canopen dev canopen",
+            "canopen dev kit",
+            "boot-core dev kit",
+            "coboot-node dev kit",
+            "coboot-tests -> kit",
+            "kit -> boot-core",
         ]);
         assert_eq!(broken_arrows(&house), Vec::<String>::new());
     }
@@ -369,6 +389,12 @@ mod tests {
             "boot-core dev unicorn-engine-sys",
             "coboot-tests -> bootloader",
             "xtask -> emulator",
+            "canopen -> kit",
+            "boot-core build kit",
+            "coboot-node -> kit",
+            "bootloader dev kit",
+            "emulator dev kit",
+            "kit -> emulator",
             "newcomer -> crc",
         ] {
             let broken = broken_arrows(&workspace_of(&[arrow]));

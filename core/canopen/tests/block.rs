@@ -1,11 +1,9 @@
 //! SDO block transfer, both ends, against frames written by hand from CiA 301 section 7.2.4.3.9 ff.
 
-mod common;
-
 use canopen::sdo::client::{Block, Buffer, Config, Download, SdoError, Step, Transfer, Upload};
 use canopen::sdo::server::Config as ServerConfig;
 use canopen::{AbortCode, Address};
-use common::{at, node, request, response, Bench, Event};
+use kit::bus::{at, node, request, response, Bench, Event};
 
 /// CRC of the bytes 1 to 9 (polynomial 1021h, start 0), from an independent calculation:
 /// `python3 -c "import binascii; print(hex(binascii.crc_hqx(bytes(range(1, 10)), 0)))"`.
@@ -623,8 +621,8 @@ fn client_aborts_a_block_transfer_that_is_wrong() {
         [0x80, i, j, at.sub, a, b, c, d]
     };
     let refused = |client: &mut dyn Transfer, at: Address, code: u32| {
-        assert_eq!(client.poll(common::at(0)), Step::Send(request(abort(at, code))));
-        assert_eq!(client.poll(common::at(0)), Step::Done(Err(SdoError::Client(AbortCode(code)))));
+        assert_eq!(client.poll(kit::bus::at(0)), Step::Send(request(abort(at, code))));
+        assert_eq!(client.poll(kit::bus::at(0)), Step::Done(Err(SdoError::Client(AbortCode(code)))));
     };
     let download = |heard: &[[u8; 8]]| {
         let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);

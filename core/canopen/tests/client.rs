@@ -1,10 +1,8 @@
 //! The SDO client against answers written by hand from CiA 301 section 7.2.4.3.
 
-mod common;
-
 use canopen::sdo::client::{Buffer, Config, Download, SdoError, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame};
-use common::{at, node, request, response};
+use kit::bus::{at, node, request, response};
 
 const CONFIG: Config = Config { timeout_ms: 1000 };
 

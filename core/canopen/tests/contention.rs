@@ -1,17 +1,12 @@
 //! Events between the segments of a block download: requests of another client or of a client that
 //! has aborted, silence, a reset. Frames written by hand from CiA 301 sections 7.2.4.3 and 7.2.8.3.
 
-mod common;
-#[path = "../../../tests/src/random.rs"]
-#[allow(dead_code, reason = "the tests need some of it")]
-mod random;
-
 use canopen::od::Objects;
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
 use canopen::sdo::server::Config;
 use canopen::{Address, Frame};
-use common::{at, node, response, Bench, Device, Event};
-use random::Random;
+use kit::bus::{at, node, response, Bench, Device, Event};
+use kit::random::Random;
 
 /// The clock, and the beginning of a download.
 trait Scene {

@@ -1,7 +1,5 @@
 //! The debugger interface, frame by frame and with hostile input.
 
-mod memory;
-
 use core::task::Poll;
 
 use canopen::debugger::{Command, Debugged, Debugger, Kind, Stop, COMMAND, DATA, ENTRIES, PIECE};
@@ -14,7 +12,8 @@ use canopen::sdo::SdoError;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, Address, BitRate, CobId, Frame, NodeId, Objects};
 use embedded_can::Frame as _;
-use memory::{at, node, request, Model, Target, RAM, ROM, SIZE};
+use kit::bus::{at, node, request};
+use kit::memory::{Model, Target, RAM, ROM, SIZE};
 use proptest::collection::vec;
 use proptest::prelude::*;
 

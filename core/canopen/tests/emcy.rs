@@ -1,15 +1,13 @@
 //! Emergencies on the bus, and the objects 1001h, 1003h and 1014h (CiA 301 sections 7.2.7 and
 //! 7.5.2).
 
-mod common;
-
 use canopen::device::{self, Device};
 use canopen::emcy::{self, code, register, Emcy, Emergency};
 use canopen::nmt::NmtCommand;
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::od::{Entry, Table};
 use canopen::{AbortCode, Address, CobId, Frame, Objects};
-use common::{at, node, request, response};
+use kit::bus::{at, node, request, response};
 
 const ENTRIES: &[Entry] = &Table::<17>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES).entries();
 

@@ -1,16 +1,11 @@
 //! One download to several servers.
 
-mod common;
-#[path = "../../../tests/src/random.rs"]
-#[allow(dead_code, reason = "the tests need some of it")]
-mod random;
-
 use canopen::frame::Channel;
 use canopen::sdo::client::{Config as ClientConfig, GroupDownload, GroupResult, GroupStep, Servers};
 use canopen::sdo::server::Config;
 use canopen::{AbortCode, Address, CobId, Frame};
-use common::{at, Bench, Event};
-use random::Random;
+use kit::bus::{at, Bench, Event};
+use kit::random::Random;
 
 const AT: Address = Address::new(0x1F50, 1);
 const WHOLE: GroupResult = GroupResult { missing: 0, ended: true };

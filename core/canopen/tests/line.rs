@@ -1,12 +1,10 @@
 //! Bus-off, error passive, lost frames; and the detection of the bit rate.
 
-mod common;
-
 use canopen::bit_rate::{BitRate, Detector, Heard};
 use canopen::line::{
     Confinement, Consequence, LineEvent, Losses, Monitor, CONTROLLER_OVERRUN, QUEUE_OVERRUN,
 };
-use common::at;
+use kit::bus::at;
 
 use Confinement::{Active, BusOff, Passive};
 

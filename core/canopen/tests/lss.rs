@@ -1,13 +1,11 @@
 //! The LSS slave against frames written by hand from CiA 305.
 
-mod common;
-
 use core::task::Poll;
 
 use canopen::lss::{BitRate, Config, Lss, LssAddress, LssDevice, Output, StoreError};
 use canopen::{CobId, Frame, NodeId};
-use common::at;
 use embedded_can::{ExtendedId, Frame as _, StandardId};
+use kit::bus::at;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 

@@ -1,12 +1,10 @@
 //! A slave on the bus; frames from CiA 301 sections 7.2.8.2 and 7.2.8.3.
 
-mod common;
-
 use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame, NodeId};
-use common::{at, node, request, response, Device, Event};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
+use kit::bus::{at, node, request, response, Device, Event};
 
 struct Bench {
     node: Node,

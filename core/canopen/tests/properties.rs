@@ -1,7 +1,5 @@
 //! Properties of every sequence of frames and every content.
 
-mod common;
-
 use canopen::nmt::NmtState;
 use canopen::node::{Config, NmtPolicy, Node};
 use std::cell::RefCell;
@@ -9,7 +7,7 @@ use std::collections::VecDeque;
 
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, SdoError, Step, Transfer, Upload};
 use canopen::{Address, Frame};
-use common::{at, node, request, Device};
+use kit::bus::{at, node, request, Device};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
@@ -354,7 +352,7 @@ proptest! {
             for (bytes, pause) in &answers {
                 while let Step::Send(_) = transfer.poll(at(now)) {}
                 now += pause;
-                transfer.handle(&common::response(*bytes), at(now));
+                transfer.handle(&kit::bus::response(*bytes), at(now));
             }
             // One pause for the repetition of a sub-block, one for the time-out.
             now += 1000;

@@ -1,13 +1,11 @@
 //! The second SDO server (1201h): its COB-IDs, and one transfer for two servers. Frames written by
 //! hand from CiA 301 section 7.2.4.3.
 
-mod common;
-
 use canopen::frame::Channel;
 use canopen::sdo::second::{SecondServer, INVALID, REQUEST, RESPONSE};
 use canopen::sdo::server::Config;
 use canopen::{AbortCode, CobId, Frame};
-use common::{response, Bench, Event};
+use kit::bus::{response, Bench, Event};
 
 const GROUP: u16 = 0x6DF;
 const OWN: u16 = 0x681;
@@ -83,7 +81,7 @@ fn each_server_answers_with_its_own_cob_id() {
 #[test]
 fn a_frame_of_another_length_moves_no_answer() {
     let mut bench = bench();
-    bench.send(&common::request(READ_1000));
+    bench.send(&kit::bus::request(READ_1000));
     bench.send(&Frame::of(id(GROUP), &READ_1000[..7]));
     assert_eq!(bench.sent(), [response(IS_1000)]);
 }
@@ -94,8 +92,8 @@ fn a_frame_of_another_length_moves_no_answer() {
 fn a_request_to_the_other_server_in_a_block_download_is_answered_at_once() {
     type Send = fn([u8; 8]) -> Frame;
     for (one, other, answer) in [
-        (to_group as Send, common::request as Send, response as Send),
-        (common::request as Send, to_group as Send, from_group as Send),
+        (to_group as Send, kit::bus::request as Send, response as Send),
+        (kit::bus::request as Send, to_group as Send, from_group as Send),
     ] {
         let mut bench = bench();
         bench.send(&one(BEGIN));

@@ -1,11 +1,9 @@
 //! The SDO server against frames written by hand from CiA 301 section 7.2.4.3.
 
-mod common;
-
 use canopen::sdo::server::{Config, SdoServer, VALUE_MAX};
 use canopen::{AbortCode, CobId, Frame, Objects};
-use common::{at, node, request, response, Bench, Device, Event};
 use embedded_can::{ExtendedId, Frame as _, StandardId};
+use kit::bus::{at, node, request, response, Bench, Device, Event};
 
 fn bench() -> Bench {
     Bench::with(Config { timeout_ms: 1000, ..Config::default() })

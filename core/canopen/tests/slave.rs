@@ -1,7 +1,5 @@
 //! A device on the bus: node, layer setting services and line together.
 
-mod common;
-
 use core::task::Poll;
 
 use canopen::bit_rate::Heard;
@@ -11,7 +9,7 @@ use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{Access, DataType, Entry, Objects};
 use canopen::slave::{Config, Output, Slave, SlaveDevice};
 use canopen::{AbortCode, Address, BitRate, CobId, Frame, NodeId};
-use common::at;
+use kit::bus::at;
 
 const ADDRESS: LssAddress = LssAddress { vendor_id: 1, product_code: 2, revision: 3, serial_number: 4 };
 static ENTRIES: [Entry; 2] = [

@@ -1,13 +1,7 @@
 //! An update that is cut at a random point goes on where it stopped: `coflash` as a library against
 //! `boot-core` with the real SDO server, in virtual time.
 
-#[path = "../../../core/boot-core/tests/bench/mod.rs"]
-mod bench;
 mod cut;
-#[path = "../../../core/boot-core/tests/model/mod.rs"]
-mod model;
-#[path = "../../../tests/src/random.rs"]
-mod random;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -22,10 +16,10 @@ use coflash::update::event::{Phase, Warning};
 use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Error;
 
-use bench::{block, block_file, crc32, program, LAYOUT, PROGRAM};
 use cut::{CutBus, Way};
-use model::{quiet_power_cuts, Cut, ModelFlash, CHIP};
-use random::Random;
+use kit::bench::{block, block_file, crc32, program, LAYOUT, PROGRAM};
+use kit::model::{quiet_power_cuts, Cut, ModelFlash, CHIP};
+use kit::random::Random;
 
 /// Data of a block.
 const CHUNK: usize = 256;
@@ -267,13 +261,13 @@ fn what_was_given_up_does_not_go_on() {
     // row erases.
     let mut cleared = first;
     cleared.power_on();
-    assert_eq!(bench::Bench::new(&mut cleared).command(bench::CLEAR), 0);
+    assert_eq!(kit::bench::Bench::new(&mut cleared).command(kit::bench::CLEAR), 0);
     let (ended, _) = recover(cleared.clone(), &image, &file, &options());
     assert!(ended.went_on().is_some() && !ended.began_again(), "{:?}", ended.events);
     cleared.power_on();
     {
-        let mut bench = bench::Bench::new(&mut cleared);
-        assert_eq!((bench.command(bench::CLEAR), bench.command(bench::CLEAR)), (0, 0));
+        let mut bench = kit::bench::Bench::new(&mut cleared);
+        assert_eq!((bench.command(kit::bench::CLEAR), bench.command(kit::bench::CLEAR)), (0, 0));
     }
     let (ended, data) = recover(cleared, &image, &file, &options());
     assert!(ended.went_on().is_none(), "{:?}", ended.events);

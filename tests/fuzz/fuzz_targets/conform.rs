@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
-use coboot_fuzz::device::{at, node, Device};
+use kit::bus::{at, node, Device};
 use coboot_fuzz::Input;
 use coflash::bus::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Means, Outcome};

@@ -10,7 +10,7 @@ use boot_core::control::{Downloader, Policy, Step};
 use boot_core::store::Journal;
 use boot_core::unseal::Room;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
-use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
+use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
 use coflash::file::block_file::{Block, CRC};
 use shared_abi::layout::Layout;

@@ -6,7 +6,7 @@
 
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters};
-use coboot_fuzz::model::ModelFlash;
+use kit::model::ModelFlash;
 use coboot_fuzz::Input;
 use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
 

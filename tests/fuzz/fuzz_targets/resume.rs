@@ -21,7 +21,8 @@ use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA, SECOND_SERVER};
 use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
-use coboot_fuzz::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::boot::Boot;
+use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::{is_eighth, Input};
 use coflash::file::block_file::{Block, CRC};
 use shared_abi::geometry::Region;
@@ -65,6 +66,9 @@ const DEVICE: Device = Device {
     revision: 0,
     serial_number: 0,
 };
+
+/// Node-ID and bit rate as stored.
+const STORED: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 
 fn node() -> NodeId {
     NodeId::new(5).expect("1 to 127")
@@ -221,9 +225,7 @@ struct Host {
 fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool {
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();
-    let parameters = Journal::open(flash, LAYOUT.parameters);
-    let stored = NodeParameters { id: Some(node()), bit_rate: BitRate::K125 };
-    let device = Bootloader::new(&CONFIG, 0, stored, 0, parameters, flash, &mut buffer, room.unsealer());
+    let device = Boot::new(&CONFIG, STORED).on(flash, &mut buffer, &mut room);
     let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
     let mut world = World { device, slave, now: 0, answers: Default::default() };
     world.turn();
@@ -313,12 +315,9 @@ fn judge(flash: &ModelFlash) {
 fn is_in_flash(flash: &mut ModelFlash) {
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();
-    let parameters = Journal::open(flash, LAYOUT.parameters);
-    let stored = NodeParameters { id: Some(node()), bit_rate: BitRate::K125 };
     let mut bytes = [0; 8];
     {
-        let mut device: Bootloader<'_, _, _, 1> =
-            Bootloader::new(&CONFIG, 0, stored, 0, parameters, &mut *flash, &mut buffer, room.unsealer());
+        let mut device = Boot::new(&CONFIG, STORED).on::<_, 1>(&mut *flash, &mut buffer, &mut room);
         assert_eq!(device.read(PARTIAL, &mut bytes), Ok(8));
     }
     let [id, end] = [0, 4].map(|at| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")));
@@ -364,11 +363,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let file = &files()[0];
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();
-    let parameters = Journal::open(&flash, LAYOUT.parameters);
-    let stored = NodeParameters { id: Some(node()), bit_rate: BitRate::K125 };
     {
-        let device =
-            Bootloader::new(&CONFIG, 0, stored, 0, parameters, &mut flash, &mut buffer, room.unsealer());
+        let device = Boot::new(&CONFIG, STORED).on(&mut flash, &mut buffer, &mut room);
         let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
         let mut world = World { device, slave, now: 0, answers: Default::default() };
         world.turn();

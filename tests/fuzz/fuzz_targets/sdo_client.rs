@@ -6,7 +6,7 @@
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame};
-use coboot_fuzz::device::{at, node, response};
+use kit::bus::{at, node, response};
 use coboot_fuzz::{Input, ENDLESS};
 
 const AT: Address = Address::new(0x2000, 0);

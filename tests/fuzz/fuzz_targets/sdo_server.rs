@@ -11,7 +11,7 @@ use canopen::node::{Config, NmtPolicy, Node};
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Upload};
 use canopen::sdo::server::Config as SdoConfig;
 use canopen::{Address, CobId, Frame};
-use coboot_fuzz::device::{at, node, request, Device};
+use kit::bus::{at, node, request, Device};
 use coboot_fuzz::{drain, run, Input};
 
 /// Existing objects of every type and access, for frames that pass the first checks.

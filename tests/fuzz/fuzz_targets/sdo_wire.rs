@@ -12,7 +12,7 @@ use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transf
 use canopen::sdo::server::Config as SdoConfig;
 use canopen::sdo::SdoError;
 use canopen::{Address, Frame};
-use coboot_fuzz::device::{at, node, Device};
+use kit::bus::{at, node, Device};
 use coboot_fuzz::Input;
 
 const AT: Address = Address::new(0x2000, 0);

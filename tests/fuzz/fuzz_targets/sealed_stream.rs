@@ -22,7 +22,8 @@ use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
-use coboot_fuzz::model::{ModelFlash, CHIP, ONE_PROGRAM};
+use kit::boot::Boot;
+use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::{is_eighth, Input};
 use coflash::file::sealed::{hash, key_block, Kek, Sealer, SigningKey};
 use seal::wire::{head_size, Head, DOMAIN, HASH};
@@ -167,9 +168,8 @@ fn hostile(file: &[u8], payload_too: bool, input: &mut Input<'_>) -> Vec<u8> {
 type Sealed<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, 1>;
 
 fn device<'b, 'f>(flash: &'f mut ModelFlash, buffer: &'b mut [u8], room: &'b mut Room) -> Sealed<'b, 'f> {
-    let parameters = Journal::open(flash, LAYOUT.parameters);
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Bootloader::new(&CONFIG, 0, node, 0, parameters, flash, buffer, room.unsealer())
+    Boot::new(&CONFIG, node).on(flash, buffer, room)
 }
 
 fn settle(device: &mut Sealed<'_, '_>) {

@@ -12,12 +12,12 @@ use boot_core::control::{Policy, Step};
 use boot_core::profile::Profile;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
-use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLOCK_FIRMWARE};
 use canopen::{AbortCode, Address, BitRate, Instant, NodeId};
-use coboot_fuzz::model::{ModelFlash, CHIP, TWO_PROGRAMS};
+use kit::boot::Boot;
+use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 use coboot_fuzz::Input;
 use shared_abi::layout::Layout;
 
@@ -97,10 +97,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
 type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
-    let parameters = Journal::open(flash, LAYOUT.parameters);
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    let unsealer = Box::leak(Box::<Room>::default()).unsealer();
-    Bootloader::new(config, 0, node, 0, parameters, flash, buffer, unsealer)
+    Boot::new(config, node).on(flash, buffer, Box::leak(Box::default()))
 }
 
 fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_>) {

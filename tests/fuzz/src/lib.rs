@@ -58,21 +58,11 @@ impl Drop for Told<'_> {
     }
 }
 
-/// The devices and the wire of the tests in `canopen`.
-#[path = "../../../core/canopen/tests/common/mod.rs"]
-pub mod device;
-/// The memory of the debugger interface's tests in `canopen`.
-#[path = "../../../core/canopen/tests/memory/mod.rs"]
-pub mod memory;
-/// The strict flash of the tests in `boot-core`.
-#[path = "../../../core/boot-core/tests/model/mod.rs"]
-pub mod model;
-
 use canopen::node::Node;
 use canopen::sdo::client::{Step, Transfer};
 use canopen::sdo::SdoError;
 use canopen::Instant;
-use device::Device;
+use kit::bus::Device;
 
 /// The fuzzer's bytes, consumed from the front.
 pub struct Input<'a>(&'a [u8]);

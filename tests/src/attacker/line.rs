@@ -12,7 +12,7 @@ use shared_abi::layout::Layout;
 
 use super::board::Board;
 use super::target::{Event, Happened, PowerCut, Target};
-use crate::random::Random;
+use kit::random::Random;
 
 /// The device has said all that it has to say when it was silent for this time, in us: its answer to a
 /// frame begins earlier.

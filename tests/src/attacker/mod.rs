@@ -39,7 +39,7 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 use shared_abi::geometry::Region;
 
-use crate::random::Random;
+use kit::random::Random;
 use model::{Ask, Model, Node, NO_NODE};
 use setup::{Image, Setup};
 use target::{Happened, PowerCut, Target, View};

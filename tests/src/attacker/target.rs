@@ -6,7 +6,7 @@ use shared_abi::geometry::Sector;
 use shared_abi::layout::Layout;
 use std::task::Poll;
 
-use crate::random::Random;
+use kit::random::Random;
 
 /// Something that happened on the device or on its bus.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -20,7 +20,7 @@ use boot_core::unseal::Room;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
-use super::model::{ModelFlash, CHIP, TWO_PROGRAMS};
+use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 
 /// Two programs; setups with one program use the first.
 pub static LAYOUT: Layout = TWO_PROGRAMS;
@@ -265,10 +265,8 @@ impl Device {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
         let (mut buffer, mut room) = ([0; 256], Room::new());
-        let unsealer = room.unsealer();
-        talk(&mut Host {
-            node: Bootloader::new(config, 0, node, 0, parameters, flash, &mut buffer, unsealer),
-        })
+        let node = Boot::new(config, node).with(parameters, flash, &mut buffer, &mut room);
+        talk(&mut Host { node })
     }
 }
 

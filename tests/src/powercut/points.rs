@@ -8,9 +8,9 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::Mutex;
 
 use super::device::{Bug, Device, Outcome};
-use super::model::{quiet_power_cuts, until_power_cut, Cut};
 use super::point::{self, At};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
+use kit::model::{quiet_power_cuts, until_power_cut, Cut};
 
 /// The number of violations that a report describes.
 pub(super) const TOLD: usize = 10;

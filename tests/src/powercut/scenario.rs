@@ -5,7 +5,7 @@ use boot_core::crc32;
 use boot_core::store::Key;
 use boot_core::store::NodeParameters;
 
-use crate::ihex::intel_hex;
+use kit::ihex::intel_hex;
 
 use super::device::{image, Device, Outcome, BOARD_NODE, LAYOUT, PRODUCT_CODE, VENDOR_ID};
 

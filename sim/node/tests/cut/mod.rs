@@ -10,11 +10,11 @@ use boot_core::canopen::slave::{self, Output, Slave};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::Step;
 use boot_core::store::Journal;
-use boot_core::unseal::Room;
 use coflash::bus::{Adapter, AdapterError};
 
-use crate::bench::{node, CONFIG};
-use crate::model::{until_power_cut, Chip, Cut, ModelFlash};
+use kit::bench::{node, CONFIG};
+use kit::boot::{leaked, Boot};
+use kit::model::{until_power_cut, Chip, Cut, ModelFlash};
 
 /// The bytes of blocks that may wait for the flash.
 const BUFFER: usize = 4096;
@@ -110,11 +110,8 @@ impl CutBus {
     fn power_on(&mut self) {
         self.chip.model().power_on();
         let config: &'static Config = &const { CONFIG };
-        let parameters = Journal::open(&self.chip, config.layout.parameters);
-        let unsealer = Box::leak(Box::<Room>::default()).unsealer();
-        let buffer = vec![0; BUFFER].leak();
-        let chip = self.chip.clone();
-        let device = Bootloader::new(config, 0, node(), 0, parameters, chip, buffer, unsealer);
+        let (buffer, room) = leaked(BUFFER);
+        let device = Boot::new(config, node()).on(self.chip.clone(), buffer, room);
         let says = slave::Config::default();
         let says = slave::Config {
             node: boot_core::canopen::node::Config {

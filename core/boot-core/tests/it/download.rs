@@ -1,9 +1,5 @@
 //! Program download by block file: every block and command, in and out of order, on a strict flash.
 
-mod bench;
-mod model;
-
-use bench::*;
 use boot_core::control::{Downloader, Policy, Step, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
@@ -13,7 +9,8 @@ use boot_core::unseal::{Room, Unsealer};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
-use model::{ModelFlash, CHIP};
+use kit::bench::*;
+use kit::model::{ModelFlash, CHIP};
 use shared_abi::block_file::Control;
 use shared_abi::geometry::Region;
 use shared_abi::warm_start::BootRequest;

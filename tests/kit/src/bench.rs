@@ -1,5 +1,4 @@
 //! A bootloader on the model of the flash, and the actions of a host.
-#![allow(dead_code, reason = "each test file uses some of it")]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
 use boot_core::control::{Policy, Step};
@@ -7,13 +6,13 @@ use boot_core::crc::CrcKind;
 use boot_core::program::{verify, Invalid};
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
-use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, NodeId};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
+use crate::boot::{leaked, Boot};
 use crate::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
@@ -79,11 +78,9 @@ impl<'f> Bench<'f> {
     }
 
     pub fn with_config(flash: &'f mut ModelFlash, config: Config, size: usize) -> Self {
-        let buffer = Box::leak(vec![0; size].into_boxed_slice());
+        let (buffer, room) = leaked(size);
         let config = Box::leak(Box::new(config));
-        let parameters = Journal::open(flash, LAYOUT.parameters);
-        let unsealer = Box::leak(Box::<Room>::default()).unsealer();
-        Self { node: Bootloader::new(config, 0, node(), 0, parameters, flash, buffer, unsealer) }
+        Self { node: Boot::new(config, node()).on(flash, buffer, room) }
     }
 
     pub fn settle(&mut self) {

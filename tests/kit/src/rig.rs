@@ -1,9 +1,7 @@
 //! A bootloader of any profile on one or two programs, driven through its object dictionary alone.
 //!
 //! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
-//! [`Rig::boot`] and [`Rig::stored`]: after a change of the construction, or of the stored data,
-//! adapt these two functions.
-#![allow(dead_code, reason = "each test file uses some of it")]
+//! [`boot`](crate::boot) and [`Rig::stored`].
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
 use boot_core::control::{Erase, Policy, Step};
@@ -19,6 +17,7 @@ use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
+use crate::boot::{leaked, Boot};
 use crate::ihex::{record, END_OF_FILE};
 use crate::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
 
@@ -97,6 +96,11 @@ pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT);
 impl Setup {
     pub fn programs(&self) -> u8 {
         self.layout.programs.len() as u8
+    }
+
+    /// Whether there is a program with this number.
+    pub fn has(&self, program: u8) -> bool {
+        (1..=self.programs()).contains(&program)
     }
 
     pub fn region(&self, program: u8) -> Region {
@@ -179,34 +183,15 @@ impl Rig {
         Self { setup, chip, node, buffer }
     }
 
-    /// THE function that makes a bootloader.
     fn boot(setup: &'static Setup, chip: &Chip, buffer: usize) -> Box<dyn Node> {
         let flash = chip.clone();
-        let buffer = Box::leak(vec![0; buffer].into_boxed_slice());
+        let (buffer, room) = leaked(buffer);
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
-        let unsealer = Box::leak(Box::<boot_core::unseal::Room>::default()).unsealer();
+        let boot = Boot::new(&setup.config, node);
         match setup.programs() {
-            1 => Box::new(Bootloader::<_, _, 1>::new(
-                &setup.config,
-                0,
-                node,
-                0,
-                parameters,
-                flash,
-                buffer,
-                unsealer,
-            )),
-            2 => Box::new(Bootloader::<_, _, 2>::new(
-                &setup.config,
-                0,
-                node,
-                0,
-                parameters,
-                flash,
-                buffer,
-                unsealer,
-            )),
+            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, buffer, room)),
+            2 => Box::new(boot.with::<_, _, 2>(parameters, flash, buffer, room)),
             _ => unreachable!(),
         }
     }

@@ -1,11 +1,8 @@
-//! Random numbers for seeded attacks: the same seed gives the same numbers. The tests of the core
-//! crates also use this file.
+//! Random numbers for seeded attacks: the same seed gives the same numbers.
 
 /// A generator of random numbers (splitmix64).
 pub struct Random(pub u64);
 
-// The tests of other crates include this file, and use a part of it each.
-#[allow(dead_code)]
 impl Random {
     /// The next number.
     #[allow(clippy::should_implement_trait, reason = "it never ends")]

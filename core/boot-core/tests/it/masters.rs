@@ -7,19 +7,14 @@
 //! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test masters
 //! ```
 
-mod bench;
-mod model;
-#[path = "../../../tests/src/random.rs"]
-mod random;
-
-use bench::{block_file, crc32, program, Bench as Device, CLEAR, CONTROL, DATA, DEVICE, PROGRAM};
 use boot_core::control::{Policy, Step as Work};
 use boot_core::store::{Journal, ProgramRecord};
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, SdoError, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
-use model::{ModelFlash, CHIP};
-use random::Random;
+use kit::bench::{block_file, crc32, program, Bench as Device, CLEAR, CONTROL, DATA, DEVICE, PROGRAM};
+use kit::model::{ModelFlash, CHIP};
+use kit::random::Random;
 
 const NODE: u8 = 5;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
@@ -222,7 +217,7 @@ fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
 
 /// Whether the record of program 1, if there is one, matches the flash.
 fn record_is_true(flash: &ModelFlash) -> bool {
-    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
     let Some(record) = ProgramRecord::load(&journal, flash, 1) else { return true };
     crc32(&flash.cells(PROGRAM)[..record.size as usize]) == record.crc
 }

@@ -1,11 +1,9 @@
 //! The journal: stored values are read back, whenever the power is cut.
 
-mod model;
-
 use boot_core::flash::{run, Flash, FlashFault, Operation};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use canopen::{BitRate, NodeId};
-use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 

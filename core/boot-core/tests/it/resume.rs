@@ -1,17 +1,13 @@
 //! A download of block files that was cut off goes on where it stopped, and a block may come twice.
-#![cfg(not(feature = "sealed"))]
 
-mod bench;
-mod model;
-
-use bench::{block, block_file, last, program, Bench, CLEAR, CONFIG, LAYOUT, PROGRAM};
 use boot_core::bootloader::Config;
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use canopen::od::{Address, Objects};
 use canopen::AbortCode;
-use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use kit::bench::{block, block_file, last, program, Bench, CLEAR, CONFIG, LAYOUT, PROGRAM};
+use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 
@@ -340,7 +336,7 @@ fn the_last_block_may_come_again_and_is_written_once() {
             let mut other = block.clone();
             other[20] ^= 1;
             let len = other.len();
-            let crc = bench::block_crc(&other[..len - 4]);
+            let crc = kit::bench::block_crc(&other[..len - 4]);
             other[len - 4..].copy_from_slice(&crc.to_le_bytes());
             assert_eq!(bench.transfer(&other), Err(AbortCode::DEVICE_STATE), "block {number}");
         }

@@ -1,5 +1,4 @@
 //! A device for the tests, and the wire between both ends.
-#![allow(dead_code, missing_docs)]
 
 use canopen::frame::Channel;
 use canopen::od::{put, Access, DataType, Entry};

@@ -1,20 +1,14 @@
 //! A whole program in one download: raw image and Intel HEX, on a strict flash.
 
-mod bench;
-#[path = "../../../tests/src/ihex.rs"]
-#[allow(dead_code, reason = "the tests need its records")]
-mod ihex;
-mod model;
-
-use bench::*;
 use boot_core::bootloader::{entries, entry_count, Config};
 use boot_core::control::Policy;
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, Instant};
-use ihex::{record, END_OF_FILE as EOF};
-use model::{ModelFlash, CHIP};
+use kit::bench::*;
+use kit::ihex::{record, END_OF_FILE as EOF};
+use kit::model::{ModelFlash, CHIP};
 use proptest::prelude::*;
 use shared_abi::warm_start::BootRequest;
 

@@ -1,16 +1,8 @@
 //! What the objects say, and what the device does beside a download: each object of each program,
 //! emergencies, layer setting services, the second server, and commands in each other's way.
 
-mod bench;
-#[path = "../../../tests/src/ihex.rs"]
-#[allow(dead_code, reason = "the rig needs its records")]
-mod ihex;
-mod model;
-mod rig;
-
 use std::task::Poll;
 
-use bench::{Bench, CONFIG, CONTROL};
 use boot_core::bootloader::Config;
 use boot_core::control::{Policy, Step};
 use boot_core::flash::FlashFault;
@@ -21,8 +13,10 @@ use canopen::lss::{LssDevice, StoreError};
 use canopen::od::{Address, Objects};
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
-use model::{ModelFlash, CHIP};
-use rig::{
+use kit::bench::{Bench, CONFIG, CONTROL};
+use kit::boot::{leaked, Boot};
+use kit::model::{ModelFlash, CHIP};
+use kit::rig::{
     crc32, program, Rig, Setup, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
 };
 use shared_abi::label;
@@ -158,13 +152,13 @@ fn a_control_block_names_the_version() {
         rig.command(1, CLEAR).unwrap();
         rig.settle();
         // Manual L-1112d_10, figure 13: size, vendor-ID, product code, version, date.
-        let control = rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
+        let control = kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE, told, 0, 0]);
         let mut last = 600_u32.to_le_bytes().to_vec();
         last.extend(crc32(&image).to_le_bytes());
         for block in [
-            rig::block(0, 0, &control),
-            rig::block(1, STANDARD_1.region(1).base, &image),
-            rig::block(u32::MAX, 0, &last),
+            kit::rig::block(0, 0, &control),
+            kit::rig::block(1, STANDARD_1.region(1).base, &image),
+            kit::rig::block(u32::MAX, 0, &last),
         ] {
             rig.send(1, &block).unwrap();
             rig.settle();
@@ -182,8 +176,8 @@ fn a_hole_in_a_program_is_erased_with_it() {
     rig.install(1, &raw(&STANDARD_1, 1, 0x2C00));
     let (first, last) = (raw(&STANDARD_1, 1, 256), [0x5A; 16]);
     // The record of the end is cut off from the first data, and the end from the second.
-    let head = String::from_utf8(rig::hex(region.base, &first)).unwrap();
-    let tail = String::from_utf8(rig::hex(region.base + 0x2800, &last)).unwrap();
+    let head = String::from_utf8(kit::rig::hex(region.base, &first)).unwrap();
+    let tail = String::from_utf8(kit::rig::hex(region.base + 0x2800, &last)).unwrap();
     let text = head.lines().take(17).chain(tail.lines()).collect::<Vec<_>>().join("\n") + "\n";
     rig.command(1, CLEAR).unwrap();
     rig.settle();
@@ -370,7 +364,7 @@ fn the_end_of_work_is_told_by_an_emergency() {
     let mut rig = Rig::new(&STANDARD_1, 1024);
     rig.command(1, CLEAR).unwrap();
     rig.settle();
-    let mut bad = rig::block(0, 0, &[0; 8]);
+    let mut bad = kit::rig::block(0, 0, &[0; 8]);
     *bad.last_mut().unwrap() ^= 1;
     assert!(rig.send(1, &bad).is_err());
     rig.settle();
@@ -384,20 +378,10 @@ fn the_end_of_work_is_told_by_an_emergency() {
 fn a_device_tells_why_it_stayed() {
     let messages = |reason: u8, boot_up_emergency| {
         let mut flash = ModelFlash::new(&CHIP);
-        let journal = Journal::open(&flash, bench::LAYOUT.parameters);
         let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
-        let buffer = Box::leak(vec![0; 256].into_boxed_slice());
-        let unsealer = Box::leak(Box::<boot_core::unseal::Room>::default()).unsealer();
-        let mut node = boot_core::bootloader::Bootloader::<_, _, 1>::new(
-            config,
-            0x1234_5678,
-            bench::node(),
-            reason,
-            journal,
-            &mut flash,
-            buffer,
-            unsealer,
-        );
+        let (buffer, room) = leaked(256);
+        let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), reason };
+        let mut node = boot.on::<_, 1>(&mut flash, buffer, room);
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
         let mut bytes = [0; 4];
@@ -519,7 +503,7 @@ fn an_idle_device_stays_idle() {
     assert!(bench.node.busy());
     assert_eq!(bench.status() & BUSY, BUSY);
     bench.settle();
-    let journal = Journal::open(bench.node.flash(), bench::LAYOUT.parameters);
+    let journal = Journal::open(bench.node.flash(), kit::bench::LAYOUT.parameters);
     assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
 }
 
@@ -532,13 +516,13 @@ fn a_program_that_came_back_is_confirmed_once() {
     let mut bench = Bench::new(&mut flash);
     let confirmed = |bench: &mut Bench<'_>| {
         let flash = bench.node.flash();
-        let journal = Journal::open(flash, bench::LAYOUT.parameters);
+        let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
         ProgramRecord::load(&journal, flash, 1).map(|record| record.confirmed)
     };
     bench.node.confirm(1);
     bench.settle();
     assert_eq!(confirmed(&mut bench), None, "there is no program");
-    bench.install(&bench::program(200, 0x11));
+    bench.install(&kit::bench::program(200, 0x11));
     for nobody in [0, 2, 255] {
         bench.node.confirm(nobody);
         bench.settle();
@@ -564,13 +548,13 @@ fn a_program_that_came_back_is_confirmed_once() {
 fn a_busy_device_confirms_nothing() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    bench.install(&bench::program(200, 0x11));
+    bench.install(&kit::bench::program(200, 0x11));
     assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Pending);
     bench.node.confirm(1);
     bench.settle();
     assert_eq!(bench.node.stored(), Poll::Ready(Ok(())));
     let flash = bench.node.flash();
-    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
     assert_eq!(journal.get(flash, Key::Node).map(|[id, ..]| id), Some(9));
     assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
 }
@@ -581,7 +565,7 @@ fn a_busy_device_confirms_nothing() {
 fn a_signature_waits_for_a_confirmation() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::new(&mut flash);
-    bench.install(&bench::program(200, 0x11));
+    bench.install(&kit::bench::program(200, 0x11));
     for command in [SET_SIGNATURE, CLR_SIGNATURE] {
         bench.node.confirm(1);
         assert_eq!(bench.node.write(CONTROL, &[command]), Err(MAN_BUSY));
@@ -591,7 +575,7 @@ fn a_signature_waits_for_a_confirmation() {
     assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Trial(1)));
     assert_eq!(bench.command(SET_SIGNATURE), 0);
     let flash = bench.node.flash();
-    let journal = Journal::open(flash, bench::LAYOUT.parameters);
+    let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
     let record = ProgramRecord::load(&journal, flash, 1).unwrap();
     assert!(record.confirmed && record.signed);
 }
@@ -637,8 +621,8 @@ fn the_next_block_is_taken_while_the_flash_works_if_there_is_room() {
         let mut rig = Rig::new(&STANDARD_2, buffer);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
-        rig.send(1, &rig::block(0, 0, &rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
-        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.send(1, &kit::rig::block(0, 0, &kit::rig::words(&[600, VENDOR_ID, PRODUCT_CODE]))).unwrap();
+        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
         assert_eq!(rig.status(1) & BUSY, u32::from(!room));
         let next = rig.node.download_start(Address::new(0x1F50, 1), None);
         assert_eq!(next, if room { Ok(()) } else { Err(MAN_BUSY) }, "{buffer}");
@@ -659,9 +643,9 @@ fn what_no_block_has_belongs_to_the_program_and_is_erased() {
     rig.command(1, CLEAR).unwrap();
     rig.settle();
     for block in [
-        rig::block(0, 0, &[0; 8]),
-        rig::block(1, region.base, &data),
-        rig::block(u32::MAX, 0, &rig::words(&[0x2400, crc32(&whole)])),
+        kit::rig::block(0, 0, &[0; 8]),
+        kit::rig::block(1, region.base, &data),
+        kit::rig::block(u32::MAX, 0, &kit::rig::words(&[0x2400, crc32(&whole)])),
     ] {
         rig.send(1, &block).unwrap();
         rig.settle();
@@ -722,14 +706,14 @@ fn a_block_is_refused_while_programming_is_not_allowed() {
     let policy = Policy { allowed: || ALLOWED.load(Ordering::Relaxed), ..Policy::DEFAULT };
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::with(&mut flash, policy);
-    bench.install(&bench::program(200, 0x11));
+    bench.install(&kit::bench::program(200, 0x11));
     assert_eq!(bench.command(CLEAR), 0);
     ALLOWED.store(false, Ordering::Relaxed);
     bench.node.flash().touched.clear();
-    assert_eq!(bench.block(&bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
+    assert_eq!(bench.block(&kit::bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
     assert_eq!(bench.node.flash().touched, []);
     ALLOWED.store(true, Ordering::Relaxed);
-    bench.install(&bench::program(300, 0x22));
+    bench.install(&kit::bench::program(300, 0x22));
 }
 
 /// SYS TEC manual, table 3: SECURED for what belongs to the bootloader, ADDRESS for all else.
@@ -761,10 +745,10 @@ fn a_block_outside_the_program_is_refused_with_the_reason() {
         let mut rig = Rig::new(&STANDARD_1, 32 * 1024);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
-        rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+        rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
         rig.settle();
         rig.chip.model().touched.clear();
-        assert!(rig.send(1, &rig::block(1, base, &vec![0; size])).is_err(), "{base:#x}, {size}");
+        assert!(rig.send(1, &kit::rig::block(1, base, &vec![0; size])).is_err(), "{base:#x}, {size}");
         rig.settle();
         assert_eq!(rig.status(1), status, "{base:#x}, {size}");
         assert_eq!(rig.chip.model().touched, [], "{base:#x}, {size}");
@@ -786,7 +770,7 @@ fn open(setup: &'static Setup, buffer: usize) -> Rig {
     let mut rig = Rig::new(setup, buffer);
     rig.command(1, CLEAR).unwrap();
     rig.settle();
-    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
     rig.settle();
     rig
 }
@@ -795,7 +779,7 @@ fn open(setup: &'static Setup, buffer: usize) -> Rig {
 #[test]
 fn a_block_that_is_no_block_is_told_how() {
     let base = STANDARD_1.region(1).base;
-    let whole = rig::block(1, base, &raw(&STANDARD_1, 1, 64));
+    let whole = kit::rig::block(1, base, &raw(&STANDARD_1, 1, 64));
     for (len, abort) in [
         (4, LENGTH_TOO_LOW),
         (11, LENGTH_TOO_LOW),
@@ -818,7 +802,7 @@ fn a_block_that_is_no_block_is_told_how() {
 #[test]
 fn a_block_is_as_large_as_the_buffer_and_no_larger() {
     let base = STANDARD_1.region(1).base;
-    let block = |size: usize| rig::block(1, base, &raw(&STANDARD_1, 1, size));
+    let block = |size: usize| kit::rig::block(1, base, &raw(&STANDARD_1, 1, size));
     for (buffer, largest) in [(1024, 1024), (16 * 1024, 16_384), (64 * 1024, 16_384)] {
         let largest = largest - 16;
         // The program has less flash than the largest block.
@@ -855,7 +839,7 @@ fn the_first_number_tells_a_block() {
         let mut rig = Rig::new(&STANDARD_1, 1024);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
-        assert!(rig.send(1, &rig::block(number, base, &[0; 64])).is_err());
+        assert!(rig.send(1, &kit::rig::block(number, base, &[0; 64])).is_err());
         assert_eq!(rig.status(1), status, "{number:X}");
     }
 }
@@ -866,7 +850,7 @@ fn only_the_last_block_may_be_longer_than_it_says() {
     let region = STANDARD_1.region(1);
     let image = raw(&STANDARD_1, 1, 64);
     let old = |number: u32, address: u32, data: &[u8; 40], told: u32| {
-        let mut bytes = rig::words(&[number, address, told]);
+        let mut bytes = kit::rig::words(&[number, address, told]);
         bytes.extend(data);
         bytes.extend(crc32(&bytes).to_le_bytes());
         bytes
@@ -876,7 +860,7 @@ fn only_the_last_block_may_be_longer_than_it_says() {
     last[36..].copy_from_slice(&crc32(&image).to_le_bytes());
     for (number, told, good) in [(u32::MAX, 8, true), (u32::MAX, 9, false), (2, 8, false)] {
         let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
         rig.settle();
         let sent = rig.send(1, &old(number, region.base + 64, &last, told));
         assert_eq!(sent, if good { Ok(()) } else { Err(LENGTH) }, "{number:X}, {told}");
@@ -892,9 +876,9 @@ fn a_program_is_its_first_two_vectors_at_least() {
     for (size, status) in [(7, FORMAT), (8, 0)] {
         let image = raw(&STANDARD_1, 1, 8);
         let mut rig = open(&STANDARD_1, 1024);
-        rig.send(1, &rig::block(1, region.base, &image)).unwrap();
+        rig.send(1, &kit::rig::block(1, region.base, &image)).unwrap();
         rig.settle();
-        let last = rig::block(u32::MAX, 0, &rig::words(&[size, crc32(&image[..size as usize])]));
+        let last = kit::rig::block(u32::MAX, 0, &kit::rig::words(&[size, crc32(&image[..size as usize])]));
         assert_eq!(rig.send(1, &last).is_ok(), status == 0, "{size}");
         rig.settle();
         assert_eq!(rig.status(1), status, "{size}");
@@ -905,12 +889,12 @@ fn a_program_is_its_first_two_vectors_at_least() {
 /// that is no program's; what goes beyond is not Intel HEX.
 #[test]
 fn a_record_stays_in_its_segment() {
-    let segment = ihex::record(0, 2, &[0x10, 0x00]);
+    let segment = kit::ihex::record(0, 2, &[0x10, 0x00]);
     for (offset, status) in [(0x2000, ADDRESS), (0xFFF0, ADDRESS), (0xFFF1, FORMAT)] {
         let mut rig = Rig::new(&STANDARD_1, 4096);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
-        let text = format!("{segment}\n{}\n", ihex::record(offset, 0, &[0; 16]));
+        let text = format!("{segment}\n{}\n", kit::ihex::record(offset, 0, &[0; 16]));
         assert!(rig.send(1, text.as_bytes()).is_err());
         rig.settle();
         assert_eq!(rig.status(1), status, "{offset:X}");
@@ -938,7 +922,7 @@ fn a_size_that_is_told_is_erased_ahead() {
 fn clear_ends_the_download_of_its_own_program() {
     let image = raw(&STANDARD_2, 1, 600);
     let mut rig = open(&STANDARD_2, 1024);
-    rig.send(1, &rig::block(1, STANDARD_2.region(1).base, &image)).unwrap();
+    rig.send(1, &kit::rig::block(1, STANDARD_2.region(1).base, &image)).unwrap();
     assert_eq!(rig.status(1) & BUSY, BUSY);
     assert_eq!(rig.command(2, CLEAR), Err(MAN_BUSY));
     assert_eq!(rig.command(1, CLEAR), Ok(()));
@@ -957,8 +941,10 @@ fn a_block_goes_on_beside_a_command_that_fails() {
     rig.command(1, CLEAR).unwrap();
     rig.settle();
     let base = STANDARD_2.region(1).base;
-    let last = rig::words(&[600, crc32(&one)]);
-    for block in [rig::block(0, 0, &[0; 8]), rig::block(1, base, &one), rig::block(u32::MAX, 0, &last)] {
+    let last = kit::rig::words(&[600, crc32(&one)]);
+    for block in
+        [kit::rig::block(0, 0, &[0; 8]), kit::rig::block(1, base, &one), kit::rig::block(u32::MAX, 0, &last)]
+    {
         rig.begin(1, None, &block[..10]).unwrap();
         let next = rig.chip.model().operations + 1;
         rig.chip.model().fail = Some((next, FlashFault::Protected));
@@ -978,7 +964,7 @@ fn a_block_goes_on_beside_a_command_that_fails() {
 fn a_refused_block_is_no_emergency() {
     let mut rig = open(&STANDARD_1, 1024);
     let base = STANDARD_1.region(1).base;
-    assert!(rig.send(1, &rig::block(7, base + 0x400, &[0; 64])).is_err());
+    assert!(rig.send(1, &kit::rig::block(7, base + 0x400, &[0; 64])).is_err());
     rig.settle();
     assert_eq!((rig.status(1), rig.node.next_emergency()), (SEQUENCE, None));
 }
@@ -993,13 +979,13 @@ fn a_release_beside_an_open_download_leaves_it_open() {
     rig.settle();
     rig.command(1, CLEAR).unwrap();
     rig.settle();
-    rig.send(1, &rig::block(0, 0, &[0; 8])).unwrap();
+    rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
     rig.command(1, SET_SIGNATURE).unwrap();
     rig.settle();
     assert_eq!(rig.stored().records[0].map(|record| record.2), Some(true), "it is released");
     let base = STANDARD_1.region(1).base;
-    let last = rig::words(&[900, crc32(&new)]);
-    for block in [rig::block(1, base, &new), rig::block(u32::MAX, 0, &last)] {
+    let last = kit::rig::words(&[900, crc32(&new)]);
+    for block in [kit::rig::block(1, base, &new), kit::rig::block(u32::MAX, 0, &last)] {
         assert_eq!(rig.send(1, &block), Ok(()));
         rig.settle();
     }
@@ -1010,7 +996,7 @@ fn a_release_beside_an_open_download_leaves_it_open() {
 #[test]
 fn a_stream_that_is_refused_as_it_begins_leaves_nothing() {
     let image = raw(&STANDARD_1, 1, 600);
-    let text = ihex::intel_hex(STANDARD_1.region(1).base, &image);
+    let text = kit::ihex::intel_hex(STANDARD_1.region(1).base, &image);
     let mut rig = Rig::new(&STANDARD_1, 1024);
     rig.command(1, CLEAR).unwrap();
     rig.settle();
@@ -1035,7 +1021,7 @@ fn a_record_fits_into_half_of_the_buffer() {
         let mut rig = Rig::new(&STANDARD_1, buffer);
         rig.command(1, CLEAR).unwrap();
         rig.settle();
-        let sent = rig.send(1, ihex::intel_hex(base, &image).as_bytes());
+        let sent = rig.send(1, kit::ihex::intel_hex(base, &image).as_bytes());
         assert_eq!(sent.is_ok(), fits, "{buffer}: {sent:?}");
         rig.settle();
         assert_eq!(rig.state(1) == 0, fits, "{buffer}");

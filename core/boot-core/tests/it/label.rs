@@ -2,18 +2,15 @@
 //! anything is lost if the label is in the first block, and never becomes valid if it is in a later
 //! one.
 
-mod bench;
-mod model;
-
-use bench::{
-    autostart, block, block_file, cut_at_every_operation, program, Bench, CLEAR, IDENTIFICATION, LAYOUT,
-    SET_SIGNATURE, START,
-};
 use boot_core::control::{Policy, Verdict};
 use boot_core::store::{Journal, ProgramRecord};
 use canopen::program::FlashError;
 use canopen::AbortCode;
-use model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use kit::bench::{
+    autostart, block, block_file, cut_at_every_operation, program, Bench, CLEAR, IDENTIFICATION, LAYOUT,
+    SET_SIGNATURE, START,
+};
+use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::block_file::Control;
 use shared_abi::label::{self, Label};
 use shared_abi::warm_start::BootRequest;

@@ -1,6 +1,5 @@
 //! A device with the debugger interface, and a memory that fails the test if it is accessed without
 //! permission.
-#![allow(dead_code, missing_docs)]
 
 use core::task::Poll;
 
@@ -10,26 +9,14 @@ use canopen::lss::{LssDevice, StoreError};
 use canopen::node::{Config, Node};
 use canopen::od::{put, Entry};
 use canopen::slave::SlaveDevice;
-use canopen::{AbortCode, Address, BitRate, CobId, Frame, Instant, NodeId, Objects};
+use canopen::{AbortCode, Address, BitRate, Frame, NodeId, Objects};
 
-pub const NODE: u8 = 5;
+use crate::bus::{at, node, request};
+
 /// RAM of this size; a ROM of the same size lies before it.
 pub const SIZE: u32 = 0x1000;
 pub const RAM: u32 = 0x2000_0000;
 pub const ROM: u32 = RAM - SIZE;
-
-pub fn node() -> NodeId {
-    NodeId::new(NODE).unwrap()
-}
-
-pub fn at(millis: u32) -> Instant {
-    Instant::from_millis(millis)
-}
-
-/// A frame of the client to the server.
-pub fn request(bytes: [u8; 8]) -> Frame {
-    Frame::of(CobId::sdo_request(node()), &bytes)
-}
 
 #[derive(Debug)]
 pub struct Model {

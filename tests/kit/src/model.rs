@@ -1,6 +1,5 @@
 //! A strict flash: it behaves like the F4's, refuses operations that the F4 would carry out wrongly
 //! without an error, and loses power on demand.
-#![allow(dead_code)]
 
 use std::cell::{Cell, RefCell, RefMut};
 use std::collections::BTreeMap;

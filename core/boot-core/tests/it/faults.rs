@@ -1,16 +1,10 @@
 //! Faults that were found by review: work on one program that affects another one, and the journal
 //! of a newer bootloader.
 
-#[path = "../../../tests/src/ihex.rs"]
-#[allow(dead_code, reason = "the tests need its records")]
-mod ihex;
-mod model;
-mod rig;
-
 use canopen::od::Address;
 use canopen::{BitRate, NodeId};
-use model::{ModelFlash, CHIP};
-use rig::{
+use kit::model::{ModelFlash, CHIP};
+use kit::rig::{
     block, crc32, hex, program, words, Rig, Setup, AT_ONCE_2, ESACADEMY_2, LIFT_2, PRODUCT_CODE, STANDARD_1,
     STANDARD_2,
 };

@@ -1,13 +1,11 @@
 //! The boot decision: the promised order of its checks.
 
-mod model;
-
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::flash::run;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
-use model::ModelFlash;
+use kit::model::ModelFlash;
 use shared_abi::handoff::ResetCause;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;

@@ -11,14 +11,6 @@
 //! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-core --test attacker lift_2    # one, with its actions
 //! ```
 
-#[path = "../../../tests/src/ihex.rs"]
-#[allow(dead_code, reason = "the tests need its records")]
-mod ihex;
-mod model;
-#[path = "../../../tests/src/random.rs"]
-mod random;
-mod rig;
-
 use std::cell::Cell;
 use std::fmt;
 use std::panic::{catch_unwind, AssertUnwindSafe};
@@ -29,9 +21,9 @@ use boot_core::flash::FlashFault;
 use boot_core::store::NodeParameters;
 use canopen::od::Address;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use model::{Cut, PowerCut};
-use random::Random;
-use rig::{block, crc32, hex, program, words, Rig, Setup, Stored, PRODUCT_CODE, VENDOR_ID};
+use kit::model::{Cut, PowerCut};
+use kit::random::Random;
+use kit::rig::{block, crc32, hex, program, words, Rig, Setup, Stored, PRODUCT_CODE, VENDOR_ID};
 use shared_abi::geometry::Region;
 use shared_abi::label;
 use shared_abi::warm_start::BootRequest;
@@ -951,12 +943,6 @@ impl Attack {
     }
 }
 
-impl Setup {
-    fn has(&self, program: u8) -> bool {
-        (1..=self.programs()).contains(&program)
-    }
-}
-
 /// The program to start.
 fn number(request: BootRequest) -> Option<u8> {
     match request {
@@ -1106,7 +1092,7 @@ macro_rules! attacked {
         $(
             #[test]
             fn $test() {
-                attacks(&rig::$setup);
+                attacks(&kit::rig::$setup);
             }
         )*
     };

@@ -1,14 +1,8 @@
 //! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
 
-#[path = "../../../tests/src/ihex.rs"]
-#[allow(dead_code, reason = "the rig needs its records")]
-mod ihex;
-mod model;
-mod rig;
-
 use canopen::AbortCode;
-use model::{quiet_power_cuts, until_power_cut, Cut};
-use rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
+use kit::model::{quiet_power_cuts, until_power_cut, Cut};
+use kit::rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::Region;
 
 const CLEAR: u8 = 0x03;

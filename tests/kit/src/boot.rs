@@ -1,0 +1,56 @@
+//! The one way to make a bootloader in a test: what it starts from, and then the flash.
+
+use boot_core::bootloader::{Bootloader, Config};
+use boot_core::flash::Flash;
+use boot_core::store::{Journal, NodeParameters, Parameters};
+use boot_core::unseal::Room;
+
+/// What a bootloader starts from, apart from its memory.
+pub struct Boot {
+    /// The product.
+    pub config: &'static Config,
+    /// Node-ID and bit rate as stored.
+    pub node: NodeParameters,
+    /// The device's own number.
+    pub serial_number: u32,
+    /// The code of the reason why the device stayed in the bootloader.
+    pub reason: u8,
+}
+
+impl Boot {
+    /// A device with the serial number 0 that stayed for no reason.
+    #[must_use]
+    pub fn new(config: &'static Config, node: NodeParameters) -> Self {
+        Self { config, node, serial_number: 0, reason: 0 }
+    }
+
+    /// Starts on this flash, with the journal in it.
+    pub fn on<'b, F: Flash, const PROGRAMS: usize>(
+        self,
+        flash: F,
+        buffer: &'b mut [u8],
+        room: &'b mut Room,
+    ) -> Bootloader<'b, F, Journal, PROGRAMS> {
+        let journal = Journal::open(&flash, self.config.layout.parameters);
+        self.with(journal, flash, buffer, room)
+    }
+
+    /// Starts on this flash, with the parameters in this store.
+    pub fn with<'b, F: Flash, P: Parameters, const PROGRAMS: usize>(
+        self,
+        parameters: P,
+        flash: F,
+        buffer: &'b mut [u8],
+        room: &'b mut Room,
+    ) -> Bootloader<'b, F, P, PROGRAMS> {
+        let Self { config, node, serial_number, reason } = self;
+        Bootloader::new(config, serial_number, node, reason, parameters, flash, buffer, room.unsealer())
+    }
+}
+
+/// A buffer for blocks, and the state of sealed images, for a bootloader that lives as long as the
+/// test.
+#[must_use]
+pub fn leaked(buffer: usize) -> (&'static mut [u8], &'static mut Room) {
+    (vec![0; buffer].leak(), Box::leak(Box::default()))
+}

@@ -1,0 +1,33 @@
+//! What the tests of several crates share. It is a crate, so that each of its parts is compiled once
+//! and has one place; no crate that is handed out needs it, except for its own tests.
+//!
+//! | module | what it has |
+//! |---|---|
+//! | [`random`] | random numbers by a seed |
+//! | [`ihex`] | Intel HEX as tools write it |
+//! | [`bus`] | feature `bus`: a CANopen device with a domain, and frames to it and from it |
+//! | [`memory`] | feature `debugger`: a device with the debugger interface, and its memory |
+//! | [`model`] | feature `boot`: a strict flash that loses power on demand |
+//! | [`boot`] | feature `boot`: the one way to make a bootloader |
+//! | [`bench`] | feature `boot`: a bootloader on that flash, and the actions of a host |
+//! | [`rig`] | feature `boot`: a bootloader of any profile, driven by its objects alone |
+
+#[cfg(feature = "boot")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod bench;
+#[cfg(feature = "boot")]
+pub mod boot;
+#[cfg(feature = "bus")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod bus;
+pub mod ihex;
+#[cfg(feature = "debugger")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod memory;
+#[cfg(feature = "boot")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod model;
+pub mod random;
+#[cfg(feature = "boot")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod rig;
