@@ -1,6 +1,6 @@
 //! Hash, key ids and encryption of sealed images, each implemented by an external crate.
 
-use hmac::{Hmac, Mac as _};
+use hmac::{Hmac, KeyInit as _, Mac as _};
 use sha2::{Digest as _, Sha512, Sha512_256};
 
 /// SHA-512/256 (FIPS 180-4): the only hash of sealed images.
