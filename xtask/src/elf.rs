@@ -1,7 +1,8 @@
-//! A reader of ELF files with the parts that the size gate needs: 32 bit, little-endian (System V
-//! ABI, chapters 4 and 5).
-//!
-//! Every offset in the file may be hostile: an offset outside the file is an error with a message.
+//! The loaded pieces and the sections of a 32-bit little-endian ELF file.
+
+use object::elf::{FileHeader32, PT_LOAD, SHF_ALLOC, SHT_NOBITS};
+use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
+use object::LittleEndian;
 
 use crate::Outcome;
 
@@ -32,103 +33,50 @@ pub struct Section {
     pub loaded: bool,
 }
 
-/// A function or a static.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Symbol {
-    /// The name as mangled by the compiler.
-    pub name: String,
-    /// Its address; bit 0 is set for a Thumb function.
-    pub address: u32,
-    /// Its length in bytes.
-    pub size: u32,
-    /// Index of its section in [`Elf::sections`].
-    pub section: usize,
-}
-
 /// The contents of an ELF file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Elf {
     /// The loaded segments.
     pub segments: Vec<Segment>,
-    /// All sections, in the order of the file, so that a symbol's section index is valid.
+    /// All sections, in the order of the file.
     pub sections: Vec<Section>,
-    /// Functions and statics; empty in a stripped file.
-    pub symbols: Vec<Symbol>,
 }
-
-const PT_LOAD: u32 = 1;
-const SHT_SYMTAB: u32 = 2;
-const SHT_NOBITS: u32 = 8;
-const SHF_ALLOC: u32 = 2;
-const STT_OBJECT: u8 = 1;
-const STT_FUNC: u8 = 2;
 
 impl Elf {
     /// Reads an ELF file.
     ///
     /// # Errors
-    /// When it is not a 32-bit little-endian ELF file, or one of its tables points outside the
-    /// file.
+    /// When it is not a 32-bit little-endian ELF file, or one of its tables or segments is outside
+    /// the file.
     pub fn parse(file: &[u8]) -> Outcome<Self> {
-        let file = File(file);
-        if file.bytes(0, 6)? != [0x7F, b'E', b'L', b'F', 1, 1] {
-            return Err("this is no 32-bit little-endian ELF file.".into());
-        }
+        let invalid = |error| format!("this is no 32-bit little-endian ELF file, or it is cut off: {error}.");
+        let header = FileHeader32::<LittleEndian>::parse(file).map_err(invalid)?;
         let mut segments = Vec::new();
-        for header in file.table(file.word(0x1C)?, file.half(0x2A)?, file.half(0x2C)?, 32)? {
-            if file.word(header)? == PT_LOAD {
-                let segment = Segment {
-                    offset: file.word(header + 4)?,
-                    load_address: file.word(header + 12)?,
-                    file_size: file.word(header + 16)?,
-                };
-                file.bytes(segment.offset as usize, segment.file_size as usize)?;
-                segments.push(segment);
+        for segment in header.program_headers(LittleEndian, file).map_err(invalid)? {
+            if segment.p_type(LittleEndian) == PT_LOAD {
+                segment
+                    .data(LittleEndian, file)
+                    .map_err(|()| "a segment is outside of the ELF file.".to_owned())?;
+                segments.push(Segment {
+                    offset: segment.p_offset(LittleEndian),
+                    load_address: segment.p_paddr(LittleEndian),
+                    file_size: segment.p_filesz(LittleEndian),
+                });
             }
         }
-
-        let headers: Vec<usize> =
-            file.table(file.word(0x20)?, file.half(0x2E)?, file.half(0x30)?, 40)?.collect();
-        let extent = |header: usize| -> Outcome<(usize, usize)> {
-            Ok((file.word(header + 16)? as usize, file.word(header + 20)? as usize))
+        let table = header.sections(LittleEndian, file).map_err(invalid)?;
+        let section = |section: &_| {
+            let name = table.section_name(LittleEndian, section).map_err(invalid)?;
+            let is_allocated = section.sh_flags(LittleEndian) & SHF_ALLOC != 0;
+            Ok(Section {
+                name: String::from_utf8_lossy(name).into_owned(),
+                address: section.sh_addr(LittleEndian),
+                offset: section.sh_offset(LittleEndian),
+                size: section.sh_size(LittleEndian),
+                loaded: is_allocated && section.sh_type(LittleEndian) != SHT_NOBITS,
+            })
         };
-        let names = match headers.get(usize::from(file.half(0x32)?)) {
-            Some(&header) => extent(header)?,
-            None => (0, 0),
-        };
-        let mut sections = Vec::new();
-        let mut symbols = Vec::new();
-        for &header in &headers {
-            let kind = file.word(header + 4)?;
-            sections.push(Section {
-                name: file.name(names, file.word(header)?)?,
-                address: file.word(header + 12)?,
-                offset: file.word(header + 16)?,
-                size: file.word(header + 20)?,
-                loaded: file.word(header + 8)? & SHF_ALLOC != 0 && kind != SHT_NOBITS,
-            });
-            if kind == SHT_SYMTAB {
-                let Some(&strings) = headers.get(file.word(header + 24)? as usize) else {
-                    return Err("the symbol table names a string table that is not there.".into());
-                };
-                let strings = extent(strings)?;
-                let (offset, size) = extent(header)?;
-                for entry in file.bytes(offset, size)?.chunks_exact(16) {
-                    let entry = File(entry);
-                    let [info] = entry.bytes(12, 1)? else { unreachable!("one byte was asked for") };
-                    let section = usize::from(entry.half(14)?);
-                    if matches!(info & 0xF, STT_OBJECT | STT_FUNC) && section < headers.len() {
-                        symbols.push(Symbol {
-                            name: file.name(strings, entry.word(0)?)?,
-                            address: entry.word(4)?,
-                            size: entry.word(8)?,
-                            section,
-                        });
-                    }
-                }
-            }
-        }
-        Ok(Self { segments, sections, symbols })
+        Ok(Self { segments, sections: table.iter().map(section).collect::<Outcome<_>>()? })
     }
 
     /// The address of a section's bytes in flash, if the image contains them.
@@ -148,50 +96,12 @@ impl Elf {
     }
 }
 
-/// A file whose every access is checked.
-#[derive(Clone, Copy)]
-struct File<'a>(&'a [u8]);
-
-impl<'a> File<'a> {
-    fn bytes(self, offset: usize, len: usize) -> Outcome<&'a [u8]> {
-        offset.checked_add(len).and_then(|end| self.0.get(offset..end)).ok_or_else(|| {
-            format!("the ELF file is cut off: it refers to {len} bytes at offset {offset:#x}.")
-        })
-    }
-
-    fn half(self, offset: usize) -> Outcome<u16> {
-        self.bytes(offset, 2).map(|bytes| u16::from_le_bytes([bytes[0], bytes[1]]))
-    }
-
-    fn word(self, offset: usize) -> Outcome<u32> {
-        self.bytes(offset, 4).map(|bytes| u32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]))
-    }
-
-    /// The offsets of a table's entries, each at least `least` bytes long and all inside the file.
-    fn table(self, offset: u32, size: u16, count: u16, least: u16) -> Outcome<impl Iterator<Item = usize>> {
-        if count > 0 && size < least {
-            return Err(format!("the ELF file has table entries of {size} bytes where {least} are needed."));
-        }
-        let (offset, size, count) = (offset as usize, usize::from(size), usize::from(count));
-        self.bytes(offset, size * count)?;
-        Ok((0..count).map(move |entry| offset + entry * size))
-    }
-
-    /// A string of a string table (its offset and length).
-    fn name(self, (offset, len): (usize, usize), at: u32) -> Outcome<String> {
-        let strings = self.bytes(offset, len)?;
-        let rest = strings.get(at as usize..).unwrap_or_default();
-        let end = rest.iter().position(|&byte| byte == 0).unwrap_or(rest.len());
-        Ok(String::from_utf8_lossy(&rest[..end]).into_owned())
-    }
-}
-
 #[cfg(test)]
 pub mod tests {
     use super::*;
 
     /// A file built by hand after the System V ABI: a vector table at 0800_0000, and `.data` that
-    /// runs at 2000_0000 and is loaded after the vectors; one function in `.vectors`.
+    /// runs at 2000_0000 and is loaded after the vectors.
     pub fn by_hand() -> Vec<u8> {
         let mut file = vec![
             0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, // e_ident
@@ -215,10 +125,6 @@ pub mod tests {
         let strings = b"\0.vectors\0.data\0.bss\0.symtab\0.shstrtab\0start\0"; // 45 bytes at 0x128
         file.extend(strings);
         file.resize(0x160, 0);
-        // name, value, size, info/other/shndx
-        put(&mut file, &[0, 0, 0, 0]);
-        put(&mut file, &[39, 0x0800_0011, 0x10, 0x0001_0012]); // FUNC, GLOBAL, section 1
-        put(&mut file, &[39, 0x0800_0000, 0, 0x0001_0003]); // SECTION: of no interest
         file.resize(0x200, 0);
         // name, type, flags, addr, offset, size, link, info, addralign, entsize
         put(&mut file, &[0; 10]);
@@ -245,8 +151,6 @@ pub mod tests {
         assert_eq!(names, ["", ".vectors", ".data", ".bss", ".symtab", ".symtab", ".shstrtab"]);
         let loads: Vec<_> = elf.sections.iter().map(|section| elf.load_address(section)).collect();
         assert_eq!(loads, [None, Some(0x0800_0000), Some(0x0800_0020), None, None, None, None]);
-        let symbol = Symbol { name: "start".into(), address: 0x0800_0011, size: 0x10, section: 1 };
-        assert_eq!(elf.symbols, [symbol]);
     }
 
     #[test]

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use addr2line::Loader;
+use addr2line::gimli::{Dwarf, EndianSlice, Error, LittleEndian};
+use addr2line::Context;
+use object::{Object, ObjectSection};
 
 use crate::{workspace, Outcome};
 
@@ -12,18 +14,24 @@ pub const ZEROS: &str = "(zeros)";
 /// A shorter run of zeros belongs to the code or data around it.
 const LONG: usize = 64;
 
-/// The number of bytes of each part, for these contents at this address of an ELF file. A part is a
+/// The number of bytes of each part, for these contents at this address of the ELF file `elf`, which
+/// contains `file`. A part is a
 /// module of one of our crates (`boot-core/intake`), or another author's crate.
 ///
 /// # Errors
 /// When the file has no debug information that can be read.
-pub fn of(elf: &Path, address: u32, contents: &[u8]) -> Outcome<BTreeMap<String, u32>> {
+pub fn of(elf: &Path, file: &[u8], address: u32, contents: &[u8]) -> Outcome<BTreeMap<String, u32>> {
     /// The length of the shortest instruction.
     const STEP: usize = 2;
     let unreadable = |error: &dyn std::fmt::Display| {
         format!("the debug information of {} cannot be read: {error}.", workspace::shown(elf))
     };
-    let loader = Loader::new(elf).map_err(|error| unreadable(&error))?;
+    let object = object::File::parse(file).map_err(|error| unreadable(&error))?;
+    let section = |name: &str| object.section_by_name(name).and_then(|section| section.data().ok());
+    let dwarf = Dwarf::load(|id| {
+        Ok::<_, Error>(EndianSlice::new(section(id.name()).unwrap_or_default(), LittleEndian))
+    });
+    let context = dwarf.and_then(Context::from_dwarf).map_err(|error| unreadable(&error))?;
     let root = workspace::root();
     let mut parts = BTreeMap::new();
     let mut at = 0;
@@ -34,8 +42,8 @@ pub fn of(elf: &Path, address: u32, contents: &[u8]) -> Outcome<BTreeMap<String,
             at += zeros;
             continue;
         }
-        let mut frames =
-            loader.find_frames(u64::from(address) + at as u64).map_err(|error| unreadable(&error))?;
+        let frames = context.find_frames(u64::from(address) + at as u64).skip_all_loads();
+        let mut frames = frames.map_err(|error| unreadable(&error))?;
         let mut files = Vec::new();
         while let Some(frame) = frames.next().map_err(|error| unreadable(&error))? {
             files.extend(frame.location.and_then(|location| location.file).map(str::to_owned));

@@ -95,7 +95,7 @@ fn tables(board: &Layout, name: &str) -> Outcome<(Flash, Vec<Share>)> {
     let image = image.ok_or_else(|| format!("{name} is no bootloader: it has no RAM image."))?;
     let file = fs::read(&path).map_err(|error| format!("{}: {error}.", workspace::shown(&path)))?;
     let contents = &file[image.offset as usize..][..image.size as usize];
-    let parts = by_part(&elf, parts::of(&path, image.address, contents)?);
+    let parts = by_part(&elf, parts::of(&path, &file, image.address, contents)?);
     println!("\npart                               raw  packed (share)");
     for Share { part, raw, packed } in &parts {
         println!("{part:<31} {raw:>6}  {packed:>6}");
