@@ -1,7 +1,7 @@
 //! The jobs of the repository: `cargo xtask` lists them.
 //!
-//! There is one file for each job. This crate depends only on the standard library, on `shared-abi`
-//! and on two small crates, so that it compiles in seconds on a machine with only a Rust toolchain.
+//! There is one file for each job. This crate depends on the standard library, on `shared-abi` and on a
+//! few small crates, so that it compiles in seconds on a machine with only a Rust toolchain.
 //! Jobs that need more call [`setup`] first.
 #![forbid(unsafe_code)]
 
@@ -74,185 +74,51 @@ struct Job {
     run: fn(Args) -> Outcome,
 }
 
-/// The jobs, in the order in which a newcomer needs them.
-const JOBS: &[Job] = &[
-    Job {
-        name: "demo",
-        about: "the main job: flash, start, call back and flash again on an emulated board",
-        help: demo::HELP,
-        run: demo::run,
-    },
-    Job {
-        name: "check",
-        about: "before each commit: formatting, clippy, arrows, unit tests; two minutes",
-        help: check::HELP,
-        run: check::run,
-    },
-    Job {
-        name: "test",
-        about: "the tests of the product, with one summary at the end; --all for all",
-        help: test::HELP,
-        run: test::run,
-    },
-    Job {
-        name: "build",
-        about: "the firmware of a board: bootloader and both versions of the application",
-        help: build::HELP,
-        run: build::run,
-    },
-    Job {
-        name: "emulate",
-        about: "an emulated board for other programs to talk to",
-        help: emulate::HELP,
-        run: emulate::run,
-    },
-    Job {
-        name: "hil",
-        about: "the main job and the update suite on a real board, through a debug probe",
-        help: hil::HELP,
-        run: hil::run,
-    },
-    Job {
-        name: "layout",
-        about: "the memory map of a board, or its linker fragment",
-        help: layout::HELP,
-        run: layout::run,
-    },
-    Job {
-        name: "new-board",
-        about: "the three files of a port, with steps to go through",
-        help: new_board::HELP,
-        run: new_board::run,
-    },
-    Job {
-        name: "chips",
-        about: "a board for every chip, built and updated in the emulator",
-        help: chips::HELP,
-        run: chips::run,
-    },
-    Job {
-        name: "examples",
-        about: "the programs in examples/, each built by its own tools",
-        help: examples::HELP,
-        run: examples::run,
-    },
-    Job {
-        name: "diagrams",
-        about: "the graphs of the documents, from text",
-        help: diagrams::HELP,
-        run: diagrams::run,
-    },
-    Job { name: "docs", about: "the pages as a site, its links checked", help: book::HELP, run: book::run },
-    Job { name: "eds", about: "the EDS files of bootloader and application", help: eds::HELP, run: eds::run },
-    Job {
-        name: "fuzz",
-        about: "the fuzz targets, each for a while (nightly toolchain)",
-        help: fuzz::HELP,
-        run: fuzz::run,
-    },
-    Job {
-        name: "deny",
-        about: "licences and origins of the crates of others",
-        help: deny::HELP,
-        run: deny::run,
-    },
-    Job {
-        name: "bench",
-        about: "how fast a program gets into the device, beside the limits of wire and flash",
-        help: bench::HELP,
-        run: bench::run,
-    },
-    Job {
-        name: "powercut",
-        about: "cut the power at every flash operation, and look what is there",
-        help: powercut::HELP,
-        run: powercut::run,
-    },
-    Job {
-        name: "reproduce",
-        about: "two clones in two folders give the same firmware",
-        help: reproduce::HELP,
-        run: reproduce::run,
-    },
-    Job {
-        name: "coverage",
-        about: "which lines of the device's crates the tests reach",
-        help: coverage::HELP,
-        run: coverage::run,
-    },
-    Job {
-        name: "mutants",
-        about: "changes of the code that a test must notice",
-        help: mutants::HELP,
-        run: mutants::run,
-    },
-    Job {
-        name: "evidence",
-        about: "one page of what the last runs have measured",
-        help: evidence::HELP,
-        run: evidence::run,
-    },
-    Job {
-        name: "attack",
-        about: "the standing attacker of the bus, for millions of frames",
-        help: attack::HELP,
-        run: attack::run,
-    },
-    Job {
-        name: "opinion",
-        about: "the emulated CPU against QEMU's, word for word",
-        help: opinion::HELP,
-        run: opinion::run,
-    },
-    Job {
-        name: "size",
-        about: "the bootloader's flash against its budget",
-        help: size::HELP,
-        run: size::run,
-    },
-    Job {
-        name: "pairs",
-        about: "bootloaders with every pair of a product's choices: they build and fit",
-        help: pairs::HELP,
-        run: pairs::run,
-    },
-    Job {
-        name: "arrows",
-        about: "who depends on whom, against the rules of the house",
-        help: arrows::HELP,
-        run: arrows::run,
-    },
-    Job {
-        name: "lint",
-        about: "formatting, clippy and documentation, warnings denied",
-        help: lint::HELP,
-        run: lint::run,
-    },
-    Job {
-        name: "sbom",
-        about: "the software bills of materials of bootloader and host tool",
-        help: sbom::HELP,
-        run: sbom::run,
-    },
-    Job {
-        name: "package",
-        about: "what is handed out: archives, packages, wheel, sums; installed and run by --check",
-        help: package::HELP,
-        run: package::run,
-    },
-    Job {
-        name: "portable",
-        about: "the host tools' code compiles for Windows and macOS",
-        help: portable::HELP,
-        run: portable::run,
-    },
-    Job {
-        name: "setup",
-        about: "what the other jobs need on this machine, installed where missing",
-        help: setup::HELP,
-        run: setup::run,
-    },
-];
+/// A job for each line: its name, its module, and one line for the list.
+macro_rules! jobs {
+    ($($name:literal $module:ident $about:literal)+) => {
+        &[$(Job { name: $name, about: $about, help: $module::HELP, run: $module::run }),+]
+    };
+}
+
+/// How many of the jobs are those that a newcomer needs.
+const FIRST: usize = 8;
+
+/// The jobs: first those that a newcomer needs.
+const JOBS: &[Job] = jobs! {
+    "demo" demo "the main job: flash, start, call back and flash again on an emulated board"
+    "check" check "before each commit: formatting, clippy, arrows, unit tests; two minutes"
+    "test" test "the tests of the product, with one summary at the end; --all for all"
+    "build" build "the firmware of a board: bootloader and both versions of the application"
+    "emulate" emulate "an emulated board for other programs to talk to"
+    "layout" layout "the memory map of a board, or its linker fragment"
+    "new-board" new_board "the three files of a port, with steps to go through"
+    "docs" book "the pages as a site, its links checked"
+
+    "hil" hil "the main job and the update suite on a real board, through a debug probe"
+    "chips" chips "a board for every chip, built and updated in the emulator"
+    "examples" examples "the programs in examples/, each built by its own tools"
+    "diagrams" diagrams "the graphs of the documents, from text"
+    "eds" eds "the EDS files of bootloader and application"
+    "fuzz" fuzz "the fuzz targets, each for a while (nightly toolchain)"
+    "deny" deny "licences and origins of the crates of others"
+    "bench" bench "how fast a program gets into the device, beside the limits of wire and flash"
+    "powercut" powercut "cut the power at every flash operation, and look what is there"
+    "reproduce" reproduce "two clones in two folders give the same firmware"
+    "coverage" coverage "which lines of the device's crates the tests reach"
+    "mutants" mutants "changes of the code that a test must notice"
+    "evidence" evidence "one page of what the jobs have measured of this commit"
+    "attack" attack "the standing attacker of the bus, for millions of frames"
+    "opinion" opinion "the emulated CPU against QEMU's, word for word"
+    "size" size "the bootloader's flash against its budget"
+    "pairs" pairs "bootloaders with every pair of a product's choices: they build and fit"
+    "arrows" arrows "who depends on whom, against the rules of the house"
+    "lint" lint "formatting, clippy and documentation, warnings denied"
+    "sbom" sbom "the software bills of materials of bootloader and host tool"
+    "package" package "what is handed out: archives, packages, wheel, sums; installed and run by --check"
+    "portable" portable "the host tools' code compiles for Windows and macOS"
+    "setup" setup "what the other jobs need on this machine, installed where missing"
+};
 
 fn main() -> ExitCode {
     // The programs that a job has started get the signal from the terminal, too.
@@ -265,12 +131,16 @@ fn main() -> ExitCode {
     }
     let mut words = std::env::args().skip(1);
     let outcome = match words.next().as_deref() {
-        None | Some("help" | "--help" | "-h") => {
-            print!("{}", overview());
+        None => {
+            print!("{}\n{} more: cargo xtask --all\n", overview(&JOBS[..FIRST]), JOBS.len() - FIRST);
+            Ok(())
+        }
+        Some("--all" | "help" | "--help" | "-h") => {
+            print!("{}", overview(JOBS));
             Ok(())
         }
         Some(name) => match JOBS.iter().find(|job| job.name == name) {
-            None => Err(format!("there is no job \"{name}\".\n\n{}", overview())),
+            None => Err(format!("there is no job \"{name}\".\n\n{}", overview(JOBS))),
             Some(job) => {
                 let args = Args::new(words);
                 if args.asks_for_help() {
@@ -291,10 +161,9 @@ fn main() -> ExitCode {
     }
 }
 
-fn overview() -> String {
-    let mut text =
-        String::from("usage: cargo xtask JOB [OPTIONS]    (cargo xtask JOB --help tells more)\n\n");
-    for job in JOBS {
+fn overview(jobs: &[Job]) -> String {
+    let mut text = String::from("usage: cargo xtask JOB [OPTIONS]    (cargo xtask JOB --help says more)\n\n");
+    for job in jobs {
         text += &format!("  {:<9} {}\n", job.name, job.about);
     }
     text
@@ -309,7 +178,13 @@ mod tests {
         for job in JOBS {
             assert!(job.help.starts_with(&format!("usage: cargo xtask {}", job.name)), "{}", job.name);
             assert!(job.help.ends_with('\n'), "{}", job.name);
-            assert!(overview().contains(job.about));
+            assert!(overview(JOBS).contains(job.about));
         }
+    }
+
+    #[test]
+    fn a_newcomer_sees_eight_jobs() {
+        let first: Vec<_> = JOBS[..FIRST].iter().map(|job| job.name).collect();
+        assert_eq!(first, ["demo", "check", "test", "build", "emulate", "layout", "new-board", "docs"]);
     }
 }
