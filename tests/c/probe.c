@@ -1,4 +1,4 @@
-/* Object 2100h: the callgate by hand, for the tests (tests/tests/c_application.rs), so that a client can call each service
+/* Object 2100h: the callgate by hand, for the tests (tests/device/c_application.rs), so that a client can call each service
  * with arguments of its own, bad ones too. It adds its objects to those of the application in C; no product has it.
  */
 #include "coboot/coboot.h"

@@ -52,7 +52,7 @@ const RULES: &[Rule] = &[
         may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi", KIT],
     },
     Rule { name: "emulator", may_use: &["shared-abi"] },
-    Rule { name: KIT, may_use: &["boot-core", "canopen", "shared-abi"] },
+    Rule { name: KIT, may_use: &["boot-core", "canopen", "coboot-app", "shared-abi"] },
     Rule {
         name: "coboot-tests",
         may_use: &[

@@ -82,7 +82,7 @@ pub const VARIANTS: &[Variant] = table![
     Variant { program: 2, least_programs: 2, ..application("app-program-2", "version-2,program-2") },
     Variant { least_programs: 2, ..application("app-lift", "lift") },
     Variant { least_programs: 2, ..application("app-lift-v2", "lift,version-2") },
-    // The image for the sessions of the dialects over UART (tests/tests/matrix.rs).
+    // The image for the sessions of the dialects over UART (tests/port/matrix.rs).
     Variant { least_programs: 2, ..application("app-virtual-can-v2", "virtual-can,version-2") },
     Variant { least_programs: 2, ..application("app-virtual-can-lift", "virtual-can,lift") },
     ;

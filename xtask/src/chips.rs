@@ -12,7 +12,7 @@ pub const HELP: &str = "\
 usage: cargo xtask chips [CHIP...] [--yes]
 
 Lays down a board for each chip in a copy of the repository, builds bootloader and application for it, and plays
-the main job on the emulated chip (tests/tests/porting.rs). Without a CHIP it takes one of each line and size of
+the main job on the emulated chip (tests/port/porting.rs). Without a CHIP it takes one of each line and size of
 flash: packages differ in nothing that is built. The first chip of a line takes a minute and a half, the next
 ones 20 seconds: half an hour for all on two cores. So this is a job of its own and no part of
 .ci/run.

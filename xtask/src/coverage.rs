@@ -34,8 +34,8 @@ const CRATES: [(&str, &str); 5] = [
     ("coboot-app", "coboot-app"),
     ("coboot-seal", "core/seal"),
 ];
-/// The tests of sealed images that need no built firmware.
-pub const SEALED_TESTS: [&str; 4] = ["sealed_access", "sealed_dictionary", "sealed_model", "sealed_pieces"];
+/// The tests of sealed images that need no built firmware, in the test program `sealed`.
+pub const SEALED_TESTS: [&str; 4] = ["access::", "dictionary::", "model::", "pieces::"];
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
@@ -53,8 +53,8 @@ pub fn run(mut args: Args) -> Outcome {
     process::run(llvm_cov(&["--no-report", "--quiet"]).args(packages))?;
     let core = ["--no-report", "--quiet", "--package", "coboot-core", "--features", "sealed"];
     process::run(&mut llvm_cov(&core))?;
-    let tests = SEALED_TESTS.iter().flat_map(|test| ["--test", test]);
-    process::run(llvm_cov(&["--no-report", "--quiet", "--package", "coboot-tests"]).args(tests))?;
+    let sealed = ["--no-report", "--quiet", "--package", "coboot-tests", "--test", "sealed", "--"];
+    process::run(llvm_cov(&sealed).args(SEALED_TESTS))?;
 
     let folder = workspace::target_dir().join("coverage");
     let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&folder));

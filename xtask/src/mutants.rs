@@ -34,7 +34,8 @@ const SEALED: &str = r"/(unseal|intake/sealed)\b";
 /// them before the first change.
 const WITH_SEALED: &str =
     "--features=coboot-core/sealed --test-package=coboot-core,coboot-tests --baseline=skip \
-                           --timeout=300 --build-timeout=1200 --cargo-arg=--test=objects";
+                           --timeout=300 --build-timeout=1200 --cargo-arg=--test=it --cargo-arg=--test=sealed --cargo-test-arg=-- \
+                           --cargo-test-arg=objects::";
 
 pub fn run(mut args: Args) -> Outcome {
     let (package, base, shard) = (args.value("--package")?, args.value("--in-diff")?, args.value("--shard")?);
@@ -89,7 +90,7 @@ pub fn run(mut args: Args) -> Outcome {
         }
         // First without sealed images; then, with them, what no test has noticed, and the files that are
         // not built without.
-        let tests = coverage::SEALED_TESTS.map(|test| format!("--cargo-arg=--test={test}"));
+        let tests = coverage::SEALED_TESTS.map(|test| format!("--cargo-test-arg={test}"));
         let sealed: Vec<_> = WITH_SEALED.split(' ').map(str::to_owned).chain(tests).collect();
         let left = mutants(name, name, &[&options[..], &[format!("--exclude-re={SEALED}")]].concat())?;
         let again: Vec<_> = left.iter().map(|line| format!("--re=^{}$", exactly(line))).collect();

@@ -43,7 +43,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     println!(
         "\nNow go through the steps in the new files; docs/porting.md tells which test proves each.\n\
-         Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test main_job"
+         Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test update main_job::"
     );
     Ok(())
 }

@@ -52,6 +52,7 @@ fn board() -> Outcome {
     let images = build::images(DEFAULT, &["bootloader-virtual-can", "app-virtual-can"])?;
     let mut test = process::cargo("test");
     test.args(build::tests_args(DEFAULT));
-    test.args(["--quiet", "--test", "second_board", "--", "--include-ignored", "--nocapture"]);
+    test.args(["--quiet", "--test", "foreign", "second_board::"]);
+    test.args(["--", "--include-ignored", "--nocapture"]);
     process::run(test.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", images))
 }

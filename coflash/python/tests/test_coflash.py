@@ -1,6 +1,6 @@
 """The package against `coboot-node` over TCP (socketcand), as a test bench uses it.
 
-``COBOOT_NODE`` names the program; ``tests/tests/python_package.rs`` builds package and program, and
+``COBOOT_NODE`` names the program; ``tests/foreign/python_package.rs`` builds package and program, and
 runs this file.
 """
 

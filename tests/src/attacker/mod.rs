@@ -20,7 +20,7 @@
 //!
 //! The attackers below the bus are in `core/boot-core/tests`: `attacker.rs` drives the object dictionary
 //! on the strict flash model, with faults of the flash, and `masters.rs` the slave; sealed devices
-//! have `tests/tests/sealed_attacker.rs`.
+//! have `tests/sealed/attacker.rs`.
 
 pub mod board;
 pub mod line;
@@ -47,7 +47,7 @@ use target::{Happened, PowerCut, Target, View};
 /// The longest time from a request to its answer in virtual time, in us: the request, the answer, a
 /// heartbeat and some emergencies of 1.1 ms each at 125 kbit/s, and two ticks of the device.
 pub const ANSWER_US: u64 = 15_000;
-/// The longest way back from bus-off (`tests/tests/hostile_bus.rs`), in us.
+/// The longest way back from bus-off (`tests/device/hostile_bus.rs`), in us.
 const BUS_OFF_US: u64 = 5_400_000;
 /// A device has started, and a rescue window is over, in us.
 const START_US: u64 = 700_000;

@@ -20,6 +20,7 @@ use boot_core::unseal::Room;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
+use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 
 /// Two programs; setups with one program use the first.

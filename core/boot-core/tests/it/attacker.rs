@@ -7,8 +7,8 @@
 //! its actions:
 //!
 //! ```sh
-//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test attacker    # seeds per setup
-//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-core --test attacker lift_2    # one, with its actions
+//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core attacker::    # seeds per setup
+//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-core attacker::lift_2    # one, with its actions
 //! ```
 
 use std::cell::Cell;

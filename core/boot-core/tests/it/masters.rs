@@ -4,7 +4,7 @@
 //! commanded to, and never have a record of a missing program. The same seed gives the same attack:
 //!
 //! ```sh
-//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core --test masters
+//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-core masters::
 //! ```
 
 use boot_core::control::{Policy, Step as Work};

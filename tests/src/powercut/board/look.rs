@@ -7,11 +7,11 @@ use shared_abi::geometry::Region;
 use boot_core::crc32;
 use boot_core::store::{Journal, ProgramRecord};
 
-use super::super::model::ModelFlash;
 use super::story::{Outcome, Seen, Story};
 use super::BOOT_MS;
 use crate::bench::Bench;
 use crate::firmware;
+use kit::model::ModelFlash;
 
 const VERSION: Address = Address::new(0x100A, 0);
 

@@ -16,8 +16,8 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use crate::access::{self, Access};
-use crate::remote::{Remote, PC, XPSR, XPSR_AT};
+use super::access::{self, Access};
+use super::remote::{Remote, PC, XPSR, XPSR_AT};
 
 pub const FLASH: u32 = 0x0800_0000;
 pub const FLASH_SIZE: u32 = 0x10_0000;

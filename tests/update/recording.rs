@@ -39,6 +39,10 @@ fn the_recorded_update_is_what_the_tool_prints() {
         let output = endpoint.run(&mut command);
         let printed = String::from_utf8(output.stdout).unwrap();
         assert!(output.status.success(), "{line}: {}", String::from_utf8_lossy(&output.stderr));
-        assert_eq!(lasting(recorded), lasting(&printed), "{line}: change docs/pictures/two-windows.txt and .svg");
+        assert_eq!(
+            lasting(recorded),
+            lasting(&printed),
+            "{line}: change docs/pictures/two-windows.txt and .svg"
+        );
     }
 }

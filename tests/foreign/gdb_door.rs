@@ -1,7 +1,5 @@
 //! gdb with the emulated board: it stops in the application's 1F51h callback and in the bootloader
 //! after it, while a host calls the bootloader.
-#![cfg(unix)]
-
 use std::env;
 use std::fs::{self, File};
 use std::path::Path;

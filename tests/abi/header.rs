@@ -79,7 +79,7 @@ int main(void)
 "#;
 
 fn include() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/c/coboot")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot")
 }
 
 /// A compiler that takes nothing lightly.

@@ -2,7 +2,6 @@
 //! which images the device accepts and refuses, and that the old program starts after every
 //! refusal.
 
-#[path = "sealed/limits.rs"]
 mod limits;
 
 use std::process::Command;

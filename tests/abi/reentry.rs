@@ -124,7 +124,7 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
         (scratch("reentry-harness.c"), scratch("reentry-events"), scratch("reentry-harness"));
     fs::write(&source, HARNESS).unwrap();
     fs::write(&events, script).unwrap();
-    let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/c/coboot");
+    let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot");
     let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
     clang.args(["-std=c11", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]);
     clang.args(["-fsanitize=undefined", "-fsanitize-trap=undefined"]);

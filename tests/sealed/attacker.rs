@@ -6,8 +6,8 @@
 //! The same seed gives the same attack:
 //!
 //! ```sh
-//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-tests --test sealed_attacker   # seeds per setup
-//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-tests --test sealed_attacker          # one, told
+//! COBOOT_ATTACKS=20000 cargo test --release -p coboot-tests --test sealed attacker::   # seeds per setup
+//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-tests --test sealed attacker::          # one, told
 //! ```
 
 use std::panic::{catch_unwind, AssertUnwindSafe};

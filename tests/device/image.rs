@@ -1,9 +1,7 @@
 //! The bootloader's image: the linker's image and the compressed one are equal, every loader writes
 //! it to the right place, and an image that is damaged in flash does not run.
 
-#[path = "image/gdb.rs"]
 mod gdb;
-#[path = "image/zx0.rs"]
 mod zx0;
 
 use canopen::program::ProgramControl;

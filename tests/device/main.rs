@@ -1,0 +1,23 @@
+//! What the built firmware does, on the emulated chip.
+
+mod abi;
+mod application;
+mod boot_time;
+mod bus;
+mod c_application;
+mod contention;
+mod debugger;
+mod device;
+mod handover;
+mod hostile_bus;
+mod image;
+mod line;
+mod log;
+mod mute;
+mod options;
+mod program_control;
+mod reentry;
+mod slcan;
+mod uart;
+mod virtual_can;
+mod watchdog;

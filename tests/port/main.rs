@@ -1,0 +1,5 @@
+//! Other boards and other products: what a port has to do, and what it can combine.
+
+mod can2;
+mod matrix;
+mod porting;
