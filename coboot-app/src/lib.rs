@@ -6,7 +6,8 @@
 //! | [`start`] | how the program came up: node-ID, bit rate, serial number (the handoff) |
 //! | [`program_control`] | objects 1F51h, 1F56h and 1F57h: what to answer and what to do |
 //! | [`departure`] | the way back to the bootloader: when the device may leave |
-//! | [`bootloader`] | the services of the bootloader underneath (the callgate), and the reset itself |
+//! | [`bootloader`] | the services of the bootloader underneath, and the reset itself |
+//! | [`callgate`] | how these services are called: finds the callgate's table and enters it |
 //! | [`label!`](label!) | whom the image is for, at its place in the image |
 //! | [`layout!`](layout!) | the memory map of the board, as the build script has written it |
 //! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
@@ -26,6 +27,7 @@
 
 mod abort;
 pub mod bootloader;
+pub mod callgate;
 pub mod departure;
 pub mod label;
 pub mod program_control;
@@ -41,7 +43,7 @@ pub use program_control::{Answer, ProgramControl};
 pub use start::{Defaults, Start};
 
 pub use shared_abi::bit_timing::BitTiming;
-pub use shared_abi::{callgate, geometry, handoff, layout, warm_start};
+pub use shared_abi::{geometry, handoff, layout, warm_start};
 
 /// The memory map of the board as the build script has written it
 /// (`coboot_linker::Application::emit`), for a `static` of the program:
