@@ -26,6 +26,7 @@ mod emulate;
 mod evidence;
 mod examples;
 mod fleet;
+mod footprint;
 mod fuzz;
 mod header;
 mod hil;
