@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use shared_abi::geometry::{Geometry, Sector};
 
-use crate::machine::memory::HostMemory;
+use crate::memory::HostMemory;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 use cells::carry_out;
