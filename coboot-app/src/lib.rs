@@ -57,25 +57,3 @@ macro_rules! layout {
         include!(concat!(env!("OUT_DIR"), "/coboot_layout.rs"))
     };
 }
-
-/// Whether the counter of milliseconds, which wraps, has reached `deadline`.
-const fn has_reached(now: u32, deadline: u32) -> bool {
-    now.wrapping_sub(deadline) < 1 << 31
-}
-
-#[cfg(test)]
-mod tests {
-    use super::has_reached;
-
-    /// Half a turn of the counter of milliseconds is the past, the other half the future.
-    #[test]
-    fn a_deadline_is_reached_for_half_a_turn_of_the_counter() {
-        for deadline in [0, 5, u32::MAX] {
-            for (later, is_reached) in
-                [(0, true), (1, true), ((1 << 31) - 1, true), (1 << 31, false), (u32::MAX, false)]
-            {
-                assert_eq!(has_reached(deadline.wrapping_add(later), deadline), is_reached, "{later}");
-            }
-        }
-    }
-}
