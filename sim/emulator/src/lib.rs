@@ -15,6 +15,7 @@ pub mod frame;
 pub mod gdb;
 pub mod machine;
 pub mod memory;
+pub mod noise;
 pub mod options;
 pub mod pacing;
 pub mod periph;
