@@ -3,9 +3,10 @@
 
 use core::sync::atomic::{AtomicU32, Ordering};
 
-use shared_abi::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs, Status};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::{BootRequest, WarmStart};
+
+use crate::callgate::{Callgate, CallgateError, NodeArgs, ProgramArgs, Status};
 
 /// The services that [`ProgramControl`](crate::ProgramControl) needs from the bootloader.
 /// [`Bootloader`] implements them for the chip; a test implements its own.
@@ -50,7 +51,7 @@ impl Confirmed {
 
 /// The bootloader of a board.
 ///
-/// Each service uses up to [`callgate::STACK`](shared_abi::callgate::STACK) bytes of the caller's
+/// Each service uses up to [`callgate::STACK`](crate::callgate::STACK) bytes of the caller's
 /// stack and no other RAM of the caller. Call one service at a time, from one priority, and do not
 /// use the flash controller meanwhile. If the bootloader has no callgate, every service returns
 /// [`CallgateError::Absent`] or [`CallgateError::Version`], and the application goes on.

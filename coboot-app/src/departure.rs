@@ -4,8 +4,6 @@
 //! still serves requests meanwhile ([`Departure::begin`]). If the bootloader is to answer, the
 //! application sends nothing any more ([`Departure::begin_silent`]).
 
-use crate::has_reached;
-
 /// How long the device stays after its answer is on the bus, in ms. At least 10 are required (SYS
 /// TEC manual L-1112d_10, 4.5); one more is added because the present millisecond may be almost
 /// over.
@@ -159,6 +157,11 @@ impl<R: Copy> Departure<R> {
     }
 }
 
+/// Whether the counter of milliseconds, which wraps, has reached `deadline`.
+pub(crate) const fn has_reached(now: u32, deadline: u32) -> bool {
+    now.wrapping_sub(deadline) < 1 << 31
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -294,5 +297,17 @@ mod tests {
         departure.begin_silent('s', 0);
         assert_eq!(departure.proceed(false, 14), Next::Wait);
         assert_eq!(departure.proceed(false, 15), Next::Leave('s'));
+    }
+
+    /// Half a turn of the counter of milliseconds is the past, the other half the future.
+    #[test]
+    fn a_deadline_is_reached_for_half_a_turn_of_the_counter() {
+        for deadline in [0, 5, u32::MAX] {
+            for (later, is_reached) in
+                [(0, true), (1, true), ((1 << 31) - 1, true), (1 << 31, false), (u32::MAX, false)]
+            {
+                assert_eq!(has_reached(deadline.wrapping_add(later), deadline), is_reached, "{later}");
+            }
+        }
     }
 }

@@ -6,7 +6,8 @@
 //! | [`start`] | how the program came up: node-ID, bit rate, serial number (the handoff) |
 //! | [`program_control`] | objects 1F51h, 1F56h and 1F57h: what to answer and what to do |
 //! | [`departure`] | the way back to the bootloader: when the device may leave |
-//! | [`bootloader`] | the services of the bootloader underneath (the callgate), and the reset itself |
+//! | [`bootloader`] | the services of the bootloader underneath, and the reset itself |
+//! | [`callgate`] | how these services are called: finds the callgate's table and enters it |
 //! | [`label!`](label!) | whom the image is for, at its place in the image |
 //! | [`layout!`](layout!) | the memory map of the board, as the build script has written it |
 //! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
@@ -26,6 +27,7 @@
 
 mod abort;
 pub mod bootloader;
+pub mod callgate;
 pub mod departure;
 pub mod label;
 pub mod program_control;
@@ -41,7 +43,7 @@ pub use program_control::{Answer, ProgramControl};
 pub use start::{Defaults, Start};
 
 pub use shared_abi::bit_timing::BitTiming;
-pub use shared_abi::{callgate, geometry, handoff, layout, warm_start};
+pub use shared_abi::{geometry, handoff, layout, warm_start};
 
 /// The memory map of the board as the build script has written it
 /// (`coboot_linker::Application::emit`), for a `static` of the program:
@@ -54,26 +56,4 @@ macro_rules! layout {
     () => {
         include!(concat!(env!("OUT_DIR"), "/coboot_layout.rs"))
     };
-}
-
-/// Whether the counter of milliseconds, which wraps, has reached `deadline`.
-const fn has_reached(now: u32, deadline: u32) -> bool {
-    now.wrapping_sub(deadline) < 1 << 31
-}
-
-#[cfg(test)]
-mod tests {
-    use super::has_reached;
-
-    /// Half a turn of the counter of milliseconds is the past, the other half the future.
-    #[test]
-    fn a_deadline_is_reached_for_half_a_turn_of_the_counter() {
-        for deadline in [0, 5, u32::MAX] {
-            for (later, is_reached) in
-                [(0, true), (1, true), ((1 << 31) - 1, true), (1 << 31, false), (u32::MAX, false)]
-            {
-                assert_eq!(has_reached(deadline.wrapping_add(later), deadline), is_reached, "{later}");
-            }
-        }
-    }
 }

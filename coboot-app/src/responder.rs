@@ -24,8 +24,8 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::abort::Abort;
 use crate::bootloader::Services;
+use crate::departure::has_reached;
 use crate::departure::Next;
-use crate::has_reached;
 use crate::program_control::{Answer, ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
 
 /// A CAN data frame with an identifier of 11 bits.

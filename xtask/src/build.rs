@@ -8,8 +8,8 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
+use crate::footprint::{self, Flash};
 use crate::setup::{Part, Setup};
-use crate::size::{self, Flash};
 use crate::workspace::{PROFILE, TARGET};
 use crate::{pack, process, workspace, Outcome};
 
@@ -434,7 +434,7 @@ fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
 /// # Errors
 /// When it lies outside its flash.
 pub fn report(image: &Path, region: Region) -> Outcome {
-    let flash = Flash::of(&size::read(image)?, region)
+    let flash = Flash::of(&footprint::read(image)?, region)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.

@@ -3,6 +3,7 @@
 //! A probe puts the bootloader into the flash, a relay switches the power, and everything else goes
 //! over the bus by the command line of `coflash`, as a user of the product does it.
 
+mod bench;
 mod coflash;
 mod command;
 mod power;
@@ -11,14 +12,12 @@ mod report;
 mod steps;
 
 use std::fs;
-use std::path::PathBuf;
 use std::time::Instant;
-
-use shared_abi::layout::Layout;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
 use crate::{build, process, workspace, Outcome};
+use bench::Bench;
 use coflash::Coflash;
 use power::Power;
 use probe::Probe;
@@ -43,22 +42,6 @@ the main job and the update suite on its CAN bus. Programs that are in the board
   --json FILE     writes the report to FILE
   --yes           installs what is missing with sudo
 ";
-
-/// The bench: a board with everything that reaches it.
-struct Bench {
-    board: &'static Layout,
-    probe: Probe,
-    power: Option<Power>,
-    coflash: Coflash,
-    /// The folder of the board's images.
-    images: PathBuf,
-    /// The folder for files that the steps make.
-    work: PathBuf,
-    /// The CRC of the last program that went into the device to its end, as text.
-    installed: Option<String>,
-    /// The document that `coflash conform` wrote.
-    conform: Option<serde_json::Value>,
-}
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;

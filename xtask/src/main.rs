@@ -29,6 +29,7 @@ mod evidence;
 mod examples;
 #[cfg(test)]
 mod fleet;
+mod footprint;
 mod fuzz;
 mod hil;
 mod layout;

@@ -11,7 +11,7 @@ use crate::{build, evidence, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json] [--yes]
 
-Runs the programs of sim/emulator/tests/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
+Runs the programs of sim/emulator/tests/it/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
 (mps2-an386), and compares their results word for word. A difference that is not explained in the
 table of the programs is a failure. Then updates the bootloader with CAN over UART through the serial
 port of the emulated board and of QEMU's STM32F405 (netduinoplus2), and compares every sector of the
@@ -34,8 +34,8 @@ pub fn run(mut args: Args) -> Outcome {
 
 fn cpu(json: bool) -> Outcome {
     let mut test = process::cargo("test");
-    test.args(["--quiet", "--package", "coboot-emulator", "--test", "second_opinion"]);
-    test.args(["--", "--include-ignored", "--nocapture", "--test-threads=1"]);
+    test.args(["--quiet", "--package", "coboot-emulator", "--test", "it"]);
+    test.args(["--", "second_opinion::", "--include-ignored", "--nocapture", "--test-threads=1"]);
     if !json {
         return process::run(&mut test);
     }

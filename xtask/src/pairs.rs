@@ -5,8 +5,8 @@ use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::elf::Elf;
+use crate::footprint::{kib, Flash};
 use crate::setup::{Part, Setup};
-use crate::size::{kib, Flash};
 use crate::{build, Outcome};
 
 pub const HELP: &str = "\

@@ -18,7 +18,7 @@ usage: cargo xtask setup [--yes]
 
 Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
 clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C, gcc-arm-none-eabi for the examples, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+in C and the programs of the emulator's tests, gcc-arm-none-eabi for the examples, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -35,7 +35,8 @@ pub enum Part {
     C,
     /// The examples in C and C++: two compilers for the chip, and CMake.
     Examples,
-    /// The emulator: cmake builds Unicorn from C, and libclang makes its bindings.
+    /// The emulator: cmake builds Unicorn from C, libclang makes its bindings, and clang assembles the
+    /// programs of its tests.
     Emulator,
     /// The third-party CANopen client: a Python environment.
     Python,
@@ -253,7 +254,9 @@ fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'st
     let mut tools = Vec::new();
     for part in parts {
         tools.extend_from_slice(match part {
-            Part::Emulator => &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang],
+            Part::Emulator => {
+                &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang, Tool::Clang]
+            }
             Part::C => &[Tool::Clang],
             Part::Examples => &[Tool::ArmGcc, Tool::Clang, Tool::Make, Tool::Cmake],
             Part::Gdb => &[Tool::Gdb],
@@ -480,7 +483,7 @@ mod tests {
         assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
         assert_eq!(
             missing_packages(&[Part::Emulator, Part::Emulator], nothing),
-            ["build-essential", "cmake", "libclang-dev", "make", "pkg-config"]
+            ["build-essential", "clang", "cmake", "libclang-dev", "make", "pkg-config"]
         );
         assert_eq!(
             missing_packages(&[Part::Emulator], |tool| !matches!(tool, Tool::Cmake | Tool::Libclang)),

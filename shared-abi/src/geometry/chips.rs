@@ -1,6 +1,7 @@
 //! All order codes of chips of the lines: line, package and flash.
 
-use super::{Geometry, Line};
+use super::chip::{text, Geometry};
+use super::line::Line;
 
 /// Defines a constant for each chip, and the list of all chips.
 macro_rules! chips {
@@ -9,7 +10,7 @@ macro_rules! chips {
             #[doc = concat!("The ", stringify!($chip), ".")]
             pub const $chip: Geometry = {
                 const NAME: [u8; 11] = lower_case(stringify!($chip));
-                Geometry::new(Line::$line, super::text(&NAME))
+                Geometry::new(Line::$line, text(&NAME))
             };
         )+)+
 

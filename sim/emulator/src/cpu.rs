@@ -24,18 +24,18 @@ use std::collections::HashSet;
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
+use crate::chip::{
+    Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
+    SYSTEM_PAGE,
+};
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
     Masks, BUS_FAULT, DEBUG_MONITOR, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT,
 };
 use crate::cortex::scs::{cfsr, hfsr, RefusedStore, Traps};
-use crate::machine::chip::{
-    Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
-    SYSTEM_PAGE,
-};
-use crate::machine::memory::{HostMemory, PAGE};
-use crate::machine::report::Access;
-use crate::machine::Error;
+use crate::error::Error;
+use crate::memory::{HostMemory, PAGE};
+use crate::report::Access;
 use crate::time::Time;
 use traps::Instruction;
 
@@ -468,8 +468,8 @@ impl Cpu {
         };
         notes.blocks.clear();
         let chip = self.chip_mut();
-        chip.block = (0, 0);
-        chip.flush_tlb = true;
+        chip.slice.block = (0, 0);
+        chip.slice.flush_tlb = true;
     }
 
     /// Drops every translation and what the translator knows of the memory.
@@ -480,8 +480,8 @@ impl Cpu {
         notes.blocks.clear();
         let _ = self.uc.ctl_flush_tb();
         self.flush_tlb();
-        self.chip_mut().stale.clear();
-        self.chip_mut().flush_tlb = false;
+        self.chip_mut().slice.stale.clear();
+        self.chip_mut().slice.flush_tlb = false;
     }
 
     /// Empties the TLB.
@@ -558,7 +558,7 @@ impl Cpu {
                 let at = (address - region.base) as usize;
                 memory.bytes_mut()[at..at + bytes.len()].copy_from_slice(bytes);
                 if len > 0 && holds_code {
-                    chip.stale.push((address, len));
+                    chip.slice.stale.push((address, len));
                 }
                 return true;
             }
@@ -588,7 +588,7 @@ impl Cpu {
     pub fn run(&mut self, single: bool) -> Exit {
         self.drop_stale();
         self.set_traps();
-        self.chip_mut().leave = false;
+        self.chip_mut().slice.leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
         self.uc.get_data_mut().notes.masks = masks;
         if self.has_breakpoint(self.pc()) {
@@ -625,7 +625,7 @@ impl Cpu {
     fn run_up_to(&mut self, address: u32) -> Exit {
         let block = (u64::from(self.pc()), u64::from(address) + 4);
         let _ = self.uc.ctl_remove_cache(block.0, block.1);
-        self.chip_mut().leave = false;
+        self.chip_mut().slice.leave = false;
         self.uc.get_data_mut().notes.on_the_way_to = Some(address);
         let exit = self.enter(Some(address));
         self.uc.get_data_mut().notes.on_the_way_to = None;
@@ -660,7 +660,7 @@ impl Cpu {
 
     fn enter(&mut self, until: Option<u32>) -> Exit {
         let chip = self.chip();
-        let stops = chip.scs.debug.breakpoints().chain(chip.stops.iter().copied());
+        let stops = chip.scs.debug.breakpoints().chain(chip.slice.stops.iter().copied());
         let exits: Vec<u64> = stops.chain(until).map(u64::from).collect();
         if !exits.is_empty() {
             let _ = self.uc.ctl_set_exits(&exits);
@@ -684,13 +684,13 @@ impl Cpu {
     fn start(&mut self, count: usize) -> Result<(), uc_error> {
         let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
         let begin = self.pc() | u32::from(thumb);
-        self.chip_mut().entries += 1;
+        self.chip_mut().slice.entries += 1;
         self.uc.emu_start(u64::from(begin), 0, 0, count)
     }
 
     /// Whether code stops at this address, by the program's own comparators or by a debugger.
     fn is_stop(&self, address: u32) -> bool {
-        self.has_breakpoint(address) || self.chip().stops.contains(&address)
+        self.has_breakpoint(address) || self.chip().slice.stops.contains(&address)
     }
 
     fn has_breakpoint(&self, address: u32) -> bool {
@@ -719,7 +719,7 @@ impl Cpu {
         let chip = self.chip_mut();
         chip.scs.debug.note(DFSR_HALTED);
         chip.scs.exceptions.pend(DEBUG_MONITOR);
-        chip.check_exceptions = true;
+        chip.slice.check_exceptions = true;
         match exit {
             Exit::SupervisorCall | Exit::ExceptionReturn(_) | Exit::Breakpoint => exit,
             // A step does not sleep.
@@ -731,7 +731,7 @@ impl Cpu {
     fn one_instruction(&mut self) -> Exit {
         let chip = self.chip_mut();
         let (cycles, instructions) = (chip.clock.cycles, chip.counters.instructions);
-        chip.block = (0, 0);
+        chip.slice.block = (0, 0);
         // Blocks that were translated without the counter of instructions would run to their ends.
         let _ = self.uc.ctl_flush_tb();
         self.uc.get_data_mut().notes.single = true;
@@ -764,17 +764,17 @@ impl Cpu {
     }
 
     fn drop_stale(&mut self) {
-        for (address, len) in std::mem::take(&mut self.chip_mut().stale) {
+        for (address, len) in std::mem::take(&mut self.chip_mut().slice.stale) {
             if !self.was_executed(address, len) {
                 continue;
             }
             let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
             self.uc.get_data_mut().notes.blocks.clear();
         }
-        if std::mem::take(&mut self.chip_mut().flush_tlb) {
+        if std::mem::take(&mut self.chip_mut().slice.flush_tlb) {
             self.flush_tlb();
         }
-        if std::mem::take(&mut self.chip_mut().breakpoints_changed) {
+        if std::mem::take(&mut self.chip_mut().slice.breakpoints_changed) {
             let _ = self.uc.ctl_flush_tb();
         }
     }
@@ -826,7 +826,9 @@ impl Cpu {
             Some(EXCP_UDEF) | Some(_) => Exit::Fault(Fault::usage(cfsr::UNDEFINSTR)),
             None => match result {
                 // A write in the block that ends in WFI may have set `leave`.
-                Ok(()) if self.chip().leave && !matches!(self.last_hint(pc), Some(Hint::Wfi)) => Exit::Slice,
+                Ok(()) if self.chip().slice.leave && !matches!(self.last_hint(pc), Some(Hint::Wfi)) => {
+                    Exit::Slice
+                }
                 Ok(()) => Exit::WaitForInterrupt,
                 // Every memory error calls a hook that records a fault; the only other error is an
                 // access that the model denies without a hook.
@@ -837,7 +839,7 @@ impl Cpu {
 
     /// The hint instruction that ended the last block, if the PC is right behind it.
     fn last_hint(&self, pc: u32) -> Option<Hint> {
-        let (start, size) = self.chip().block;
+        let (start, size) = self.chip().slice.block;
         if size == 0 || pc != start.wrapping_add(size) {
             return None;
         }
@@ -868,7 +870,7 @@ impl Cpu {
     /// the rest.
     fn uncharge(&mut self, pc: u32) {
         let chip = self.chip_mut();
-        let (start, size) = chip.block;
+        let (start, size) = chip.slice.block;
         if pc < start || pc >= start.wrapping_add(size) {
             return;
         }
@@ -883,7 +885,7 @@ impl Cpu {
     /// The exception that is to be taken now.
     #[must_use]
     pub fn deliverable(&mut self) -> Option<u16> {
-        if !self.chip().check_exceptions {
+        if !self.chip().slice.check_exceptions {
             return None;
         }
         let masks = self.privileged(|cpu| cpu.masks());
@@ -953,7 +955,7 @@ impl Cpu {
         self.renew_mode();
         let chip = self.chip_mut();
         chip.scs.exceptions.enter(exception);
-        chip.check_exceptions = chip.scs.exceptions.any_pending();
+        chip.slice.check_exceptions = chip.scs.exceptions.any_pending();
         chip.clock.cycles += ENTRY_CYCLES;
         if let Some(count) = chip.counters.exceptions.get_mut(usize::from(exception)) {
             *count += 1;
@@ -1057,7 +1059,7 @@ impl Cpu {
         self.renew_mode();
         let chip = self.chip_mut();
         chip.scs.exceptions.leave(leaving);
-        chip.check_exceptions = chip.scs.exceptions.any_pending();
+        chip.slice.check_exceptions = chip.scs.exceptions.any_pending();
         chip.clock.cycles += RETURN_CYCLES;
         Ok(())
     }
@@ -1132,19 +1134,19 @@ fn masks(uc: &Unicorn<'_, State>) -> Masks {
 }
 
 // The hooks of loads and stores never stop the engine themselves: it would put the PC back to the
-// instruction, which then runs twice. They set `Chip::leave`, and the next block does not start. The
+// instruction, which then runs twice. They set `Slice::leave`, and the next block does not start. The
 // exception is a store with a precise fault, to which the PC has to point.
 
 /// After a store to a peripheral: a bus error becomes a fault, or is ignored.
 fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
-    let Some(address) = uc.get_data_mut().chip.bus_error.take() else { return };
+    let Some(address) = uc.get_data_mut().chip.slice.bus_error.take() else { return };
     let masks = uc.get_data().notes.masks.unwrap_or_else(|| masks(uc));
     let State { chip, notes } = uc.get_data_mut();
-    chip.leave = true;
+    chip.slice.leave = true;
     match chip.scs.refuse_store(address, masks) {
-        RefusedStore::Pended => chip.check_exceptions = true,
+        RefusedStore::Pended => chip.slice.check_exceptions = true,
         // The program asks to have the fault ignored: nothing to report.
-        RefusedStore::Ignored => drop(chip.unlocated.pop()),
+        RefusedStore::Ignored => drop(chip.slice.unlocated.pop()),
         RefusedStore::Taken => {
             notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
             let _ = uc.emu_stop();
@@ -1154,9 +1156,9 @@ fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
 
 /// Finds the instruction of each access to a peripheral that is to be reported.
 fn locate_reports(uc: &mut Unicorn<'_, State>) {
-    while let Some(mut report) = uc.get_data_mut().chip.unlocated.pop() {
+    while let Some(mut report) = uc.get_data_mut().chip.slice.unlocated.pop() {
         let chip = &uc.get_data().chip;
-        let (start, size) = chip.block;
+        let (start, size) = chip.slice.block;
         let code = Cpu::memory(chip, start)
             .and_then(|(memory, offset)| memory.bytes().get(offset..offset + size as usize))
             .unwrap_or(&[]);
@@ -1171,7 +1173,7 @@ fn locate_reports(uc: &mut Unicorn<'_, State>) {
 // -----------------------------------------------------------------------------------------------------------
 
 fn stop(uc: &mut Unicorn<'_, State>) {
-    uc.get_data_mut().chip.leave = true;
+    uc.get_data_mut().chip.slice.leave = true;
     let _ = uc.emu_stop();
 }
 
@@ -1180,7 +1182,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
     let single = state.notes.single;
-    if !single && (chip.leave || chip.clock.cycles >= chip.slice_end) {
+    if !single && (chip.slice.leave || chip.clock.cycles >= chip.slice.end) {
         return stop(uc);
     }
     if is_flash(chip, address) && is_flash_busy(chip) {
@@ -1193,23 +1195,23 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
     if single {
-        chip.block = (address, size);
+        chip.slice.block = (address, size);
         return;
     }
-    if chip.check_exceptions {
+    if chip.slice.check_exceptions {
         let masks = state.notes.masks.unwrap_or_else(|| masks(uc));
         if uc.get_data().chip.scs.exceptions.deliverable(masks).is_some() {
             return stop(uc);
         }
     }
     let chip = &mut uc.get_data_mut().chip;
-    if let Some(watch) = &mut chip.watch {
+    if let Some(watch) = &mut chip.slice.watch {
         let inside = watch.code.contains(address, 1);
         if inside != watch.inside {
             // With an empty TLB, the first access to each page is seen.
             watch.inside = inside;
-            chip.flush_tlb = true;
-            chip.leave = true;
+            chip.slice.flush_tlb = true;
+            chip.slice.leave = true;
             return stop(uc);
         }
     }
@@ -1220,7 +1222,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         state.notes.fpu_instruction = block.fpu;
         return stop(uc);
     }
-    chip.block = (address, size);
+    chip.slice.block = (address, size);
     chip.clock.cycles += block.instructions;
     chip.counters.instructions += block.instructions;
 }
@@ -1414,7 +1416,7 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         };
     }
     let is_ram = geometry.sram.contains(address, 1) || geometry.ccm.contains(address, 1);
-    if let Some(watch) = chip.watch.as_mut().filter(|watch| watch.inside && is_ram) {
+    if let Some(watch) = chip.slice.watch.as_mut().filter(|watch| watch.inside && is_ram) {
         watch.touched.insert(address & !(PAGE - 1));
     }
     if geometry.sram.contains(address, 1) {

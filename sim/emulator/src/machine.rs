@@ -1,71 +1,29 @@
 //! One emulated board: chip and CPU in virtual time.
 
-pub mod chip;
-pub mod clock;
 mod debugger;
 pub mod image;
-pub mod memory;
-pub mod report;
-pub mod variant;
 
 use std::collections::BTreeSet;
 
 use shared_abi::geometry::{Geometry, Region};
 
 use crate::bxcan::BxCan;
+use crate::chip::Chip;
+pub use crate::chip::Counters;
 use crate::cpu::{Cpu, Entry, Exit};
-use crate::periph::flash::Noise;
+pub use crate::error::Error;
+use crate::noise::Noise;
+pub use crate::options::Options;
 pub use crate::periph::flash::{Cells, Cut, FlashCut, FlashTimes, Operation};
+pub use crate::periph::rcc::ResetCause;
 pub use crate::periph::usart::Usart;
 use crate::peripheral::Peripheral;
+pub use crate::report::{Access, Report};
+use crate::slice::Watch;
 use crate::time::{Span, Time};
-pub use chip::Counters;
-use chip::{Chip, Watch};
 use debugger::Debugger;
 pub use debugger::Halt;
 pub use image::LoadedImage;
-pub use report::{Access, Report};
-
-/// How a machine is set up.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Options {
-    /// Chooses what RAM holds at power-on, and how a power failure tears a flash operation.
-    pub seed: u64,
-    /// Crystal at OSC_IN, in Hz; 0 for none.
-    pub hse_hz: u32,
-    /// Which of the datasheet's times flash operations take.
-    pub flash_times: FlashTimes,
-    /// The 96-bit unique ID.
-    pub unique_id: [u32; 3],
-    /// The CAN controller whose pins the board's transceiver is at: 0 is CAN1, 1 is CAN2. The other
-    /// one hears a recessive line.
-    pub transceiver: usize,
-}
-
-impl Default for Options {
-    fn default() -> Self {
-        Self {
-            seed: 1,
-            hse_hz: 8_000_000,
-            flash_times: FlashTimes::Typical,
-            unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
-            transceiver: 0,
-        }
-    }
-}
-
-/// Why the chip came out of reset.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ResetCause {
-    /// Power came up.
-    PowerOn,
-    /// NRST was pulled low.
-    Pin,
-    /// AIRCR.SYSRESETREQ.
-    Software,
-    /// The independent watchdog ran out.
-    IndependentWatchdog,
-}
 
 /// Why [`Machine::run_until`] came back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -83,32 +41,6 @@ pub enum Stop {
     Lockup,
     /// A debugger has halted the machine ([`Machine::halted`]): it does not run.
     Halted,
-}
-
-/// An error in setting up a machine.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The CPU emulation refused.
-    #[error("{doing}: {error}")]
-    Engine {
-        /// The action that failed.
-        doing: &'static str,
-        /// The error of the CPU emulation.
-        error: String,
-    },
-    /// The image cannot be used.
-    #[error("{0}")]
-    Image(String),
-    /// An address lies outside the required memory.
-    #[error("{len} bytes at {address:08X}h are not all in {wanted}")]
-    Address {
-        /// First address.
-        address: u32,
-        /// Length.
-        len: usize,
-        /// The memory that they must be in.
-        wanted: &'static str,
-    },
 }
 
 /// The state of the CPU: executing or waiting.
@@ -196,7 +128,7 @@ impl Machine {
         chip.flash.preset(offset, bytes);
         let changed = chip.flash.take_changed();
         let base = chip.geometry.flash.base;
-        chip.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
         Ok(())
     }
 
@@ -304,7 +236,7 @@ impl Machine {
         chip.flash.preset_cells(cells, seed);
         let base = chip.geometry.flash.base;
         let changed = chip.flash.take_changed();
-        chip.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
     }
 
     // --- time
@@ -324,10 +256,10 @@ impl Machine {
     /// If it returns [`Stop::Deadline`], [`Self::now`] is at `deadline` or less than a block of
     /// code past it.
     pub fn run_until(&mut self, deadline: Time) -> Stop {
-        self.cpu.chip_mut().deadline = deadline;
+        self.cpu.chip_mut().slice.deadline = deadline;
         loop {
-            if let Some(held) = self.is_held() {
-                return held;
+            if self.halted().is_some() {
+                return Stop::Halted;
             }
             if !self.is_powered() {
                 self.off_time = self.off_time.max(deadline);
@@ -339,11 +271,11 @@ impl Machine {
                 self.power_off();
                 return Stop::PowerCut;
             }
-            if let Some(cause) = chip.reset_request.take() {
+            if let Some(cause) = chip.slice.reset_request.take() {
                 self.reset(cause);
                 return Stop::Reset(cause);
             }
-            if std::mem::take(&mut chip.attention) {
+            if std::mem::take(&mut chip.slice.attention) {
                 return Stop::Attention;
             }
             if chip.now() >= deadline {
@@ -361,7 +293,7 @@ impl Machine {
     fn step(&mut self) -> Entry {
         let chip = self.cpu.chip_mut();
         let now = chip.now();
-        if let Some(until) = chip.hold_until {
+        if let Some(until) = chip.slice.hold_until {
             if now < until {
                 let target = chip.next_stop().min(until);
                 self.skip_to(target);
@@ -370,7 +302,7 @@ impl Machine {
                 chip.counters.flash_stall_time.0 += passed.0;
                 return Entry::Taken;
             }
-            chip.hold_until = None;
+            chip.slice.hold_until = None;
         }
         match self.activity {
             Activity::Runs => self.execute(),
@@ -409,16 +341,16 @@ impl Machine {
                 return Entry::Taken;
             }
             let entry = self.cpu.enter_exception(exception);
-            return self.note_exception(entry);
+            return self.debugger.note_exception(entry);
         }
         self.cpu.chip_mut().limit_slice();
-        let Some(exit) = self.run_code() else { return Entry::Taken };
+        let Some(exit) = self.debugger.run_code(&mut self.cpu) else { return Entry::Taken };
         match exit {
             Exit::Slice => Entry::Taken,
             Exit::WaitForInterrupt => {
                 let chip = self.cpu.chip_mut();
                 if chip.scs.sleeps_deeply() {
-                    let pc = chip.block.0;
+                    let pc = chip.slice.block.0;
                     let what = "SLEEPDEEP is set: Stop and Standby are not modelled, the CPU sleeps".into();
                     chip.report(Access::Read, pc, 2, 0, pc, what);
                 }
@@ -441,7 +373,7 @@ impl Machine {
             },
             Exit::FlashBusy => {
                 let chip = self.cpu.chip_mut();
-                chip.hold_until = chip.flash.busy_until();
+                chip.slice.hold_until = chip.flash.busy_until();
                 chip.counters.flash_stalls += 1;
                 Entry::Taken
             }
@@ -456,10 +388,87 @@ impl Machine {
         let in_flash = chip.geometry.flash.contains(address, 4) || address < chip.geometry.flash.size;
         let busy = chip.flash.busy_until().filter(|_| in_flash);
         if busy.is_some() {
-            chip.hold_until = busy;
+            chip.slice.hold_until = busy;
             chip.counters.flash_stalls += 1;
         }
         busy.is_some()
+    }
+
+    // --- the debugger
+    // --------------------------------------------------------------------------------------------------
+
+    /// Halts the machine for a debugger that takes over.
+    pub fn attach_debugger(&mut self) {
+        self.debugger = Debugger::attached();
+    }
+
+    /// The debugger leaves: its breakpoints go, and the machine goes on.
+    pub fn detach_debugger(&mut self) {
+        self.debugger = Debugger::default();
+        let chip = self.cpu.chip_mut();
+        chip.slice.stops.clear();
+        chip.slice.breakpoints_changed = true;
+    }
+
+    /// Why the machine is halted, if it is.
+    #[must_use]
+    pub fn halted(&self) -> Option<Halt> {
+        self.debugger.halted
+    }
+
+    /// Halts the machine where it is.
+    pub fn halt(&mut self) {
+        self.debugger.halt();
+    }
+
+    /// Lets a halted machine go on, or execute one instruction. A step over WFI does not sleep; one
+    /// may end at the first instruction of an exception's handler.
+    pub fn resume(&mut self, step: bool) {
+        self.debugger.resume(step, self.cpu.pc());
+    }
+
+    /// Sets or removes a breakpoint. Addresses are those that the program runs at.
+    pub fn set_breakpoint(&mut self, address: u32, set: bool) {
+        let chip = self.cpu.chip_mut();
+        let changed = if set {
+            chip.slice.stops.insert(address & !1)
+        } else {
+            chip.slice.stops.remove(&(address & !1))
+        };
+        chip.slice.breakpoints_changed |= changed;
+    }
+
+    /// r0 to r12, SP, LR, PC, xPSR.
+    pub fn core_registers(&mut self) -> [u32; 17] {
+        self.cpu.core_registers()
+    }
+
+    /// Sets a register, numbered as in [`Self::core_registers`]. Of xPSR, the flags alone change.
+    ///
+    /// # Panics
+    /// For a number above 16.
+    pub fn set_core_register(&mut self, number: usize, value: u32) {
+        self.cpu.set_core_register(number, value);
+    }
+
+    /// Writes memory as a debug probe does: RAM, flash (without erasing it), or a register.
+    ///
+    /// # Errors
+    /// [`Error::Address`] where nothing can be written.
+    pub fn poke(&mut self, address: u32, bytes: &[u8]) -> Result<(), Error> {
+        if self.write_ram(address, bytes).is_ok() || self.load_bin(address, bytes).is_ok() {
+            return Ok(());
+        }
+        let nothing = || Error::Address { address, len: bytes.len(), wanted: "memory or registers" };
+        let &[a, b, c, d] = bytes else { return Err(nothing()) };
+        if !address.is_multiple_of(4) || self.register(address).is_none() {
+            return Err(nothing());
+        }
+        let chip = self.cpu.chip_mut();
+        chip.store(address, 4, u32::from_le_bytes([a, b, c, d]));
+        // No instruction made these accesses.
+        chip.slice.unlocated.clear();
+        Ok(())
     }
 
     // --- looking and touching
@@ -590,13 +599,13 @@ impl Machine {
 
     /// Records from now on which RAM the code in this region accesses.
     pub fn watch(&mut self, code: Region) {
-        self.cpu.chip_mut().watch = Some(Watch { code, inside: false, touched: BTreeSet::new() });
+        self.cpu.chip_mut().slice.watch = Some(Watch { code, inside: false, touched: BTreeSet::new() });
     }
 
     /// Returns the pages of RAM (4 KiB, by their first addresses) that the watched code has
     /// accessed since the last call.
     pub fn take_touched(&mut self) -> Vec<u32> {
-        let watch = self.cpu.chip_mut().watch.as_mut();
+        let watch = self.cpu.chip_mut().slice.watch.as_mut();
         watch.map(|watch| std::mem::take(&mut watch.touched).into_iter().collect()).unwrap_or_default()
     }
 
@@ -610,7 +619,7 @@ impl Machine {
     /// How often translated code was entered: the measure of what an idle machine costs the host.
     #[must_use]
     pub fn entries(&self) -> u64 {
-        self.cpu.chip().entries
+        self.cpu.chip().slice.entries
     }
 
     /// The core clock that the program has set up, in Hz.

@@ -6,10 +6,10 @@ use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
+use super::bench::Bench;
 use super::coflash::{Answer, Coflash};
 use super::command::{self, Running};
 use super::report::Verdict;
-use super::Bench;
 use crate::Outcome;
 use serde_json::Value;
 

@@ -15,8 +15,9 @@ use shared_abi::block_file::{
 };
 use shared_abi::geometry::Region;
 
+use super::format::{Begin, Destination, Format, Recognition, SMALLEST_PROGRAM};
+use super::judge::Judge;
 use super::stream::judge_start;
-use super::{Begin, Destination, Format, Judge, Recognition, SMALLEST_PROGRAM};
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;

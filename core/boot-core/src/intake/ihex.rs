@@ -7,8 +7,9 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
+use super::format::{Destination, Format, Recognition};
+use super::judge::Judge;
 use super::stream::Stream;
-use super::{Destination, Format, Judge, Recognition};
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
 

@@ -4,8 +4,9 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 use shared_abi::vectors::VectorTable;
 
+use super::format::{Destination, Format, Recognition};
+use super::judge::Judge;
 use super::stream::Stream;
-use super::{Destination, Format, Judge, Recognition};
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 

@@ -5,7 +5,8 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 use seal::wire::MAGIC;
 
-use super::{Begin, Destination, Format, Judge, Recognition};
+use super::format::{Begin, Destination, Format, Recognition};
+use super::judge::Judge;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;

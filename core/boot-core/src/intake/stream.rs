@@ -6,7 +6,8 @@ use canopen::AbortCode;
 use shared_abi::geometry::Region;
 use shared_abi::label;
 
-use super::{Begin, Destination, Judge, SMALLEST_PROGRAM};
+use super::format::{Begin, Destination, SMALLEST_PROGRAM};
+use super::judge::Judge;
 use crate::program::Expected;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;

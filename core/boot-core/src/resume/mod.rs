@@ -5,8 +5,11 @@
 
 #[cfg(feature = "sealed")]
 mod absent;
+mod number;
 #[cfg(not(feature = "sealed"))]
 mod present;
+
+pub(crate) use number::ANY;
 
 #[cfg(feature = "sealed")]
 pub use absent::{LastBlock, Partial};
@@ -15,7 +18,3 @@ pub use present::{LastBlock, Partial};
 
 /// Whether the bootloader has room for downloads that go on, and for the second SDO server.
 pub const HAS_ROOM: bool = !cfg!(feature = "sealed");
-
-/// The number of a block that is not known: the sequence goes on with any block that begins at most
-/// where the existing data end.
-pub(crate) const ANY: u32 = 0;

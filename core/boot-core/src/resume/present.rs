@@ -1,6 +1,6 @@
 //! The real types.
 
-use super::ANY;
+use super::number::ANY;
 
 /// How often the progress of a download is stored, at most.
 const NOTES: u32 = 16;

@@ -12,7 +12,7 @@
 
 use shared_abi::geometry::Region;
 
-use super::{Key, Parameters, StoreError, Value};
+use super::parameters::{Key, Parameters, StoreError, Value};
 use crate::crc;
 use crate::flash::{Flash, FlashFault, Next, Operation, ERASED};
 use crate::sequence::{EraseSectors, ProgramWords};

@@ -3,7 +3,7 @@
 use canopen::bit_rate::BitRate;
 use canopen::NodeId;
 
-use super::{Key, Parameters, Value};
+use super::parameters::{Key, Parameters, Value};
 use crate::flash::Flash;
 
 /// The node-ID and the bit rate of a device.

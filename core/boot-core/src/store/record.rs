@@ -1,6 +1,6 @@
 //! The record of a program.
 
-use super::{Key, Parameters, Value};
+use super::parameters::{Key, Parameters, Value};
 use crate::flash::Flash;
 use crate::resume::Partial;
 

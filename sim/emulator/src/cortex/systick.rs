@@ -1,6 +1,6 @@
 //! SysTick (PM0214 section 4.5).
 
-use crate::machine::clock::{picos_of, ticks_in};
+use crate::clock::{picos_of, ticks_in};
 use crate::time::Time;
 
 const CSR_ENABLE: u32 = 1 << 0;

@@ -4,7 +4,7 @@
 //! to date then, so the instruction is the one whose base and offset give that address (encodings:
 //! DDI 0403E A5.2.4 and A5.3.5 to A5.3.10).
 
-use crate::machine::report::Access;
+use crate::report::Access;
 
 /// A load or store as far as its address goes.
 struct Form {

@@ -4,7 +4,7 @@ use object::elf::{self, FileHeader32, ProgramHeader32, PT_LOAD};
 use object::read::elf::{FileHeader, ProgramHeader};
 use object::LittleEndian;
 
-use super::Error;
+use crate::error::Error;
 
 /// A run of bytes that an image puts into flash.
 #[derive(Clone, Debug, PartialEq, Eq)]

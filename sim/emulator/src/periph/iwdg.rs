@@ -1,6 +1,6 @@
 //! Independent watchdog (RM0090 section 21).
 
-use crate::machine::clock::{picos_of, ticks_in};
+use crate::clock::{picos_of, ticks_in};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 

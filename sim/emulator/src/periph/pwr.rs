@@ -1,8 +1,8 @@
 //! Power controller (RM0090 section 5, RM0390 section 5).
 
-use crate::machine::variant::Variant;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
+use crate::variant::Variant;
 
 const CR_DBP: u32 = 1 << 8;
 const CR_FPDS: u32 = 1 << 9;

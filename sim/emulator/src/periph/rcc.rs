@@ -1,9 +1,8 @@
 //! Reset and clock control (RM0090 sections 6 and 7, RM0390 section 6).
 
-use crate::machine::variant::Variant;
-use crate::machine::ResetCause;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
+use crate::variant::Variant;
 
 /// High-speed internal oscillator, Hz.
 pub const HSI_HZ: u32 = 16_000_000;
@@ -42,6 +41,19 @@ const CSR_IWDGRSTF: u32 = 1 << 29;
 const BDCR_LSEON: u32 = 1 << 0;
 const BDCR_LSERDY: u32 = 1 << 1;
 const BDCR_BDRST: u32 = 1 << 16;
+
+/// Why the chip came out of reset.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ResetCause {
+    /// Power came up.
+    PowerOn,
+    /// NRST was pulled low.
+    Pin,
+    /// AIRCR.SYSRESETREQ.
+    Software,
+    /// The independent watchdog ran out.
+    IndependentWatchdog,
+}
 
 /// The frequencies that the program has set up, in Hz.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -383,7 +395,7 @@ mod tests {
     use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
 
     use super::*;
-    use crate::machine::variant;
+    use crate::variant;
 
     fn f407(hse_hz: u32) -> Rcc {
         Rcc::new(variant::of(&STM32F407VG), hse_hz)

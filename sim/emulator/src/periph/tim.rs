@@ -7,7 +7,7 @@
 //! **What is missing.** The pins (PWM, input capture, encoders), counting down, triggers between
 //! timers and DMA requests. Each is reported when a program sets it up.
 
-use crate::machine::clock::{picos_of, ticks_in};
+use crate::clock::{picos_of, ticks_in};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
 

@@ -8,7 +8,7 @@
 
 use std::collections::VecDeque;
 
-use crate::machine::clock::picos_of;
+use crate::clock::picos_of;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::{Span, Time};
 

@@ -4,7 +4,7 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
-use crate::sdo::client::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::client::transfer::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use crate::time::Instant;
 

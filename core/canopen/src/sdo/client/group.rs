@@ -5,7 +5,7 @@ use crate::frame::{CobId, Frame};
 use crate::od::Address;
 use crate::sdo::block::check_blksize;
 use crate::sdo::client::download::SubBlock;
-use crate::sdo::client::Config;
+use crate::sdo::client::transfer::Config;
 use crate::sdo::wire::{BlockAck, Request, Response};
 use crate::time::Instant;
 

@@ -3,7 +3,7 @@
 use crate::abort::AbortCode;
 use crate::od::{Address, DataType, Objects};
 
-use super::VALUE_MAX;
+use super::value::VALUE_MAX;
 
 /// A download by any kind of transfer: the number of bytes received, and the permitted number.
 #[derive(Clone, Copy, Debug)]

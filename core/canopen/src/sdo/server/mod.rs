@@ -22,14 +22,13 @@ mod block_upload;
 mod incoming;
 mod outgoing;
 mod segmented;
+mod sender;
+mod value;
 
-use block_upload::Sender;
 use incoming::Incoming;
 use outgoing::Outgoing;
-
-/// The longest variable or string, in bytes. A longer value must be a domain. (A signature with the
-/// signed data, 2002h, has 76 bytes.)
-pub const VALUE_MAX: usize = if cfg!(feature = "sealed") { 80 } else { 64 };
+use sender::Sender;
+pub use value::VALUE_MAX;
 
 /// How long an answer is delayed for lack of room before the device is asked for room in its
 /// reserve, in milliseconds.

@@ -4,7 +4,7 @@ use crate::abort::AbortCode;
 use crate::od::{Address, Objects};
 use crate::sdo::block::SEGMENT;
 
-use super::VALUE_MAX;
+use super::value::VALUE_MAX;
 
 /// An upload by any kind of transfer: the number of bytes, and the number of sent bytes.
 #[derive(Clone, Copy, Debug)]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use shared_abi::geometry::{Geometry, Sector};
 
-use super::Noise;
+use crate::noise::Noise;
 
 /// The cells between 0 and 1 that an erase leaves which the power failure found in the middle. On
 /// the chip it is as many as the sector has; here a few, all over the sector.

@@ -1,15 +1,10 @@
-//! The programs, for a Cortex-M4 with RAM at 2000_0000h. They run in RAM, so that every address in
-//! a result is the same on all machines. Each starts at a symbol of its own with the stack at
-//! 2001_0000h, writes words from 2000_0000h on, and ends with a jump to 2000_3000h, where the
-//! machine has its own code.
-//!
-//! r7 is where the next word goes; handlers move it too. r5 and r6 are scratch of the macros.
+// The programs, for a Cortex-M4 with RAM at 2000_0000h. They run in RAM, so that every address in
+// a result is the same on all machines. Each starts at a symbol of its own with the stack at
+// 2001_0000h, writes words from 2000_0000h on, and ends with a jump to 2000_3000h, where the
+// machine has its own code.
+//
+// r7 is where the next word goes; handlers move it too. r5 and r6 are scratch of the macros.
 
-#![no_std]
-#![no_main]
-
-core::arch::global_asm!(
-    r#"
     .syntax unified
     .thumb
 
@@ -649,8 +644,8 @@ after_second:
     faults ldrex r1, [r0]
     faults strex r2, r1, [r0]
     faults ldrexh r1, [r0]      // 0x20000402: aligned
-    faults ldm r0, {{r1, r2}}
-    faults stm r0, {{r1, r2}}
+    faults ldm r0, {r1, r2}
+    faults stm r0, {r1, r2}
     faults ldrd r1, r2, [r0]
     faults strd r1, r2, [r0]
     faults vldr s0, [r0]
@@ -667,7 +662,7 @@ after_second:
     faults ldr r1, [r0, r3, lsl #1]
     faults ldr r1, [r0, r3]
     faults strh r1, [r0, r3]
-    faults ldm r0, {{r1, r2}}
+    faults ldm r0, {r1, r2}
     faults strd r1, r2, [r0]
     faults vldr s0, [r0]
     store CCR, 0x00000200
@@ -824,6 +819,7 @@ after_second:
     store IPR0, 0xFFFFFFFF
     log_word IPR0
     end
+
     // The end on a machine with semihosting: the first 64 words go to standard output.
     handler semihosted_end
     movs r0, #1                 // SYS_OPEN ":tt", mode "wb"
@@ -847,10 +843,3 @@ open_block:
     .word terminal, 5, 3
 terminal:
     .asciz ":tt"
-"#
-);
-
-#[panic_handler]
-fn panic(_: &core::panic::PanicInfo) -> ! {
-    loop {}
-}

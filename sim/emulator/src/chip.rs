@@ -1,31 +1,30 @@
 //! Everything of the chip except the instruction set: memories, peripherals, clocks, and the
 //! address map.
 
-use std::collections::BTreeSet;
-
 use shared_abi::geometry::{Geometry, Region};
 
-use super::clock::CycleClock;
-use super::memory::{HostMemory, PAGE};
-use super::report::{Access, Report, Reports};
-use super::variant::{self, Variant};
-use super::{Options, ResetCause};
 use crate::bxcan::BxCan;
+use crate::clock::CycleClock;
 use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::{Effect, Scs};
+use crate::memory::{HostMemory, PAGE};
+use crate::options::Options;
 use crate::periph::crc::Crc;
 use crate::periph::exti::Exti;
 use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
 use crate::periph::iwdg::Iwdg;
 use crate::periph::pwr::Pwr;
-use crate::periph::rcc::{self, Clocks, Rcc, HSI_HZ};
+use crate::periph::rcc::{self, Clocks, Rcc, ResetCause, HSI_HZ};
 use crate::periph::syscfg::Syscfg;
 use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::report::{Access, Report, Reports};
+use crate::slice::Slice;
 use crate::time::Time;
+use crate::variant::{self, Variant};
 
 /// Where flash (or whatever the boot pins choose) shows up for the reset vector.
 pub const BOOT_ALIAS: u32 = 0;
@@ -68,16 +67,6 @@ enum Block {
     Can2,
     Usart(usize),
     Tim(usize),
-}
-
-/// The record of the RAM that a piece of code accesses.
-pub struct Watch {
-    /// The code.
-    pub code: Region,
-    /// The code runs at present.
-    pub inside: bool,
-    /// The pages of RAM that it accessed, by their addresses.
-    pub touched: BTreeSet<u32>,
 }
 
 /// The block that answers at an address, with the offset in its registers.
@@ -229,46 +218,10 @@ pub struct Chip {
     pub options: HostMemory,
     /// The reports of accesses that went wrong.
     pub reports: Reports,
-    /// Reports of accesses to peripherals whose instruction is still to be found; their address is
-    /// the one that the program used.
-    pub unlocated: Vec<Report>,
     /// The counters.
     pub counters: Counters,
-
-    /// The CPU goes on until its cycle count reaches this.
-    pub slice_end: u64,
-    /// The deadline of the machine's owner, which the slice never passes.
-    pub deadline: Time,
-    /// The CPU leaves translated code at the end of the present block.
-    pub leave: bool,
-    /// An exception is pending that might be taken when the masks allow.
-    pub check_exceptions: bool,
-    /// The CAN bus must process a change.
-    pub attention: bool,
-    /// A system reset was asked for.
-    pub reset_request: Option<ResetCause>,
-    /// The CPU stands still until this time, because the bus to the flash is held.
-    pub hold_until: Option<Time>,
-    /// A bus error came back for the last store, to this address.
-    pub bus_error: Option<u32>,
-    /// Code that has changed since it was translated: (address, length).
-    pub stale: Vec<(u32, u32)>,
-    /// The translator must forget which memory may be read: a flash operation started, and loads
-    /// from flash must be noticed.
-    pub flush_tlb: bool,
-    /// This was done for the running operation.
-    guarded: bool,
-    /// Breakpoints were set or removed, so translations of code may stop at the wrong places.
-    pub breakpoints_changed: bool,
-    /// The addresses at which a debugger wants code to stop.
-    pub stops: BTreeSet<u32>,
-    /// How often translated code was entered.
-    pub entries: u64,
-    /// The block that runs: address and length in bytes.
-    pub block: (u32, u32),
-    /// Code that is watched.
-    pub watch: Option<Watch>,
-
+    /// What the chip and the CPU loop have to say to each other.
+    pub slice: Slice,
     clocks: Clocks,
     lines: Vec<u16>,
 }
@@ -312,7 +265,6 @@ impl Chip {
             system,
             options: HostMemory::new(OPTION_PAGE.size, 0xFF),
             reports: Reports::default(),
-            unlocated: Vec::new(),
             counters: Counters {
                 instructions: 0,
                 cycles: 0,
@@ -324,22 +276,7 @@ impl Chip {
                 flash_stalls: 0,
                 flash_stall_time: crate::time::Span(0),
             },
-            slice_end: 0,
-            deadline: Time(0),
-            leave: false,
-            check_exceptions: false,
-            attention: false,
-            reset_request: None,
-            hold_until: None,
-            bus_error: None,
-            stale: Vec::new(),
-            flush_tlb: false,
-            guarded: false,
-            breakpoints_changed: false,
-            stops: BTreeSet::new(),
-            entries: 0,
-            block: (0, 0),
-            watch: None,
+            slice: Slice::default(),
             lines: Vec::new(),
         }
     }
@@ -380,12 +317,12 @@ impl Chip {
         };
         self.scs = Scs::new(self.geometry.interrupts, self.clock.hz());
         self.scs.debug = debug;
-        self.breakpoints_changed = true;
-        self.leave = false;
-        self.check_exceptions = false;
-        self.reset_request = None;
-        self.hold_until = None;
-        self.bus_error = None;
+        self.slice.breakpoints_changed = true;
+        self.slice.leave = false;
+        self.slice.check_exceptions = false;
+        self.slice.reset_request = None;
+        self.slice.hold_until = None;
+        self.slice.bus_error = None;
         if self.flash.hardware_watchdog() {
             let now = self.now();
             // The key that starts the watchdog is always accepted.
@@ -401,7 +338,7 @@ impl Chip {
         self.rcc = Rcc::new(self.variant, hse_hz);
         self.dbgmcu = [0; 3];
         self.counters.resets = 0;
-        self.attention = false;
+        self.slice.attention = false;
         self.reset(ResetCause::PowerOn);
     }
 
@@ -476,7 +413,7 @@ impl Chip {
             }
         }
         if !wrong.is_empty() {
-            self.report(Access::Write, RCC_CFGR, 4, 0, self.block.0, wrong.join("; "));
+            self.report(Access::Write, RCC_CFGR, 4, 0, self.slice.block.0, wrong.join("; "));
         }
     }
 
@@ -494,7 +431,7 @@ impl Chip {
         if self.rcc.clocks() != hclk {
             self.apply_clocks();
             self.check_clocks();
-            self.leave = true;
+            self.slice.leave = true;
         }
         self.flash.advance(now);
         self.settle_flash();
@@ -509,8 +446,8 @@ impl Chip {
             tim.advance(now);
         }
         if self.iwdg.has_expired() {
-            self.reset_request = Some(ResetCause::IndependentWatchdog);
-            self.leave = true;
+            self.slice.reset_request = Some(ResetCause::IndependentWatchdog);
+            self.slice.leave = true;
         }
         if self.scs.systick.advance(now) {
             self.scs.exceptions.pend(SYS_TICK);
@@ -534,14 +471,14 @@ impl Chip {
         self.exti.interrupts(&mut lines);
         self.scs.exceptions.set_levels(&lines);
         self.lines = lines;
-        self.check_exceptions = self.scs.exceptions.any_pending();
+        self.slice.check_exceptions = self.scs.exceptions.any_pending();
     }
 
     fn take_flash_changes(&mut self) {
         let base = self.geometry.flash.base;
         for (offset, len) in self.flash.take_changed() {
-            self.stale.push((base + offset, len));
-            self.leave = true;
+            self.slice.stale.push((base + offset, len));
+            self.slice.leave = true;
         }
         self.counters.sectors_erased = self.flash.counters.sectors_erased;
         self.counters.units_programmed = self.flash.counters.units_programmed;
@@ -575,7 +512,7 @@ impl Chip {
 
     fn stop_before(&self, event: Option<Time>) -> Time {
         let now = self.now();
-        event.filter(|&event| event > now).map_or(self.deadline, |event| event.min(self.deadline))
+        event.filter(|&event| event > now).map_or(self.slice.deadline, |event| event.min(self.slice.deadline))
     }
 
     /// Sets the end of the CPU's run to the deadline or the next event, whichever comes first.
@@ -585,7 +522,7 @@ impl Chip {
 
     fn end_slice_at(&mut self, event: Option<Time>) {
         let until = self.stop_before(event);
-        self.slice_end = self.clock.cycle_at(until);
+        self.slice.end = self.clock.cycle_at(until);
     }
 
     /// Reports an access that is wrong or not modelled.
@@ -628,7 +565,7 @@ impl Chip {
             self.complain(Access::Write, address, size, value, unmodelled);
         }
         if self.flash.take_bus_error() {
-            self.bus_error = Some(address);
+            self.slice.bus_error = Some(address);
         }
         self.after_write();
     }
@@ -651,7 +588,7 @@ impl Chip {
             what.push_str(&format!(" (the alias of bit {bit} of the register at {word:08X}h)"));
         }
         let time = self.now();
-        self.unlocated.push(Report { time, address, pc: 0, size, access, value, what, count: 1 });
+        self.slice.unlocated.push(Report { time, address, pc: 0, size, access, value, what, count: 1 });
     }
 
     /// Word-sized bit-band access to SRAM: (offset of the byte, bit).
@@ -761,8 +698,8 @@ impl Chip {
             Place::Scs(offset) => self.store_scs(offset, value, now),
             Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.clock.cycles),
             Place::Fpb(offset) => {
-                self.breakpoints_changed = true;
-                self.leave = true;
+                self.slice.breakpoints_changed = true;
+                self.slice.leave = true;
                 self.scs.debug.write_fpb(offset, value)
             }
             Place::Dbgmcu(0) | Place::Itm => Ok(()),
@@ -787,7 +724,7 @@ impl Chip {
                 let changed = self.rcc.clocks() != self.clocks;
                 if changed || offset == rcc::APB1ENR || offset == rcc::APB2ENR {
                     self.apply_clocks();
-                    self.leave = true;
+                    self.slice.leave = true;
                 }
                 if changed {
                     self.check_clocks();
@@ -807,8 +744,8 @@ impl Chip {
                     self.tell_slave();
                 }
                 if self.can.iter().any(BxCan::wants_attention) {
-                    self.attention = true;
-                    self.leave = true;
+                    self.slice.attention = true;
+                    self.slice.leave = true;
                 }
             }
             _ => {}
@@ -835,17 +772,17 @@ impl Chip {
     /// Call it after anything that may have started, ended or waited for a flash operation.
     fn settle_flash(&mut self) {
         if let Some(until) = self.flash.take_wait() {
-            self.hold_until = Some(until);
-            self.leave = true;
+            self.slice.hold_until = Some(until);
+            self.slice.leave = true;
         }
         let busy = self.flash.busy_until().is_some();
-        if busy && !self.guarded {
-            self.flush_tlb = true;
-            self.leave = true;
+        if busy && !self.slice.guarded {
+            self.slice.flush_tlb = true;
+            self.slice.leave = true;
         }
-        self.guarded = busy;
+        self.slice.guarded = busy;
         if self.flash.power_has_failed() {
-            self.leave = true;
+            self.slice.leave = true;
         }
         self.take_flash_changes();
     }
@@ -856,10 +793,10 @@ impl Chip {
         }
         match self.scs.write(offset, value, now)? {
             Effect::None => {}
-            Effect::FpuAccess | Effect::Stepping | Effect::Traps => self.leave = true,
+            Effect::FpuAccess | Effect::Stepping | Effect::Traps => self.slice.leave = true,
             Effect::SystemReset => {
-                self.reset_request = Some(ResetCause::Software);
-                self.leave = true;
+                self.slice.reset_request = Some(ResetCause::Software);
+                self.slice.leave = true;
             }
         }
         Ok(())
@@ -871,7 +808,7 @@ impl Chip {
         self.update_lines();
         let now = self.now();
         let next = self.next_event();
-        self.leave |= next.is_some_and(|event| event <= now);
+        self.slice.leave |= next.is_some_and(|event| event <= now);
         self.end_slice_at(next);
     }
 

@@ -1,7 +1,6 @@
-//! Tests of the machine through its public interface. The programs are machine code with listings;
-//! the expected results come from the architecture and the reference manuals.
+//! Tests of the machine through its public interface. The programs are in `programs/`; the expected
+//! results come from the architecture and the reference manuals.
 
-#[rustfmt::skip]
 mod programs;
 
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
@@ -29,7 +28,7 @@ fn table(program: &Program) -> Vec<u8> {
     let mut table = [0_u32; 128];
     table[0] = STACK;
     table[1] = program.base | 1;
-    for &(exception, vector) in program.vectors {
+    for &(exception, vector) in &program.vectors {
         table[exception] = vector;
     }
     table.iter().flat_map(|word| word.to_le_bytes()).collect()
@@ -37,7 +36,7 @@ fn table(program: &Program) -> Vec<u8> {
 
 fn load(machine: &mut Machine, program: &Program) {
     machine.load_bin(0x0800_0000, &table(program)).unwrap();
-    machine.load_bin(program.base, &bytes(program.code)).unwrap();
+    machine.load_bin(program.base, &program.code).unwrap();
 }
 
 fn with_options(program: &Program, options: Options) -> Machine {
@@ -54,7 +53,7 @@ fn machine(program: &Program) -> Machine {
 /// A machine that is about to run the program in RAM, with `argument` at [`ARGUMENT`].
 fn machine_in_ram(program: &Program, argument: u32, options: Options) -> Machine {
     let mut machine = with_options(&programs::TO_RAM, options);
-    machine.write_ram(program.base, &bytes(program.code)).unwrap();
+    machine.write_ram(program.base, &program.code).unwrap();
     put(&mut machine, ARGUMENT, argument);
     put(&mut machine, 0x2000_0200, 1);
     machine

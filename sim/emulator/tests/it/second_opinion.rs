@@ -1,9 +1,8 @@
-//! Small programs for the CPU (programs.rs) on our machine, against the Armv7-M Architecture
-//! Reference Manual (DDI 0403E), and on a machine that others wrote: QEMU's mps2-an386.
+//! Small programs for the CPU (second_opinion/programs.s) on our machine, against the Armv7-M
+//! Architecture Reference Manual (DDI 0403E), and on a machine that others wrote: QEMU's mps2-an386.
 //!
-//! `cargo xtask opinion` runs the second half. Nothing else depends on this folder.
+//! `cargo xtask opinion` runs the second half.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -11,8 +10,9 @@ use std::{env, fs, thread};
 
 use emulator::machine::{Machine, Options};
 use emulator::time::Time;
-use object::{Object, ObjectSection, ObjectSymbol};
 use shared_abi::geometry::STM32F407VG;
+
+use crate::assembler::{assemble, Assembled};
 
 const STACK: u32 = 0x2001_0000;
 /// Where the programs write.
@@ -223,33 +223,15 @@ fn programs(image: &Image) -> Vec<Program> {
 // --- the programs, assembled
 // -------------------------------------------------------------------------------------------------
 
-struct Image {
-    code: Vec<u8>,
-    symbols: BTreeMap<String, u32>,
-}
+struct Image(Assembled);
 
 impl Image {
-    fn build(test: &str) -> Self {
-        let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
-        let elf = folder.join(format!("second_opinion_{test}.elf"));
-        let mut rustc = Command::new(env::var_os("RUSTC").unwrap_or_else(|| "rustc".into()));
-        rustc.args(["--edition", "2021", "--target", "thumbv7em-none-eabihf", "-C", "panic=abort"]);
-        rustc.arg(format!("-Clink-args=-Ttext={CODE:#x} --no-gc-sections -eorder"));
-        rustc.arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/second_opinion/programs.rs"));
-        assert!(rustc.arg("-o").arg(&elf).status().unwrap().success(), "cargo xtask setup adds the target");
-        let bytes = fs::read(&elf).unwrap();
-        let elf = object::File::parse(&bytes[..]).unwrap();
-        let text = elf.section_by_name(".text").unwrap();
-        assert_eq!(text.address(), u64::from(CODE));
-        let address = |symbol: &object::Symbol| u32::try_from(symbol.address()).unwrap();
-        Self {
-            code: text.data().unwrap().to_vec(),
-            symbols: elf.symbols().map(|it| (it.name().unwrap().to_owned(), address(&it))).collect(),
-        }
+    fn build() -> Self {
+        Self(assemble("second_opinion/programs.s", CODE))
     }
 
     fn symbol(&self, name: &str) -> u32 {
-        self.symbols[name]
+        self.0.symbol(name).unwrap_or_else(|| panic!("the programs have no symbol {name}"))
     }
 }
 
@@ -268,7 +250,7 @@ fn ours(image: &Image, name: &str) -> Vec<u32> {
     let mut machine = Machine::new(&STM32F407VG, Options::default()).unwrap();
     machine.load_bin(0x0800_0000, &bytes(&[STACK, image.symbol(name) | 1])).unwrap();
     machine.power_on(Time(0));
-    machine.write_ram(CODE, &image.code).unwrap();
+    machine.write_ram(CODE, &image.0.code).unwrap();
     machine.write_ram(END, &bytes(&[0xE7FD_BF30])).unwrap(); // wfi, for ever
     machine.run_until(Time(100_000_000_000));
     let mut result = [0; 4 * WORDS];
@@ -290,7 +272,7 @@ fn qemu(image: &Image, name: &str) -> Result<Vec<u32>, String> {
     // Virtual time advances with the instructions, not with the host's clock.
     qemu.args(["-icount", "shift=5", "-semihosting-config", "enable=on,target=native"]);
     qemu.args(["-device", &place("start", 0, &bytes(&[STACK, image.symbol(name) | 1]))]);
-    qemu.args(["-device", &place("code", CODE, &image.code)]);
+    qemu.args(["-device", &place("code", CODE, &image.0.code)]);
     qemu.args(["-device", &place("end", END, &end)]);
     qemu.stdin(Stdio::null()).stdout(Stdio::piped());
     let mut child = qemu.spawn().map_err(|error| format!("qemu-system-arm: {error}"))?;
@@ -330,7 +312,7 @@ fn differences(left: &[u32], right: &[u32]) -> Vec<(usize, u32, u32)> {
 
 #[test]
 fn our_machine_does_what_the_manual_says() {
-    let image = Image::build("ours");
+    let image = Image::build();
     let mut wrong = String::new();
     for program in programs(&image) {
         let mut expected = expected(&program);
@@ -348,7 +330,7 @@ fn our_machine_does_what_the_manual_says() {
 #[test]
 #[ignore = "needs QEMU: cargo xtask opinion"]
 fn qemu_does_the_same() {
-    let image = Image::build("qemu");
+    let image = Image::build();
     let (mut compared, mut explained, mut wrong) = (0, Vec::new(), Vec::new());
     let programs = programs(&image);
     for program in &programs {

@@ -1,0 +1,78 @@
+//! What is stored: values under keys.
+
+use crate::flash::{Flash, FlashFault, Next};
+
+/// The key of a stored value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Key {
+    /// The record of a program (1 to 254), see [`ProgramRecord`].
+    Program(u8),
+    /// The number of consecutive times that the application ended without a request.
+    CrashCount,
+    /// Node-ID and bit rate, see [`NodeParameters`].
+    Node,
+    /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
+    /// accepts, and the counter of the installed program. This value survives the program's record.
+    #[cfg(feature = "sealed")]
+    Counter(u8),
+    /// An event (0 to 7), see `seal::access`.
+    #[cfg(feature = "sealed")]
+    Event(u8),
+    /// The number of grants of rights, and whether one of them has opened the device permanently.
+    #[cfg(feature = "sealed")]
+    Grants,
+}
+
+impl Key {
+    /// The word for the key. FFFFFFFFh (erased flash) means no key.
+    #[must_use]
+    pub const fn tag(self) -> u32 {
+        match self {
+            Self::Program(number) => 0x0001_0000 | number as u32,
+            Self::CrashCount => 0x0002_0000,
+            Self::Node => 0x0003_0000,
+            #[cfg(feature = "sealed")]
+            Self::Counter(number) => 0x0004_0000 | number as u32,
+            #[cfg(feature = "sealed")]
+            Self::Event(place) => 0x0005_0000 | place as u32,
+            #[cfg(feature = "sealed")]
+            Self::Grants => 0x0006_0000,
+        }
+    }
+}
+
+/// The words of a value; their meaning depends on the key.
+pub type Value = [u32; 4];
+
+/// Why a value could not be stored. 1F57h then shows NVDATA.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum StoreError {
+    /// The flash refused or failed.
+    Flash(FlashFault),
+    /// No slot accepted the record: the region is worn out.
+    WornOut,
+    /// The journal has a newer format. It belongs to a newer bootloader and is not changed. To use
+    /// this bootloader, erase the two parameter sectors with a debugger.
+    NewerFormat,
+    /// A store outside the flash failed.
+    Device,
+}
+
+/// A place for parameters: the [`Journal`] in flash, or a part of the board (an EEPROM), which may
+/// ignore the flash.
+///
+/// An implementation must guarantee two properties: after a power cut at any time,
+/// [`get`](Self::get) returns for every key the value before the store or the new one; and every
+/// store ends, with an error if the memory is full or worn out.
+pub trait Parameters {
+    /// The value of a key, `None` if it was never stored.
+    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
+
+    /// Starts to store one value; [`next`](Self::next) carries it out.
+    fn store(&mut self, key: Key, value: Value);
+
+    /// The next operation of the store. `outcome` is the result of the previous one (`Ok` at
+    /// first). After an error the old value still exists.
+    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError>;
+}

@@ -1,0 +1,27 @@
+//! The errors of a machine.
+
+/// An error in setting up a machine.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The CPU emulation refused.
+    #[error("{doing}: {error}")]
+    Engine {
+        /// The action that failed.
+        doing: &'static str,
+        /// The error of the CPU emulation.
+        error: String,
+    },
+    /// The image cannot be used.
+    #[error("{0}")]
+    Image(String),
+    /// An address lies outside the required memory.
+    #[error("{len} bytes at {address:08X}h are not all in {wanted}")]
+    Address {
+        /// First address.
+        address: u32,
+        /// Length.
+        len: usize,
+        /// The memory that they must be in.
+        wanted: &'static str,
+    },
+}
