@@ -184,7 +184,8 @@ const TOOLS: &str = "xtask";
 /// The test programs that take a minute and more.
 const SLOW: [&str; 6] = ["porting", "powercut_board", "python_package", "powercut", "examples", "clients"];
 /// The packages that are built for a chip, or by another tool.
-const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
+const NOT_ON_HOST: [&str; 6] =
+    ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
 
 /// The test programs that run for a board of each chip: they show the mistakes that a port can have.
 /// Dialects, logs and the rest are the same on all of them; at night all tests run for each chip.
