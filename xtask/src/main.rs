@@ -46,6 +46,7 @@ mod parts;
 mod portable;
 mod powercut;
 mod process;
+mod product;
 mod record;
 mod reproduce;
 mod rooms;
