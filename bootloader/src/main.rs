@@ -3,7 +3,7 @@
 //! | file | what it does | unsafe |
 //! |---|---|---|
 //! | `main.rs` | the tasks: it only connects the other parts | no |
-//! | `product.rs` | the choices of a product | no |
+//! | `product.rs` | the choices that a product has; it makes them in `products/` | no |
 //! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
@@ -11,7 +11,7 @@
 //! | `boot_report.rs` | the boot stage's report to the RAM part | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
-//! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
+//! | `debugger.rs` | the device without the debugger interface (the feature `debugger` takes that of `bsp`) | no |
 //! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
 //! The behaviour of the bootloader is in `boot-core` and `canopen`.
@@ -19,6 +19,7 @@
 #![no_main]
 
 mod boot_report;
+#[cfg(not(feature = "debugger"))]
 mod debugger;
 mod flash_controller;
 mod log;
@@ -29,6 +30,8 @@ mod start;
 mod storage;
 mod watchdog;
 
+#[cfg(feature = "debugger")]
+use bsp::debugger;
 use cortex_m::peripheral::SCB;
 use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;
@@ -97,7 +100,8 @@ mod app {
             device_type: PRODUCT.profile.device_type,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
-            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            // The version, and the product if it is not the default one (build.rs).
+            software_version: env!("COBOOT_VERSION"),
             heartbeat_ms: PRODUCT.heartbeat_ms,
             vendor_id: IDENTITY.vendor_id,
             product_code: IDENTITY.product_code,
