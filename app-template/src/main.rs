@@ -4,26 +4,41 @@
 //! |---|---|
 //! | `main.rs` | wiring of the tasks: put your own beside them |
 //! | `entries.rs` | the table of the object dictionary: add your objects; keep 1F51h, 1F56h and 1F57h |
-//! | `objects.rs` | the values behind it; what is coboot's of them is asked of `coboot-app` |
-//! | `debugger.rs` | the debugger interface (feature `debugger`): never in a product |
+//! | `objects.rs` | the values of the object dictionary, and the callback `start_bootloader` |
+//! | `Cargo.toml` | the version of the application |
 //!
-//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is left free for the
-//! debugger, which stops what is below it and nothing else.
+//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's; 2 is free.
 #![no_std]
 #![no_main]
 
-mod debugger;
-mod entries;
-mod objects;
-
+use bsp::IDENTITY;
 use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;
 
 systick_monotonic!(Mono, 1_000);
 
+/// 100Ah: the version in `Cargo.toml`.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// The first number of the version.
+const MAJOR: u32 = match u32::from_str_radix(env!("CARGO_PKG_VERSION_MAJOR"), 10) {
+    Ok(number) => number,
+    Err(_) => unreachable!(),
+};
+
+// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
+// file.
+coboot_app::label!(
+    vendor_id: IDENTITY.vendor_id,
+    product_code: IDENTITY.product_code,
+    version: MAJOR,
+);
+
+/// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
+#[used]
+static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", env!("CARGO_PKG_VERSION"), "\0");
+
 /// A fault, or a panic (which ends in a fault), restarts the device. The bootloader decides which
 /// program runs then.
-#[cfg(not(feature = "debugger"))]
 #[cortex_m_rt::exception]
 unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
     cortex_m::peripheral::SCB::sys_reset()
@@ -31,9 +46,10 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
+    use app_template::objects::{Application, HEARTBEAT_MS};
     use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
     use canopen::node::{self, NmtPolicy};
-    use canopen::slave::{self, Slave, SlaveDevice};
+    use canopen::slave::{self, Slave};
     use canopen::{BitRate, Frame, Instant, NodeId};
     use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
     use heapless::spsc::{Consumer, Producer, Queue};
@@ -41,9 +57,7 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
-    use super::Mono;
-    use crate::debugger::{self, Debugger};
-    use crate::objects::{Application, HEARTBEAT_MS};
+    use super::{Mono, VERSION};
 
     /// Received frames that may wait for the protocol task.
     const RX_QUEUE: usize = 16;
@@ -68,7 +82,6 @@ mod app {
         to_handle: Consumer<'static, Frame>,
         slave: Slave,
         application: Application,
-        debugger: Debugger,
         led: bsp::Led,
     }
 
@@ -76,10 +89,7 @@ mod app {
     fn init(cx: init::Context) -> (Shared, Local) {
         let mut rcc = bsp::clocks(cx.device.RCC);
         let board = bsp::init(&mut rcc, cx.device.CAN1);
-        #[cfg(not(feature = "virtual-can"))]
         let can = CanPort::new(board.can);
-        #[cfg(feature = "virtual-can")]
-        let can = CanPort::new(board.uart);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
@@ -94,7 +104,7 @@ mod app {
         );
         let node_id = start.node_id.and_then(NodeId::new);
         let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
-        let application = Application::new(&start, bit_rate);
+        let application = Application::new(&start, bit_rate, VERSION);
         let config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
@@ -112,7 +122,6 @@ mod app {
                 to_handle,
                 slave: Slave::new(application.lss_address(), node_id, bit_rate, config),
                 application,
-                debugger: Debugger::start(),
                 led: board.led,
             },
         )
@@ -136,29 +145,23 @@ mod app {
     }
 
     /// Runs the protocol when a frame came in, a mailbox became free or time has passed.
-    #[task(binds = CAN1_TX, shared = [can], local = [to_handle, slave, application, debugger], priority = 3)]
+    #[task(binds = CAN1_TX, shared = [can], local = [to_handle, slave, application], priority = 3)]
     fn protocol(cx: protocol::Context) {
         let now = Instant::from_millis(Mono::now().ticks());
         let protocol::SharedResources { mut can, .. } = cx.shared;
-        let protocol::LocalResources { to_handle, slave, application, debugger, .. } = cx.local;
+        let protocol::LocalResources { to_handle, slave, application, .. } = cx.local;
         application.set_time(now);
         if !serves(slave, &mut can, application) {
             return;
         }
         let status = can.lock(line::status);
-        let device = debugger.attach(application);
-        #[cfg(feature = "debugger")]
-        let device = &mut { device };
-        slave.observe(status, now, device);
+        slave.observe(status, now, application);
         loop {
-            let device = debugger.attach(application);
-            #[cfg(feature = "debugger")]
-            let device = &mut { device };
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
             // waiting behind it.
-            carry_out(slave, &mut can, now, device);
+            carry_out(slave, &mut can, now, application);
             let Some(frame) = to_handle.dequeue() else { return };
-            if slave.handle(&frame, now, device) {
+            if slave.handle(&frame, now, application) {
                 application.control.restart(now.as_millis());
             }
             application.leave_owed(slave);
@@ -174,10 +177,7 @@ mod app {
         match application.proceed(bus_idle) {
             Next::Serve => return true,
             Next::Wait => {}
-            Next::Leave(request) => {
-                EXIT.ask(application.path(request), request);
-                debugger::release_program();
-            }
+            Next::Leave(request) => EXIT.ask(application.path(request), request),
         }
         false
     }
@@ -187,9 +187,9 @@ mod app {
         slave: &mut Slave,
         can: &mut impl Mutex<T = CanPort>,
         now: Instant,
-        device: &mut impl SlaveDevice,
+        application: &mut Application,
     ) {
-        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), device) {
+        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), application) {
             can.lock(|can| line::carry_out(can, output));
         }
     }
@@ -202,7 +202,6 @@ mod app {
             rtic::pend(pac::Interrupt::CAN1_TX);
             if ticks.is_multiple_of(500 / TICK_MS) {
                 cx.local.led.toggle();
-                debugger::example();
             }
             ticks = ticks.wrapping_add(1);
             Mono::delay(TICK_MS.millis()).await;

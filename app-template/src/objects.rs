@@ -9,21 +9,17 @@ use canopen::emcy::Emcy;
 use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
-#[cfg(feature = "lift")]
-use canopen::password::Lock;
-#[cfg(feature = "lift")]
-use canopen::program::UNLOCK;
 use canopen::program::{
-    region_value, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION, UNLOCK_ENTRIES,
+    region_value, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
 };
 use canopen::slave::Slave;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
 use coboot_app::callgate::PROGRAM_SIGNED;
+use coboot_app::rules::Command;
 use coboot_app::warm_start::{BootRequest, Owed};
 use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services, Start};
 
-use crate::debugger;
 use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the
@@ -31,41 +27,13 @@ use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.
 pub const HEARTBEAT_MS: u16 = 500;
-/// 100Ah.
-#[cfg(not(feature = "version-2"))]
-macro_rules! version {
-    () => {
-        "1.0.0"
-    };
-}
-#[cfg(feature = "version-2")]
-macro_rules! version {
-    () => {
-        "2.0.0"
-    };
-}
-const SOFTWARE_VERSION: &str = version!();
+/// 80h to 1F51h: a master calls the bootloader (SYS TEC manual L-1112d_10, table 2).
+const START_BOOTLOADER: u8 = Command::StartBootloader as u8;
 
 /// Programs of the device, each a sub-index of 1F51h, 1F56h and 1F57h.
 const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
-const ENTRY_COUNT: usize = entry_count(PROGRAMS) + debugger::ENTRIES.len();
-/// The object dictionary, with 1025h where there is a debugger interface.
-static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS).with(&debugger::ENTRIES).entries();
-/// The one of a lift device.
-static WITH_PASSWORD: [Entry; ENTRY_COUNT + UNLOCK_ENTRIES.len()] =
-    entries(PROGRAMS).with(&debugger::ENTRIES).with(&UNLOCK_ENTRIES).entries();
-
-// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
-// file.
-coboot_app::label!(
-    vendor_id: IDENTITY.vendor_id,
-    product_code: IDENTITY.product_code,
-    version: if cfg!(feature = "version-2") { 2 } else { 1 },
-);
-
-/// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
-#[used]
-static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", version!(), "\0");
+/// The object dictionary.
+static ENTRIES: [Entry; entry_count(PROGRAMS)] = entries(PROGRAMS).entries();
 
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
@@ -80,8 +48,6 @@ pub struct Application {
     path: ReentryPath,
     /// An answer that the SDO server still has to withhold.
     owed: Option<Owed>,
-    #[cfg(feature = "lift")]
-    lock: Lock,
     /// The time of the last call of [`Self::set_time`].
     now: Instant,
     emcy: Emcy,
@@ -93,13 +59,13 @@ pub struct Application {
 
 impl Application {
     /// Builds the state from the bootloader's values. Asks the bootloader for the CRC over this
-    /// program, once.
-    pub fn new(start: &Start, bit_rate: BitRate) -> Self {
+    /// program, once. `software_version` is 100Ah.
+    pub fn new(start: &Start, bit_rate: BitRate, software_version: &'static str) -> Self {
         let device = Device {
             device_type: DEVICE_TYPE,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
-            software_version: SOFTWARE_VERSION,
+            software_version,
             heartbeat_ms: HEARTBEAT_MS,
             vendor_id: IDENTITY.vendor_id,
             product_code: IDENTITY.product_code,
@@ -107,16 +73,12 @@ impl Application {
             serial_number: start.serial_number,
         };
         let control = ProgramControl::new(start, PROGRAMS, BOOTLOADER.program_crc(start.program));
-        // The bootloader of a lift is node 126, whatever the node-ID of this program.
-        let control = if cfg!(feature = "lift") { control.answering_itself() } else { control };
         Self {
             device,
             control,
             bootloader: BOOTLOADER,
             path: ReentryPath::default(),
             owed: None,
-            #[cfg(feature = "lift")]
-            lock: Lock::new(shared_abi::LIFT_PASSWORD),
             now: Instant::from_millis(0),
             bit_rate,
             emcy: Emcy::new(),
@@ -132,9 +94,6 @@ impl Application {
     /// Passes the time in: call it at least every few milliseconds.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
-        // Asked at least now and then, as it wants.
-        #[cfg(feature = "lift")]
-        let _ = self.lock.is_waiting(now);
     }
 
     /// Advances the departure, if one is in progress.
@@ -148,6 +107,19 @@ impl Application {
             BootRequest::PowerOn => ReentryPath::SystemReset,
             _ => self.path,
         }
+    }
+
+    /// The callback of 1F51h = 80h, START_BOOTLOADER: a master calls the bootloader in the place of
+    /// `program`.
+    ///
+    /// It runs before the SDO answer is sent, so it only takes a note: [`proceed`](Self::proceed)
+    /// lets the device leave when the answer is on the bus. The first 80h to a program that has just
+    /// been downloaded and started confirms that program instead (`coboot_app::rules`). An
+    /// application that must not leave now, since its machine moves, returns
+    /// `Err(AbortCode::DEVICE_STATE)` first, and stays.
+    fn start_bootloader(&mut self, program: u8) -> Result<(), AbortCode> {
+        let now = self.now.as_millis();
+        Ok(self.control.write_answered(program, &[START_BOOTLOADER], now, &mut self.bootloader)?)
     }
 
     /// Call it after every frame. Withdraws an answer that the bootloader is to send. If the client
@@ -166,11 +138,7 @@ impl Application {
 
 impl Objects for Application {
     fn entries(&self) -> &'static [Entry] {
-        if cfg!(feature = "lift") {
-            &WITH_PASSWORD
-        } else {
-            &ENTRIES
-        }
+        &ENTRIES
     }
 
     fn read(&mut self, at: Address, buf: &mut [u8]) -> Result<usize, AbortCode> {
@@ -208,18 +176,13 @@ impl Objects for Application {
         }
         let now = self.now.as_millis();
         match (at.index, data) {
-            // The callback runs before the SDO answer is sent, so it only takes a note.
+            (PROGRAM_CONTROL, &[START_BOOTLOADER]) => self.start_bootloader(at.sub),
+            // The other commands: stop, start, reset and clear a program.
             (PROGRAM_CONTROL, data) => {
                 match self.control.write(at.sub, data, now, &mut self.bootloader)? {
                     Answer::Send => {}
                     Answer::Withhold(owed) => self.owed = Some(owed),
                 }
-                Ok(())
-            }
-            #[cfg(feature = "lift")]
-            (UNLOCK, password) => {
-                self.lock.open(password, self.now)?;
-                self.control.arm();
                 Ok(())
             }
             (REENTRY_PATH, &[value]) => {

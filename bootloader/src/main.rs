@@ -11,7 +11,7 @@
 //! | `boot_report.rs` | the boot stage's report to the RAM part | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
-//! | `debugger.rs` | the debugger interface (feature `debugger`) | no |
+//! | `debugger.rs` | the device without the debugger interface (the feature `debugger` takes that of `bsp`) | no |
 //! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
 //! The behaviour of the bootloader is in `boot-core` and `canopen`.
@@ -19,6 +19,7 @@
 #![no_main]
 
 mod boot_report;
+#[cfg(not(feature = "debugger"))]
 mod debugger;
 mod flash_controller;
 mod log;
@@ -29,6 +30,8 @@ mod start;
 mod storage;
 mod watchdog;
 
+#[cfg(feature = "debugger")]
+use bsp::debugger;
 use cortex_m::peripheral::SCB;
 use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;

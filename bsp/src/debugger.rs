@@ -1,18 +1,61 @@
-//! The chip's memory for the debugger interface (feature `debugger`): a request may name any
-//! address, and none causes a fault.
+//! The debugger interface, 1025h, to the chip's memory (feature `debugger`): **every node on the bus
+//! can read and write this device's memory**. A request may name any address, and none causes a
+//! fault.
 
+use canopen::debugger::{self, Command, Debugged, Kind, Memory};
+use canopen::AbortCode;
 use shared_abi::memory_map::{may_read, may_write};
 
 use crate::{pac, LAYOUT};
 
-/// Why an access is refused.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Refused {
-    /// The address has no memory that may be accessed (`shared_abi::memory_map`).
-    Address,
-    /// The flash is busy: reading it now would stop the CPU until the flash is idle. Or the CCM has
-    /// no clock.
-    Busy,
+pub use canopen::debugger::ENTRIES;
+
+/// The interface of a device. With the feature `monitor` it also reports where the program stops.
+pub struct Debugger(debugger::Debugger<Chip>);
+
+impl Debugger {
+    /// The interface to this chip's memory.
+    #[must_use]
+    #[allow(clippy::new_without_default, reason = "a device has one, where its tasks are set up")]
+    pub const fn new() -> Self {
+        Self(debugger::Debugger::new(Chip))
+    }
+
+    /// The device with the interface in front of it.
+    pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, Chip> {
+        #[cfg(feature = "monitor")]
+        if let Some((kind, address)) = crate::monitor::take_stop() {
+            if let Some(stop) = debugger::Stop::from_number(kind) {
+                self.0.stopped(stop, address);
+            }
+        }
+        self.0.attach(device)
+    }
+}
+
+/// All memory of the chip.
+pub struct Chip;
+
+impl Memory for Chip {
+    fn is_locked(&mut self) -> bool {
+        is_locked()
+    }
+
+    fn allows(&mut self, command: &Command) -> bool {
+        let allowed = match command.kind {
+            Kind::Read => may_read,
+            Kind::Write => may_write,
+        };
+        allowed(LAYOUT.chip, command.address, command.len.into())
+    }
+
+    fn read(&mut self, address: u32, bytes: &mut [u8]) -> Result<(), AbortCode> {
+        read(address, bytes)
+    }
+
+    fn write(&mut self, address: u32, bytes: &[u8]) -> Result<(), AbortCode> {
+        write(address, bytes)
+    }
 }
 
 /// Whether the chip's read-out protection is on, at level 1 or 2 (RM0090, embedded flash: read
@@ -27,13 +70,15 @@ pub fn is_locked() -> bool {
 /// Reads memory or registers, by words if the address allows it.
 ///
 /// # Errors
-/// See [`Refused`]; then nothing was read.
-pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
+/// [`AbortCode::INVALID_VALUE`] if the address has no memory that may be accessed
+/// (`shared_abi::memory_map`); [`AbortCode::LOCAL_CONTROL`] if the flash is busy, because reading it
+/// now would stop the CPU until it is idle, or if the CCM has no clock. Then nothing was read.
+pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), AbortCode> {
     if !may_read(LAYOUT.chip, address, bytes.len() as u32) {
-        return Err(Refused::Address);
+        return Err(AbortCode::INVALID_VALUE);
     }
     if is_busy(address) {
-        return Err(Refused::Busy);
+        return Err(AbortCode::LOCAL_CONTROL);
     }
     let mut at = address;
     let mut rest = bytes;
@@ -58,13 +103,13 @@ pub fn read(address: u32, bytes: &mut [u8]) -> Result<(), Refused> {
 /// Writes RAM or registers, with the same access widths as [`read`].
 ///
 /// # Errors
-/// See [`Refused`]; then nothing was written.
-pub fn write(address: u32, bytes: &[u8]) -> Result<(), Refused> {
+/// As for [`read`]; then nothing was written.
+fn write(address: u32, bytes: &[u8]) -> Result<(), AbortCode> {
     if !may_write(LAYOUT.chip, address, bytes.len() as u32) {
-        return Err(Refused::Address);
+        return Err(AbortCode::INVALID_VALUE);
     }
     if is_busy(address) {
-        return Err(Refused::Busy);
+        return Err(AbortCode::LOCAL_CONTROL);
     }
     let mut at = address;
     let mut rest = bytes;

@@ -203,7 +203,8 @@ pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), 
 /// Tells cargo to link the binaries of this package with `script`, which is in `folder` together
 /// with the files that it includes.
 pub fn link(folder: &Path, script: &str) {
-    println!("cargo::rustc-link-search={}", folder.display());
+    // Not `rustc-link-search`: packages that depend on this one would find its files, too.
+    println!("cargo::rustc-link-arg-bins=-L{}", folder.display());
     println!("cargo::rustc-link-arg-bins=-T{script}");
     // Without it the linker aligns segments to pages of 64 KiB, and the file claims more flash than
     // the program fills.

@@ -6,16 +6,13 @@
 
 use std::fmt::Write;
 
+use app_template::entries as application;
 use boot_core::bootloader::{entries, entry_count, Extras};
 use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, IDENTITY, PROGRAM_REGION};
-
-/// The table of the application template. It does not depend on the chip.
-#[path = "../../app-template/src/entries.rs"]
-mod application;
 
 /// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
 const DATE: &str = "11-21-2026";

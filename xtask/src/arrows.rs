@@ -43,7 +43,15 @@ const RULES: &[Rule] = &[
     Rule { name: "coboot-linker", may_use: &["shared-abi"] },
     Rule { name: "bsp", may_use: &["canopen", "shared-abi"] },
     Rule { name: "bootloader", may_use: &["boot-core", "bsp", "coboot-linker", "seal", "shared-abi"] },
-    Rule { name: "app-template", may_use: &["canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"] },
+    Rule { name: "app-template", may_use: &["canopen", "coboot-app", "coboot-linker", "bsp"] },
+    Rule {
+        name: "app-template-v2",
+        may_use: &["app-template", "canopen", "coboot-app", "coboot-linker", "bsp"],
+    },
+    Rule {
+        name: "test-app",
+        may_use: &["app-template", "canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"],
+    },
     Rule { name: "vendor-can", may_use: &[] },
     Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can"] },
     Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
@@ -56,6 +64,7 @@ const RULES: &[Rule] = &[
     Rule {
         name: "coboot-tests",
         may_use: &[
+            "app-template",
             "boot-core",
             "bsp",
             "canopen",

@@ -74,17 +74,17 @@ pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader-sealed", "sealed"),
     // With the debugger interface, only for the tests: never ship it.
     bootloader("bootloader-debugger", "debugger"),
-    application("app-debugger", "debugger"),
-    // Version 1 is the unchanged template.
-    application("app-v1", ""),
-    application("app-v2", "version-2"),
-    application("app-virtual-can", "virtual-can"),
-    Variant { program: 2, least_programs: 2, ..application("app-program-2", "version-2,program-2") },
-    Variant { least_programs: 2, ..application("app-lift", "lift") },
-    Variant { least_programs: 2, ..application("app-lift-v2", "lift,version-2") },
+    application("app-debugger", "test-app", "debugger"),
+    // The unchanged template, in two versions.
+    application("app-v1", "app-template", ""),
+    application("app-v2", "app-template-v2", ""),
+    application("app-virtual-can", "test-app", "virtual-can"),
+    Variant { program: 2, least_programs: 2, ..application("app-program-2", "app-template-v2", "program-2") },
+    Variant { least_programs: 2, ..application("app-lift", "test-app", "lift") },
+    Variant { least_programs: 2, ..application("app-lift-v2", "test-app", "lift,version-2") },
     // The image for the sessions of the dialects over UART (tests/port/matrix.rs).
-    Variant { least_programs: 2, ..application("app-virtual-can-v2", "virtual-can,version-2") },
-    Variant { least_programs: 2, ..application("app-virtual-can-lift", "virtual-can,lift") },
+    Variant { least_programs: 2, ..application("app-virtual-can-v2", "test-app", "virtual-can,version-2") },
+    Variant { least_programs: 2, ..application("app-virtual-can-lift", "test-app", "virtual-can,lift") },
     ;
     // Each log and the serial transport with each dialect, for example `bootloader-log-rtt-paulus`.
     "log-rtt" with "paulus", "esacademy", "lift";
@@ -105,8 +105,8 @@ const fn product(name: &'static str, product: &'static str) -> Variant {
     Variant { product: Some(product), ..bootloader(name, "") }
 }
 
-const fn application(name: &'static str, features: &'static str) -> Variant {
-    Variant { name, package: "app-template", features, product: None, program: 1, least_programs: 1 }
+const fn application(name: &'static str, package: &'static str, features: &'static str) -> Variant {
+    Variant { name, package, features, product: None, program: 1, least_programs: 1 }
 }
 
 impl Variant {

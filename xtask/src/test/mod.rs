@@ -238,7 +238,8 @@ fn room() -> Outcome {
 }
 
 /// The packages that are built for a chip, or by another tool.
-const NOT_ON_HOST: [&str; 4] = ["bsp", "bootloader", "app-template", "coflash-python"];
+const NOT_ON_HOST: [&str; 6] =
+    ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
 
 /// The test programs that need no firmware.
 fn host_programs() -> Outcome<Vec<Program>> {

@@ -1,0 +1,8 @@
+//! What the reference application is on the bus: its object dictionary. `main.rs` has the tasks.
+//!
+//! On the host the crate has the table alone.
+#![no_std]
+
+pub mod entries;
+#[cfg(target_arch = "arm")]
+pub mod objects;

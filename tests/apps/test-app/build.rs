@@ -1,0 +1,7 @@
+//! Links the program for its place in the flash of the chosen board.
+
+fn main() {
+    coboot_linker::Application::chosen().emit();
+    // Functions that compile to the same code are one.
+    println!("cargo::rustc-link-arg-bins=--icf=all");
+}

@@ -1,0 +1,239 @@
+//! The application of the tests: that of the template, with what only tests need.
+//!
+//! | file | what it adds |
+//! |---|---|
+//! | `main.rs` | the tasks of the template; CAN over the UART, and a second version |
+//! | `device.rs` | the objects of a lift and of the debugger |
+//! | `debugger.rs` | the debugger interface with breakpoints (feature `debugger`) |
+//! | `no_debugger.rs` | nothing, in its place |
+//!
+//! Priorities: 4 and 3 serve the bus, 1 and `idle` are the application's. 2 is the debugger's, which
+//! stops what is below it and nothing else.
+#![no_std]
+#![no_main]
+
+#[cfg_attr(not(feature = "debugger"), path = "no_debugger.rs")]
+mod debugger;
+mod device;
+
+use bsp::IDENTITY;
+use panic_probe as _;
+use rtic_monotonics::systick::prelude::*;
+
+systick_monotonic!(Mono, 1_000);
+
+macro_rules! version {
+    ($one:literal, $two:literal) => {
+        #[cfg(not(feature = "version-2"))]
+        version!($one);
+        #[cfg(feature = "version-2")]
+        version!($two);
+    };
+    ($version:literal) => {
+        /// 100Ah.
+        const VERSION: &str = $version;
+
+        /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
+        #[used]
+        static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", $version, "\0");
+    };
+}
+version!("1.0.0", "2.0.0");
+
+// Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
+// file.
+coboot_app::label!(
+    vendor_id: IDENTITY.vendor_id,
+    product_code: IDENTITY.product_code,
+    version: if cfg!(feature = "version-2") { 2 } else { 1 },
+);
+
+/// A fault, or a panic (which ends in a fault), restarts the device. The bootloader decides which
+/// program runs then.
+#[cfg(not(feature = "debugger"))]
+#[cortex_m_rt::exception]
+unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
+    cortex_m::peripheral::SCB::sys_reset()
+}
+
+#[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
+mod app {
+    use app_template::objects::{Application, HEARTBEAT_MS};
+    use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
+    use canopen::node::{self, NmtPolicy};
+    use canopen::slave::{self, Slave, SlaveDevice};
+    use canopen::{BitRate, Frame, Instant, NodeId};
+    use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
+    use heapless::spsc::{Consumer, Producer, Queue};
+    use rtic::Mutex;
+    use rtic_monotonics::fugit::ExtU32;
+    use rtic_monotonics::Monotonic;
+
+    use super::Mono;
+    use crate::debugger::{self, Debugger};
+    use crate::device::Device;
+
+    /// Received frames that may wait for the protocol task.
+    const RX_QUEUE: usize = 16;
+    /// How often the protocol looks at its deadlines, in ms.
+    const TICK_MS: u32 = 5;
+    /// The bit rate that the program uses when no bootloader has started it.
+    const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
+        Some(rate) => rate,
+        None => panic!("board: the bit rate must be one of CANopen's, or 0 to find it out"),
+    };
+    /// How the device is to leave: from the protocol task to `idle`, where no exception is active.
+    static EXIT: Exit = Exit::new();
+
+    #[shared]
+    struct Shared {
+        can: CanPort,
+    }
+
+    #[local]
+    struct Local {
+        received: Producer<'static, Frame>,
+        to_handle: Consumer<'static, Frame>,
+        slave: Slave,
+        device: Device,
+        debugger: Debugger,
+        led: bsp::Led,
+    }
+
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new()])]
+    fn init(cx: init::Context) -> (Shared, Local) {
+        let mut rcc = bsp::clocks(cx.device.RCC);
+        let board = bsp::init(&mut rcc, cx.device.CAN1);
+        #[cfg(not(feature = "virtual-can"))]
+        let can = CanPort::new(board.can);
+        #[cfg(feature = "virtual-can")]
+        let can = CanPort::new(board.uart);
+        Mono::start(cx.core.SYST, bsp::SYSCLK);
+
+        // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
+        // with the application.
+        let start = Start::read(
+            LAYOUT,
+            Defaults {
+                node_id: NodeId::new(NODE_ID).map(NodeId::get),
+                bit_rate: BIT_RATE,
+                serial_number: bsp::serial_number(),
+            },
+        );
+        let node_id = start.node_id.and_then(NodeId::new);
+        let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
+        let device = Device::new(&start, bit_rate);
+        let config = slave::Config {
+            node: node::Config {
+                heartbeat_ms: HEARTBEAT_MS,
+                nmt: NmtPolicy::Follow,
+                ..node::Config::default()
+            },
+            ..slave::Config::default()
+        };
+        let (received, to_handle) = cx.local.queue.split();
+        tick::spawn().ok();
+        (
+            Shared { can },
+            Local {
+                received,
+                to_handle,
+                slave: Slave::new(device.application.lss_address(), node_id, bit_rate, config),
+                device,
+                debugger: debugger::start(),
+                led: board.led,
+            },
+        )
+    }
+
+    #[idle]
+    fn idle(_: idle::Context) -> ! {
+        loop {
+            if let Some((path, request)) = EXIT.asked() {
+                Bootloader::new(LAYOUT).leave(path, request);
+            }
+            cortex_m::asm::wfi();
+        }
+    }
+
+    /// Empties the controller's FIFO. It holds three frames only, so nothing may delay this task.
+    #[task(binds = CAN1_RX0, shared = [can], local = [received], priority = 4)]
+    fn can_rx(mut cx: can_rx::Context) {
+        cx.shared.can.lock(|can| line::receive(can, |frame| cx.local.received.enqueue(frame).is_ok()));
+        rtic::pend(pac::Interrupt::CAN1_TX);
+    }
+
+    /// Runs the protocol when a frame came in, a mailbox became free or time has passed.
+    #[task(binds = CAN1_TX, shared = [can], local = [to_handle, slave, device, debugger], priority = 3)]
+    fn protocol(cx: protocol::Context) {
+        let now = Instant::from_millis(Mono::now().ticks());
+        let protocol::SharedResources { mut can, .. } = cx.shared;
+        let protocol::LocalResources { to_handle, slave, device, debugger, .. } = cx.local;
+        device.set_time(now);
+        if !serves(slave, &mut can, &mut device.application) {
+            return;
+        }
+        let status = can.lock(line::status);
+        let debugged = debugger.attach(device);
+        #[cfg(feature = "debugger")]
+        let debugged = &mut { debugged };
+        slave.observe(status, now, debugged);
+        loop {
+            let debugged = debugger.attach(device);
+            #[cfg(feature = "debugger")]
+            let debugged = &mut { debugged };
+            // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
+            // waiting behind it.
+            carry_out(slave, &mut can, now, debugged);
+            let Some(frame) = to_handle.dequeue() else { return };
+            if slave.handle(&frame, now, debugged) {
+                device.application.control.restart(now.as_millis());
+            }
+            device.application.leave_owed(slave);
+            if !serves(slave, &mut can, &mut device.application) {
+                return;
+            }
+        }
+    }
+
+    /// Advances the departure, if one is in progress. Returns whether requests are served.
+    fn serves(slave: &Slave, can: &mut impl Mutex<T = CanPort>, application: &mut Application) -> bool {
+        let bus_idle = slave.is_idle() && can.lock(CanPort::is_idle);
+        match application.proceed(bus_idle) {
+            Next::Serve => return true,
+            Next::Wait => {}
+            Next::Leave(request) => {
+                EXIT.ask(application.path(request), request);
+                debugger::release_program();
+            }
+        }
+        false
+    }
+
+    /// Carries out the slave's actions until there are none left.
+    fn carry_out(
+        slave: &mut Slave,
+        can: &mut impl Mutex<T = CanPort>,
+        now: Instant,
+        device: &mut impl SlaveDevice,
+    ) {
+        while let Some(output) = slave.poll(now, can.lock(CanPort::has_room), device) {
+            can.lock(|can| line::carry_out(can, output));
+        }
+    }
+
+    /// Lets time pass for the protocol, and shows life.
+    #[task(local = [led], priority = 1)]
+    async fn tick(cx: tick::Context) {
+        let mut ticks = 0_u32;
+        loop {
+            rtic::pend(pac::Interrupt::CAN1_TX);
+            if ticks.is_multiple_of(500 / TICK_MS) {
+                cx.local.led.toggle();
+                debugger::example();
+            }
+            ticks = ticks.wrapping_add(1);
+            Mono::delay(TICK_MS.millis()).await;
+        }
+    }
+}
