@@ -1,5 +1,6 @@
-//! Passes the numbers of the chosen board and the template of the image to the linker. For the
-//! bootloader it first builds the resident part, which is a separate program.
+//! Passes the numbers of the chosen board and the template of the image to the linker, and the file
+//! of the product to the compiler. For the bootloader it first builds the resident part, which is a
+//! separate program.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -20,8 +21,7 @@ fn main() {
     let templates = package.join("../linker");
     println!("cargo:rerun-if-changed={}", templates.display());
     println!("cargo:rustc-link-search={}", templates.display());
-    // The resident part belongs to the same product as the rest (bootloader/src/product.rs).
-    println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
+    let product = product(&package, &out);
     coboot_linker::link(&out, template);
     // Functions with identical code are merged.
     println!("cargo:rustc-link-arg-bins=--icf=all");
@@ -35,13 +35,49 @@ fn main() {
     }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
-        _ => resident(&package, &out, layout),
+        _ => resident(&package, &out, layout, &product),
     }
 }
 
-/// Builds the resident part with the features of the bootloader, and writes its bytes to
-/// `OUT_DIR/resident.bin`.
-fn resident(package: &Path, out: &Path, layout: &Layout) {
+/// The product of a build that names none.
+const DEFAULT_PRODUCT: &str = "default";
+
+/// Makes the file of the product a module (`src/product.rs`), and the version text that names the
+/// product. Returns the choice: the name of a file in `products/`, or the path of another file.
+///
+/// `cargo xtask build --product` makes the choice, as an argument of cargo. A variable of the shell
+/// has no effect: `.cargo/config.toml` overrides it with the default.
+fn product(package: &Path, out: &Path) -> String {
+    println!("cargo:rerun-if-env-changed=COBOOT_PRODUCT");
+    let chosen = env::var("COBOOT_PRODUCT").unwrap_or_else(|_| DEFAULT_PRODUCT.to_owned());
+    let file = if chosen.ends_with(".rs") {
+        PathBuf::from(&chosen)
+    } else {
+        package.join("products").join(format!("{chosen}.rs"))
+    };
+    assert!(
+        file.is_absolute() && file.exists(),
+        "there is no product \"{chosen}\": no file {}",
+        file.display()
+    );
+    println!("cargo:rerun-if-changed={}", file.display());
+    fs::write(out.join("product.rs"), format!("#[path = {file:?}]\nmod chosen;\n"))
+        .expect("OUT_DIR is writable");
+
+    let version = format!("coboot {}", env::var("CARGO_PKG_VERSION").expect("cargo sets it"));
+    let name = file.file_stem().and_then(|name| name.to_str()).unwrap_or_default();
+    if chosen == DEFAULT_PRODUCT {
+        println!("cargo:rustc-env=COBOOT_VERSION={version}");
+    } else {
+        println!("cargo:rustc-env=COBOOT_VERSION={version} {name}");
+        println!("cargo:warning=this is the product \"{name}\" ({})", file.display());
+    }
+    chosen
+}
+
+/// Builds the resident part with the features and the product of the bootloader, and writes its
+/// bytes to `OUT_DIR/resident.bin`.
+fn resident(package: &Path, out: &Path, layout: &Layout, product: &str) {
     let workspace = package.join("..");
     for used in [
         "bootloader/src",
@@ -67,7 +103,9 @@ fn resident(package: &Path, out: &Path, layout: &Layout) {
     let mut cargo = Command::new(env::var_os("CARGO").expect("cargo sets it"));
     cargo.current_dir(&workspace).args(["rustc", "--quiet", "--package=bootloader", "--bin=resident"]);
     cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
-    cargo.arg(features.join(",")).arg("--target-dir").arg(&target).args(["--", PACKS_WELL]);
+    cargo.arg(features.join(",")).arg("--target-dir").arg(&target);
+    cargo.arg("--config").arg(format!("env.COBOOT_PRODUCT.value={product:?}"));
+    cargo.args(["--config", "env.COBOOT_PRODUCT.force=true", "--", PACKS_WELL]);
     // The inner build keeps these settings; all others concern only the outer build.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
     let told = env::vars_os().map(|(name, _)| name).filter(|name| {

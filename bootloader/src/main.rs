@@ -3,7 +3,7 @@
 //! | file | what it does | unsafe |
 //! |---|---|---|
 //! | `main.rs` | the tasks: it only connects the other parts | no |
-//! | `product.rs` | the choices of a product | no |
+//! | `product.rs` | the choices that a product has; it makes them in `products/` | no |
 //! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
@@ -100,7 +100,8 @@ mod app {
             device_type: PRODUCT.profile.device_type,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
-            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
+            // The version, and the product if it is not the default one (build.rs).
+            software_version: env!("COBOOT_VERSION"),
             heartbeat_ms: PRODUCT.heartbeat_ms,
             vendor_id: IDENTITY.vendor_id,
             product_code: IDENTITY.product_code,

@@ -1,4 +1,4 @@
-//! The choices of a product: the only file that a product changes.
+//! The choices that a product has. A product makes them in its file, `products/default.rs`.
 //!
 //! The resident part and the RAM part are both built from it. Names in brackets are those of the
 //! SYS TEC manual (L-1112d_10, chapter 4.6). If choices contradict each other, the build fails with
@@ -21,8 +21,8 @@ use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
 use shared_abi::warm_start::Cell;
 
-#[path = "test_products.rs"]
-mod test_products;
+// The file of this product, as the module `chosen` (build.rs).
+include!(concat!(env!("OUT_DIR"), "/product.rs"));
 
 /// The choices of a product.
 #[derive(Clone, Debug)]
@@ -305,11 +305,8 @@ pub enum NodeSource {
     Function(fn() -> (u8, u8)),
 }
 
-/// This product, or another one that the repository builds for its tests (`test_products.rs`).
-pub const PRODUCT: Product = test_products::or_this(PRODUCT_OF_THIS_FILE).checked();
-
-/// **The fields that a product changes**: name the fields that differ from the default.
-const PRODUCT_OF_THIS_FILE: Product = Product { ..Product::DEFAULT };
+/// This product.
+pub const PRODUCT: Product = chosen::PRODUCT.checked();
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;

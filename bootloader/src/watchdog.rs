@@ -2,7 +2,7 @@
 //! manual L-1112d_10, 3.4.8).
 //!
 //! Only a reset stops the watchdog. The bootloader starts a program through a reset, so the program
-//! starts without the watchdog unless `product.rs` says otherwise.
+//! starts without the watchdog unless the product says otherwise.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 

@@ -52,8 +52,10 @@ impl Copy {
         let target = if firmware { self.target.join("fw").join(chip) } else { self.target.clone() };
         let mut cargo = Command::new(env!("CARGO"));
         cargo.current_dir(&self.root).args(words).env("CARGO_TARGET_DIR", target).env("COBOOT_BOARD", board);
+        // A variable of the shell does not change the product: there is none with this name.
+        cargo.env("COBOOT_PRODUCT", "of-the-shell");
         if let Some(name) = product {
-            cargo.env("COBOOT_PRODUCT", name);
+            cargo.arg("--config").arg(format!("env.COBOOT_PRODUCT.value=\"{name}\""));
         }
         cargo.output().expect("cargo can be started")
     }
@@ -237,7 +239,7 @@ const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
 /// A mistake in the choices of a product.
 const fn product(wrong: &'static str, says: &'static str) -> Mistake {
-    let file = "bootloader/src/product.rs";
+    let file = "bootloader/products/default.rs";
     Mistake { file, right: "Product { ..Product::DEFAULT }", wrong, by: By::Product(None), says }
 }
 

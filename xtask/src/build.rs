@@ -9,18 +9,21 @@ use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
 use crate::footprint::{self, Flash};
+use crate::product::Product;
 use crate::setup::{Part, Setup};
 use crate::workspace::{PROFILE, TARGET};
 use crate::{pack, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask build [NAME...] [--all] [--unpacked] [--board BOARD] [--yes]
+usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--unpacked] [--board BOARD] [--yes]
 
 Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
 bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
 app-c is the application in C, for each program of the board, and with the tests' objects (app-c-probe).
 
   --all           every image of the board and the applications in C: what the tests need
+  --product FILE  the product of the bootloaders: a file like bootloader/products/default.rs, or the name
+                  of a file there. Its name is in the file of the image (bootloader-NAME.elf) and in 100Ah
   --unpacked      bootloaders as the linker makes them: the part that runs from RAM is not packed
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -34,7 +37,7 @@ pub struct Variant {
     pub package: &'static str,
     /// The features in addition to the one for the board.
     pub features: &'static str,
-    /// The value of `COBOOT_PRODUCT` for the build, if it needs one.
+    /// The name of its product (`bootloader/products`), if it is not the default.
     pub product: Option<&'static str>,
     /// The number of the program; 0 for a bootloader.
     pub program: u8,
@@ -100,7 +103,7 @@ const fn bootloader(name: &'static str, features: &'static str) -> Variant {
     Variant { name, package: "bootloader", features, product: None, program: 0, least_programs: 1 }
 }
 
-/// The bootloader with the choices of this product (`bootloader/src/test_products.rs`).
+/// The bootloader of this product (`bootloader/products`).
 const fn product(name: &'static str, product: &'static str) -> Variant {
     Variant { product: Some(product), ..bootloader(name, "") }
 }
@@ -126,6 +129,28 @@ impl Variant {
         VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len())
     }
 
+    /// The product of the image.
+    ///
+    /// # Errors
+    /// When its file is missing.
+    pub fn product(&self) -> Outcome<Product> {
+        self.product.map_or_else(|| Ok(Product::default()), Product::named)
+    }
+
+    /// The name of this image of another product.
+    fn name_of(&self, product: &Product) -> Outcome<String> {
+        if self.product.is_some() {
+            return Err(format!("{} has a product; --product is for the others.", self.name));
+        }
+        let name = format!("{}-{}", self.name, product.name);
+        let other = VARIANTS.iter().find(|other| other.name == name);
+        if other.is_some_and(|other| other.product != Some(&product.name) || other.features != self.features)
+        {
+            return Err(format!("{name} is another image already; give the product another name."));
+        }
+        Ok(name)
+    }
+
     /// Whether the image is a bootloader.
     pub const fn is_bootloader(&self) -> bool {
         self.program == 0
@@ -141,6 +166,8 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
     let (every, unpacked) = (args.flag("--all"), args.flag("--unpacked"));
+    let product = args.value("--product")?.map(|word| Product::chosen(&word)).transpose()?;
+    let product = product.filter(|product| !product.is_default());
     let mut names = args.rest();
     let all = names.len();
     names.retain(|name| name != C_APPLICATION);
@@ -154,8 +181,13 @@ pub fn run(mut args: Args) -> Outcome {
     };
     setup.prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
     for variant in chosen {
-        let built = build(board, variant)?;
-        put(board, variant, if unpacked { built } else { finished(variant, built)? })?;
+        let (name, product) = match &product {
+            Some(product) if variant.is_bootloader() => (variant.name_of(product)?, product.clone()),
+            _ => (variant.name.to_owned(), variant.product()?),
+        };
+        let built = build(board, variant, &product)?;
+        let file = if unpacked { built } else { finished(variant, built)? };
+        put(board, &name, variant.region(board), &file)?;
     }
     if in_c {
         c_applications(board)?;
@@ -170,7 +202,8 @@ pub fn run(mut args: Args) -> Outcome {
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
-        put(board, variant, finished(variant, build(board, variant)?)?)?;
+        let built = build(board, variant, &variant.product()?)?;
+        put(board, variant.name, variant.region(board), &finished(variant, built)?)?;
     }
     Ok(workspace::firmware_dir(board))
 }
@@ -309,10 +342,9 @@ fn rust_lld() -> Outcome<PathBuf> {
 ///
 /// # Errors
 /// When it does not build.
-pub fn to_look_at(board: &Layout, features: &str, product: Option<&str>) -> Outcome<Vec<u8>> {
-    let mut cargo = cargo_for("bootloader", board, features);
-    cargo.env("CARGO_TERM_QUIET", "true");
-    process::run(with_product(&mut cargo, product))?;
+pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
+    let mut cargo = cargo_for("bootloader", board, features, product);
+    process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
     pack::pack(&built(board, "bootloader")?)
 }
 
@@ -374,29 +406,20 @@ include!("../../linker/packs_well.rs");
 
 /// The cargo command that builds an image. Its additional compiler arguments apply only to the last
 /// crate; with `lto` all code for the chip is generated there.
-fn cargo_for(package: &str, board: &Layout, features: &str) -> Command {
+fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -> Command {
     let is_packed = package == "bootloader";
     let mut cargo = process::cargo(if is_packed { "rustc" } else { "build" });
-    cargo.args(firmware_args(package, board, features));
+    cargo.args(firmware_args(package, board, features)).args(product.args());
     if is_packed {
         cargo.args(["--bin", package, "--", PACKS_WELL]);
     }
     cargo
 }
 
-/// Builds an image; returns the linker's ELF file.
-fn build(board: &Layout, variant: &Variant) -> Outcome<Vec<u8>> {
-    let mut cargo = cargo_for(variant.package, board, variant.features);
-    process::run(with_product(&mut cargo, variant.product))?;
+/// Builds an image of a product; returns the linker's ELF file.
+fn build(board: &Layout, variant: &Variant, product: &Product) -> Outcome<Vec<u8>> {
+    process::run(&mut cargo_for(variant.package, board, variant.features, product))?;
     built(board, variant.package)
-}
-
-/// Selects a product for cargo's build.
-fn with_product<'a>(cargo: &'a mut Command, product: Option<&str>) -> &'a mut Command {
-    if let Some(product) = product {
-        cargo.env("COBOOT_PRODUCT", product);
-    }
-    cargo
 }
 
 /// The ELF file of cargo's last build of a package.
@@ -416,17 +439,17 @@ fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
 }
 
 /// Writes an image into the board's folder, under its name, and prints its size.
-fn put(board: &Layout, variant: &Variant, file: Vec<u8>) -> Outcome {
+fn put(board: &Layout, name: &str, region: Region, file: &[u8]) -> Outcome {
     let dir = workspace::firmware_dir(board);
     fs::create_dir_all(&dir)
         .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
-    let to = dir.join(format!("{}.elf", variant.name));
+    let to = dir.join(format!("{name}.elf"));
     // An unchanged file is not written, so that its time does not change.
-    if fs::read(&to).ok().as_ref() != Some(&file) {
-        fs::write(&to, &file)
+    if fs::read(&to).ok().as_deref() != Some(file) {
+        fs::write(&to, file)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
     }
-    report(&to, variant.region(board))
+    report(&to, region)
 }
 
 /// Prints the size of an image.
@@ -463,6 +486,13 @@ mod tests {
             refused.contains("has no image \"app-program-2\"") && refused.contains(", app-v1,"),
             "{refused}"
         );
+        let other = Variant::by_name(one, "bootloader-sealed").ok().unwrap();
+        let lift = Product::named("lift").ok().unwrap();
+        assert_eq!(other.name_of(&lift).ok().unwrap(), "bootloader-sealed-lift");
+        let standard = Variant::by_name(one, "bootloader").ok().unwrap();
+        assert_eq!(standard.name_of(&lift).ok().unwrap(), "bootloader-lift");
+        let sealed = Product { name: "sealed".to_owned(), ..lift };
+        assert!(standard.name_of(&sealed).unwrap_err().contains("another image already"));
         let second = Variant::by_name(two, "app-program-2").ok().unwrap();
         assert_eq!(second.region(two), two.programs[1]);
         assert_eq!(

@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, process, product, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
@@ -55,12 +55,12 @@ pub fn formatting() -> Outcome<Vec<String>> {
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
         problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
     }
-    // The files of the boards: build scripts find them, `cargo fmt` does not.
-    for folder in build::BOARD_FOLDERS {
+    // The files of the boards and products: build scripts find them, `cargo fmt` does not.
+    for folder in build::BOARD_FOLDERS.into_iter().chain([product::FOLDER]) {
         let mut rustfmt = std::process::Command::new("rustfmt");
         rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
         if process::run(rustfmt.args(build::board_files(folder)?)).is_err() {
-            problems.push(format!("a board in {folder} is not formatted; `rustfmt` on the file does it."));
+            problems.push(format!("a file in {folder} is not formatted; `rustfmt` on the file does it."));
         }
     }
     Ok(problems)

@@ -48,6 +48,7 @@ mod parts;
 mod portable;
 mod powercut;
 mod process;
+mod product;
 mod reproduce;
 mod rooms;
 mod sbom;

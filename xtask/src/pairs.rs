@@ -1,13 +1,16 @@
 //! `cargo xtask pairs`: builds bootloaders so that every pair of choices of a product is together
 //! in at least one.
 
+use std::fs;
+
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::footprint::{kib, Flash};
+use crate::product::Product;
 use crate::setup::{Part, Setup};
-use crate::{build, Outcome};
+use crate::{build, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask pairs [--spread] [--yes]
@@ -20,44 +23,50 @@ build or does not fit its flash. It prints the choices and the size of each.
   --yes      installs what is missing with sudo
 ";
 
-/// The fields of a product that are varied, and their numbers of values. The values themselves are
-/// in `bootloader/src/test_products.rs`, in the same order.
-const FIELDS: [(&str, u8); 34] = [
-    ("profile", 4),
-    ("autostart", 2),
-    ("rescue_window_ms", 2),
-    ("rescue_window_confirmed_ms", 2),
-    ("node_ids", 2),
-    ("bit_rates", 2),
-    ("node_source", 3),
-    ("boot_up_message", 2),
-    ("sdo_request_base", 2),
-    ("sdo_response_base", 2),
-    ("auto_bit_rate", 2),
-    ("boot_up_emergency", 2),
-    ("heartbeat_ms", 2),
-    ("lss", 2),
-    ("lss_start_in_configuration", 2),
-    ("lss_announce", 2),
-    ("lss_store", 2),
-    ("block_upload", 2),
-    ("identity_check", 2),
-    ("check", 2),
-    ("programming_allowed", 2),
-    ("erase", 2),
-    ("start_allowed", 2),
-    ("crc", 2),
-    ("crc_step", 2),
-    ("block_buffer", 2),
-    ("watchdog_ms", 2),
-    ("program_watchdog_ms", 2),
-    ("answer_to_reset_ms", 2),
-    ("max_crash_resets", 2),
-    ("security_counter", 2),
-    ("counter_with_confirmation", 2),
-    ("second_server", 2),
-    ("resume", 2),
+/// The fields of a product that are varied, and their values, as the product's file writes them. The
+/// first value is the default.
+const FIELDS: [(&str, &[&str]); 34] = [
+    ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
+    ("autostart", &["Some(1)", "None"]),
+    ("rescue_window_ms", &["300", "0"]),
+    ("rescue_window_confirmed_ms", &["0", "100"]),
+    ("node_ids", &["1..=127", "2..=100"]),
+    ("bit_rates", &["0..=8", "2..=6"]),
+    ("node_source", &["NodeSource::Stored", "NodeSource::Constant", SWITCHES]),
+    ("boot_up_message", &["true", "false"]),
+    ("sdo_request_base", &["0x600", "0x680"]),
+    ("sdo_response_base", &["0x580", "0x480"]),
+    ("auto_bit_rate", &["true", "false"]),
+    ("boot_up_emergency", &["true", "false"]),
+    ("heartbeat_ms", &["1000", "0"]),
+    ("lss", &["true", "false"]),
+    ("lss_start_in_configuration", &["false", "true"]),
+    ("lss_announce", &["false", "true"]),
+    ("lss_store", &["true", "false"]),
+    ("block_upload", &["true", "false"]),
+    ("identity_check", &["true", "false"]),
+    ("check", &["|_, _| Verdict::Standard", "|_, _| Verdict::Accept"]),
+    ("programming_allowed", &["|| true", "|| bsp::inputs('C') & 2 != 0"]),
+    ("erase", &["None", "Some(|_| Erase::AtOnce)"]),
+    ("start_allowed", &["|_| true", "|_| bsp::inputs('C') & 1 != 0"]),
+    ("crc", &["CrcKind::Crc32", "CrcKind::Crc16"]),
+    ("crc_step", &["1024", "64 * 1024"]),
+    ("block_buffer", &["80 * 1024", "1024"]),
+    ("watchdog_ms", &["Some(1000)", "None"]),
+    ("program_watchdog_ms", &["None", "Some(1000)"]),
+    ("answer_to_reset_ms", &["20", "50"]),
+    ("max_crash_resets", &["3", "1"]),
+    ("security_counter", &["0", "5"]),
+    ("counter_with_confirmation", &["false", "true"]),
+    ("second_server", &["true", "false"]),
+    ("resume", &["true", "false"]),
 ];
+
+/// Seven switches for the node-ID, four for the bit rate.
+const SWITCHES: &str = "NodeSource::Function(|| {
+        let switches = bsp::inputs('E');
+        ((switches >> 8) as u8 & 0x7F, (switches >> 4) as u8 & 0xF)
+    })";
 
 /// The values of a product, in the order of [`FIELDS`]; 0 is the default.
 type Row = [u8; FIELDS.len()];
@@ -69,11 +78,18 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware])?;
     let rows = covering();
     let mut largest = 0;
+    let folder = workspace::target_dir().join("pairs");
+    fs::create_dir_all(&folder)
+        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
     for (number, row) in rows.iter().enumerate() {
         println!("{:>2}  {}", number + 1, words(row));
+        let path = folder.join(format!("pairs-{:02}.rs", number + 1));
+        fs::write(&path, file(row))
+            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&path)))?;
+        let product = Product::of_file(&path)?;
         let one = [BOARDS[number % BOARDS.len()]];
         for board in if spread { &one[..] } else { BOARDS } {
-            let used = size(board, row)?;
+            let used = size(board, row, &product)?;
             largest = largest.max(used);
             println!("    {:<24} {used:>6} bytes", board.board);
         }
@@ -82,12 +98,27 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-/// The size in a board's flash of the bootloader with these choices, in bytes.
-fn size(board: &Layout, row: &Row) -> Outcome<u32> {
-    let product: String =
-        std::iter::once(':').chain(row.iter().map(|value| char::from(b'0' + value))).collect();
+/// The file of the product with these choices.
+fn file(row: &Row) -> String {
+    let mut file = String::from(
+        "//! A product of `cargo xtask pairs`.
+
+use super::*;
+
+/// The choices of this product.
+pub const PRODUCT: Product = Product {
+",
+    );
+    for ((name, values), value) in FIELDS.iter().zip(row).filter(|(_, value)| **value > 0) {
+        file += &format!("    {name}: {},\n", values[usize::from(*value)]);
+    }
+    file + "    ..Product::DEFAULT\n};\n"
+}
+
+/// The size in a board's flash of the bootloader of this product, in bytes.
+fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let told = |problem: String| format!("{}, {}: {problem}", board.board, words(row));
-    let elf = build::to_look_at(board, "", Some(&product)).map_err(told)?;
+    let elf = build::to_look_at(board, "", product).map_err(told)?;
     let used = Flash::of(&Elf::parse(&elf)?, board.bootloader).map_err(told)?.used;
     if used > board.bootloader.size {
         return Err(told(format!("{used} bytes, of {}", kib(board.bootloader.size))));
@@ -101,7 +132,7 @@ fn words(row: &Row) -> String {
     let words: Vec<_> = others
         .map(
             |((name, values), value)| {
-                if *values > 2 {
+                if values.len() > 2 {
                     format!("{name}={value}")
                 } else {
                     (*name).to_owned()
@@ -143,7 +174,7 @@ fn covering() -> Vec<Row> {
                 allowed(&with).then(|| new.count())
             };
             // Of equal values it takes the first: the default.
-            row[field] = (0..FIELDS[field].1).rev().max_by_key(|value| adds(*value));
+            row[field] = (0..FIELDS[field].1.len() as u8).rev().max_by_key(|value| adds(*value));
         }
         let row = row.map(|value| value.unwrap_or(0));
         open.retain(|(a, b)| row[a.0] != a.1 || row[b.0] != b.1);
@@ -160,8 +191,8 @@ fn pairs() -> Vec<(Choice, Choice)> {
     let mut pairs = Vec::new();
     for a in 0..FIELDS.len() {
         for b in a + 1..FIELDS.len() {
-            for value_a in 0..FIELDS[a].1 {
-                for value_b in 0..FIELDS[b].1 {
+            for value_a in 0..FIELDS[a].1.len() as u8 {
+                for value_b in 0..FIELDS[b].1.len() as u8 {
                     let mut row = [None; FIELDS.len()];
                     (row[a], row[b]) = (Some(value_a), Some(value_b));
                     if allowed(&row) {
@@ -190,7 +221,7 @@ mod tests {
         }
         for row in &rows {
             assert!(allowed(&row.map(Some)), "{}", words(row));
-            assert!(row.iter().zip(FIELDS).all(|(value, (_, values))| *value < values));
+            assert!(row.iter().zip(FIELDS).all(|(value, (_, values))| usize::from(*value) < values.len()));
         }
         assert!((12..=24).contains(&rows.len()), "{} rows", rows.len());
     }

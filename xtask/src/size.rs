@@ -104,13 +104,14 @@ fn tables(board: &Layout, name: &str) -> Outcome<(Flash, Vec<Share>)> {
 
 /// The sizes of the bootloaders of other products, and of those with features that no product has.
 fn by_variant(board: &Layout) -> Outcome<String> {
-    let measure = |features: &str, product| -> Outcome<Flash> {
-        Flash::of(&Elf::parse(&build::to_look_at(board, features, product)?)?, board.bootloader)
+    let measure = |variant: &build::Variant| -> Outcome<Flash> {
+        let elf = build::to_look_at(board, variant.features, &variant.product()?)?;
+        Flash::of(&Elf::parse(&elf)?, board.bootloader)
     };
     let mut text = String::new();
     let _ = writeln!(text, "bootloader                      packed     raw");
     for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
-        let flash = measure(variant.features, variant.product)?;
+        let flash = measure(variant)?;
         let _ = writeln!(text, "{:<31} {:>6}  {:>6}", variant.name, flash.used, flash.raw());
     }
     Ok(text)

@@ -1,0 +1,6 @@
+//! For the tests: the dialect of ESAcademy.
+
+use super::*;
+
+/// The choices of this product.
+pub const PRODUCT: Product = Product { profile: Profile::ESACADEMY, ..Product::DEFAULT };

@@ -1,0 +1,6 @@
+//! For the tests: the dialect of port's Paulus.
+
+use super::*;
+
+/// The choices of this product.
+pub const PRODUCT: Product = Product { profile: Profile::PAULUS, ..Product::DEFAULT };
