@@ -18,31 +18,45 @@ unsafe impl Controller for Can<pac::CAN1> {
     const IS_SLAVE: bool = false;
 }
 
-// SAFETY: its master is CAN1, and `take_can2` enables the clock of CAN1.
+// SAFETY: its master is CAN1, and `Take` enables the clock of CAN1.
 unsafe impl Controller for Can<pac::CAN2> {
     const MASTER: *mut RegisterBlock = CAN1;
     const IS_SLAVE: bool = true;
 }
 
-/// Takes CAN2 in exchange for its master: CAN1 gets its clock and is reset, and only serves CAN2.
-///
-/// The interrupts of CAN2 are on from here. Each gets the priority of CAN1's, and its handler calls
-/// the handler of CAN1's (`can_controller!`). Call this where CAN1's interrupts already have their
-/// priorities and no interrupt can come: in the `init` of a program.
-pub fn take_can2(_can1: pac::CAN1, rcc: &mut Rcc) -> pac::CAN2 {
-    pac::CAN1::enable(rcc);
-    pac::CAN1::reset(rcc);
-    // SAFETY: no other code sets the priorities of these interrupts, and no code relies on their
-    // being masked.
-    unsafe {
-        let mut nvic = cortex_m::Peripherals::steal().NVIC;
-        for (own, task) in
-            [(Interrupt::CAN2_TX, Interrupt::CAN1_TX), (Interrupt::CAN2_RX0, Interrupt::CAN1_RX0)]
-        {
-            nvic.set_priority(own, NVIC::get_priority(task));
-            NVIC::unmask(own);
-        }
+/// A controller that a board takes in exchange for CAN1, which exists once.
+pub trait Take {
+    /// Takes it.
+    fn take(can1: pac::CAN1, rcc: &mut Rcc) -> Self;
+}
+
+impl Take for pac::CAN1 {
+    fn take(can1: pac::CAN1, _: &mut Rcc) -> Self {
+        can1
     }
-    // SAFETY: the caller gives up the only CAN1, so it calls this once.
-    unsafe { pac::CAN2::steal() }
+}
+
+impl Take for pac::CAN2 {
+    /// CAN1 gets its clock and is reset, and only serves CAN2.
+    ///
+    /// The interrupts of CAN2 are on from here. Each gets the priority of CAN1's, and its handler
+    /// calls the handler of CAN1's (`can_controller!`). Call this where CAN1's interrupts already
+    /// have their priorities and no interrupt can come: in the `init` of a program.
+    fn take(_can1: pac::CAN1, rcc: &mut Rcc) -> Self {
+        pac::CAN1::enable(rcc);
+        pac::CAN1::reset(rcc);
+        // SAFETY: no other code sets the priorities of these interrupts, and no code relies on their
+        // being masked.
+        unsafe {
+            let mut nvic = cortex_m::Peripherals::steal().NVIC;
+            for (own, task) in
+                [(Interrupt::CAN2_TX, Interrupt::CAN1_TX), (Interrupt::CAN2_RX0, Interrupt::CAN1_RX0)]
+            {
+                nvic.set_priority(own, NVIC::get_priority(task));
+                NVIC::unmask(own);
+            }
+        }
+        // SAFETY: the caller gives up the only CAN1, so it calls this once.
+        unsafe { pac::CAN2::steal() }
+    }
 }

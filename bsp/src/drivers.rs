@@ -1,21 +1,91 @@
 //! The set-up that is the same for every board; the board file has the numbers and the pins.
 
+use stm32f4xx_hal::gpio::{Output, Pin, PinState};
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
+use crate::can_controllers::Take;
 use crate::clock::raise_voltage;
-use crate::{CanController, Led, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, LAYOUT, SYSCLK};
+use crate::{CanController, Facts, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, FACTS, LAYOUT, SYSCLK};
 
-/// The board's parts, set up by its `init`.
+/// The LED that blinks while the device works.
+pub type Led = Pin<{ FACTS.led.0 }, { FACTS.led.1 }, Output>;
+
+/// The board's parts, set up by [`init`].
 pub struct Board {
     /// The CAN controller with its pins; its clock is on, and it is not yet configured.
     pub can: CanController,
     /// The LED.
     pub led: Led,
-    /// The UART with its pins; it is on, at `UART_BIT_RATE`.
+    /// The UART with its pins; it is on, at the board's bit rate.
     #[cfg(feature = "uart")]
     pub uart: crate::uart::Port<crate::UartController>,
+}
+
+/// Sets the board's pins up.
+#[must_use]
+pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
+    const STANDBY: crate::Pin = match FACTS.can_standby {
+        Some((pin, _)) => pin,
+        None => FACTS.led,
+    };
+    let Facts { can_standby, .. } = FACTS;
+    reset_ports(rcc);
+    let led = pin::<{ FACTS.led.0 }, { FACTS.led.1 }>(&can1).into_push_pull_output();
+    if let Some((_, high)) = can_standby {
+        let state = if high { PinState::High } else { PinState::Low };
+        let _ = pin::<{ STANDBY.0 }, { STANDBY.1 }>(&can1).into_push_pull_output_in_state(state);
+    }
+    #[cfg(feature = "uart")]
+    let uart = {
+        // SAFETY: only this function takes the UART, and it takes the only CAN1.
+        let uart = unsafe { crate::UartController::steal() };
+        let transmit = pin::<{ FACTS.uart_pins.transmit.0 }, { FACTS.uart_pins.transmit.1 }>(&can1);
+        let receive = pin::<{ FACTS.uart_pins.receive.0 }, { FACTS.uart_pins.receive.1 }>(&can1);
+        crate::uart::Port::new(uart, (transmit, receive), rcc)
+    };
+    let transmit = pin::<{ FACTS.can_pins.transmit.0 }, { FACTS.can_pins.transmit.1 }>(&can1);
+    let receive = pin::<{ FACTS.can_pins.receive.0 }, { FACTS.can_pins.receive.1 }>(&can1);
+    let can = CanController::new(Take::take(can1, rcc), (transmit, receive), rcc);
+    Board {
+        can,
+        led,
+        #[cfg(feature = "uart")]
+        uart,
+    }
+}
+
+/// A pin of the board in its state after a reset. Only `init` knows which pins it needs, so no caller
+/// passes them; the CAN controller, which exists once, proves that it runs once.
+fn pin<const PORT: char, const NUMBER: u8>(_: &pac::CAN1) -> Pin<PORT, NUMBER> {
+    const { assert!(size_of::<Pin<PORT, NUMBER>>() == 0, "a pin of the HAL has data") };
+    // SAFETY: a pin of the HAL is a type without data. Only `init` makes pins, each once.
+    unsafe { core::mem::MaybeUninit::uninit().assume_init() }
+}
+
+/// Enables and resets the ports of the board's pins.
+fn reset_ports(rcc: &mut Rcc) {
+    const fn bit(pin: crate::Pin) -> u32 {
+        1 << (pin.0 as u32 - 'A' as u32)
+    }
+    const fn bits(pins: crate::Pins) -> u32 {
+        bit(pins.transmit) | bit(pins.receive)
+    }
+    const PORTS: u32 = bit(FACTS.led)
+        | bits(FACTS.can_pins)
+        | if cfg!(feature = "uart") { bits(FACTS.uart_pins) } else { 0 }
+        | match FACTS.can_standby {
+            Some((pin, _)) => bit(pin),
+            None => 0,
+        };
+    // SAFETY: the bits are those of ports (RCC_AHB1ENR and RCC_AHB1RSTR have the same order); the
+    // other bits stay. Only `init` uses the ports.
+    rcc.ahb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PORTS) });
+    // SAFETY: as above.
+    rcc.ahb1rstr().modify(|r, w| unsafe { w.bits(r.bits() | PORTS) });
+    // SAFETY: as above.
+    rcc.ahb1rstr().modify(|r, w| unsafe { w.bits(r.bits() & !PORTS) });
 }
 
 /// The clocks in the HAL's types, for the HAL's drivers. The clocks must be in their reset state.

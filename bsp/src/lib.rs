@@ -28,24 +28,11 @@ pub mod virtual_can;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
-/// Takes a GPIO port or a UART, for the `init` of a board. Only the board file knows which one it
-/// needs, so no caller passes it. The CAN controller, which exists once, proves that `init` runs
-/// once.
-#[cfg(target_arch = "arm")]
-macro_rules! take_port {
-    ($port:ident, $can:ident) => {{
-        let _: &pac::CAN1 = &$can;
-        // SAFETY: only `init` sets up the pins of a board and its UART, and it takes the only CAN
-        // controller.
-        unsafe { pac::$port::steal() }
-    }};
-}
-
 /// Selects the board's CAN controller for coboot, CAN1 or CAN2.
 ///
 /// The tasks of a program are bound to CAN1's interrupts for either controller: with CAN2, the
-/// handlers of CAN2's interrupts call the tasks' entries. `init` of such a board gives both the
-/// same priority ([`can_controllers::take_can2`]), so that neither interrupts the other.
+/// handlers of CAN2's interrupts call the tasks' entries. [`init`] gives both the same priority
+/// ([`can_controllers`]), so that neither interrupts the other.
 macro_rules! can_controller {
     (CAN1) => {
         can_controller!(1, CAN1);
@@ -79,13 +66,13 @@ macro_rules! can_controller {
 }
 
 /// Selects the board's USART; its interrupt has the same name.
-#[cfg(target_arch = "arm")]
 macro_rules! uart {
-    ($(#[$doc:meta])* $usart:ident) => {
-        $(#[$doc])*
-        pub type UartController = pac::$usart;
+    ($usart:ident) => {
+        /// The UART. It is set up with the feature `uart` alone.
+        #[cfg(target_arch = "arm")]
+        pub type UartController = stm32f4xx_hal::pac::$usart;
 
-        #[cfg(feature = "uart")]
+        #[cfg(all(target_arch = "arm", feature = "uart"))]
         #[no_mangle]
         #[allow(non_snake_case)]
         extern "C" fn $usart() {
@@ -94,6 +81,7 @@ macro_rules! uart {
     };
 }
 
+use clock::ClockTree;
 use shared_abi::geometry::Geometry;
 use shared_abi::layout::Layout;
 
@@ -102,6 +90,46 @@ include!(concat!(env!("OUT_DIR"), "/board.rs"));
 
 /// The chip on the board.
 const CHIP: &Geometry = BOARD.chip;
+
+/// The facts of a board: the constant `FACTS` of its file in `boards/`.
+#[derive(Clone, Copy, Debug)]
+pub struct Facts {
+    /// The identity that the device reports.
+    pub identity: Identity,
+    /// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
+    /// layer setting services (LSS).
+    pub node_id: u8,
+    /// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it
+    /// by listening.
+    pub bit_rate: u32,
+    /// How the clocks are made.
+    pub clock_tree: ClockTree,
+    /// The pin that asks for the bootloader after a reset, if the board has one.
+    pub entry_strap: Option<Strap>,
+    /// The pin of the LED that blinks while the device works.
+    pub led: Pin,
+    /// The pins of the CAN controller.
+    pub can_pins: Pins,
+    /// The pin that takes the CAN transceiver out of standby, and the level that does it: high, or
+    /// low.
+    pub can_standby: Option<(Pin, bool)>,
+    /// The pins of the UART.
+    pub uart_pins: Pins,
+    /// Bit rate of the UART, in bit/s.
+    pub uart_bit_rate: u32,
+}
+
+/// A pin of the chip: its port, `'A'` and on, and its number in the port, 0 to 15.
+pub type Pin = (char, u8);
+
+/// The pins of a controller with two lines.
+#[derive(Clone, Copy, Debug)]
+pub struct Pins {
+    /// The line that the chip drives.
+    pub transmit: Pin,
+    /// The line that the chip reads.
+    pub receive: Pin,
+}
 
 /// The entry strap: a pin that asks for the bootloader after a reset.
 ///
@@ -148,6 +176,17 @@ impl Strap {
     }
 }
 
+/// The identity that the device reports.
+pub const IDENTITY: Identity = FACTS.identity;
+/// Node-ID of a device that has no other one stored ([`Facts::node_id`]).
+pub const NODE_ID: u8 = FACTS.node_id;
+/// Bit rate of a device that has no other one stored ([`Facts::bit_rate`]).
+pub const BIT_RATE: u32 = FACTS.bit_rate;
+/// How the clocks are made; the chip can run with them.
+pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked();
+/// The pin that asks for the bootloader after a reset.
+pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
+
 /// The core's clock, in Hz.
 pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
 /// Clock of the CAN controller in Hz: the clock of APB1.
@@ -169,14 +208,14 @@ pub use board::*;
 
 const _: () = assert!(
     BIT_RATE == 0 || can::BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
-    "board: the clock of the CAN controller (APB1) cannot make BIT_RATE"
+    "board: the clock of the CAN controller (APB1) cannot make bit_rate"
 );
 const _: () = assert!(
     match ENTRY_STRAP {
         Some(strap) => strap.is_possible(CHIP.ports),
         None => true,
     },
-    "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`"
+    "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`"
 );
 
 /// Compares the chip of the HAL and its PAC with the chip of the board.
@@ -220,7 +259,7 @@ mod chip_check {
 }
 
 #[cfg(target_arch = "arm")]
-pub use drivers::{clocks, entry_strap, inputs, Board};
+pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
 /// The port for frames: the CAN controller, or the UART instead of it.
 #[cfg(all(target_arch = "arm", not(feature = "virtual-can")))]
 pub type CanPort = can::Port<CanController>;

@@ -32,7 +32,7 @@ mod drivers {
     use stm32f4xx_hal::serial::Instance;
 
     use crate::clock::ClockTree;
-    use crate::{CLOCK_TREE, UART_BIT_RATE};
+    use crate::{CLOCK_TREE, FACTS};
 
     /// A USART that a board may choose.
     pub trait Controller: Instance<RB = usart1::RegisterBlock> {
@@ -66,10 +66,11 @@ mod drivers {
     }
 
     /// The divider of the board's UART.
-    const DIVIDER: u16 = match super::divider(clock::<crate::UartController>(&CLOCK_TREE), UART_BIT_RATE) {
-        Some(divider) => divider,
-        None => panic!("board: the clock of the UART cannot make UART_BIT_RATE"),
-    };
+    const DIVIDER: u16 =
+        match super::divider(clock::<crate::UartController>(&CLOCK_TREE), FACTS.uart_bit_rate) {
+            Some(divider) => divider,
+            None => panic!("board: the clock of the UART cannot make uart_bit_rate"),
+        };
 
     /// A USART with its pins.
     pub struct Port<U: Controller> {
@@ -77,7 +78,7 @@ mod drivers {
     }
 
     impl<U: Controller> Port<U> {
-        /// Sets the UART up for `UART_BIT_RATE` and switches it on. Its interrupts are off.
+        /// Sets the UART up for the board's bit rate and switches it on. Its interrupts are off.
         pub fn new(
             usart: U,
             (tx, rx): (impl Into<U::Tx<PushPull>>, impl Into<U::Rx<PushPull>>),

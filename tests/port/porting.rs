@@ -298,7 +298,7 @@ const MISTAKES: &[Mistake] = &[
         right: "pll_n: 160",
         wrong: "pll_n: 163",
         by: By::Board,
-        says: "board: the clock of the CAN controller (APB1) cannot make BIT_RATE",
+        says: "board: the clock of the CAN controller (APB1) cannot make bit_rate",
     },
     Mistake {
         file: BOARD,
@@ -356,38 +356,38 @@ const MISTAKES: &[Mistake] = &[
         right: "port: 'C'",
         wrong: "port: 'I'",
         by: By::Board,
-        says: "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`",
+        says: "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`",
     },
     Mistake {
         file: BOARD,
         right: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None })",
         wrong: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::Down })",
         by: By::Board,
-        says: "board: the chip has no such pin as ENTRY_STRAP names, or its resistor pulls it to `pressed`",
+        says: "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`",
     },
     // DS10693 table 11: PB7 has no CAN1.
     Mistake {
         file: BOARD,
-        right: "(gpiob.pb9, gpiob.pb8)",
-        wrong: "(gpiob.pb7, gpiob.pb8)",
+        right: "transmit: ('B', 9)",
+        wrong: "transmit: ('B', 7)",
         by: By::Drivers,
         says: "can1::Tx: From<stm32f4xx_hal::gpio::Pin<'B', 7>>",
     },
     // DS10693, alternate functions: PA4 is the clock of USART2.
     Mistake {
         file: BOARD,
-        right: "(gpioa.pa2, gpioa.pa3)",
-        wrong: "(gpioa.pa4, gpioa.pa3)",
+        right: "transmit: ('A', 2)",
+        wrong: "transmit: ('A', 4)",
         by: By::Drivers,
         says: "usart2::Tx: From<stm32f4xx_hal::gpio::Pin<'A', 4>>",
     },
     // 40 MHz and at least 16 cycles a bit.
     Mistake {
         file: BOARD,
-        right: "UART_BIT_RATE: u32 = 115_200",
-        wrong: "UART_BIT_RATE: u32 = 3_000_000",
+        right: "uart_bit_rate: 115_200",
+        wrong: "uart_bit_rate: 3_000_000",
         by: By::Drivers,
-        says: "board: the clock of the UART cannot make UART_BIT_RATE",
+        says: "board: the clock of the UART cannot make uart_bit_rate",
     },
     // Choices that contradict each other, or the layout, which has only one program.
     product(
@@ -460,8 +460,8 @@ const MISTAKES: &[Mistake] = &[
     // The product does not detect the bit rate.
     Mistake {
         file: BOARD,
-        right: "BIT_RATE: u32 = 125_000",
-        wrong: "BIT_RATE: u32 = 0",
+        right: " bit_rate: 125_000",
+        wrong: " bit_rate: 0",
         by: By::Product(Some("least")),
         says: "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off",
     },

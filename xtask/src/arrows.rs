@@ -12,7 +12,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use crate::args::Args;
-use crate::{process, rooms, workspace, Outcome};
+use crate::{ordered, process, rooms, workspace, Outcome};
 use serde_json::Value;
 
 pub const HELP: &str = "\
@@ -22,7 +22,8 @@ Checks the dependencies between the crates against the rules in xtask/src/arrows
 emulator takes nothing but the geometry of the silicon from shared-abi (its program the names of
 the boards, too); that the pure crates
 forbid unsafe code; and that the modules of a crate do not use each other in circles (nor, in
-coflash, its files), those of boot-core and coflash no others than xtask/src/rooms.rs allows.
+coflash, its files), those of boot-core and coflash no others than xtask/src/rooms.rs allows; and that everything is there that
+the owner of the product ordered by name (xtask/src/ordered.rs).
 ";
 
 /// The crates of ours that one of our crates may depend on. Dev- and build-dependencies follow the
@@ -102,8 +103,10 @@ const COMMAND_LINE: &str = "src/bin";
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     let metadata = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
-    let packages = packages(&process::json(&metadata)?)?;
+    let metadata = process::json(&metadata)?;
+    let packages = packages(&metadata)?;
     let mut broken = broken_arrows(&packages);
+    broken.extend(ordered::broken(&metadata)?);
     let Some(emulator) = packages.iter().find(|package| package.name == "emulator") else {
         return Err("the workspace has no crate \"emulator\".".into());
     };
@@ -142,7 +145,10 @@ pub fn run(args: Args) -> Outcome {
     for line in &broken {
         println!("{line}");
     }
-    Err(format!("{} rules of the house are broken; they stand in xtask/src/arrows.rs.", broken.len()))
+    Err(format!(
+        "{} rules of the house are broken; they stand in xtask/src/arrows.rs and ordered.rs.",
+        broken.len()
+    ))
 }
 
 fn read(path: &Path) -> Outcome<String> {

@@ -39,6 +39,7 @@ mod modules;
 mod mutants;
 mod new_board;
 mod opinion;
+mod ordered;
 mod pack;
 mod package;
 #[cfg(test)]

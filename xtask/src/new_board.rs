@@ -190,112 +190,56 @@ impl Fit {
 
 fn board_file(name: &str, chip: &Geometry) -> String {
     let Fit { mhz, apb1, apb2, wait_states, can: (port, receive, transmit) } = Fit::of(chip);
-    let ports = match port {
-        'A' => "        let gpioa = take_port!(GPIOA, can1).split(rcc);\n".to_owned(),
-        port => format!(
-            "        #[cfg(feature = \"uart\")]
-        let gpioa = take_port!(GPIOA, can1).split(rcc);
-        let gpio{0} = take_port!(GPIO{port}, can1).split(rcc);\n",
-            port.to_ascii_lowercase()
-        ),
-    };
-    let can = port.to_ascii_lowercase();
     format!(
         "//! {name} ({}), with a CAN transceiver on P{port}{receive} and P{port}{transmit}.
 
 use crate::clock::ClockTree;
-use crate::{{Identity, Strap}};
+use crate::{{Facts, Identity, Pins}};
 
-// Step 5: vendor-ID, product code and names. The product code tells your product from others.
-/// The identity that the device reports.
-pub const IDENTITY: Identity = Identity {{
-    vendor_id: 0,
-    product_code: 0,
-    revision: 0x0001_0000,
-    device_name: \"{name}\",
-    hardware_version: \"1\",
+/// The facts of this board.
+pub const FACTS: Facts = Facts {{
+    // Step 5: vendor-ID, product code and names. The product code tells your product from others.
+    identity: Identity {{
+        vendor_id: 0,
+        product_code: 0,
+        revision: 0x0001_0000,
+        device_name: \"{name}\",
+        hardware_version: \"1\",
+    }},
+    // Step 6: the node-ID of a new device; 255 for one that waits for layer setting services (LSS).
+    node_id: 1,
+    // Step 7: the bit rate of a new device; 0 for one that detects it by listening.
+    bit_rate: 125_000,
+    // Step 8: the crystal, or the clock at OSC_IN with `hse_bypass`, and the numbers of the PLL. Here
+    // {mhz} MHz from a crystal of 8 MHz; {} MHz on APB1 make each bit rate of CiA 301.
+    clock_tree: ClockTree {{
+        hse: 8_000_000,
+        hse_bypass: false,
+        pll_input: 2_000_000,
+        pll_n: {mhz},
+        pll_p: 2,
+        apb1: {apb1},
+        apb2: {apb2},
+        wait_states: {wait_states},
+    }},
+    // Step 9: a pin that keeps the device in the bootloader, if the board has one:
+    // `Some(crate::Strap {{ port: 'A', pin: 0, pressed: false, pull: crate::Pull::Up }})`.
+    entry_strap: None,
+    // Step 10: the LED.
+    led: ('C', 13),
+    // Step 11: the CAN pins.
+    can_pins: Pins {{ transmit: ('{port}', {transmit}), receive: ('{port}', {receive}) }},
+    // Step 12: the transceiver's standby pin, if it has one, and the level of normal operation:
+    // `Some((('C', 14), false))` for a low level.
+    can_standby: None,
+    // Step 13: the UART for messages while you port: its pins, and below its name.
+    uart_pins: Pins {{ transmit: ('A', 2), receive: ('A', 3) }},
+    uart_bit_rate: 115_200,
 }};
 
-// Step 6: the node-ID of a new device.
-/// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
-/// layer setting services (LSS).
-pub const NODE_ID: u8 = 1;
-
-// Step 7: the bit rate of a new device.
-/// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it by
-/// listening.
-pub const BIT_RATE: u32 = 125_000;
-
-// Step 8: the crystal, or the clock at OSC_IN with `hse_bypass`, and the numbers of the PLL.
-/// {mhz} MHz from a crystal of 8 MHz; {} MHz on APB1 make each bit rate of CiA 301.
-pub const CLOCK_TREE: ClockTree = ClockTree {{
-    hse: 8_000_000,
-    hse_bypass: false,
-    pll_input: 2_000_000,
-    pll_n: {mhz},
-    pll_p: 2,
-    apb1: {apb1},
-    apb2: {apb2},
-    wait_states: {wait_states},
-}}
-.checked();
-
-// Step 9: a pin that keeps the device in the bootloader, if the board has one:
-// `Some(Strap {{ port: 'A', pin: 0, pressed: false, pull: crate::Pull::Up }})`.
-/// The pin that asks for the bootloader after a reset.
-pub const ENTRY_STRAP: Option<Strap> = None;
-
-/// Bit rate of the UART, in bit/s.
-pub const UART_BIT_RATE: u32 = 115_200;
-
-// Step 10: the CAN controller, CAN1 or CAN2 (docs/porting.md).
+// Step 14: the CAN controller, CAN1 or CAN2 (docs/porting.md).
 can_controller!(CAN1);
-
-#[cfg(target_arch = \"arm\")]
-pub use pins::*;
-
-/// LED, CAN controller and UART, by the types that the HAL has for pins.
-#[cfg(target_arch = \"arm\")]
-mod pins {{
-    use stm32f4xx_hal::can::CanExt;
-    use stm32f4xx_hal::gpio::{{GpioExt, Output, Pin}};
-    use stm32f4xx_hal::pac;
-    use stm32f4xx_hal::rcc::Rcc;
-
-    #[cfg(feature = \"uart\")]
-    use crate::uart::Port;
-    use crate::Board;
-
-    // Step 11: the LED, its pin here and in `init`.
-    /// The LED that blinks while the device works.
-    pub type Led = Pin<'C', 13, Output>;
-
-    // Step 12: the UART for messages while you port, its pins in `init`.
-    uart! {{
-        /// The UART, on PA2 and PA3. It is set up with the feature `uart` alone.
-        USART2
-    }}
-
-    /// Sets the pins up.
-    #[must_use]
-    pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {{
-        // Each port is taken once.
-{ports}        let gpioc = take_port!(GPIOC, can1).split(rcc);
-        let led = gpioc.pc13.into_push_pull_output();
-        #[cfg(feature = \"uart\")]
-        let uart = Port::new(take_port!(USART2, can1), (gpioa.pa2, gpioa.pa3), rcc);
-        // Step 13: the transceiver's standby pin, if it has one, before the controller is set up:
-        // `let _ = gpioc.pc14.into_push_pull_output_in_state(PinState::Low);` (`gpio::PinState`).
-        // Step 14: the CAN pins, transmit and receive.
-        let can = can1.can((gpio{can}.p{can}{transmit}, gpio{can}.p{can}{receive}), rcc);
-        Board {{
-            can,
-            led,
-            #[cfg(feature = \"uart\")]
-            uart,
-        }}
-    }}
-}}
+uart!(USART2);
 ",
         constant(chip),
         mhz / apb1,
@@ -306,11 +250,11 @@ fn c_header(name: &str, chip: &Geometry) -> String {
     let Fit { can: (port, receive, transmit), .. } = Fit::of(chip);
     format!(
         "/* {name}: the numbers of bsp/src/boards/{}.rs for the application in C. */
-/* Step 15: the CAN pins of step 14, by alternate function 9; CAN1 alone. */
+/* Step 15: the CAN pins of step 11, by alternate function 9; CAN1 alone. */
 #define CAN_PORT '{port}'
 #define CAN_RX_PIN {receive}
 #define CAN_TX_PIN {transmit}
-/* Step 16: the LED of step 11. */
+/* Step 16: the LED of step 10. */
 #define LED_PORT 'C'
 #define LED_PIN 13
 /* Step 17: the crystal of step 8. */

@@ -1,0 +1,259 @@
+//! What the owner of the product ordered by name, as a part of `cargo xtask arrows`: paths, tasks,
+//! crates and functions that must not be lost when the rest is moved.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::workspace::{self, TARGET};
+use crate::{process, Outcome};
+
+/// The paths at the top level.
+const TOP_LEVEL: [&str; 6] = ["Cargo.toml", "bootloader", "app-template", "shared-abi", "linker", "tests"];
+/// The programs with an RTIC task for received frames and a timer monotonic.
+const PROGRAMS: [&str; 2] = ["bootloader", "app-template"];
+/// The interrupts of received frames that a task may be bound to.
+const RX_INTERRUPTS: [&str; 4] = ["CAN1_RX0", "CAN1_RX1", "CAN2_RX0", "CAN2_RX1"];
+/// The crates of others that the image of the bootloader contains.
+const IN_THE_IMAGE: [&str; 7] =
+    ["rtic", "stm32f4xx-hal", "bxcan", "cortex-m", "heapless", "crc", "panic-probe"];
+/// What `shared-abi` has: the words for it, a file, and a piece of code in that file.
+const SHARED: [(&str, &str, &str); 3] = [
+    ("warm-start cell", "shared-abi/src/warm_start.rs", "pub struct Cell"),
+    ("vector relocation", "shared-abi/src/vectors.rs", "0xE000_ED08"),
+    ("callgate", "shared-abi/src/callgate.rs", "pub struct Table"),
+];
+/// The file of the callback of 1F51h = 80h, and what it has.
+const CALLBACK: (&str, [&str; 2]) =
+    ("app-template/src/objects.rs", ["fn start_bootloader(", "self.start_bootloader("]);
+/// The test program of the ABI.
+const ABI_TESTS: &str = "abi";
+
+/// The parts of the repository that the orders are about.
+#[derive(Default)]
+struct House {
+    /// The files at and below the top-level paths, by their paths: the text of Rust sources, without
+    /// comments, and nothing of the others.
+    files: BTreeMap<String, String>,
+    /// The crates that the image of the bootloader contains.
+    image: BTreeSet<String>,
+    /// The names of the test programs, with their sources.
+    tests: Vec<(String, String)>,
+}
+
+/// The orders that are not kept, as messages.
+///
+/// # Errors
+/// When the repository cannot be read.
+pub fn broken(metadata: &Value) -> Outcome<Vec<String>> {
+    let root = workspace::root();
+    let mut house = House::default();
+    for path in TOP_LEVEL {
+        gather(root, path, &mut house.files)?;
+    }
+    let mut tree = process::cargo("tree");
+    tree.args(["--package", "bootloader", "--target", TARGET, "--edges", "normal", "--prefix", "none"]);
+    let tree = process::output(&mut tree)?;
+    house.image = tree.lines().filter_map(|line| Some(line.split(' ').next()?.to_owned())).collect();
+    house.tests = test_programs(metadata, root);
+    Ok(house.broken())
+}
+
+/// Reads a file, or the files below a folder; a path that does not exist has none.
+fn gather(root: &Path, path: &str, files: &mut BTreeMap<String, String>) -> Outcome {
+    let place = root.join(path);
+    if !place.is_dir() {
+        if place.exists() {
+            let is_source = place.extension().is_some_and(|extension| extension == "rs");
+            let text = if is_source { fs::read_to_string(&place) } else { Ok(String::new()) };
+            let text = text.map_err(|error| format!("{path} cannot be read: {error}."))?;
+            files.insert(path.to_owned(), code(&text));
+        }
+        return Ok(());
+    }
+    let entries = fs::read_dir(&place).map_err(|error| format!("{path} cannot be read: {error}."))?;
+    for entry in entries.flatten() {
+        gather(root, &format!("{path}/{}", entry.file_name().to_string_lossy()), files)?;
+    }
+    Ok(())
+}
+
+/// A source without its comments: they may name what is not there.
+fn code(text: &str) -> String {
+    text.lines().map(|line| line.split("//").next().unwrap_or_default()).collect::<Vec<_>>().join("\n")
+}
+
+/// The test programs in the output of `cargo metadata`.
+fn test_programs(metadata: &Value, root: &Path) -> Vec<(String, String)> {
+    let list = |value: &Value, key: &str| value[key].as_array().cloned().unwrap_or_default();
+    let packages = list(metadata, "packages").into_iter();
+    let targets = packages.flat_map(|package| list(&package, "targets"));
+    let tests = targets.filter(|target| list(target, "kind").iter().any(|kind| kind == "test"));
+    tests
+        .filter_map(|target| {
+            let source = Path::new(target["src_path"].as_str()?);
+            let source = source.strip_prefix(root).unwrap_or(source);
+            Some((target["name"].as_str()?.to_owned(), source.to_string_lossy().replace('\\', "/")))
+        })
+        .collect()
+}
+
+impl House {
+    fn broken(&self) -> Vec<String> {
+        let mut broken = Vec::new();
+        for path in TOP_LEVEL {
+            let below = format!("{path}/");
+            if !self.files.keys().any(|file| file == path || file.starts_with(&below)) {
+                broken.push(format!("the top level has no {path}"));
+            }
+        }
+        for program in PROGRAMS {
+            let below = format!("{program}/src/");
+            let sources: Vec<&str> = self
+                .files
+                .iter()
+                .filter(|(path, _)| path.starts_with(&below))
+                .map(|(_, text)| &**text)
+                .collect();
+            if !sources.iter().any(|source| has_receiving_task(source)) {
+                broken.push(format!(
+                    "{program}: no RTIC task is bound to the interrupt of received CAN frames"
+                ));
+            }
+            if !sources.iter().any(|source| source.contains("_monotonic!(")) {
+                broken.push(format!("{program}: there is no timer monotonic"));
+            }
+        }
+        for krate in IN_THE_IMAGE {
+            if !self.image.contains(krate) {
+                broken.push(format!("bootloader: its image does not contain {krate}"));
+            }
+        }
+        for (what, file, piece) in SHARED {
+            if !self.has(file, piece) {
+                broken.push(format!("{file}: shared-abi has no {what} (`{piece}`)"));
+            }
+        }
+        let (file, pieces) = CALLBACK;
+        if !pieces.iter().all(|piece| self.has(file, piece)) {
+            broken.push(format!(
+                "{file}: there is no callback of 1F51h = 80h, `start_bootloader`, that is called"
+            ));
+        }
+        if !self.tests.iter().any(|(name, source)| name == ABI_TESTS && source.starts_with("tests/")) {
+            broken.push(format!("tests: there is no test program `{ABI_TESTS}`"));
+        }
+        broken
+    }
+
+    fn has(&self, file: &str, piece: &str) -> bool {
+        self.files.get(file).is_some_and(|text| text.contains(piece))
+    }
+}
+
+/// Whether an RTIC application has a task for received frames.
+fn has_receiving_task(source: &str) -> bool {
+    let Some((_, app)) = source.split_once("#[rtic::app(") else { return false };
+    app.split("#[task(").skip(1).any(|task| {
+        let attribute = task.split(")]").next().unwrap_or_default();
+        let binds = attribute.split(',').find_map(|part| part.trim().strip_prefix("binds = "));
+        binds.is_some_and(|interrupt| RX_INTERRUPTS.contains(&interrupt))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const APP: &str = "systick_monotonic!(Mono, 1_000);\n#[rtic::app(device = pac)]\nmod app {\n\
+                       #[task(binds = CAN1_RX0, shared = [can], priority = 4)]\nfn can_rx() {}\n\
+                       #[task(binds = CAN1_TX, priority = 3)]\nfn protocol() {}\n}";
+
+    fn house() -> House {
+        let mut house = House::default();
+        let mut put = |path: &str, text: &str| {
+            house.files.entry(path.to_owned()).or_default().push_str(&format!("{text}\n"));
+        };
+        put("Cargo.toml", "");
+        put("linker/application.x", "");
+        put("tests/Cargo.toml", "");
+        for program in PROGRAMS {
+            put(&format!("{program}/src/main.rs"), APP);
+        }
+        for (_, file, piece) in SHARED {
+            put(file, piece);
+        }
+        for piece in CALLBACK.1 {
+            put(CALLBACK.0, piece);
+        }
+        house.image = IN_THE_IMAGE.map(str::to_owned).into();
+        house.tests = vec![("abi".to_owned(), "tests/abi/main.rs".to_owned())];
+        house
+    }
+
+    #[test]
+    fn a_house_with_everything_keeps_the_orders() {
+        assert_eq!(house().broken(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn each_thing_that_is_missing_is_named() {
+        let without_file = |file: &str| {
+            let mut house = house();
+            house.files.remove(file);
+            house
+        };
+        for (file, says) in [
+            ("Cargo.toml", "no Cargo.toml"),
+            ("linker/application.x", "no linker"),
+            ("tests/Cargo.toml", "the top level has no tests"),
+            ("shared-abi/src/warm_start.rs", "no warm-start cell"),
+            ("shared-abi/src/vectors.rs", "no vector relocation"),
+            ("shared-abi/src/callgate.rs", "no callgate"),
+            ("app-template/src/objects.rs", "no callback of 1F51h"),
+        ] {
+            let broken = without_file(file).broken();
+            assert!(broken.len() == 1 && broken[0].contains(says), "{file}: {broken:?}");
+        }
+        for krate in IN_THE_IMAGE {
+            let mut house = house();
+            house.image.remove(krate);
+            assert_eq!(house.broken(), [format!("bootloader: its image does not contain {krate}")]);
+        }
+        for tests in [vec![], vec![("abi".to_owned(), "shared-abi/tests/abi.rs".to_owned())]] {
+            let broken = House { tests, ..house() }.broken();
+            assert!(broken.len() == 1 && broken[0].contains("test program `abi`"), "{broken:?}");
+        }
+    }
+
+    #[test]
+    fn a_program_without_its_task_or_its_timer_is_named() {
+        let with = |program: &str, from: &str, to: &str| {
+            let mut house = house();
+            let file = house.files.get_mut(&format!("{program}/src/main.rs")).unwrap();
+            assert!(file.contains(from), "{from}");
+            *file = code(&file.replace(from, to));
+            house.broken()
+        };
+        for program in PROGRAMS {
+            for (from, to, says) in [
+                ("binds = CAN1_RX0, ", "", "no RTIC task"),
+                ("CAN1_RX0", "CAN1_SCE", "no RTIC task"),
+                ("#[task(binds = CAN1_RX0", "// #[task(binds = CAN1_RX0", "no RTIC task"),
+                ("#[rtic::app(device = pac)]", "", "no RTIC task"),
+                ("systick_monotonic!(", "// systick_monotonic!(", "no timer monotonic"),
+            ] {
+                let broken = with(program, from, to);
+                assert!(broken.len() == 1 && broken[0].contains(says), "{program}, {from}: {broken:?}");
+                assert!(broken[0].starts_with(program), "{broken:?}");
+            }
+            assert_eq!(with(program, "CAN1_RX0", "CAN2_RX0"), Vec::<String>::new());
+        }
+        // A callback that nobody calls is none.
+        let mut house = house();
+        house.files.insert(CALLBACK.0.to_owned(), CALLBACK.1[0].to_owned());
+        assert!(house.broken()[0].contains("that is called"));
+    }
+}
