@@ -41,8 +41,6 @@ mod new_board;
 mod opinion;
 mod pack;
 mod package;
-#[cfg(test)]
-mod pages;
 mod pairs;
 mod parts;
 mod portable;
