@@ -35,6 +35,10 @@
 //! ```
 #![forbid(unsafe_code)]
 
+// The command line names this library as every other program does.
+#[cfg(feature = "cli")]
+extern crate self as coflash;
+
 mod json;
 #[macro_use]
 mod setters;
@@ -42,6 +46,9 @@ mod setters;
 #[cfg(feature = "agent")]
 pub mod agent;
 pub mod bus;
+#[cfg(feature = "cli")]
+#[doc(hidden)]
+pub mod cli;
 #[cfg(feature = "conform")]
 pub mod conform;
 pub mod device;

@@ -1,8 +1,6 @@
 //! The command line of coflash.
 #![forbid(unsafe_code)]
 
-mod cli;
-
 fn main() -> std::process::ExitCode {
-    cli::main()
+    coflash::cli::main()
 }

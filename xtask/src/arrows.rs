@@ -54,7 +54,7 @@ const RULES: &[Rule] = &[
         may_use: &["app-template", "canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"],
     },
     Rule { name: "vendor-can", may_use: &[] },
-    Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can"] },
+    Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can", KIT] },
     Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
     Rule {
         name: "coboot-node",
@@ -78,7 +78,7 @@ const RULES: &[Rule] = &[
             KIT,
         ],
     },
-    Rule { name: "xtask", may_use: &["shared-abi"] },
+    Rule { name: "xtask", may_use: &["shared-abi", KIT] },
 ];
 
 /// What the tests share: in no package, and so a dev-dependency, of crates that have tests with it.

@@ -5,8 +5,8 @@ use std::fs;
 use shared_abi::layout::BOARDS;
 
 use crate::build::{C_APPLICATION, VARIANTS};
-use crate::pages::{self, Shown};
 use crate::{workspace, JOBS};
+use kit::pages::{self, Shown};
 
 /// A block of code in a document that names its source file.
 struct Quote {

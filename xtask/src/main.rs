@@ -42,8 +42,6 @@ mod opinion;
 mod ordered;
 mod pack;
 mod package;
-#[cfg(test)]
-mod pages;
 mod pairs;
 mod parts;
 mod portable;

@@ -850,5 +850,4 @@ fn last_part(link: &str) -> Option<String> {
 }
 
 #[cfg(test)]
-#[path = "controller/tests.rs"]
 mod tests;

@@ -57,7 +57,7 @@ mod values;
 mod verify;
 mod verify_device;
 mod waiting;
-mod words;
+pub mod words;
 mod write;
 
 /// Converts firmware and downloads it over CANopen.
@@ -234,7 +234,7 @@ impl Cli {
 }
 
 /// The commands and their options, with the help arranged.
-fn commands() -> clap::Command {
+pub fn commands() -> clap::Command {
     help::in_order(Cli::command())
 }
 
@@ -354,44 +354,11 @@ fn configured(named: Option<PathBuf>, given: &ArgMatches) -> Result<clap::Comman
 }
 
 #[cfg(test)]
-#[path = "../../../xtask/src/pages.rs"]
-mod pages;
-
-#[cfg(test)]
 mod tests {
-    use clap::error::ErrorKind;
-
     use super::*;
 
     #[test]
     fn the_arguments_are_well_formed() {
         commands().debug_assert();
-    }
-
-    /// Every call of this tool on every page is parsed by the command line's own reader.
-    #[test]
-    fn what_the_pages_show_is_understood() {
-        let mut count = 0;
-        for shown in pages::commands() {
-            let Some(words) = pages::call_of(&shown.words, "coflash") else { continue };
-            // A placeholder is replaced by a value.
-            let of = |word: &String| if word == "BOARD" { "stm32f407g-disc1" } else { word }.to_string();
-            let words = std::iter::once("coflash".to_string()).chain(words.iter().map(of));
-            let words: Vec<String> = words.filter(|word| word != "COMMAND").collect();
-            count += 1;
-            let words = words::ordered(words.iter().map(OsString::from).collect(), &commands());
-            let Err(error) = commands().try_get_matches_from(&words) else { continue };
-            let mention = shown.inline
-                && (matches!(
-                    error.kind(),
-                    ErrorKind::MissingRequiredArgument
-                        | ErrorKind::MissingSubcommand
-                        | ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand
-                ) || error.kind() == ErrorKind::InvalidValue
-                    && error.to_string().contains("a value is required"));
-            let help = matches!(error.kind(), ErrorKind::DisplayHelp | ErrorKind::DisplayVersion);
-            assert!(mention || help, "{}: {words:?}: {error}", shown.place);
-        }
-        assert!(count > 60, "{count}");
     }
 }

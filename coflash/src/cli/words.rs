@@ -7,7 +7,7 @@ use clap::{Arg, Command};
 
 /// Moves options that stand before their command behind it: `coflash --node 5 info` becomes
 /// `coflash info --node 5`. Unknown options stay in place, and the parser reports them.
-pub(super) fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
+pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     let mut kept: Vec<OsString> = Vec::new();
     let mut moved: Vec<(String, Vec<OsString>)> = Vec::new();
     let mut rest = words.iter();

@@ -5,6 +5,7 @@
 //!
 //! | module | what it does |
 //! |---|---|
+//! | [`args`] | the words of the command line |
 //! | [`file_flash`] | the flash of a chip in a file |
 //! | [`device`] | a device: boot decision, bootloader, and the replacement of a program |
 //! | [`stand_in`] | the replacement of a program: the objects that a host reads from a running
@@ -14,6 +15,7 @@
 //! `docs/node.md` describes the properties and limits of a node.
 #![forbid(unsafe_code)]
 
+pub mod args;
 pub mod device;
 pub mod file_flash;
 pub mod server;

@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`random`] | random numbers by a seed |
 //! | [`ihex`] | Intel HEX as tools write it |
+//! | [`pages`] | the commands on the pages of the documentation |
 //! | [`bus`] | feature `bus`: a CANopen device with a domain, and frames to it and from it |
 //! | [`memory`] | feature `debugger`: a device with the debugger interface, and its memory |
 //! | [`model`] | feature `boot`: a strict flash that loses power on demand |
@@ -27,6 +28,7 @@ pub mod memory;
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod model;
+pub mod pages;
 pub mod random;
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]

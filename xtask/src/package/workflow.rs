@@ -4,8 +4,8 @@ use std::fs;
 
 use yaml_rust2::{Yaml, YamlLoader};
 
-use crate::pages::Shown;
 use crate::{docs, workspace};
+use kit::pages::Shown;
 
 /// The faults of a workflow; empty if it is right.
 fn faults(text: &str) -> Vec<String> {

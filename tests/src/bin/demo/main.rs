@@ -4,7 +4,6 @@
 //! the board.
 //! onto the board.
 
-#[path = "demo/sealed.rs"]
 mod sealed;
 
 use std::fs::File;

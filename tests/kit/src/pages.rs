@@ -1,7 +1,7 @@
 //! The commands on the pages: every line of a block for a shell, and every call in running text.
 //!
-//! Only for tests. The tests of `coflash` and `coboot-node`, which have the readers of their
-//! command lines, include this file by its path.
+//! The tests of `coflash`, `coboot-node` and `xtask` read them with the readers of their command
+//! lines.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -26,6 +26,10 @@ const SHELLS: [&str; 3] = ["sh", "bash", "shell"];
 const FOREIGN: [&str; 4] = ["target", ".git", "corpus", "node_modules"];
 
 /// The commands of all pages.
+///
+/// # Panics
+/// When a page cannot be read.
+#[must_use]
 pub fn commands() -> Vec<Shown> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().find(|folder| folder.join("docs").is_dir());
     let root = root.expect("a crate lies in the workspace");
@@ -141,8 +145,7 @@ fn words(line: &str) -> Vec<String> {
 }
 
 /// The arguments of a program, if the command runs it: by its name, or by `cargo run -p NAME --`.
-// Not every crate that includes this file uses it.
-#[allow(dead_code)]
+#[must_use]
 pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
     match words {
         [name, rest @ ..] if name == program => Some(rest),
@@ -156,8 +159,7 @@ pub fn call_of<'w>(words: &'w [String], program: &str) -> Option<&'w [String]> {
 }
 
 /// A word in capitals is a placeholder: for a command, a board, a file.
-// As above.
-#[allow(dead_code)]
+#[must_use]
 pub fn is_placeholder(word: &str) -> bool {
     !word.is_empty() && word.bytes().all(|byte| byte.is_ascii_uppercase() || byte == b'_')
 }
