@@ -11,7 +11,6 @@
 //! | `boot_report.rs` | the boot stage's report to the RAM part | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
-//! | `debugger.rs` | the device without the debugger interface (the feature `debugger` takes that of `bsp`) | no |
 //! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
 //! The behaviour of the bootloader is in `boot-core` and `canopen`.
@@ -19,8 +18,6 @@
 #![no_main]
 
 mod boot_report;
-#[cfg(not(feature = "debugger"))]
-mod debugger;
 mod flash_controller;
 mod log;
 mod memory;
@@ -30,8 +27,6 @@ mod start;
 mod storage;
 mod watchdog;
 
-#[cfg(feature = "debugger")]
-use bsp::debugger;
 use cortex_m::peripheral::SCB;
 use panic_probe as _;
 use rtic_monotonics::systick::prelude::*;
@@ -61,6 +56,7 @@ mod app {
     use boot_core::store::NodeParameters;
     use boot_core::unseal::Room;
     use bsp::clock::Source;
+    use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
     use bsp::{line, pac, CanPort, CLOCK_TREE, IDENTITY, LAYOUT};
     use cortex_m::peripheral::SCB;
@@ -69,7 +65,6 @@ mod app {
     use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
     use super::{product, start, Mono};
-    use crate::debugger::{self, Debugger};
     use crate::log::{self, log};
     use crate::product::PRODUCT;
     use crate::services::{StoreState, STORE_STATE_WORDS};
@@ -86,7 +81,7 @@ mod app {
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
     const EXTRAS: Extras = Extras {
-        sealed: cfg!(feature = "sealed"),
+        sealed: product::SEALED,
         second_server: PRODUCT.second_server,
         resume: PRODUCT.resume,
         ..PRODUCT.profile.extras

@@ -12,8 +12,6 @@ use boot_core::control::{Erase, Policy, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::decision;
 use boot_core::flash::Flash;
-#[cfg(feature = "sealed")]
-use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
@@ -23,6 +21,9 @@ use shared_abi::warm_start::Cell;
 
 // The file of this product, as the module `chosen` (build.rs).
 include!(concat!(env!("OUT_DIR"), "/product.rs"));
+
+/// Whether the bootloader takes sealed images.
+pub const SEALED: bool = cfg!(feature = "sealed");
 
 /// The choices of a product.
 #[derive(Clone, Debug)]
@@ -141,8 +142,8 @@ impl Product {
         lss_store: true,
         block_upload: true,
         // There is no room for them beside sealed images.
-        second_server: !cfg!(feature = "sealed"),
-        resume: !cfg!(feature = "sealed"),
+        second_server: !SEALED,
+        resume: !SEALED,
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -150,7 +151,7 @@ impl Product {
         start_allowed: |_| true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
-        block_buffer: if cfg!(feature = "sealed") { 48 } else { 80 } * 1024,
+        block_buffer: if SEALED { 48 } else { 80 } * 1024,
         watchdog_ms: Some(1000),
         program_watchdog_ms: None,
         answer_to_reset_ms: 20,
@@ -168,10 +169,7 @@ impl Product {
                 "product: autostart names a program that the layout has not"
             );
         }
-        assert!(
-            !cfg!(feature = "sealed") || matches!(self.crc, CrcKind::Crc32),
-            "product: a sealed image carries a CRC-32"
-        );
+        assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
             self.rescue_window_ms
@@ -262,7 +260,7 @@ impl Product {
             crc: self.crc,
             crc_step: self.crc_step,
             #[cfg(feature = "sealed")]
-            seal: SealPolicy {
+            seal: boot_core::policy::SealPolicy {
                 vendor_id: IDENTITY.vendor_id,
                 product_code: IDENTITY.product_code,
                 revision: IDENTITY.revision,

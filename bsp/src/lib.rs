@@ -11,7 +11,8 @@ pub mod can;
 #[cfg(target_arch = "arm")]
 pub mod can_controllers;
 pub mod clock;
-#[cfg(all(target_arch = "arm", feature = "debugger"))]
+#[cfg(target_arch = "arm")]
+#[cfg_attr(not(feature = "debugger"), path = "no_debugger.rs")]
 pub mod debugger;
 #[cfg(target_arch = "arm")]
 mod drivers;

@@ -18,8 +18,6 @@ use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::boot_report::BootReport;
 use crate::caches::Caches;
-#[cfg(feature = "sealed")]
-use crate::callgate;
 use crate::flash::ResidentFlash;
 use crate::product::{self, NO_NODE_ID, PRODUCT};
 use crate::{ram_image, storing};
@@ -62,7 +60,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let mut flash = unsafe { ResidentFlash::steal(true) };
     ResidentFlash::switch_crc_unit_on(&rcc);
     #[cfg(feature = "sealed")]
-    callgate::store_after_reset(&mut flash, request);
+    crate::callgate::store_after_reset(&mut flash, request);
     let mut parameters = product::parameters(&flash);
     let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
     // SAFETY: as above; nothing is programmed from here on.

@@ -22,30 +22,22 @@ use rtic_monotonics::systick::prelude::*;
 
 systick_monotonic!(Mono, 1_000);
 
-macro_rules! version {
-    ($one:literal, $two:literal) => {
-        #[cfg(not(feature = "version-2"))]
-        version!($one);
-        #[cfg(feature = "version-2")]
-        version!($two);
-    };
-    ($version:literal) => {
-        /// 100Ah.
-        const VERSION: &str = $version;
+/// Whether this is version 2.
+const IS_VERSION_2: bool = cfg!(feature = "version-2");
+/// 100Ah.
+const VERSION: &str = if IS_VERSION_2 { "2.0.0" } else { "1.0.0" };
 
-        /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
-        #[used]
-        static MARKED_VERSION: &str = concat!("$CANopenSoftwareVersion\0", $version, "\0");
-    };
-}
-version!("1.0.0", "2.0.0");
+/// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
+#[used]
+static MARKED_VERSION: &str =
+    if IS_VERSION_2 { "$CANopenSoftwareVersion\02.0.0\0" } else { "$CANopenSoftwareVersion\01.0.0\0" };
 
 // Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
 // file.
 coboot_app::label!(
     vendor_id: IDENTITY.vendor_id,
     product_code: IDENTITY.product_code,
-    version: if cfg!(feature = "version-2") { 2 } else { 1 },
+    version: if IS_VERSION_2 { 2 } else { 1 },
 );
 
 /// A fault, or a panic (which ends in a fault), restarts the device. The bootloader decides which

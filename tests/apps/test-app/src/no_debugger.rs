@@ -1,23 +1,10 @@
 //! In the place of `debugger.rs`, without the feature `debugger`: nothing.
 
-use canopen::od::Entry;
+pub use bsp::debugger::{Debugger, ENTRIES};
 
-/// No objects.
-pub const ENTRIES: [Entry; 0] = [];
-
-/// Nothing.
-pub struct Debugger;
-
-impl Debugger {
-    /// The device, unchanged.
-    pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> &'a mut D {
-        device
-    }
-}
-
-/// Nothing.
-pub fn start() -> Debugger {
-    Debugger
+/// An interface without function.
+pub const fn start() -> Debugger {
+    Debugger::new()
 }
 
 /// Nothing.

@@ -1,17 +1,18 @@
-//! The device without the debugger interface, 1025h: no object and no code. With the feature
-//! `debugger`, `bsp::debugger` takes this place: **every node on the bus can then read and write
-//! this device's memory**.
+//! A device without the debugger interface, 1025h: no object, and no code. The feature `debugger`
+//! puts the module `debugger.rs` in its place.
 
-use boot_core::canopen::od::Entry;
+use canopen::od::Entry;
 
 /// No objects.
 pub const ENTRIES: [Entry; 0] = [];
 
 /// An interface without function.
+#[derive(Default)]
 pub struct Debugger;
 
 impl Debugger {
     /// An interface without function.
+    #[must_use]
     pub const fn new() -> Self {
         Self
     }
