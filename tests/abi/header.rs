@@ -1,8 +1,8 @@
 //! The C header, compiled as C and as C++: what they make of it is what Rust has.
 
+use std::env;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::{env, fs};
 
 /// A program in C and C++ that prints what the header's functions make, as bytes, and a verdict on
 /// records that come in as bytes.
@@ -102,11 +102,7 @@ fn succeed(command: &mut Command) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-fn scratch(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_TARGET_TMPDIR")).join(name)
-}
-
-/// The bytes are those of tests/abi.rs, whose check words come from an implementation in a third
+/// The bytes are those of `layout.rs`, whose check words come from an implementation in a third
 /// language; so does that of the label.
 #[test]
 fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
@@ -121,8 +117,9 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
         00\n\
         011211\n";
     for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
-        let (source, program) = (scratch("header").with_extension(extension), scratch("header"));
-        fs::write(&source, PROGRAM).unwrap();
+        let folder = kit::folder!("header");
+        let source = folder.write(format!("header.{extension}"), PROGRAM);
+        let program = folder.join("header");
         succeed(
             clang()
                 .args([standard, "-O2", "-fsanitize=undefined", "-fsanitize-trap=undefined"])
@@ -185,12 +182,12 @@ fn it_compiles_for_the_chip() {
         clang
     };
     for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
-        let source = scratch("chip").with_extension(extension);
-        fs::write(&source, FOR_THE_CHIP).unwrap();
+        let folder = kit::folder!("header");
+        let source = folder.write(format!("chip.{extension}"), FOR_THE_CHIP);
         let name = if extension == "c" { "arm-none-eabi-gcc" } else { "arm-none-eabi-g++" };
         for mut compiler in [clang("thumbv7em-none-eabihf"), clang("thumbv7em-none-eabi"), gcc(name)] {
             compiler.args(["-mcpu=cortex-m4", "-ffreestanding", "-Os", standard, "-c"]);
-            succeed(compiler.arg(&source).arg("-o").arg(scratch("chip.o")));
+            succeed(compiler.arg(&source).arg("-o").arg(folder.join("chip.o")));
         }
     }
 }

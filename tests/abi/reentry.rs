@@ -1,10 +1,10 @@
 //! The way back in C (`examples/c/coboot/reentry.c`) beside that in Rust (`coboot_app::departure`): whatever
 //! comes, in whatever order, both do the same.
 
+use std::env;
 use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
-use std::{env, fs};
 
 use coboot_app::departure::{Departure, Next};
 use kit::random::Random;
@@ -119,11 +119,9 @@ fn c_and_rust_leave_at_the_same_time_with_the_same_request() {
     }
     assert!(left.iter().all(|count| *count > 50), "not every request was seen: {left:?}");
 
-    let scratch = |name: &str| Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    let (source, events, program) =
-        (scratch("reentry-harness.c"), scratch("reentry-events"), scratch("reentry-harness"));
-    fs::write(&source, HARNESS).unwrap();
-    fs::write(&events, script).unwrap();
+    let folder = kit::folder!("reentry");
+    let (source, events) = (folder.write("harness.c", HARNESS), folder.write("events", script));
+    let program = folder.join("harness");
     let library = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/c/coboot");
     let mut clang = Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()));
     clang.args(["-std=c11", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror"]);

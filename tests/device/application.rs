@@ -5,7 +5,6 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::sync::Mutex;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -16,6 +15,7 @@ use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::label::label_of;
 use coflash::file::read::{read, Firmware};
 use coflash::update::{flash, FlashOptions};
+use kit::folder::Alone;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::toml::Toml;
 
@@ -26,12 +26,14 @@ fn example() -> PathBuf {
 
 /// The ELF file of the example. `None` if the tests run for another board.
 fn built() -> Option<Vec<u8>> {
-    build(&example(), "no-stack")
+    let alone = alone();
+    build(&example(), "no-stack", &alone)
 }
 
 /// The ELF file of a copy of the example in which `old` is replaced by `new`: a change by its
 /// author.
 fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
+    let alone = alone();
     let copy = Path::new(env!("CARGO_TARGET_TMPDIR")).join("application").join(name);
     fs::create_dir_all(copy.join("src")).expect("the folder can be made");
     for file in ["Cargo.toml", "Cargo.lock", "build.rs", "board.toml", "src/identity.rs", "src/main.rs"] {
@@ -49,17 +51,19 @@ fn altered(name: &str, old: &str, new: &str) -> Option<Vec<u8>> {
         };
         fs::write(copy.join(file), text).expect("the copy can be written");
     }
-    build(&copy, name)
+    build(&copy, name, &alone)
 }
 
-fn build(folder: &Path, program: &str) -> Option<Vec<u8>> {
-    /// One build at a time: they share the folder of `cargo xtask examples`.
-    static BUILD: Mutex<()> = Mutex::new(());
+/// One build at a time: they share the folder of `cargo xtask examples`.
+fn alone() -> Alone {
+    Alone::at(&Path::new(env!("CARGO_TARGET_TMPDIR")).join("application.lock"))
+}
+
+fn build(folder: &Path, program: &str, _: &Alone) -> Option<Vec<u8>> {
     if firmware::board().board != LAYOUT.board {
         println!("not run: the example is for {}", LAYOUT.board);
         return None;
     }
-    let _one = BUILD.lock();
     let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("../examples/rust");
     let status = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
         .current_dir(folder)

@@ -1,10 +1,9 @@
 //! CAN over UART: the bootloader and the application use the board's serial port, with `coflash`
 //! and its adapter.
 
-use std::path::PathBuf;
+use std::env;
 use std::process::Command;
 use std::time::Duration;
-use std::{env, fs};
 
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
@@ -202,9 +201,8 @@ fn the_coflash_command_finds_the_device_at_its_serial_port() {
 fn python_canopen_flashes_the_device_through_its_serial_port() {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    let file =
-        PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(firmware::APP_VIRTUAL_CAN).with_extension("blk");
-    fs::write(&file, firmware::blocks(firmware::APP_VIRTUAL_CAN).emit()).unwrap();
+    let folder = kit::folder!("virtual-can");
+    let file = folder.write("program.blk", firmware::blocks(firmware::APP_VIRTUAL_CAN).emit());
     let mut endpoint = Endpoint::serial(empty_board());
     let port = endpoint.url().replace("@125k", "");
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/python/canopen_client.py");

@@ -1,9 +1,9 @@
 //! Foreign programs, unmodified, and our own command line: against the emulated device through the
 //! socketcand endpoint.
 
+use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::{env, fs};
 
 use canopen::Address;
 use coboot_tests::bench::Bench;
@@ -34,18 +34,13 @@ fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name)
 }
 
-/// A block file of the application, for clients that read files.
-fn block_file(image: &str) -> PathBuf {
-    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("blk");
-    fs::write(&path, firmware::blocks(image).emit()).unwrap();
-    path
-}
-
 #[test]
 fn python_canopen_identifies_flashes_and_starts_the_device() {
     let mut endpoint = endpoint();
+    let folder = kit::folder!("clients");
+    let file = folder.write("program.blk", firmware::blocks(firmware::APP_V1).emit());
     let mut python = python();
-    python.arg(script("canopen_client.py")).arg(endpoint.address()).arg(block_file(firmware::APP_V1));
+    python.arg(script("canopen_client.py")).arg(endpoint.address()).arg(file);
     let output = endpoint.run(&mut python);
     let said = text(&output);
     assert!(output.status.success(), "{said}");
@@ -68,12 +63,12 @@ fn python_canopen_identifies_flashes_and_starts_the_device() {
 /// device with a running program.
 #[test]
 fn python_canopen_updates_the_device_by_raw_images() {
+    let folder = kit::folder!("clients");
     let mut endpoint = endpoint();
     for (image, way, version) in
         [(firmware::APP_V1, None, "1.0.0"), (firmware::APP_V2, Some("--block"), "2.0.0")]
     {
-        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("bin");
-        fs::write(&path, firmware::raw(image)).unwrap();
+        let path = folder.write(format!("{image}.bin"), firmware::raw(image));
         let mut python = python();
         python.arg(script("image_client.py")).arg(endpoint.address()).arg(path).args(way);
         let output = endpoint.run(&mut python);
@@ -88,10 +83,10 @@ fn python_canopen_updates_the_device_by_raw_images() {
 /// s.
 #[test]
 fn canopen_asyncio_updates_the_device_by_raw_images() {
+    let folder = kit::folder!("clients");
     let mut endpoint = endpoint();
     for (image, stopped, version) in [(firmware::APP_V1, false, "1.0.0"), (firmware::APP_V2, true, "2.0.0")] {
-        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(image).with_extension("asyncio.bin");
-        fs::write(&path, firmware::raw(image)).unwrap();
+        let path = folder.write(format!("{image}.bin"), firmware::raw(image));
         let mut python = python();
         python.arg(script("asyncio_client.py")).arg(endpoint.address()).arg(path).arg("1");
         let output = endpoint.run(&mut python);
@@ -137,7 +132,7 @@ fn a_bad_file_touches_no_device() {
     let elf = firmware::elf(firmware::APP_V1);
     let mut damaged = firmware::blocks(firmware::APP_V1).emit();
     damaged[100] ^= 1;
-    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR"));
+    let folder = kit::folder!("bad-files");
     for (name, bytes) in [
         ("truncated.elf", &elf[..elf.len() / 2]),
         ("empty.hex", &[]),
@@ -145,8 +140,7 @@ fn a_bad_file_touches_no_device() {
         ("damaged.blk", &damaged),
         ("checksum.hex", b":020000040801F1\n:0400000000C0012017\n:00000001FF\n"),
     ] {
-        let path = directory.join(name);
-        fs::write(&path, bytes).unwrap();
+        let path = folder.write(name, bytes);
         let from = endpoint.bench.time();
         let mut command = coflash();
         command.args(["--bus", &endpoint.url(), "flash", "--board", firmware::board().board]).arg(&path);

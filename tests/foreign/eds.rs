@@ -18,15 +18,6 @@ fn images() -> [Image; 6] {
 /// The board whose files are committed in `docs/eds/`.
 const COMMITTED_BOARD: &str = "stm32f407g-disc1";
 
-/// The file of this board, for programs that read files. Each test has its own folder.
-fn written(image: &Image, test: &str) -> PathBuf {
-    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("eds-{}-{test}", bsp::LAYOUT.board));
-    fs::create_dir_all(&folder).unwrap();
-    let path = folder.join(image.file);
-    fs::write(&path, image.eds()).unwrap();
-    path
-}
-
 /// The python of `cargo xtask test`, with the pinned third-party packages.
 fn python() -> PathBuf {
     env::var_os("COBOOT_PYTHON")
@@ -60,8 +51,9 @@ fn the_committed_files_are_what_the_tables_give() {
 
 #[test]
 fn dcfchk_finds_no_fault_in_the_files_and_one_in_each_damaged_copy() {
+    let folder = kit::folder!("eds");
     for image in images() {
-        let (good, said) = dcfchk(&written(&image, "checked"));
+        let (good, said) = dcfchk(&folder.write(image.file, image.eds()));
         assert!(good && said.is_empty(), "{}: {said}", image.file);
     }
 
@@ -84,8 +76,8 @@ fn dcfchk_finds_no_fault_in_the_files_and_one_in_each_damaged_copy() {
         let at = whole.find(section).unwrap_or_else(|| panic!("{fault}: no {section}"));
         let (before, behind) = whole.split_at(at);
         assert!(behind.contains(good), "{fault}: no {good}");
-        let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(format!("fault-{fault}.eds"));
-        fs::write(&path, format!("{before}{}", behind.replacen(good, bad, 1))).unwrap();
+        let bytes = format!("{before}{}", behind.replacen(good, bad, 1));
+        let path = folder.write(format!("fault-{fault}.eds"), bytes);
         let (good, said) = dcfchk(&path);
         assert!(!good, "the fault \"{fault}\" was not found: {said}");
     }
@@ -110,10 +102,11 @@ fn board_with_application() -> Bench {
 
 /// python-canopen imports the file, reads every value of the device and compares it.
 fn compare(image: &Image, bench: Bench) {
+    let folder = kit::folder!("eds");
     let mut endpoint = Endpoint::new(bench);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/eds_client.py");
     let mut client = Command::new(python());
-    client.arg(script).arg(endpoint.address()).arg(written(image, "compared"));
+    client.arg(script).arg(endpoint.address()).arg(folder.write(image.file, image.eds()));
     let output = endpoint.run(&mut client);
     let said = text(&output);
     assert!(output.status.success(), "{said}");

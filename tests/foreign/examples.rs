@@ -126,12 +126,11 @@ fn each_can_be_called_back_at_every_bit_rate() {
 }
 
 /// A copy of the example in C, to build it with a mistake.
-struct Project(PathBuf);
+struct Project(kit::folder::Folder);
 
 impl Project {
     fn new(name: &str) -> Self {
-        let root = Path::new(env!("CARGO_TARGET_TMPDIR")).join("c-mistakes").join(name);
-        let _ = fs::remove_dir_all(&root);
+        let root = kit::folder!(name);
         let house = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
         copy(&house.join("examples/c"), &root);
         Self(root)
@@ -154,7 +153,7 @@ impl Project {
         let build = self.0.join("build");
         let toolchain = self.0.join("cmake/arm-none-eabi-gcc.cmake");
         let mut configure = Command::new("cmake");
-        configure.arg("-S").arg(&self.0).arg("-B").arg(&build).args(options);
+        configure.arg("-S").arg(&*self.0).arg("-B").arg(&build).args(options);
         configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
         for command in [&mut configure, Command::new("cmake").arg("--build").arg(&build)] {
             let output = command.output().expect("`cargo xtask setup` installs cmake");

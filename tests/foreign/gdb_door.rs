@@ -79,8 +79,8 @@ fn gdb_stops_in_the_callback_of_the_application_and_in_the_bootloader() {
     bench.confirm_program();
     let mut desk = Desk::new(bench);
 
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
-    let (said, told) = (folder.join("gdb-door.txt"), folder.join("gdb-door-coflash.txt"));
+    let folder = kit::folder!("gdb-door");
+    let (said, told) = (folder.join("gdb.txt"), folder.join("coflash.txt"));
     let bootloader = firmware::dir().join(firmware::BOOTLOADER);
     let mut gdb = Command::new("gdb-multiarch");
     gdb.args(["-nx", "-batch"]);

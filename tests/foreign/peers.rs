@@ -1,9 +1,9 @@
 //! python-canopen, unmodified, as the master of a bus with three emulated devices, through the
 //! socketcand endpoint.
 
-use std::path::{Path, PathBuf};
+use std::env;
+use std::path::Path;
 use std::process::Command;
-use std::{env, fs};
 
 use canopen::{Address, BitRate};
 use coboot_tests::bench::Bench;
@@ -56,8 +56,8 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
     bench.set_host_bit_rate(250_000);
     bench.power_on();
     bench.run_ms(100);
-    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("master.blk");
-    fs::write(&path, firmware::blocks(firmware::APP_V1).emit()).unwrap();
+    let folder = kit::folder!("peers");
+    let path = folder.write("program.blk", firmware::blocks(firmware::APP_V1).emit());
     let path = path.to_str().expect("a path of this repository");
     master(&mut endpoint, &["use", "--device-name", bsp::IDENTITY.device_name, path]);
 

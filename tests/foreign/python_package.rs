@@ -10,6 +10,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{firmware, sealed_board};
+use kit::folder::Alone;
 
 /// The python of `cargo xtask test`, with the pinned third-party packages.
 fn python() -> Command {
@@ -28,14 +29,6 @@ fn done(command: &mut Command) -> String {
     said
 }
 
-/// An empty folder.
-fn folder(name: &str) -> PathBuf {
-    let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    let _ = fs::remove_dir_all(&path);
-    fs::create_dir_all(&path).unwrap();
-    path
-}
-
 /// The only file in a folder.
 fn only(folder: &Path) -> PathBuf {
     let files: Vec<_> = fs::read_dir(folder).unwrap().map(|file| file.unwrap().path()).collect();
@@ -43,20 +36,22 @@ fn only(folder: &Path) -> PathBuf {
     file.clone()
 }
 
-/// The package as a user has it, in its own folder.
-static PACKAGE: LazyLock<PathBuf> = LazyLock::new(|| {
-    let wheels = folder("python-wheels");
+/// The package as a user has it, in its own folder, until this process ends.
+static PACKAGE: LazyLock<(PathBuf, Alone)> = LazyLock::new(|| {
+    let installed = Path::new(env!("CARGO_TARGET_TMPDIR")).join("python-package");
+    let alone = Alone::at(&installed.with_extension("lock"));
+    let wheels = kit::folder!("python-wheels");
     let maturin = ["-m", "maturin", "build", "--profile", "dev", "--manifest-path"];
-    done(python().args(maturin).arg(source().join("Cargo.toml")).arg("--out").arg(&wheels));
+    done(python().args(maturin).arg(source().join("Cargo.toml")).arg("--out").arg(&*wheels));
     let wheel = only(&wheels);
     // One wheel for every Python from 3.9 on.
     let name = wheel.file_name().unwrap().to_string_lossy().into_owned();
     assert!(name.starts_with("coflash-") && name.contains("-cp39-abi3-"), "{name}");
 
-    let installed = folder("python-package");
+    let _ = fs::remove_dir_all(&installed);
     let pip = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"];
     done(python().args(pip).arg(&installed).arg(&wheel));
-    installed
+    (installed, alone)
 });
 
 fn root() -> &'static Path {
@@ -70,7 +65,7 @@ fn source() -> PathBuf {
 /// A Python with the package.
 fn with_package() -> Command {
     let mut python = python();
-    python.current_dir(&*PACKAGE).env("PYTHONPATH", &*PACKAGE).env("PYTHONDONTWRITEBYTECODE", "1");
+    python.current_dir(&PACKAGE.0).env("PYTHONPATH", &PACKAGE.0).env("PYTHONDONTWRITEBYTECODE", "1");
     python
 }
 
@@ -113,14 +108,12 @@ fn a_sealed_device_is_updated_from_python() {
     let mut flipped = genuine.clone();
     // In the image, whose hash the signature covers.
     flipped[50] ^= 1;
-    let folder = folder("python-sealed");
+    let folder = kit::folder!("python-sealed");
     let mut python = with_package();
     python.args(["-c", SEALED]).arg(endpoint.url());
     // A bad signature makes the device wait, so it comes last.
     for (name, bytes) in [("genuine.cbs", &genuine), ("flipped.cbs", &flipped)] {
-        let path = folder.join(name);
-        fs::write(&path, bytes).unwrap();
-        python.arg(path);
+        python.arg(folder.write(name, bytes));
     }
     let output = endpoint.run(&mut python);
     let said = [&output.stdout[..], &output.stderr[..]].concat();

@@ -1,15 +1,16 @@
 //! Tests of `coflash ui` in a real Chromium, which tests/python/ui_page.py controls: with nodes
 //! (`coboot-node`) that the script starts, and with the emulated board.
 
+use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::{Mutex, PoisonError};
-use std::{env, fs};
 
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
+use kit::folder::Folder;
 
 /// One browser at a time: several would only slow each other down.
 static BROWSER: Mutex<()> = Mutex::new(());
@@ -22,10 +23,8 @@ fn given(name: &str) -> PathBuf {
 }
 
 /// The script with the arguments of every scenario, and a folder for its files.
-fn script(scenario: &str) -> (Command, PathBuf) {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("ui-{scenario}"));
-    let _ = fs::remove_dir_all(&folder);
-    fs::create_dir_all(&folder).unwrap();
+fn script(scenario: &str) -> (Command, Folder) {
+    let folder = kit::folder!(&format!("ui-{scenario}"));
     let mut command = Command::new(given("COBOOT_PYTHON"));
     command
         .arg(Path::new(env!("CARGO_MANIFEST_DIR")).join("python/ui_page.py"))
@@ -33,7 +32,7 @@ fn script(scenario: &str) -> (Command, PathBuf) {
         .arg("--coflash")
         .arg(given("COBOOT_COFLASH"))
         .arg("--folder")
-        .arg(&folder);
+        .arg(&*folder);
     // The pictures of the documentation are taken here, if they are requested.
     if let Some(pictures) = env::var_os("COBOOT_PICTURES") {
         command.arg("--pictures").arg(pictures);
@@ -45,20 +44,19 @@ fn script(scenario: &str) -> (Command, PathBuf) {
 }
 
 #[track_caller]
-fn check(scenario: &str, output: &Output, folder: &Path) {
+fn check(scenario: &str, output: &Output) {
     let said = [&output.stdout[..], &output.stderr[..]].concat();
     let said = String::from_utf8_lossy(&said);
     assert!(output.status.success() && said.contains(&format!("{scenario}: done")), "{said}");
-    let _ = fs::remove_dir_all(folder);
 }
 
 /// Runs a scenario with nodes of its own.
 #[track_caller]
 fn with_nodes(scenario: &str) {
     let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
-    let (mut command, folder) = script(scenario);
+    let (mut command, _folder) = script(scenario);
     let output = command.arg("--node").arg(given("COBOOT_NODE")).output().unwrap();
-    check(scenario, &output, &folder);
+    check(scenario, &output);
 }
 
 #[test]
@@ -98,10 +96,10 @@ fn the_emulated_board_is_updated_by_dropping_an_elf() {
     bench.power_on();
     bench.await_boot_up(100);
     let mut endpoint = Endpoint::new(bench);
-    let (mut command, folder) = script("emulated");
+    let (mut command, _folder) = script("emulated");
     command.args(["--bus", &endpoint.url(), "--image"]).arg(firmware::dir().join(firmware::APP_V1));
     let output = endpoint.run(&mut command);
-    check("emulated", &output, &folder);
+    check("emulated", &output);
     assert_eq!(endpoint.bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "1.0.0");
     endpoint.bench.assert_nothing_unmodelled();
 }

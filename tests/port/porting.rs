@@ -6,8 +6,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
+use kit::folder::Alone;
 use shared_abi::layout;
 
 const TARGET: &str = "thumbv7em-none-eabihf";
@@ -18,17 +18,15 @@ struct Copy {
     /// Cargo's folder for the copy. Cargo identifies packages by their place in the workspace, so a
     /// folder that is shared with another copy would be rebuilt each time.
     target: PathBuf,
-    /// One test at a time.
-    _alone: MutexGuard<'static, ()>,
+    _alone: Alone,
 }
 
 impl Copy {
     /// The copy of an earlier run is updated: unchanged files keep their time, so that cargo
     /// rebuilds only what it must.
     fn new() -> Self {
-        static ALONE: Mutex<()> = Mutex::new(());
-        let alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
         let tmp = Path::new(env!("CARGO_TARGET_TMPDIR")).join("porting");
+        let alone = Alone::at(&tmp.join("lock"));
         let (root, target) = (tmp.join("copy"), tmp.join("target"));
         synchronise(&Path::new(env!("CARGO_MANIFEST_DIR")).join(".."), &root);
         if !target.exists() {

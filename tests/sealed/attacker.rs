@@ -11,7 +11,7 @@
 //! ```
 
 use std::panic::{catch_unwind, AssertUnwindSafe};
-use std::sync::{Once, OnceLock};
+use std::sync::OnceLock;
 use std::task::Poll;
 
 use boot_core::bootloader::PasswordObject;
@@ -24,7 +24,7 @@ use coboot_tests::sealed::{
 };
 use coflash::file::sealed::{Certificate, Sealer};
 use kit::ihex::intel_hex;
-use kit::model::{quiet_power_cuts, Cut, PowerCut};
+use kit::model::{until_power_cut, Cut};
 use kit::random::Random;
 use seal::access::right;
 
@@ -411,7 +411,7 @@ impl Attack<'_> {
 
     /// Actions until a reset, a start or a power cut.
     fn boot(&mut self, device: &Device) {
-        let outcome = catch_unwind(AssertUnwindSafe(|| {
+        let cut = until_power_cut(|| {
             device.run(|host| {
                 let disturbed = self.random.pick(&[0, 2, 10, 40]);
                 for _ in 0..1 + self.random.below(4) {
@@ -426,12 +426,8 @@ impl Attack<'_> {
                     }
                 }
             });
-        }));
-        match outcome {
-            Ok(()) => self.tell("reset".into()),
-            Err(cause) if cause.is::<PowerCut>() => self.tell("the power was cut".into()),
-            Err(cause) => std::panic::resume_unwind(cause),
-        }
+        });
+        self.tell(if cut { "the power was cut" } else { "reset" }.into());
         device.chip.model().power_on();
         self.look(device);
     }
@@ -487,8 +483,6 @@ fn attack(setup: usize, seed: u64) -> Result<u32, String> {
 
 #[test]
 fn whatever_is_done_what_starts_is_authentic() {
-    static QUIET: Once = Once::new();
-    QUIET.call_once(quiet_power_cuts);
     let number = |name: &str| std::env::var(name).ok().and_then(|text| text.parse::<u64>().ok());
     let seeds = match number("COBOOT_ATTACK_SEED") {
         Some(seed) => seed..seed + 1,

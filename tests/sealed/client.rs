@@ -1,9 +1,9 @@
 //! An unmodified python-canopen writes sealed images to the emulated device, in real time.
 
-use std::path::{Path, PathBuf};
+use std::env;
+use std::path::Path;
 use std::process::{Command, Output};
 use std::sync::{Mutex, PoisonError};
-use std::{env, fs};
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -82,8 +82,8 @@ fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
 fn python_canopen(endpoint: &mut Endpoint, name: &str, bytes: &[u8], ways: &[&str]) -> Output {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
-    let path = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(name);
-    fs::write(&path, bytes).unwrap();
+    let folder = kit::folder!("client");
+    let path = folder.write(name, bytes);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("python/sealed_client.py");
     endpoint.run(Command::new(python).arg(script).arg(endpoint.address()).arg(path).args(ways))
 }

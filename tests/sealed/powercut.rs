@@ -2,11 +2,9 @@
 //! again in the recovery. Afterwards there is the old program, none, or the new one, complete; the
 //! counter never decreases; and a repetition succeeds.
 
-use std::sync::Once;
-
 use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1, STANDARD_1, STANDARD_2};
 use coflash::file::sealed::Sealer;
-use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use kit::model::{until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::Region;
 
 /// The number of checks: bits between 0 and 1 read differently each time.
@@ -127,8 +125,6 @@ impl Story<'_> {
     }
 
     fn prove(&self, name: &str) -> Seen {
-        static QUIET: Once = Once::new();
-        QUIET.call_once(quiet_power_cuts);
         let mut seen = Seen::default();
         let start = self.before.chip.model().clone();
         let floor = self.before.counter(1);
@@ -276,8 +272,6 @@ fn with_confirmation_a_proved_counter_stays() {
         let device = device.copy();
         device.run(|host| assert_eq!(host.update(1, &older.file, 7).1, 0x8C, "{told}"));
     };
-    static QUIET: Once = Once::new();
-    QUIET.call_once(quiet_power_cuts);
     let update = |host: &mut Host<'_>| host.install(1, &new.file);
     let erase = |host: &mut Host<'_>| host.erase(1);
     let update_and_confirm = |host: &mut Host<'_>| {

@@ -2,9 +2,8 @@
 //! which a frame takes no time.
 
 use std::collections::VecDeque;
-use std::path::Path;
+use std::env;
 use std::time::Duration;
-use std::{env, fs};
 
 use boot_core::bootloader::{self, entries, entry_count, Extras};
 use boot_core::profile::Profile;
@@ -17,6 +16,7 @@ use coboot_node::device::{Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::stand_in::StandIn;
 use coflash::bus::{Adapter, AdapterError};
+use kit::folder::Folder;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 use crate::bench::NODE;
@@ -50,6 +50,7 @@ const STEP: Duration = Duration::from_micros(200);
 /// The node and its bus.
 pub struct NodeBus {
     device: Device<'static, 1>,
+    _folder: Folder,
     now: Duration,
     sent: VecDeque<Frame>,
     /// The results of resets.
@@ -57,17 +58,14 @@ pub struct NodeBus {
 }
 
 impl NodeBus {
-    /// A node with erased flash, in a file with the test's name.
+    /// A node with erased flash, in a file of its own.
     ///
     /// # Panics
     /// If the file cannot be created.
     #[must_use]
     pub fn new(test: &str) -> Self {
-        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/tmp");
-        fs::create_dir_all(&path).expect("a folder for files of tests");
-        let path = path.join(format!("{test}.flash"));
-        let _ = fs::remove_file(&path);
-        let flash = FileFlash::open(&path, &LAYOUT, Speed::Instant).expect("a file");
+        let folder = Folder::below(env::temp_dir(), test);
+        let flash = FileFlash::open(&folder.join("node.flash"), &LAYOUT, Speed::Instant).expect("a file");
         let setup = Setup {
             config: &CONFIG,
             stand_in: Some(Vec::leak(StandIn::entries(1))),
@@ -76,7 +74,8 @@ impl NodeBus {
             strap: false,
         };
         let (device, event) = Device::new(setup, flash, vec![0; BUFFER].leak());
-        let mut bus = Self { device, now: Duration::ZERO, sent: VecDeque::new(), events: vec![event] };
+        let mut bus =
+            Self { device, _folder: folder, now: Duration::ZERO, sent: VecDeque::new(), events: vec![event] };
         // Until its boot-up message.
         bus.run(STEP);
         bus

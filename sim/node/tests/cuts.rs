@@ -18,7 +18,7 @@ use coflash::Error;
 
 use cut::{CutBus, Way};
 use kit::bench::{block, block_file, crc32, program, LAYOUT, PROGRAM};
-use kit::model::{quiet_power_cuts, Cut, ModelFlash, CHIP};
+use kit::model::{Cut, ModelFlash, CHIP};
 use kit::random::Random;
 
 /// Data of a block.
@@ -111,7 +111,6 @@ struct Counts {
 /// runs; the limit is 110 % of the file.
 #[test]
 fn an_update_that_is_cut_anywhere_goes_on() {
-    quiet_power_cuts();
     let (installed, new) = old_and_new();
     let file = named(&new);
     let mut uncut = BTreeMap::new();

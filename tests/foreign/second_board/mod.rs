@@ -9,7 +9,6 @@ mod board;
 mod remote;
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::path::Path;
 use std::time::{Duration, Instant};
 
 use board::Board;
@@ -121,7 +120,8 @@ fn an_update_leaves_the_same_flash_on_a_board_of_others() {
     let ours = update(SerialLine::new(&mut bench));
     let resets = bench.machine().counters().resets - resets;
 
-    let log = Path::new(env!("CARGO_TARGET_TMPDIR")).join("second_board.log");
+    let folder = kit::folder!("second-board");
+    let log = folder.join("qemu.log");
     let mut board = Board::power_on(&before[..used], Chip::default().unique_id, &log).expect("QEMU starts");
     let epoch = Instant::now();
     // The boot-up message says that it listens.

@@ -7,7 +7,7 @@
 //! than most of them).
 #![cfg_attr(fuzzing, no_main)]
 
-use std::sync::{Once, OnceLock};
+use std::sync::OnceLock;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
 use boot_core::control::{Policy, Step as Work};
@@ -22,7 +22,7 @@ use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, St
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use kit::boot::Boot;
-use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::{is_eighth, Input};
 use coflash::file::block_file::{Block, CRC};
 use shared_abi::geometry::Region;
@@ -328,8 +328,6 @@ fn is_in_flash(flash: &mut ModelFlash) {
 }
 
 coboot_fuzz::target!(|bytes: &[u8]| {
-    static QUIET: Once = Once::new();
-    QUIET.call_once(quiet_power_cuts);
     let mut flash = ModelFlash::new(&CHIP);
     let mut input = Input::new(bytes);
     let mut host = Host { file: None, next: 1, honest: true };

@@ -13,7 +13,7 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::boot::{leaked, Boot};
-use crate::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use crate::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
 pub static LAYOUT_REF: &Layout = &LAYOUT;
@@ -253,7 +253,6 @@ pub fn autostart(flash: &ModelFlash) -> Result<u8, Invalid> {
 /// An update of an installed program, cut at every operation: afterwards the old program or the new
 /// one starts (identified by their seeds), complete, or none; and the update then completes.
 pub fn cut_at_every_operation(installed: &ModelFlash, old: u8, new: u8, update: impl Fn(&mut ModelFlash)) {
-    quiet_power_cuts();
     let cells = installed.cells(CHIP.flash).to_vec();
     let fresh = || {
         let mut flash = ModelFlash::new(&CHIP);

@@ -4,6 +4,7 @@
 //! | module | what it has |
 //! |---|---|
 //! | [`random`] | random numbers by a seed |
+//! | [`folder`](mod@folder) | a folder of a test's own |
 //! | [`ihex`] | Intel HEX as tools write it |
 //! | [`pages`] | the commands on the pages of the documentation |
 //! | [`bus`] | feature `bus`: a CANopen device with a domain, and frames to it and from it |
@@ -21,6 +22,7 @@ pub mod boot;
 #[cfg(feature = "bus")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod bus;
+pub mod folder;
 pub mod ihex;
 #[cfg(feature = "debugger")]
 #[allow(missing_docs, reason = "names say it")]

@@ -5,6 +5,7 @@ use std::cell::{Cell, RefCell, RefMut};
 use std::collections::BTreeMap;
 use std::panic::panic_any;
 use std::rc::Rc;
+use std::sync::Once;
 use std::task::Poll;
 
 use boot_core::flash::{Flash, FlashFault, Operation as Started};
@@ -306,6 +307,7 @@ impl Flash for ModelFlash {
 
 /// Runs `scenario`; returns whether the power was cut in it.
 pub fn until_power_cut(scenario: impl FnOnce()) -> bool {
+    quiet_power_cuts();
     let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(scenario));
     match outcome {
         Ok(()) => false,
@@ -314,14 +316,32 @@ pub fn until_power_cut(scenario: impl FnOnce()) -> bool {
     }
 }
 
-/// Suppresses the output of the expected panics of [`until_power_cut`].
-pub fn quiet_power_cuts() {
-    let default = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |info| {
-        if !info.payload().is::<PowerCut>() {
-            default(info);
-        }
-    }));
+thread_local! {
+    /// Whether a panic of this thread is caught and not printed.
+    static CAUGHT: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Catches a panic, of a power cut or of the bootloader, without printing it.
+pub fn caught<T>(act: impl FnOnce() -> T) -> std::thread::Result<T> {
+    quiet_power_cuts();
+    let before = CAUGHT.replace(true);
+    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(act));
+    CAUGHT.set(before);
+    outcome
+}
+
+/// Suppresses the output of power cuts, which are panics, and of panics in [`caught`]; once for
+/// the process.
+fn quiet_power_cuts() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let default = std::panic::take_hook();
+        std::panic::set_hook(Box::new(move |info| {
+            if !CAUGHT.get() && !info.payload().is::<PowerCut>() {
+                default(info);
+            }
+        }));
+    });
 }
 
 /// A flash that outlives a bootloader: all copies refer to the same contents.

@@ -3,9 +3,7 @@
 //! some hundred times as fast as the emulator, and its bus has no errors.
 
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
-use std::{env, fs};
+use std::env;
 
 use boot_core::bootloader::{self, entries, entry_count};
 use boot_core::control::Policy;
@@ -19,6 +17,7 @@ use canopen::{BitRate, Frame, Instant, NodeId};
 use coboot_node::device::{self, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::stand_in::StandIn;
+use kit::folder::Folder;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 use shared_abi::layout::Layout;
 
@@ -34,7 +33,7 @@ pub struct Node {
     setup: Setup,
     /// `None` without power.
     device: Option<device::Device<'static, 2>>,
-    path: PathBuf,
+    folder: Folder,
     now_us: u64,
     /// Frames of the masters.
     waiting: VecDeque<Frame>,
@@ -69,9 +68,7 @@ impl Node {
     /// If its file cannot be created.
     #[must_use]
     pub fn new(profile: &'static Profile) -> Self {
-        static NUMBER: AtomicU32 = AtomicU32::new(0);
-        let number = NUMBER.fetch_add(1, Ordering::Relaxed);
-        let path = env::temp_dir().join(format!("coboot-attacked-{}-{number}.flash", std::process::id()));
+        let folder = Folder::below(env::temp_dir(), "coboot-attacked");
         let config = Box::leak(Box::new(bootloader::Config {
             entries: table(profile),
             device: Says {
@@ -106,7 +103,7 @@ impl Node {
         let mut node = Self {
             setup,
             device: None,
-            path,
+            folder,
             now_us: 0,
             waiting: VecDeque::new(),
             busy_until: 0,
@@ -137,12 +134,6 @@ impl Node {
             }
             self.steps += 1;
         }
-    }
-}
-
-impl Drop for Node {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.path);
     }
 }
 
@@ -218,7 +209,8 @@ impl Target for Node {
         if self.device.is_some() {
             return;
         }
-        let flash = FileFlash::open(Path::new(&self.path), &LAYOUT, Speed::Instant).expect("a file");
+        let flash =
+            FileFlash::open(&self.folder.join("node.flash"), &LAYOUT, Speed::Instant).expect("a file");
         let (device, _) = device::Device::new(self.setup, flash, vec![0; BUFFER].leak());
         self.device = Some(device);
     }

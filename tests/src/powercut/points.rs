@@ -10,7 +10,7 @@ use std::sync::Mutex;
 use super::device::{Bug, Device, Outcome};
 use super::point::{self, At};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
-use kit::model::{quiet_power_cuts, until_power_cut, Cut};
+use kit::model::{until_power_cut, Cut};
 
 /// The number of violations that a report describes.
 pub(super) const TOLD: usize = 10;
@@ -270,7 +270,6 @@ fn run_until(
     every_kind: bool,
     violations: u64,
 ) -> Result<Report, String> {
-    quiet_power_cuts_once();
     let device = scenario.device(bug);
     let start = exactly(&device)?;
     let mut through = device.clone();
@@ -320,7 +319,6 @@ fn run_until(
 /// One point as text.
 #[must_use]
 pub fn reproduce(point: &Point) -> String {
-    quiet_power_cuts_once();
     let Some(scenario) = SCENARIOS.iter().find(|scenario| scenario.name == point.scenario) else {
         return format!("{point}: there is no such scenario.");
     };
@@ -351,9 +349,4 @@ pub fn reproduce(point: &Point) -> String {
         Err(what) => format!("  VIOLATION: {what}\n"),
     };
     text
-}
-
-fn quiet_power_cuts_once() {
-    static ONCE: std::sync::Once = std::sync::Once::new();
-    ONCE.call_once(quiet_power_cuts);
 }

@@ -11,17 +11,14 @@
 //! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-core attacker::lift_2    # one, with its actions
 //! ```
 
-use std::cell::Cell;
 use std::fmt;
-use std::panic::{catch_unwind, AssertUnwindSafe};
-use std::sync::Once;
 use std::task::Poll;
 
 use boot_core::flash::FlashFault;
 use boot_core::store::NodeParameters;
 use canopen::od::Address;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use kit::model::{Cut, PowerCut};
+use kit::model::{caught, Cut, PowerCut};
 use kit::random::Random;
 use kit::rig::{block, crc32, hex, program, words, Rig, Setup, Stored, PRODUCT_CODE, VENDOR_ID};
 use shared_abi::geometry::Region;
@@ -968,18 +965,6 @@ fn panic_text(cause: &(dyn std::any::Any + Send)) -> String {
 
 // --- runs
 
-thread_local! {
-    /// A panic, of a power cut or of the bootloader, is caught and not printed.
-    static CAUGHT: Cell<bool> = const { Cell::new(false) };
-}
-
-fn caught<T>(act: impl FnOnce() -> T) -> std::thread::Result<T> {
-    let before = CAUGHT.replace(true);
-    let outcome = catch_unwind(AssertUnwindSafe(act));
-    CAUGHT.set(before);
-    outcome
-}
-
 /// Runs a list of actions; returns the number of the action that broke a rule, or of all actions if
 /// the repair failed.
 fn play(setup: &'static Setup, seed: u64, actions: &[Action]) -> Result<(), (usize, Broken)> {
@@ -1050,15 +1035,6 @@ const ATTACKS: u64 = 300;
 
 /// Runs the attacks on a setup; fails with the first attack on each rule.
 fn attacks(setup: &'static Setup) {
-    static QUIET: Once = Once::new();
-    QUIET.call_once(|| {
-        let default = std::panic::take_hook();
-        std::panic::set_hook(Box::new(move |info| {
-            if !CAUGHT.get() {
-                default(info);
-            }
-        }));
-    });
     let seeds = match environment("COBOOT_ATTACK_SEED") {
         Some(seed) => {
             println!("{:#?}", Script::of(setup, seed));

@@ -1,7 +1,7 @@
 //! The effect of CLEAR, and the value of 1F57h while the flash still does discarded work.
 
 use canopen::AbortCode;
-use kit::model::{quiet_power_cuts, until_power_cut, Cut};
+use kit::model::{until_power_cut, Cut};
 use kit::rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::Region;
 
@@ -135,7 +135,6 @@ fn to_look_for_what_is_written_takes_many_small_steps() {
 /// installed or not, and removed by two CLEARs: all of the flash is erased completely.
 #[test]
 fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
-    quiet_power_cuts();
     let mut cuts = 0;
     for small in [false, true] {
         for seed in 0..12 {

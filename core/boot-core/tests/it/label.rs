@@ -10,7 +10,7 @@ use kit::bench::{
     autostart, block, block_file, cut_at_every_operation, program, Bench, CLEAR, IDENTIFICATION, LAYOUT,
     SET_SIGNATURE, START,
 };
-use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::block_file::Control;
 use shared_abi::label::{self, Label};
 use shared_abi::warm_start::BootRequest;
@@ -161,7 +161,6 @@ fn a_control_block_alone_loses_nothing() {
 /// program starts, or none.
 #[test]
 fn no_power_cut_makes_a_program_of_another_products() {
-    quiet_power_cuts();
     let (other, _) = &others()[1];
     let mut installed = ModelFlash::new(&CHIP);
     updated(&mut installed);

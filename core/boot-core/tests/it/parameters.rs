@@ -3,7 +3,7 @@
 use boot_core::flash::{run, Flash, FlashFault, Operation};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
 use canopen::{BitRate, NodeId};
-use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash};
+use kit::model::{until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
@@ -45,7 +45,6 @@ fn values_survive_a_restart_and_any_number_of_compactions() {
 /// Cuts the power at every operation of a long history, in every way, and again in the recovery.
 #[test]
 fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched() {
-    quiet_power_cuts();
     const STORES: u32 = 25;
     let history = |flash: &mut ModelFlash, done: &mut u32| {
         let mut journal = Journal::open(flash, REGIONS);

@@ -7,7 +7,7 @@ use boot_core::store::Journal;
 use canopen::od::{Address, Objects};
 use canopen::AbortCode;
 use kit::bench::{block, block_file, last, program, Bench, CLEAR, CONFIG, LAYOUT, PROGRAM};
-use kit::model::{quiet_power_cuts, until_power_cut, Cut, ModelFlash, CHIP};
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 
@@ -72,7 +72,6 @@ fn is_installed(flash: &ModelFlash, image: &[u8]) -> bool {
 
 #[test]
 fn a_cut_download_goes_on_after_a_cut_at_any_operation() {
-    quiet_power_cuts();
     // From the middle of a sector to the middle of another one.
     let (old, new) = (program(0x1200, 0x11), program(0x1A40, 0x22));
     let file = named(&new);
