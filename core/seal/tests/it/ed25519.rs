@@ -1,8 +1,6 @@
 //! The verifier against RFC 8032, all vectors of Wycheproof and `ed25519-dalek`.
 
-mod common;
-
-use common::hex;
+use crate::hex::hex;
 use curve25519_dalek::{constants::EIGHT_TORSION, EdwardsPoint, Scalar};
 use ed25519_dalek::{Signature, Signer, SigningKey, Verifier, VerifyingKey};
 use proptest::prelude::*;

@@ -1,9 +1,7 @@
 //! ChaCha20 against RFC 8439 and the crate `chacha20`.
 
-mod common;
-
+use crate::hex::hex;
 use chacha20::cipher::{KeyIvInit, StreamCipher, StreamCipherSeek};
-use common::hex;
 use proptest::prelude::*;
 use seal::chacha20::apply;
 

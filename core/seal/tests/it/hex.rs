@@ -1,4 +1,4 @@
-//! Common code of the algorithms' tests.
+//! Bytes as the standards print them.
 
 /// Bytes from hexadecimal digits; blanks and line ends between them are skipped.
 pub fn hex(digits: &str) -> Vec<u8> {

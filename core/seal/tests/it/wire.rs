@@ -1,9 +1,6 @@
 //! The fields of a sealed image against bytes at literal offsets.
 
-#[path = "common/file.rs"]
-mod file;
-
-use file::{manifest, put, record, signature};
+use crate::file::{manifest, put, record, signature};
 use seal::access::{event, right};
 use seal::wire::{array, flag, half, head_size, word, Certificate, Fault, Head, Recipient};
 use seal::{access, key_block};
@@ -77,7 +74,7 @@ fn each_field_of_a_certificate_stands_at_its_offset() {
     assert_eq!(certificate.signature(), bytes[88..]);
     // It is one only if it is whole.
     assert!(Head(&file[..176 + 151]).certificate().is_none());
-    assert_eq!(Certificate(&bytes[..10]).signed(), &[]);
+    assert_eq!(Certificate(&bytes[..10]).signed(), &[0_u8; 0]);
 }
 
 #[test]

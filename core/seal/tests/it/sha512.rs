@@ -1,9 +1,7 @@
 //! SHA-512, SHA-512/256 and HMAC-SHA-512 against the standards' examples, Wycheproof and the crates
 //! `sha2` and `hmac`.
 
-mod common;
-
-use common::hex;
+use crate::hex::hex;
 use hmac::{Hmac, KeyInit, Mac};
 use proptest::prelude::*;
 use seal::sha512::{hash_256, hmac, Sha512};

@@ -1,9 +1,6 @@
 //! Each rule by which a device accepts an image, alone, and the order of the rules.
 
-#[path = "common/file.rs"]
-mod file;
-
-use file::{manifest, put, record, signature};
+use crate::file::{manifest, put, record, signature};
 use seal::judge::{judge, Device, Needs};
 use seal::key_block::find;
 use seal::wire::{Fault, Head};
