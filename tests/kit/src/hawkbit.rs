@@ -1,9 +1,6 @@
 //! A hawkBit server on this computer, as far as devices see it, written from the public description
 //! of the Direct Device Integration API; and its faults.
 
-// Each test uses a part of this module.
-#![allow(dead_code)]
-
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};

@@ -1,22 +1,23 @@
 //! The agent against a server with faults, over real sockets, with devices that only note what they
 //! are given. Devices on a bus: sim/node/tests/agent.rs.
 
-mod hawkbit;
+mod tls;
 
-use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Sender;
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use crate::tool::folder;
 use coflash::agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
 use coflash::file::BlockFile;
 use coflash::update::Program;
-use hawkbit::{sha256, Action, Fault, File, Server};
+use kit::folder::Folder;
+use kit::hawkbit::{sha256, Action, Fault, File, Server};
 
 /// A block file that was made by another program.
-const PROGRAM: &[u8] = include_bytes!("data/identity-110.blk");
+const PROGRAM: &[u8] = data!("identity-110.blk");
 const ID: &str = "door";
 
 /// The devices: what they were given, and what they answer.
@@ -58,24 +59,6 @@ impl Devices for Fake {
     }
 }
 
-/// A folder for one test, deleted at the end.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(test: &str) -> Self {
-        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("agent-{test}"));
-        let _ = std::fs::remove_dir_all(&path);
-        std::fs::create_dir_all(&path).unwrap();
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
-
 fn file() -> File {
     File::new("program.blk", PROGRAM)
 }
@@ -87,11 +70,11 @@ fn crc() -> u32 {
 fn config(server: &Server, folder: &Folder, ids: &[&str]) -> Config {
     let mut text = format!("url = '{}'\nbus = 'socketcan:can0'\npoll-least = 1\n", server.url);
     for (number, id) in ids.iter().enumerate() {
-        std::fs::write(folder.0.join(id), format!("t-{id}\n")).unwrap();
+        std::fs::write(folder.join(id), format!("t-{id}\n")).unwrap();
         let node = number + 1;
         text += &format!("[[device]]\ncontroller-id = '{id}'\nnode = {node}\ntoken-file = '{id}'\n");
     }
-    Config::parse(&text, &folder.0, None, None).unwrap()
+    Config::parse(&text, &folder, None, None).unwrap()
 }
 
 fn options() -> Options {
@@ -118,7 +101,7 @@ fn once(server: &Server, folder: &Folder, fake: &Fake, ids: &[&str]) -> (Ended, 
 
 #[test]
 fn a_deployment_reaches_the_device_and_its_result_the_server() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("good"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("good"), Fake::default());
     server.assign(ID, Action::new(3, &file()));
     let (ended, said) = once(&server, &folder, &fake, &[ID]);
     assert_eq!((ended.updated, ended.failed, ended.unserved), (1, 0, 0), "{said}");
@@ -132,7 +115,7 @@ fn a_deployment_reaches_the_device_and_its_result_the_server() {
     assert_eq!(server.state().targets[ID].attributes["node"], "1");
     // The token is nowhere but in the header.
     assert!(!said.contains("t-door"), "{said}");
-    let kept = std::fs::read_dir(folder.0.join("agent-state")).unwrap();
+    let kept = std::fs::read_dir(folder.join("agent-state")).unwrap();
     for file in kept.flatten().filter(|file| file.path().extension().is_some_and(|end| end == "json")) {
         assert!(!std::fs::read_to_string(file.path()).unwrap().contains("t-door"));
     }
@@ -143,7 +126,7 @@ fn a_deployment_reaches_the_device_and_its_result_the_server() {
 
 #[test]
 fn the_same_action_twice_is_flashed_once() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("twice"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("twice"), Fake::default());
     server.assign(ID, Action::new(3, &file()));
     once(&server, &folder, &fake, &[ID]);
     // The server has lost its memory, and gives the action again.
@@ -159,7 +142,7 @@ fn the_same_action_twice_is_flashed_once() {
 
 #[test]
 fn a_server_that_lies_about_size_or_hash_flashes_nothing() {
-    let folder = Folder::new("lies");
+    let folder = folder("lies");
     let longer = File { content: [PROGRAM, b"x"].concat(), ..file() };
     let shorter = File { content: PROGRAM[..PROGRAM.len() - 1].to_vec(), ..file() };
     let mut altered = PROGRAM.to_vec();
@@ -191,7 +174,7 @@ fn a_server_that_lies_about_size_or_hash_flashes_nothing() {
 
 #[test]
 fn a_download_goes_on_where_it_was_cut_off() {
-    let (folder, length) = (Folder::new("cut"), PROGRAM.len());
+    let (folder, length) = (folder("cut"), PROGRAM.len());
     for ranges in [true, false] {
         let (server, fake) = (Server::start(&[ID]), Fake::default());
         server.assign(ID, Action::new(u64::from(ranges), &File { ranges, ..file() }));
@@ -208,7 +191,7 @@ fn a_download_goes_on_where_it_was_cut_off() {
 
 #[test]
 fn faults_of_the_server_are_waited_out() {
-    let folder = Folder::new("faults");
+    let folder = folder("faults");
     let faults = [
         Fault::Status(500, None),
         Fault::Status(503, Some(1)),
@@ -238,7 +221,7 @@ fn faults_of_the_server_are_waited_out() {
 #[test]
 fn one_devices_trouble_does_not_stop_another() {
     let ids = ["one", "two", "three"];
-    let (server, folder, fake) = (Server::start(&ids), Folder::new("others"), Fake::default());
+    let (server, folder, fake) = (Server::start(&ids), folder("others"), Fake::default());
     ids.iter().enumerate().for_each(|(id, name)| server.assign(name, Action::new(id as u64, &file())));
     server.fault("v1/one", 1000, Fault::Status(500, None));
     server.fault("v1/three/softwaremodules", 1000, Fault::Status(404, None));
@@ -251,7 +234,7 @@ fn one_devices_trouble_does_not_stop_another() {
 #[test]
 fn the_token_goes_to_no_other_server() {
     let (server, other) = (Server::start(&[ID]), Server::start(&["cdn"]));
-    let (folder, fake) = (Folder::new("token"), Fake::default());
+    let (folder, fake) = (folder("token"), Fake::default());
     // The other server has the file, and no device of ours.
     other.assign("cdn", Action::new(1, &file()));
     let elsewhere = format!("{}/files/program.blk", other.url);
@@ -277,7 +260,7 @@ fn the_token_goes_to_no_other_server() {
 
 #[test]
 fn redirects_without_end_have_one() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("circle"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("circle"), Fake::default());
     server.fault("v1/door", 1000, Fault::Redirect(format!("{}/DEFAULT/controller/v1/door", server.url)));
     let (ended, said) = once(&server, &folder, &fake, &[ID]);
     assert_eq!(ended.unserved, 1);
@@ -287,13 +270,13 @@ fn redirects_without_end_have_one() {
 
 #[test]
 fn a_wrong_token_is_said_and_not_shown() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("refused"), Fake::default());
-    std::fs::write(folder.0.join(ID), "wrong-secret").unwrap();
+    let (server, folder, fake) = (Server::start(&[ID]), folder("refused"), Fake::default());
+    std::fs::write(folder.join(ID), "wrong-secret").unwrap();
     let text = format!(
         "url = '{}'\nbus = 'socketcan:can0'\n[[device]]\ncontroller-id = 'door'\nnode = 1\ntoken-file = 'door'\n",
         server.url
     );
-    let config = Config::parse(&text, &folder.0, None, None).unwrap();
+    let config = Config::parse(&text, &folder, None, None).unwrap();
     let said = Mutex::new(String::new());
     let tell = |message: &Said| *said.lock().unwrap() += &message.text;
     let ended = run(&config, &options(), &fake, &tell).unwrap();
@@ -304,14 +287,10 @@ fn a_wrong_token_is_said_and_not_shown() {
 
 /// The command, as people run it: exit code, standard output and standard error.
 fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String) {
-    let nowhere = folder.0.join("nowhere");
-    let output = std::process::Command::new(env!("CARGO_BIN_EXE_coflash"))
+    let output = crate::tool::command()
         .args(arguments)
-        .current_dir(&folder.0)
-        .env("XDG_CONFIG_HOME", &nowhere)
+        .current_dir(&folder)
         .env("TOKEN_OF_THE_DOOR", "t-door")
-        .env_remove("COFLASH_BUS")
-        .env_remove("COFLASH_CONFIG")
         .output()
         .unwrap();
     let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
@@ -320,9 +299,9 @@ fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String)
 
 #[test]
 fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("command"));
+    let (server, folder) = (Server::start(&[ID]), folder("command"));
     let door = "[[device]]\ncontroller-id = 'door'\nnode = 5\ntoken-env = 'TOKEN_OF_THE_DOOR'\n";
-    std::fs::write(folder.0.join("agent.toml"), door).unwrap();
+    std::fs::write(folder.join("agent.toml"), door).unwrap();
     // A file that is right and no program: the device is not needed.
     server.assign(ID, Action::new(3, &File::new("readme.txt", b"this is no firmware")));
     server.state().targets.get_mut(ID).unwrap().wants_attributes = false;
@@ -335,7 +314,7 @@ fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
     assert!(lines.iter().any(|line| line["event"] == "failed" && line["controller"] == ID), "{out}");
     assert_eq!(lines.last().unwrap()["failed"], 1, "{out}");
     assert_eq!(server.action(ID).result.as_deref(), Some("failure"));
-    let log = std::fs::read_to_string(folder.0.join("log.txt")).unwrap();
+    let log = std::fs::read_to_string(folder.join("log.txt")).unwrap();
     assert!(log.contains("readme.txt"), "{log}");
     assert!(![&out, &err, &log].iter().any(|text| text.contains("t-door")), "{out}{err}{log}");
     // Nothing to do is a success; a server that is not there is none.
@@ -370,22 +349,22 @@ fn while_it_runs(server: &Server, folder: &Folder, fake: &Fake, act: impl FnOnce
 
 #[test]
 fn a_cancellation_during_the_update_is_rejected_with_a_reason() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("cancel"));
+    let (server, folder) = (Server::start(&[ID]), folder("cancel"));
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
     while_it_runs(&server, &folder, &fake, || {
-        let progress = |state: &hawkbit::State| {
+        let progress = |state: &kit::hawkbit::State| {
             state.targets[ID].action.as_ref().is_some_and(|action| action.progress.contains(&40))
         };
         server.wait("progress", progress);
         server.state().targets.get_mut(ID).unwrap().action.as_mut().unwrap().cancelling = true;
-        let rejected = |state: &hawkbit::State| {
+        let rejected = |state: &kit::hawkbit::State| {
             state.targets[ID].action.as_ref().is_some_and(|action| !action.rejected.is_empty())
         };
         server.wait("a rejection", rejected);
         busy.store(false, Ordering::Relaxed);
-        let ended = |state: &hawkbit::State| {
+        let ended = |state: &kit::hawkbit::State| {
             state.targets[ID].action.as_ref().is_some_and(|action| action.result.is_some())
         };
         server.wait("the end", ended);
@@ -398,7 +377,7 @@ fn a_cancellation_during_the_update_is_rejected_with_a_reason() {
 
 #[test]
 fn a_cancellation_before_the_update_is_accepted() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("cancel-early"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("cancel-early"), Fake::default());
     server.assign(ID, Action { window: Some("unavailable"), update: "skip", ..Action::new(3, &file()) });
     once(&server, &folder, &fake, &[ID]);
     assert!(server.action(ID).details("downloaded").contains("maintenance window"));
@@ -415,7 +394,7 @@ fn a_cancellation_before_the_update_is_accepted() {
 
 #[test]
 fn what_was_interrupted_goes_on_after_a_restart() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("restart"));
+    let (server, folder) = (Server::start(&[ID]), folder("restart"));
     server.assign(ID, Action::new(3, &file()));
     let fake = Fake { answers: Mutex::new(vec![Flashed::Interrupted]), ..Fake::default() };
     while_it_runs(&server, &folder, &fake, || {
@@ -432,7 +411,7 @@ fn what_was_interrupted_goes_on_after_a_restart() {
 
 #[test]
 fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("late"));
+    let (server, folder) = (Server::start(&[ID]), folder("late"));
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
@@ -455,7 +434,7 @@ fn a_result_that_could_not_be_reported_is_reported_after_a_restart() {
 
 #[test]
 fn a_failure_and_a_silent_device_are_told() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("failure"));
+    let (server, folder) = (Server::start(&[ID]), folder("failure"));
     let lines = vec!["node 1 does not answer [0x60000013]".to_string(), "what to do: look".to_string()];
     let answers = Mutex::new(vec![Flashed::NotNow("the bus is gone".to_string()), Flashed::Failed(lines)]);
     let fake = Fake { answers, silent: true, ..Fake::default() };
@@ -471,7 +450,7 @@ fn a_failure_and_a_silent_device_are_told() {
 
 #[test]
 fn what_was_fetched_is_there_when_the_bus_is_free_again() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("again"));
+    let (server, folder) = (Server::start(&[ID]), folder("again"));
     let not_now = || Flashed::NotNow("in use".to_string());
     let good = || Flashed::Done(vec!["done".to_string()]);
     let fake = Fake { answers: Mutex::new(vec![good(), not_now(), not_now(), good()]), ..Fake::default() };
@@ -482,13 +461,13 @@ fn what_was_fetched_is_there_when_the_bus_is_free_again() {
     }
     assert_eq!((fake.given().len(), server.seen("artifacts").len()), (4, 2));
     // What is not needed any more is gone.
-    let left = std::fs::read_dir(folder.0.join("agent-state")).unwrap().flatten().map(|file| file.path());
+    let left = std::fs::read_dir(folder.join("agent-state")).unwrap().flatten().map(|file| file.path());
     assert!(left.into_iter().all(|path| path.extension().is_none_or(|end| end != "part")));
 }
 
 #[test]
 fn a_bus_that_stays_away_ends_what_is_done_once() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("away"));
+    let (server, folder) = (Server::start(&[ID]), folder("away"));
     let answers = (0..100).map(|_| Flashed::NotNow("the adapter is gone".to_string())).collect();
     let fake = Fake { answers: Mutex::new(answers), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
@@ -502,7 +481,7 @@ fn a_bus_that_stays_away_ends_what_is_done_once() {
 /// The update ends while the agent is being ended: its result must not get lost.
 #[test]
 fn a_result_that_comes_while_the_agent_ends_is_kept() {
-    let (server, folder) = (Server::start(&[ID]), Folder::new("ending"));
+    let (server, folder) = (Server::start(&[ID]), folder("ending"));
     let busy = Arc::new(AtomicBool::new(true));
     let fake = Fake { busy: Some(busy.clone()), ..Fake::default() };
     server.assign(ID, Action::new(3, &file()));
@@ -525,7 +504,7 @@ fn a_result_that_comes_while_the_agent_ends_is_kept() {
 
 #[test]
 fn two_agents_do_not_share_a_folder() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("lock"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("lock"), Fake::default());
     while_it_runs(&server, &folder, &fake, || {
         server.wait("a poll", |state| !state.seen.is_empty());
         let why = run(&config(&server, &folder, &[ID]), &options(), &fake, &|_| {}).unwrap_err();
@@ -535,10 +514,10 @@ fn two_agents_do_not_share_a_folder() {
 
 #[test]
 fn a_damaged_state_file_is_named() {
-    let (server, folder, fake) = (Server::start(&[ID]), Folder::new("damaged"), Fake::default());
+    let (server, folder, fake) = (Server::start(&[ID]), folder("damaged"), Fake::default());
     server.assign(ID, Action::new(3, &file()));
     once(&server, &folder, &fake, &[ID]);
-    let state = folder.0.join("agent-state");
+    let state = folder.join("agent-state");
     let record = std::fs::read_dir(&state).unwrap().flatten().map(|file| file.path());
     let record = record.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
     std::fs::write(&record, "{").unwrap();

@@ -1,7 +1,5 @@
 //! The agent over TLS: the token goes to no server whose certificate is not right.
 
-mod hawkbit;
-
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
@@ -11,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use coflash::agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
-use hawkbit::{Action, File, Server};
+use kit::hawkbit::{Action, File, Server};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
@@ -29,7 +27,7 @@ impl Devices for Good {
 }
 
 fn pem(name: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/hawkbit/tls").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tls").join(name)
 }
 
 /// TLS in front of a server; returns its URL.
@@ -86,10 +84,8 @@ fn pass(stream: TcpStream, config: Arc<ServerConfig>, behind: &str) -> std::io::
 
 /// Runs the agent with these certificates to trust.
 fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("agent-tls-{test}"));
-    let _ = std::fs::remove_dir_all(&folder);
-    std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join("token"), "t-door").unwrap();
+    let folder = crate::tool::folder(test);
+    folder.file("token", b"t-door");
     let ca_file = ca_file.map(|name| format!("ca-file = '{}'\n", pem(name).display())).unwrap_or_default();
     let text = format!(
         "url = '{url}'\n{ca_file}[[device]]\ncontroller-id = 'door'\nbus = 'socketcan:can0'\nnode = 5\n\
@@ -101,7 +97,6 @@ fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
     let said = Mutex::new(String::new());
     let tell = |message: &Said| *said.lock().unwrap() += &format!("{}\n", message.text);
     let ended = run(&config, &Options::default().once(true).times(times), &Good, &tell).unwrap();
-    std::fs::remove_dir_all(&folder).unwrap();
     (ended, said.into_inner().unwrap())
 }
 
@@ -109,7 +104,7 @@ fn once(url: &str, ca_file: Option<&str>, test: &str) -> (Ended, String) {
 fn a_server_is_trusted_with_the_certificates_that_are_named() {
     let server = Server::start(&["door"]);
     let url = before(&server);
-    server.assign("door", Action::new(1, &File::new("a.blk", include_bytes!("data/identity-110.blk"))));
+    server.assign("door", Action::new(1, &File::new("a.blk", data!("identity-110.blk"))));
     let (ended, said) = once(&url, Some("authority.pem"), "good");
     assert_eq!((ended.updated, ended.unserved), (1, 0), "{said}");
     assert_eq!(server.action("door").result.as_deref(), Some("success"));

@@ -1,9 +1,6 @@
 //! Devices behind a gateway of CiA 309-3. The gateway is played from the standard's text: a line for
 //! each command, `[number] network node command`, and one for each answer.
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::net::{TcpListener, TcpStream};
@@ -17,8 +14,8 @@ use coflash::bus::Cia309;
 use coflash::device::{Doing, Session, Timing};
 use coflash::Error;
 
-use fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
-use tool::{coflash, data};
+use crate::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+use crate::tool::{coflash, data};
 
 /// The gateway's answer to a line, or none. The gateway adds `[7]` to the answer itself.
 type Play = Box<dyn FnMut(&str) -> Option<String> + Send>;
@@ -244,7 +241,7 @@ fn a_binary_without_an_address_goes_to_devices_that_have_none() {
         let image = Arc::new(Mutex::new(Vec::new()));
         let mut fake = quick(APPLICATION);
         fake.maker = Some(Box::new(Standard(image.clone())));
-        let (bus, server) = tool::serve(fake);
+        let (bus, server) = crate::tool::serve(fake);
         (bus, (server, image))
     };
     let binary = ["flash", "-N", "5", &file, "-I", "binary"];

@@ -1,19 +1,16 @@
 //! An update through every adapter, with the tool as a separate process.
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpListener;
 use std::thread;
 use std::time::Duration;
 
+use crate::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
+use crate::tool::kernel::{converse, standard};
+use crate::tool::{coflash, data};
 use canopen::Frame;
 use embedded_can::{Frame as _, StandardId};
-use fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
-use tool::kernel::{converse, standard};
-use tool::{coflash, data};
 
 fn device() -> Fake {
     let mut fake = Fake::new(BOOTLOADER);
@@ -156,15 +153,14 @@ impl<L: Write> Write for Until<L> {
 #[cfg(target_os = "linux")]
 #[test]
 fn socketcan() {
-    use std::process::Command;
-    let folder = tool::Folder::new("socketcan");
-    let library = tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
-    let (path, server) = tool::kernel::serve(device());
+    let folder = crate::tool::folder("socketcan");
+    let library = crate::tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
+    let (path, server) = crate::tool::kernel::serve(device());
     let call = |interface: &str, path: &std::path::Path| {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+        let mut command = crate::tool::command();
         let bus = format!("socketcan:{interface}");
         command.args(["--bus", &bus, "flash", "-N", "5", &data("identity-110.blk")]);
-        tool::run(command.env("LD_PRELOAD", &library).env("CAN_SHIM", path))
+        crate::tool::run(command.env("LD_PRELOAD", &library).env("CAN_SHIM", path))
     };
     let done = call("vcan0", &path);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);

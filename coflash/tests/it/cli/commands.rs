@@ -1,18 +1,15 @@
 //! Every command as a separate process, over a real socket, against fake devices.
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::io::Write;
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 use std::time::Duration;
 
+use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
+use crate::tool::{coflash, data, folder, run, serve, snapshot};
 use canopen::{CobId, Frame};
 use coflash::bus::candump::Line;
-use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
-use tool::{coflash, data, run, serve, snapshot, Folder};
 
 /// A device without delays.
 fn quick(running: u32) -> Fake {
@@ -23,7 +20,7 @@ fn quick(running: u32) -> Fake {
 }
 
 /// Runs a command on a device; returns its output as text and as JSON, and the device.
-fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (tool::Done, Value, Fake) {
+fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (crate::tool::Done, Value, Fake) {
     let go = |json: &[&str]| {
         let (bus, server) = serve(fake());
         let done = coflash(&[arguments, &["--bus", &bus, "-N", "5"], json].concat());
@@ -151,7 +148,7 @@ fn read_shows_values_as_what_they_are() {
         assert_eq!(said.out, "node 5, 1008h/0: \"a device with a long name\"\n");
         assert_eq!(json["text"], "a device with a long name");
     }
-    let folder = Folder::new("read");
+    let folder = folder("read");
     let (said, _, _) = on(|| quick(APPLICATION), &["read", "100A", "-o", &folder.path("version")]);
     assert_eq!(said.exit, 0, "{}", said.err);
     assert_eq!(fs::read(folder.path("version")).unwrap(), b"v1\x1B\0junk");
@@ -162,7 +159,7 @@ fn read_shows_values_as_what_they_are() {
 
 #[test]
 fn a_program_is_read_back_where_the_device_allows_it() {
-    let folder = Folder::new("read-back");
+    let folder = folder("read-back");
     // Each value of a byte, and an end inside a segment of 7.
     let program: Vec<u8> = (0..=513_u32).map(|i| (i ^ i >> 8) as u8).collect();
     for knows in [Blocks::Refused(0x0504_0001), Blocks::Known(127)] {
@@ -233,7 +230,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
     assert!(out.contains("\n9     bootloader"), "{out}");
     // An unfinished transfer of another tool is aborted first: within a block download, a request
     // can be taken for a segment.
-    let folder = Folder::new("scan");
+    let folder = folder("scan");
     let trace = folder.path("scan.log");
     scan(&["-N", "9", "--trace", &trace]);
     let text = fs::read_to_string(&trace).unwrap();
@@ -248,7 +245,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
 
 #[test]
 fn a_trace_is_shown_again_in_words() {
-    let folder = Folder::new("trace");
+    let folder = folder("trace");
     let trace = folder.path("bus.log");
     let (bus, server) = serve(quick(BOOTLOADER));
     let done = coflash(&["read", "1018/2", "-N", "5", "--bus", &bus, "--trace", &trace, "--segmented"]);
@@ -284,7 +281,7 @@ fn a_trace_that_cannot_be_written_is_a_warning() {
 
 #[test]
 fn monitor_shows_a_log() {
-    let folder = Folder::new("monitor");
+    let folder = folder("monitor");
     let log =
         folder.file("log", b"(100.000000) can0 000#8105\n\n(100.250000) can0 705#00\n(101.5) can0 706#7F\n");
     let done = coflash(&["monitor", "--replay", &log]);
@@ -326,12 +323,8 @@ fn monitor_shows_the_bus() {
 #[test]
 fn monitor_ends_with_its_reader() {
     let (bus, server) = serve(Heartbeats(Duration::ZERO));
-    let mut child = Command::new(env!("CARGO_BIN_EXE_coflash"))
-        .args(["monitor", "--bus", &bus])
-        .env_remove("COFLASH_CONFIG")
-        .stdout(Stdio::piped())
-        .spawn()
-        .unwrap();
+    let mut child =
+        crate::tool::command().args(["monitor", "--bus", &bus]).stdout(Stdio::piped()).spawn().unwrap();
     drop(child.stdout.take());
     assert_eq!(child.wait().unwrap().code(), Some(0));
     server.join().unwrap();
@@ -462,14 +455,10 @@ impl coflash::Adapter for LssDevice {
 }
 
 /// Runs the shell with these lines on its standard input.
-fn shell(arguments: &[&str], lines: &str) -> tool::Done {
-    let nowhere = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
-    let mut child = Command::new(env!("CARGO_BIN_EXE_coflash"))
+fn shell(arguments: &[&str], lines: &str) -> crate::tool::Done {
+    let mut child = crate::tool::command()
         .arg("shell")
         .args(arguments)
-        .env_remove("COFLASH_BUS")
-        .env_remove("COFLASH_CONFIG")
-        .env("XDG_CONFIG_HOME", nowhere)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -478,7 +467,7 @@ fn shell(arguments: &[&str], lines: &str) -> tool::Done {
     child.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
     let done = child.wait_with_output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
-    tool::Done { exit: done.status.code().unwrap(), out: text(done.stdout), err: text(done.stderr) }
+    crate::tool::Done { exit: done.status.code().unwrap(), out: text(done.stdout), err: text(done.stderr) }
 }
 
 #[test]
@@ -523,7 +512,7 @@ fn completions_and_manual_pages_are_written() {
     }
     let done = coflash(&["man"]);
     assert!(done.exit == 0 && done.out.contains(".TH coflash"), "{}", done.out);
-    let folder = Folder::new("man");
+    let folder = folder("man");
     assert_eq!(coflash(&["man", "--out", &folder.path("pages")]).exit, 0);
     let page = fs::read_to_string(folder.path("pages/coflash-flash.1")).unwrap();
     assert!(page.contains("check\\-target"), "{page}");
@@ -550,7 +539,7 @@ fn completions_and_manual_pages_are_written() {
 
 #[test]
 fn the_configuration_gives_defaults_and_the_command_line_wins() {
-    let folder = Folder::new("config");
+    let folder = folder("config");
     let (bus, server) = serve(quick(BOOTLOADER));
     let config = format!("bus = '{bus}'\nnode = 5\nsdo-timeout = 400\n");
     let named = folder.file("named.toml", config.as_bytes());
@@ -560,12 +549,8 @@ fn the_configuration_gives_defaults_and_the_command_line_wins() {
     // The file in the current folder is used; the node of the command line takes precedence.
     let (bus, server) = serve(quick(BOOTLOADER));
     folder.file("coflash.toml", format!("bus = '{bus}'\nnode = 6\n").as_bytes());
-    let mut here = Command::new(env!("CARGO_BIN_EXE_coflash"));
-    let done = run(here
-        .current_dir(&folder.0)
-        .args(["info", "--node", "5"])
-        .env_remove("COFLASH_BUS")
-        .env_remove("COFLASH_CONFIG"));
+    let mut here = crate::tool::command();
+    let done = run(here.current_dir(&folder).args(["info", "--node", "5"]));
     assert!(done.exit == 0 && done.out.starts_with("node 5: "), "{}{}", done.out, done.err);
     server.join().unwrap();
     // In the shell, too; but not with --all, and it is not assigned as a node-ID.
@@ -602,12 +587,8 @@ fn help_is_complete() {
     for command in
         [&["-h"][..], &["--help"], &["flash", "-h"], &["flash", "--help"], &["lss", "assign", "--help"]]
     {
-        let mut tool = Command::new(env!("CARGO_BIN_EXE_coflash"));
-        let done = run(tool
-            .args(command)
-            .env_remove("COFLASH_BUS")
-            .env_remove("COFLASH_CONFIG")
-            .env_remove("SOURCE_DATE_EPOCH"));
+        let mut tool = crate::tool::command();
+        let done = run(tool.args(command).env_remove("SOURCE_DATE_EPOCH"));
         assert_eq!(done.exit, 0);
         text.push_str(&done.out);
         text.push_str("\n----\n");

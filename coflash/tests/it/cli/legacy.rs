@@ -1,14 +1,10 @@
 //! The functions of the manual's tools (L-1112e_5, L-1112d_10), with their own options.
 
-mod fake;
-mod tool;
-
 use std::net::TcpListener;
-use std::process::Command;
 use std::time::Duration;
 
-use fake::{Fake, Outcome, BOOTLOADER};
-use tool::{coflash, data, run, serve, Folder};
+use crate::fake::{Fake, Outcome, BOOTLOADER};
+use crate::tool::{coflash, data, folder, run, serve};
 
 /// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {
@@ -88,7 +84,7 @@ fn without_a_device_they_are_the_manuals_too() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let closed = format!("socketcand://{}/can0", listener.local_addr().unwrap());
     drop(listener);
-    let folder = Folder::new("legacy-exit");
+    let folder = folder("legacy-exit");
     let file = data("plain-400.blk");
     let hex = std::fs::read_to_string(data("program.hex")).unwrap();
     // A record with the checksum FDh in place of FEh, and one that is cut off.
@@ -112,8 +108,8 @@ fn without_a_device_they_are_the_manuals_too() {
         (&["--version"], 0),
     ] {
         for way in [true, false] {
-            let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
-            command.args(arguments).env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG");
+            let mut command = crate::tool::command();
+            command.args(arguments);
             let done = run(if way {
                 command.arg("--legacy-exit-codes")
             } else {
@@ -122,7 +118,7 @@ fn without_a_device_they_are_the_manuals_too() {
             assert_eq!(done.exit, shown(number), "{arguments:?}, {number:08X}h: {}", done.err);
         }
     }
-    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+    let mut command = crate::tool::command();
     let done = run(command.args(["flash", &file, "-N", "128"]).env("COFLASH_LEGACY_EXIT_CODES", "0"));
     assert_eq!(done.exit, 2, "{}", done.err);
 }

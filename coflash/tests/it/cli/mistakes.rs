@@ -4,23 +4,20 @@
 //! Every row runs the tool as a separate process.
 #![cfg(target_os = "linux")]
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::io::{Read, Write as _};
 use std::net::{TcpListener, TcpStream};
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixListener;
-use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
+use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
+use crate::tool::{data, folder, run, serve, Done};
 use canopen::{CobId, Frame};
-use fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
-use tool::{data, run, serve, Done, Folder};
+use kit::folder::Folder;
 
 /// The situation of the command.
 #[derive(Clone, Copy, Debug)]
@@ -363,8 +360,8 @@ struct Room {
 
 impl Room {
     fn new() -> Self {
-        let folder = Folder::new("mistakes");
-        let shim = tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
+        let folder = folder("mistakes");
+        let shim = crate::tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
         folder.file("empty.hex", b"");
         folder.file("page.html", b"<!DOCTYPE html><html><body>404 Not Found</body></html>");
         folder.file("port", b"");
@@ -413,8 +410,8 @@ impl Room {
         let Mistake(line, with, ..) = mistake;
         let mut bus = "socketcand://127.0.0.1:1/can0".to_string();
         let mut server = String::new();
-        let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
-        command.env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG").current_dir(&self.folder.0);
+        let mut command = crate::tool::command();
+        command.current_dir(&self.folder);
         match with {
             Nothing => {}
             Device(device) => bus = serve(device()).0,

@@ -1,7 +1,13 @@
 //! The tool as a separate process: files, exit codes, messages, and an update over a real socket.
 
-mod fake;
-mod tool;
+mod adapters;
+mod commands;
+mod legacy;
+mod mistakes;
+mod pages;
+mod sealing;
+mod several;
+mod vendor;
 
 use std::fs;
 use std::io::ErrorKind;
@@ -10,12 +16,12 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
-use fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
-use tool::{coflash, data, run, serve, snapshot, Folder};
+use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
+use crate::tool::{coflash, data, folder, run, serve, snapshot};
 
 #[test]
 fn convert_writes_the_block_file_of_the_manual() {
-    let folder = Folder::new("convert");
+    let folder = folder("convert");
     let out = folder.path("out.blk");
     let board = ["--board", "stm32f407g-disc1"];
     let identity = ["--block-size", "0x110", "--vid", "0", "--pid", "1234"];
@@ -59,12 +65,12 @@ fn convert_writes_the_block_file_of_the_manual() {
 /// another chip.
 #[test]
 fn a_build_script_for_the_manuals_converter_works() {
-    let folder = Folder::new("legacy");
+    let folder = folder("legacy");
     let input = folder.file("blcop_app.hex", &fs::read(data("program.hex")).unwrap());
     let call = |options: &[&str]| {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
-        command.current_dir(&folder.0).arg("convert").args(options);
-        run(command.env_remove("COFLASH_BUS").env("SOURCE_DATE_EPOCH", "1420070400"))
+        let mut command = crate::tool::command();
+        command.current_dir(&folder).arg("convert").args(options);
+        run(command.env("SOURCE_DATE_EPOCH", "1420070400"))
     };
     let region = ["--start_address", "0x08010000", "--end_address", "0x080FFFFF"];
     let label = ["--vid", "0", "--pid", "1234", "--ver", "0x00640A01"];
@@ -91,7 +97,7 @@ fn a_build_script_for_the_manuals_converter_works() {
 /// one have no effect.
 #[test]
 fn convert_of_a_block_file_says_which_crc_it_keeps() {
-    let folder = Folder::new("convert-block");
+    let folder = folder("convert-block");
     let out = folder.path("out.blk");
     for (name, options, kept, warns) in [
         ("plain-400.blk", &[][..], "CRC-32", false),
@@ -113,10 +119,7 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
 #[test]
 fn inspect_tells_what_a_file_holds() {
     let shown = |file: &str, options: &[&str]| {
-        let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
-            .current_dir(data(""))
-            .args(["inspect", file])
-            .args(options));
+        let done = run(crate::tool::command().current_dir(data("")).args(["inspect", file]).args(options));
         assert_eq!(done.exit, 0, "{}", done.err);
         done.out
     };
@@ -131,7 +134,7 @@ fn inspect_tells_what_a_file_holds() {
     assert_eq!(json["blocks"]["program"]["start"], 0x0801_0000);
     assert_eq!(json["blocks"]["all"].as_array().unwrap().len(), 6);
 
-    let folder = Folder::new("inspect");
+    let folder = folder("inspect");
     let mut damaged = fs::read(data("release-110.blk")).unwrap();
     damaged[0x50] ^= 1;
     let done = coflash(&["inspect", "--json", &folder.file("damaged.blk", &damaged)]);
@@ -154,7 +157,7 @@ const NOWHERE: &str = "socketcand://127.0.0.1:1/x";
 #[test]
 #[cfg(unix)]
 fn what_is_no_file_or_too_large_is_not_read() {
-    let folder = Folder::new("endless");
+    let folder = folder("endless");
     let fifo = folder.path("fifo");
     assert!(Command::new("mkfifo").arg(&fifo).status().unwrap().success());
     let large = folder.path("large.elf");
@@ -164,7 +167,7 @@ fn what_is_no_file_or_too_large_is_not_read() {
     for (file, words) in [
         ("/dev/zero", "/dev/zero: is a device, pipe or socket and not a file"),
         (&fifo, "fifo: is a device, pipe or socket and not a file"),
-        (folder.0.to_str().unwrap(), "endless: is a folder and not a file"),
+        (folder.to_str().unwrap(), &format!("{}: is a folder and not a file", folder.display())),
         (&large, "large.elf: has 67108865 bytes, and a firmware file has at most 67108864"),
     ] {
         for command in [&["inspect"][..], &["convert"], &["--bus", NOWHERE, "flash"]] {
@@ -184,7 +187,7 @@ fn what_is_no_file_or_too_large_is_not_read() {
 /// program.
 #[test]
 fn what_can_be_no_program_is_refused_without_a_bus() {
-    let folder = Folder::new("no-program");
+    let folder = folder("no-program");
     let vectors = [0x2001_FFC0_u32, 0x0800_0189].map(u32::to_le_bytes).concat();
     let bootloader = folder.file("bootloader.bin", &[&vectors[..], &[0x5A; 1000]].concat());
     let zeros = folder.file("zeros.bin", &[0; 1000]);
@@ -220,7 +223,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
 /// The label of an image (`docs/dialects.md`) is told by `inspect`, and goes into block 0.
 #[test]
 fn the_label_is_shown_and_goes_into_block_0() {
-    let folder = Folder::new("label");
+    let folder = folder("label");
     let mut image = vec![0x5A; 1024];
     image[..8].copy_from_slice(&[0x2001_FFC0_u32, 0x0801_0201].map(u32::to_le_bytes).concat());
     let mut label = [u32::from_le_bytes(*b"CBL1"), 0x319, 0x4007_D151, 0x0001_0203, 0, 0, 0].to_vec();
@@ -250,7 +253,7 @@ fn the_label_is_shown_and_goes_into_block_0() {
         (&["--vid", "1", "--pid", "2"], vec![1024, 1, 2]),
         (&["--no-label"], vec![0, 0]),
     ] {
-        let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
+        let done = run(crate::tool::command()
             .args(["convert", &file, &out])
             .args(raw)
             .args(options)
@@ -269,7 +272,7 @@ fn the_label_is_shown_and_goes_into_block_0() {
 
 #[test]
 fn quiet_says_nothing_and_json_says_one_document() {
-    let folder = Folder::new("quiet");
+    let folder = folder("quiet");
     let out = folder.path("out.blk");
     let done = coflash(&["convert", "-q", &data("program.elf"), &out]);
     assert_eq!((done.exit, done.out.as_str(), done.err.as_str()), (0, "", ""));
@@ -289,10 +292,10 @@ fn quiet_says_nothing_and_json_says_one_document() {
 
 #[test]
 fn the_date_comes_from_the_environment() {
-    let folder = Folder::new("date");
+    let folder = folder("date");
     let out = folder.path("out.blk");
     let input = data("program.elf");
-    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+    let mut command = crate::tool::command();
     command.args([
         "convert",
         &input,
@@ -313,7 +316,7 @@ fn the_date_comes_from_the_environment() {
 
 #[test]
 fn a_bad_file_is_named_and_no_device_is_touched() {
-    let folder = Folder::new("bad");
+    let folder = folder("bad");
     let hex = fs::read_to_string(data("program.hex")).unwrap();
     let blocks = fs::read(data("plain-400.blk")).unwrap();
     let elf = fs::read(data("program.elf")).unwrap();
@@ -440,9 +443,7 @@ fn flash_and_info_over_a_socket() {
     }
 
     let (bus, _server) = serve(fake);
-    let done = run(Command::new(env!("CARGO_BIN_EXE_coflash"))
-        .args(["info", "--node", "5"])
-        .env("COFLASH_BUS", bus));
+    let done = run(crate::tool::command().args(["info", "--node", "5"]).env("COFLASH_BUS", bus));
     assert_eq!(done.exit, 0, "{}", done.err);
     assert!(done.out.starts_with("node 5: an application (device type 00020192h)\n"), "{}", done.out);
 }

@@ -1,22 +1,20 @@
 //! The commands for sealed images, one after another; OpenSSL checks the results if it is
 //! installed.
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use crate::fake::vault::Vault;
+use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+use crate::tool::{coflash, folder, serve, Done};
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
-use fake::vault::Vault;
-use fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+use kit::folder::Folder;
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
-use tool::{coflash, serve, Done, Folder};
 
 const START: u32 = 0x0801_0000;
 /// The identity of the fake device (1018h).
@@ -41,7 +39,7 @@ struct Room(Folder);
 
 impl Room {
     fn new(test: &str) -> Self {
-        let room = Self(Folder::new(&format!("sealing-{test}")));
+        let room = Self(folder(&format!("sealing-{test}")));
         let image = raw::read(&program(), Some(START)).unwrap();
         room.0.file("app.hex", ihex::emit(&image).as_bytes());
         for role in ["root", "release", "kek"] {

@@ -1,16 +1,13 @@
 //! Several devices, interruption and diagnosis, with the tool as a separate process.
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
+use crate::tool::{coflash, data, folder, serve};
 use canopen::{CobId, Frame};
-use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
-use tool::{coflash, data, serve, Folder};
 
 fn device(node: u8, running: u32) -> Fake {
     let mut fake = Fake::new(running);
@@ -28,7 +25,7 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
         refusing.on_block = Box::new(|_| Outcome::Status(0x0E));
         Bus(vec![device(5, APPLICATION), refusing, device(10, BOOTLOADER)])
     };
-    let folder = Folder::new("several");
+    let folder = folder("several");
     let report = folder.path("report.json");
     let file = data("plain-400.blk");
     let (url, server) = serve(bus());
@@ -63,7 +60,7 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
 
 #[test]
 fn a_job_file_says_who_gets_what() {
-    let folder = Folder::new("job");
+    let folder = folder("job");
     let small =
         folder.file("small.hex", b":020000040801F1\n:0C000000001000200900010801020304A8\n:00000001FF\n");
     folder.file("plain.blk", &fs::read(data("plain-400.blk")).unwrap());
@@ -165,7 +162,7 @@ fn unconfigured() -> Unconfigured {
 
 #[test]
 fn a_device_without_node_id_gets_one_by_its_lss_address() {
-    let folder = Folder::new("lss-job");
+    let folder = folder("lss-job");
     let file = data("plain-400.blk");
     let job = |node: &str, serial: u32| {
         let text = format!(
@@ -273,9 +270,8 @@ fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
         Outcome::Accept
     });
     let (url, server) = serve(slow);
-    let child = Command::new(env!("CARGO_BIN_EXE_coflash"))
+    let child = crate::tool::command()
         .args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")])
-        .env_remove("COFLASH_CONFIG")
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()

@@ -2,9 +2,6 @@
 //! faulty. Not tested on hardware.
 #![cfg(target_os = "linux")]
 
-mod fake;
-mod tool;
-
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -12,13 +9,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
-use tool::kernel::{library, serve};
-use tool::{data, run, Done, Folder};
+use crate::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
+use crate::tool::kernel::{library, serve};
+use crate::tool::{data, folder, run, Done};
+use kit::folder::Folder;
 
 /// A folder with the library of a vendor.
 fn vendor(name: &str, which: &str, options: &[&str]) -> Folder {
-    let folder = Folder::new(name);
+    let folder = folder(name);
     let (file, define) = match which {
         "peak" => ("libpcanbasic.so", "-DPCAN"),
         _ => ("libcanlib.so.1", "-DCANLIB"),
@@ -33,9 +31,9 @@ fn call(folder: &Folder, lie: &str, arguments: &[&str]) -> Done {
 }
 
 fn command(folder: &Folder, lie: &str, arguments: &[&str]) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
-    command.args(arguments).env("LD_LIBRARY_PATH", &folder.0).env("FAKE_LIE", lie);
-    command.env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG").env("COFLASH_SEARCH", "peak,kvaser");
+    let mut command = crate::tool::command();
+    command.args(arguments).env("LD_LIBRARY_PATH", folder.as_os_str()).env("FAKE_LIE", lie);
+    command.env("COFLASH_SEARCH", "peak,kvaser");
     command
 }
 
@@ -143,7 +141,7 @@ fn a_library_that_lies_is_named_and_stops_nothing() {
 
 #[test]
 fn a_library_that_is_missing_or_old_is_named_with_where_to_get_it() {
-    let broken = Folder::new("broken");
+    let broken = folder("broken");
     for file in ["libpcanbasic.so", "libpcanbasic.so.4", "libcanlib.so", "libcanlib.so.1"] {
         broken.file(file, b"no library");
     }

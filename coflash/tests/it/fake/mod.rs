@@ -1,9 +1,6 @@
 //! A fake device: an adapter with virtual time that plays a bootloader and an application, written
 //! from the manual and from CiA 301 byte by byte, without the product's own server.
 
-// Each test uses a part of this module.
-#![allow(dead_code)]
-
 use std::collections::VecDeque;
 use std::io;
 use std::time::Duration;

@@ -5,22 +5,22 @@ use coflash::file::convert::{blocks_of, GapFill, Options};
 use coflash::file::read::{self, Firmware, Format};
 use proptest::prelude::*;
 
-macro_rules! data {
+macro_rules! named {
     ($name:literal) => {
-        ($name, include_bytes!(concat!("data/", $name)).as_slice())
+        ($name, data!($name))
     };
 }
 
 const FILES: [(&str, &[u8]); 9] = [
-    data!("program.elf"),
-    data!("program.hex"),
-    data!("program-srec_cat.hex"),
-    data!("program.s2"),
-    data!("program.s3"),
-    data!("plain-400.blk"),
-    data!("identity-110.blk"),
-    data!("release-110.blk"),
-    data!("crc16-400.blk"),
+    named!("program.elf"),
+    named!("program.hex"),
+    named!("program-srec_cat.hex"),
+    named!("program.s2"),
+    named!("program.s3"),
+    named!("plain-400.blk"),
+    named!("identity-110.blk"),
+    named!("release-110.blk"),
+    named!("crc16-400.blk"),
 ];
 
 /// The contents of the file, or the reason why it is invalid.
@@ -74,7 +74,7 @@ fn an_empty_or_foreign_file_is_named_so() {
 
 #[test]
 fn a_damaged_block_file_is_named_with_its_offset() {
-    let good = include_bytes!("data/plain-400.blk").as_slice();
+    let good = data!("plain-400.blk");
     let with = |at: usize, value: u8| {
         let mut bytes = good.to_vec();
         bytes[at] = value;

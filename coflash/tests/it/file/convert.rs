@@ -7,12 +7,6 @@ use coflash::file::read::{self, Firmware, Format};
 use coflash::file::{AddressRange, Image};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
-macro_rules! data {
-    ($name:literal) => {
-        include_bytes!(concat!("data/", $name)).as_slice()
-    };
-}
-
 fn image(bytes: &[u8]) -> Image {
     match read::read(bytes, None, None).unwrap() {
         Firmware::Image(image) => image,

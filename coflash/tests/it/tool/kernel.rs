@@ -11,7 +11,7 @@ use canopen::Frame;
 use coflash::Adapter;
 use embedded_can::{Frame as _, Id, StandardId};
 
-use super::Folder;
+use kit::folder::Folder;
 
 /// The identifier of a CANopen frame.
 pub fn standard(frame: &Frame) -> u16 {

@@ -1,14 +1,11 @@
 //! The tool as a separate process, and its counterparts.
 
-// Each test uses a part of this module.
-#![allow(dead_code)]
-
 pub mod kernel;
 
 use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -16,6 +13,7 @@ use std::time::{Duration, Instant};
 use canopen::Frame;
 use coflash::Adapter;
 use embedded_can::{Frame as _, Id, StandardId};
+use kit::folder::Folder;
 
 pub struct Done {
     pub exit: i32,
@@ -23,21 +21,25 @@ pub struct Done {
     pub err: String,
 }
 
-pub fn coflash(arguments: &[&str]) -> Done {
-    run(Command::new(env!("CARGO_BIN_EXE_coflash"))
-        .args(arguments)
-        .env_remove("COFLASH_BUS")
-        .env_remove("COFLASH_CONFIG"))
+/// The tool without the settings, the adapters and the locks of the user who runs the tests.
+pub fn command() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+    // No test makes this folder. Without a folder for locks there are none: two tests may use the
+    // same name of an adapter at the same time.
+    let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
+    for name in ["XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR"] {
+        command.env(name, &nowhere);
+    }
+    command.env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG");
+    command.env("COFLASH_SEARCH", "none").env("NO_COLOR", "1");
+    command
 }
 
-/// Runs it without the settings of the user who runs the tests.
+pub fn coflash(arguments: &[&str]) -> Done {
+    run(command().args(arguments))
+}
+
 pub fn run(command: &mut Command) -> Done {
-    let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
-    // A test that names no bus must not find one of whoever runs it.
-    if !command.get_envs().any(|(name, _)| name == "COFLASH_SEARCH") {
-        command.env("COFLASH_SEARCH", "none");
-    }
-    command.env("XDG_CONFIG_HOME", &nowhere).env("XDG_STATE_HOME", &nowhere).env("NO_COLOR", "1");
     let done = command.output().unwrap();
     let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
     Done { exit: done.status.code().expect("no signal"), out: text(done.stdout), err: text(done.stderr) }
@@ -59,32 +61,9 @@ pub fn snapshot(name: &str, found: &str) {
     assert!(found == expected, "{path} says\n{expected}\nand now it is\n{found}");
 }
 
-/// A folder of one test, away at the end.
-pub struct Folder(pub PathBuf);
-
-impl Folder {
-    pub fn new(test: &str) -> Self {
-        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(test);
-        let _ = fs::remove_dir_all(&path);
-        fs::create_dir_all(&path).unwrap();
-        Self(path)
-    }
-
-    pub fn file(&self, name: &str, bytes: &[u8]) -> String {
-        let path = self.path(name);
-        fs::write(&path, bytes).unwrap();
-        path
-    }
-
-    pub fn path(&self, name: &str) -> String {
-        self.0.join(name).to_str().unwrap().to_string()
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
-    }
+/// A folder of one test, deleted at its end.
+pub fn folder(test: &str) -> Folder {
+    Folder::new(env!("CARGO_TARGET_TMPDIR"), test)
 }
 
 /// Puts a fake device behind a socketcand server; gives the bus URL. The device is handed back when

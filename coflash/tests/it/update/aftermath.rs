@@ -1,8 +1,6 @@
 //! The report of a failed update about the device: the tool asks the device, in every dialect and
 //! after every refusal. Also the detection of another tool that uses the device.
 
-mod fake;
-
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
@@ -13,13 +11,13 @@ use coflash::file::block_file::BlockFile;
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Left, Look, Report};
 use coflash::{Adapter, Error};
 
-use fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const CLEAR: u8 = 0x03;
 const CALL: u8 = 0x80;
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap();
+    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| events.push(event));
@@ -101,7 +99,7 @@ fn what_the_device_still_has_is_told() {
                 if its == Dialect::Block {
                     fake.on_block = Box::new(|_| Outcome::Abort(0x0606_0000));
                 } else {
-                    fake.knows_blocks = fake::Blocks::Known(127);
+                    fake.knows_blocks = crate::fake::Blocks::Known(127);
                     fake.refuses_segment = Some((1, 0x0C));
                 }
             }
@@ -162,7 +160,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     let written = |fake: &mut Fake| {
         fake.starts = None;
         fake.on_block = Box::new(|_| Outcome::Ignore);
-        fake.crc = Some(BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap().program_crc());
+        fake.crc = Some(BlockFile::parse(data!("identity-110.blk")).unwrap().program_crc());
     };
     let raw = left(BOOTLOADER, &written, dialect(Dialect::Raw));
     assert_eq!((raw.state, raw.look), (DeviceState::Written, Look::Silent));
@@ -228,7 +226,7 @@ impl Adapter for Echo {
 
 #[test]
 fn an_adapters_echo_is_nobody_else() {
-    for blocks in [fake::Blocks::Known(127), fake::Blocks::Refused(0x0504_0001)] {
+    for blocks in [crate::fake::Blocks::Known(127), crate::fake::Blocks::Refused(0x0504_0001)] {
         for running in [BOOTLOADER, APPLICATION] {
             let mut fake = Fake::new(running);
             fake.knows_blocks = blocks;

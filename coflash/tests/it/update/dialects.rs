@@ -1,8 +1,6 @@
 //! Devices of other manufacturers, each played from its document: the frames that they receive,
 //! byte for byte, and the results.
 
-mod fake;
-
 use std::sync::{Arc, Mutex};
 
 use canopen::NodeId;
@@ -18,7 +16,7 @@ use coflash::Adapter;
 use coflash::Error;
 use embedded_can::Frame as _;
 
-use fake::{left, Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{left, Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// Abort codes (CiA 301 table 22).
 const WRITE_ONLY: u32 = 0x0601_0001;
@@ -37,7 +35,7 @@ const PHRASE: &str = "open sesame";
 type Kept = Arc<Mutex<Vec<u8>>>;
 
 fn file() -> BlockFile {
-    BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap()
+    BlockFile::parse(data!("identity-110.blk")).unwrap()
 }
 
 fn node(id: u8) -> NodeId {

@@ -1,16 +1,14 @@
 //! The events in the form for programs: the names are a contract.
 
-mod fake;
-
 use std::time::Duration;
 
+use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{AbortCode, NodeId};
 use coflash::device::{DeviceType, Dialect, Session, Timing};
 use coflash::file::BlockFile;
 use coflash::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
 use coflash::update::{flash, Event, FlashOptions, Target};
 use coflash::Error;
-use fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use serde_json::{json, Value};
 
 fn node() -> NodeId {
@@ -19,7 +17,7 @@ fn node() -> NodeId {
 
 /// The lines of an update of this device.
 fn lines(fake: &mut Fake, options: &FlashOptions) -> Vec<Value> {
-    let file = BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap();
+    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
     let mut lines = Vec::new();
     let mut session = Session::new(fake, node(), Timing::default());
     let _ = flash(&mut session, &file, options, &mut |event| {
@@ -70,7 +68,7 @@ fn an_update_tells_its_course_and_ends_with_done() {
         assert!(line["text"].as_str().is_some_and(|text| !text.is_empty()), "{line}");
     }
     // The program is 4001 bytes (see procedure.rs), the file has 6 blocks more than that in framing.
-    let total = include_bytes!("data/identity-110.blk").len();
+    let total = data!("identity-110.blk").len();
     let last = lines.iter().rfind(|line| line["event"] == "progress").unwrap();
     assert_eq!((&last["done"], &last["total"]), (&json!(total), &json!(total)));
     let done = lines.last().unwrap();

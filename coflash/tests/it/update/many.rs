@@ -1,11 +1,10 @@
 //! Many devices on one bus, in virtual time.
 
-mod fake;
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use canopen::{CobId, Frame, NodeId};
 use coflash::bus::hub::{self, Act, Conversation, Terms};
 use coflash::device::Transfers;
@@ -15,9 +14,8 @@ use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::update::{DeviceState, Event, FlashOptions, Report};
 use coflash::Adapter;
 use coflash::Error;
-use fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
-const FILE: &[u8] = include_bytes!("data/identity-110.blk");
+const FILE: &[u8] = data!("identity-110.blk");
 
 type Results = Vec<Result<Report, Failed>>;
 

@@ -1,8 +1,6 @@
 //! Before and during the update of a lift (CiA 814-1 clause 6.3): the device's information, another
 //! device with node-ID 126, and the NMT mastership of flying masters (CiA 302-2).
 
-mod fake;
-
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -15,7 +13,7 @@ use coflash::update::{flash, Event, FlashOptions, Password, Report};
 use coflash::Adapter;
 use coflash::Error;
 
-use fake::{Deed, Fake, Maker, APPLICATION, NODE};
+use crate::fake::{Deed, Fake, Maker, APPLICATION, NODE};
 
 const LIFT: u32 = 0xFE00_01A1;
 
@@ -65,7 +63,7 @@ fn lift() -> Fake {
 }
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
+    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| {

@@ -1,11 +1,10 @@
 //! The update procedure against a device that plays every failure of the manual.
 
-mod fake;
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
+use crate::fake::{left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{CobId, Frame, NodeId};
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
@@ -15,11 +14,10 @@ use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::Adapter;
 use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
-use fake::{left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
 
 fn file() -> BlockFile {
-    BlockFile::parse(include_bytes!("data/identity-110.blk")).unwrap()
+    BlockFile::parse(data!("identity-110.blk")).unwrap()
 }
 
 /// Five blocks: 0, 1 to 4 (three of code, one of text and data), -1.
@@ -78,7 +76,7 @@ fn the_whole_procedure_from_a_running_application() {
         "command 01",
     ];
     assert_eq!(fake.writes(), steps);
-    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
     assert_eq!(fake.running, Some(APPLICATION));
     assert_eq!(
         (report.program_size, report.repeats, report.running.map(|running| running.0)),
@@ -117,7 +115,7 @@ fn the_whole_procedure_from_a_running_application() {
 #[test]
 fn progress_never_goes_back_and_ends_complete() {
     let mut fake = Fake::new(BOOTLOADER);
-    let total_bytes = include_bytes!("data/identity-110.blk").len();
+    let total_bytes = data!("identity-110.blk").len();
     let mut last = 0;
     let (_, events) = run(&mut fake, FlashOptions::default());
     let mut seen = 0;
@@ -137,7 +135,7 @@ fn blocks_are_used_where_the_device_knows_them() {
         let mut fake = Fake::new(APPLICATION);
         fake.knows_blocks = Blocks::Known(blksize);
         let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
         assert_eq!((report.transfers, report.repeats), (Transfers::Blocks, 0));
         // Block 0 and the last one have 28 and 24 bytes: four segments cost no more than the frames
         // around a block.
@@ -151,7 +149,7 @@ fn a_device_without_blocks_is_asked_once_for_them() {
         let mut fake = Fake::new(APPLICATION);
         fake.knows_blocks = Blocks::Refused(code);
         let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
         assert_eq!((report.transfers, report.repeats), (Transfers::Segments, 0));
         assert_eq!(fake.block_downloads, 1);
     }
@@ -167,7 +165,7 @@ fn a_device_that_does_not_answer_to_blocks_gets_segments() {
     let mut fake = Fake::new(BOOTLOADER);
     fake.knows_blocks = Blocks::Ignored;
     let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
     assert_eq!((report.transfers, report.repeats, fake.block_downloads), (Transfers::Segments, 2, 2));
 }
 
@@ -188,7 +186,7 @@ fn lost_segments_of_a_block_are_sent_again_within_the_transfer() {
         fake.knows_blocks = Blocks::Known(10);
         fake.lost_segments = lost.clone();
         let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-        assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"), "{lost:?}");
+        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"), "{lost:?}");
         assert_eq!((report.repeats, report.transfers), (0, Transfers::Blocks));
     }
 }
@@ -443,7 +441,7 @@ fn a_block_is_repeated_as_often_as_allowed() {
     let (report, events) = run(&mut fake, FlashOptions::default().repeats(2));
     assert_eq!(report.unwrap().repeats, 2);
     assert_eq!(fake.count("block 2"), 3);
-    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
     let again = Event::Retry(Retry::block(2, 2, 2, RepeatReason::Crc));
     assert!(events.contains(&again));
 
@@ -481,7 +479,7 @@ fn a_lost_answer_or_request_costs_a_repeat_and_nothing_else() {
             let report = run(&mut fake, FlashOptions::default()).0.unwrap();
             // The last block may be sent twice; its second copy is the same.
             fake.blocks.dedup();
-            assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"), "{block} {outcome:?}");
+            assert_eq!(fake.blocks.concat(), data!("identity-110.blk"), "{block} {outcome:?}");
             assert_eq!(report.repeats, 1);
         }
     }
@@ -657,7 +655,7 @@ fn what_others_say_on_the_bus_is_passed_over() {
         Frame::new_remote(StandardId::new(0x585).unwrap(), 8).unwrap(),
     ];
     run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!(fake.blocks.concat(), include_bytes!("data/identity-110.blk"));
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
 }
 
 #[test]

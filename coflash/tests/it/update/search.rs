@@ -1,8 +1,6 @@
 //! The search for a bootloader "until the user gives up", and the identity of a program on trial
 //! (manual L-1112d_10, chapter 5.2, steps 1 and 6).
 
-mod fake;
-
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,10 +14,10 @@ use coflash::update::event::Phase;
 use coflash::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 use coflash::Adapter;
 
-use fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
+    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| events.push(event));
@@ -254,7 +252,7 @@ fn the_user_gives_up() {
         fake.on_command = Box::new(|_| Outcome::Ignore);
         let (end, flag) = (fake.now + Duration::from_secs(120), Arc::new(AtomicBool::new(false)));
         let mut bus = GivesUp(fake, end, flag.clone());
-        let file = BlockFile::parse(include_bytes!("data/plain-400.blk")).unwrap();
+        let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
         let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
         session.cancel_by(flag);
         let options = FlashOptions::default().wait(true);

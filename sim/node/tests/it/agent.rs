@@ -1,20 +1,16 @@
 //! coflash's agent from end to end: a server, the agent, and nodes on a bus, each over a real
 //! socket.
 
-mod bus;
-#[path = "../../../coflash/tests/hawkbit/mod.rs"]
-mod hawkbit;
-
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use bus::{Coflash, Folder, Nodes, VECTORS};
+use crate::bus::{Coflash, Folder, Nodes, VECTORS};
 use coflash::agent::{run, Buses, Config, Ended, Options, Said, Times};
 use coflash::bus::Link;
-use hawkbit::{Action, File, Server};
+use kit::hawkbit::{Action, File, Server};
 
 const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];
 
@@ -133,7 +129,7 @@ fn an_agent_that_was_ended_goes_on() {
     let endless = options().once(false).cancelled(cancelled.clone());
     thread::scope(|scope| {
         let agent = scope.spawn(|| serve(&config, &endless));
-        let begun = |state: &hawkbit::State| {
+        let begun = |state: &kit::hawkbit::State| {
             state.targets[IDS[0]].action.as_ref().is_some_and(|action| !action.progress.is_empty())
         };
         server.wait("progress", begun);
@@ -192,15 +188,15 @@ fn a_bus_that_is_not_there_is_waited_for() {
     let endless = options().once(false).cancelled(cancelled.clone());
     thread::scope(|scope| {
         let agent = scope.spawn(|| serve(&config, &endless));
-        let waits = |state: &hawkbit::State| {
+        let waits = |state: &kit::hawkbit::State| {
             let action = state.targets[IDS[0]].action.as_ref();
             action.is_some_and(|action| action.details("proceeding").contains("the update waits"))
         };
         server.wait("a message", waits);
         let listen = format!("127.0.0.1:{port}");
         let arguments = ["--listen", &listen, "--node", "5", "--flash", "instant", "--stand-in"];
-        let node = bus::node(&folder, &arguments);
-        let ended = |state: &hawkbit::State| {
+        let node = crate::bus::node(&folder, &arguments);
+        let ended = |state: &kit::hawkbit::State| {
             state.targets[IDS[0]].action.as_ref().is_some_and(|action| action.result.is_some())
         };
         server.wait("the end", ended);

@@ -1,8 +1,5 @@
 //! Nodes and hosts as separate processes, and the folder of a test.
 
-// Each test uses a part of this module.
-#![allow(dead_code)]
-
 use std::cell::RefCell;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read, Write};
@@ -26,14 +23,11 @@ pub const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", 
 pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08];
 
 /// A folder for one test, deleted at the end.
-pub struct Folder(PathBuf);
+pub struct Folder(kit::folder::Folder);
 
 impl Folder {
     pub fn new(test: &str) -> Self {
-        let path = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("nodes-{test}"));
-        let _ = fs::remove_dir_all(&path);
-        fs::create_dir_all(&path).unwrap();
-        Self(path)
+        Self(kit::folder::Folder::new(env!("CARGO_TARGET_TMPDIR"), test))
     }
 
     /// A folder that contains `program.bin`.
@@ -53,12 +47,6 @@ impl Folder {
 
     pub fn read(&self, name: &str) -> Vec<u8> {
         fs::read(self.path(name)).unwrap()
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = fs::remove_dir_all(&self.0);
     }
 }
 
@@ -248,18 +236,27 @@ impl<'a> Coflash<'a> {
     }
 }
 
+/// coflash's example of a production line, with its locks in the folder of a test.
+pub fn station(folder: &Folder, arguments: &[&str]) -> Done {
+    let example = beside("examples/production_line");
+    Running::start(Command::new(example).args(arguments).env("XDG_RUNTIME_DIR", folder.path(""))).wait()
+}
+
 /// `COBOOT_COFLASH`, or the program built beside the nodes.
 fn program() -> OsString {
-    env::var_os("COBOOT_COFLASH").unwrap_or_else(|| {
-        let name = Path::new("coflash").with_extension(env::consts::EXE_EXTENSION);
-        let path = Path::new(env!("CARGO_BIN_EXE_coboot-node")).with_file_name(name);
-        assert!(
-            path.exists(),
-            "{}: build it by `cargo build -p coflash`, or run `cargo xtask test`",
-            path.display()
-        );
-        path.into_os_string()
-    })
+    env::var_os("COBOOT_COFLASH").unwrap_or_else(|| beside("coflash").into_os_string())
+}
+
+/// A program of coflash that is built beside the nodes.
+fn beside(name: &str) -> PathBuf {
+    let name = Path::new(name).with_extension(env::consts::EXE_EXTENSION);
+    let path = Path::new(env!("CARGO_BIN_EXE_coboot-node")).with_file_name(name);
+    assert!(
+        path.exists(),
+        "{}: build it by `cargo build -p coflash --bins --examples`, or run `cargo xtask test`",
+        path.display()
+    );
+    path
 }
 
 /// The next message of a server.

@@ -1,22 +1,20 @@
 //! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs`
 //! uses some commands itself; `convert`, `inspect`, `completions` and `man` talk to no device.)
 
-mod bus;
-
 use std::io::Write;
 use std::net::TcpStream;
 use std::process::Command;
 use std::sync::mpsc::RecvTimeoutError;
 use std::time::Duration;
 
-use bus::{Coflash, Folder, Nodes};
+use crate::bus::{Coflash, Folder, Nodes};
 use serde_json::{json, Value};
 
 /// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
 /// inside, Thumb bit set.
 fn program(first: u8) -> Vec<u8> {
     let mut bytes = vec![first; 200 * 1024];
-    bytes[..8].copy_from_slice(&bus::VECTORS);
+    bytes[..8].copy_from_slice(&crate::bus::VECTORS);
     bytes
 }
 
@@ -283,9 +281,9 @@ fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
     let address = nodes.address().to_owned();
     let asks = std::thread::spawn(move || {
         let mut stream = TcpStream::connect(address).unwrap();
-        assert_eq!(bus::message(&mut stream), "< hi >");
+        assert_eq!(crate::bus::message(&mut stream), "< hi >");
         stream.write_all(b"< open can0 >").unwrap();
-        assert_eq!(bus::message(&mut stream), "< ok >");
+        assert_eq!(crate::bus::message(&mut stream), "< ok >");
         ready.send(()).unwrap();
         // Reads 1008h.
         while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
@@ -313,9 +311,9 @@ fn frames_of_others_are_passed_over() {
     let address = nodes.address().to_owned();
     let noise = std::thread::spawn(move || {
         let mut stream = TcpStream::connect(address).unwrap();
-        assert_eq!(bus::message(&mut stream), "< hi >");
+        assert_eq!(crate::bus::message(&mut stream), "< hi >");
         stream.write_all(b"< open can0 >").unwrap();
-        assert_eq!(bus::message(&mut stream), "< ok >");
+        assert_eq!(crate::bus::message(&mut stream), "< ok >");
         // Answers of node 6; an SDO frame that is too short; a heartbeat of five bytes; a 29-bit
         // frame with an answer's number; PDOs.
         let frames = b"< send 586 8 60 50 1F 1 0 0 0 0 >< send 586 8 80 50 1F 1 0 0 0 8 >< send 585 3 60 50 1F >\

@@ -1,12 +1,10 @@
 //! The conformance checks against `coboot-node`, alone and with faults between it and the bus.
 
-mod bus;
-
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use bus::{Folder, Nodes};
+use crate::bus::{Folder, Nodes};
 use canopen::{CobId, Frame, NodeId};
 use coflash::bus::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Check, Means, Outcome};

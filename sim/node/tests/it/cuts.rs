@@ -1,8 +1,6 @@
 //! An update that is cut at a random point goes on where it stopped: `coflash` as a library against
 //! `boot-core` with the real SDO server, in virtual time.
 
-mod cut;
-
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -16,7 +14,7 @@ use coflash::update::event::{Phase, Warning};
 use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Error;
 
-use cut::{CutBus, Way};
+use crate::cut::{CutBus, Way};
 use kit::bench::{block, block_file, crc32, program, LAYOUT, PROGRAM};
 use kit::model::{quiet_power_cuts, Cut, ModelFlash, CHIP};
 use kit::random::Random;

@@ -1,14 +1,12 @@
 //! `coboot-node` as its users run it: over real sockets, with `coflash` as the host, and with the
 //! file read from outside.
 
-mod bus;
-
 use std::fs;
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::time::Duration;
 
-use bus::{node, Coflash, Folder, Nodes, FLASH, VECTORS};
+use crate::bus::{node, Coflash, Folder, Nodes, FLASH, VECTORS};
 
 fn program() -> Vec<u8> {
     let mut bytes: Vec<u8> = (0..300 * 1024_u32).map(|i| (i * 7 + (i >> 8) * 13) as u8).collect();
@@ -380,15 +378,15 @@ fn clients_that_misbehave_harm_nobody() {
     let mut stream = connect();
     for message in ["rawmode", "send 605 0", "open can1", "fly", "\u{fffd}", ""] {
         stream.write_all(format!("< {message} >").as_bytes()).unwrap();
-        let said = bus::message(&mut stream);
+        let said = crate::bus::message(&mut stream);
         assert!(said.starts_with("< error "), "{message}: {said}");
     }
     stream.write_all(b"< open can0 >").unwrap();
-    assert_eq!(bus::message(&mut stream), "< ok >");
+    assert_eq!(crate::bus::message(&mut stream), "< ok >");
     for message in ["send 605", "send 605 2 1", "send 800 0", "sendrtr 605 0", "send 605 8 1 2 3 4 5 6 7 800"]
     {
         stream.write_all(format!("< {message} >").as_bytes()).unwrap();
-        let said = bus::message(&mut stream);
+        let said = crate::bus::message(&mut stream);
         assert!(said.starts_with("< error "), "{message}: {said}");
     }
     // A client that never reads (heartbeats every 1 ms fill its buffers) does not block the others.
@@ -410,14 +408,14 @@ fn an_abandoned_download_locks_nobody_out() {
     stream.set_nodelay(true).unwrap();
     let say =
         |stream: &mut TcpStream, text: &str| stream.write_all(format!("< {text} >").as_bytes()).unwrap();
-    assert_eq!(bus::message(&mut stream), "< hi >");
+    assert_eq!(crate::bus::message(&mut stream), "< hi >");
     for mode in ["open can0", "rawmode"] {
         say(&mut stream, mode);
-        assert_eq!(bus::message(&mut stream), "< ok >");
+        assert_eq!(crate::bus::message(&mut stream), "< ok >");
     }
     // The next frame of the device, as identifier and data.
     let heard = |stream: &mut TcpStream| {
-        let message = bus::message(stream);
+        let message = crate::bus::message(stream);
         let words: Vec<&str> = message.split_whitespace().collect();
         format!("{}#{}", words[2], words[4])
     };

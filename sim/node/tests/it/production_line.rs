@@ -1,10 +1,6 @@
 //! coflash's example of a production line, against a node over a real socket.
 
-mod bus;
-#[path = "../../../coflash/examples/production_line.rs"]
-mod production_line;
-
-use bus::{Folder, Nodes};
+use crate::bus::{self, Folder, Nodes};
 use coflash::file::{ihex, read, Firmware, Format};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -21,13 +17,11 @@ fn program() -> String {
 }
 
 /// Runs the station; returns its exit code and its lines.
-fn station(url: &str, folder: &Folder, words: &[&str]) -> (u8, Vec<Value>) {
+fn station(url: &str, folder: &Folder, words: &[&str]) -> (i32, Vec<Value>) {
     let file = folder.path("program.hex").display().to_string();
-    let arguments = [&[url, LAYOUT.board, file.as_str()], words].concat();
-    let arguments: Vec<String> = arguments.into_iter().map(String::from).collect();
-    let mut lines = Vec::new();
-    let exit = production_line::run(&arguments, &mut |line| lines.push(line));
-    (exit, lines)
+    let done = bus::station(folder, &[&[url, LAYOUT.board, file.as_str()], words].concat());
+    let line = |line| serde_json::from_str(line).unwrap_or_else(|error| panic!("{error}: {line}"));
+    (done.exit, done.out.lines().map(line).collect())
 }
 
 #[test]

@@ -1,12 +1,10 @@
 //! Typical work of a service technician, or of a program around `coflash`: single objects, network
 //! management, events, logs and reports, against nodes over a real socket.
 
-mod bus;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use bus::{Coflash, Folder, Nodes, FLASH, VECTORS};
+use crate::bus::{Coflash, Folder, Nodes, FLASH, VECTORS};
 use serde_json::Value;
 
 fn program() -> Vec<u8> {
