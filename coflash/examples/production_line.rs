@@ -30,7 +30,7 @@ use serde_json::json;
 
 /// Why the station has produced no good device.
 #[derive(Debug)]
-pub enum Stop {
+enum Stop {
     /// The station is set up wrong.
     Station(String),
     /// The device is defective, or the bus to it.
@@ -48,7 +48,7 @@ impl From<Error> for Stop {
 
 /// The task of the station.
 #[derive(Debug)]
-pub struct Order {
+struct Order {
     bus: String,
     node: NodeId,
     /// Whether the device must get its node-ID first.
@@ -106,7 +106,7 @@ impl Order {
 }
 
 /// Carries out the task; returns the exit code.
-pub fn run(arguments: &[String], tell: &mut dyn FnMut(serde_json::Value)) -> u8 {
+fn run(arguments: &[String], tell: &mut dyn FnMut(serde_json::Value)) -> u8 {
     match Order::new(arguments).and_then(|order| order.carry_out(tell)) {
         Ok(()) => 0,
         Err(Stop::Station(what)) => {
@@ -120,7 +120,6 @@ pub fn run(arguments: &[String], tell: &mut dyn FnMut(serde_json::Value)) -> u8 
     }
 }
 
-#[allow(dead_code)] // A test runs the station without it.
 fn main() -> ExitCode {
     let arguments: Vec<String> = env::args().skip(1).collect();
     ExitCode::from(run(&arguments, &mut |line| println!("{line}")))

@@ -43,6 +43,24 @@ impl Folder {
         fs::write(&path, bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
         path
     }
+
+    /// Writes a file in it; returns its path as an argument of a command.
+    ///
+    /// # Panics
+    /// When it cannot be written.
+    pub fn file(&self, name: &str, bytes: &[u8]) -> String {
+        self.write(name, bytes);
+        self.path(name)
+    }
+
+    /// The path of a file in it, as an argument of a command.
+    ///
+    /// # Panics
+    /// When the path is not UTF-8.
+    #[must_use]
+    pub fn path(&self, name: &str) -> String {
+        self.0.join(name).to_str().expect("a path in UTF-8").to_owned()
+    }
 }
 
 impl Deref for Folder {

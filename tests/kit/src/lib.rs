@@ -7,6 +7,7 @@
 //! | [`folder`](mod@folder) | a folder of a test's own |
 //! | [`ihex`] | Intel HEX as tools write it |
 //! | [`pages`] | the commands on the pages of the documentation |
+//! | [`hawkbit`] | feature `hawkbit`: a hawkBit server with faults |
 //! | [`bus`] | feature `bus`: a CANopen device with a domain, and frames to it and from it |
 //! | [`memory`] | feature `debugger`: a device with the debugger interface, and its memory |
 //! | [`model`] | feature `boot`: a strict flash that loses power on demand |
@@ -23,6 +24,9 @@ pub mod boot;
 #[allow(missing_docs, reason = "names say it")]
 pub mod bus;
 pub mod folder;
+#[cfg(feature = "hawkbit")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod hawkbit;
 pub mod ihex;
 #[cfg(feature = "debugger")]
 #[allow(missing_docs, reason = "names say it")]

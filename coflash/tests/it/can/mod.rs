@@ -1,0 +1,4 @@
+//! Adapters and frames.
+
+mod decode;
+mod gateway;

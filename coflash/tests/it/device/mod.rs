@@ -1,0 +1,3 @@
+//! Sessions with a device.
+
+mod lss;

@@ -1,0 +1,5 @@
+//! Files: reading, conversion, sealed images.
+
+mod bad_input;
+mod convert;
+mod sealed;

@@ -1,0 +1,10 @@
+//! The update procedure against fake devices, in virtual time.
+
+mod admission;
+mod aftermath;
+mod dialects;
+mod events;
+mod many;
+mod mastership;
+mod procedure;
+mod search;

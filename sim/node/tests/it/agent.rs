@@ -1,0 +1,208 @@
+//! coflash's agent from end to end: a server, the agent, and nodes on a bus, each over a real
+//! socket.
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::Duration;
+
+use crate::bus::{Coflash, Folder, Nodes, VECTORS};
+use coflash::agent::{run, Buses, Config, Ended, Options, Said, Times};
+use coflash::bus::Link;
+use kit::hawkbit::{Action, File, Server};
+
+const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];
+
+/// A program with this byte in it, as a raw image.
+fn program(byte: u8) -> Vec<u8> {
+    let mut bytes = vec![byte; 40 * 1024];
+    bytes[..8].copy_from_slice(&VECTORS);
+    bytes
+}
+
+fn file(byte: u8) -> File {
+    File::new("program.bin", &program(byte))
+}
+
+/// The configuration for these devices on a bus: nodes 5, 6 and 7.
+fn config(server: &Server, bus: &str, folder: &Folder, ids: &[&str]) -> Config {
+    let mut text =
+        format!("bus = '{bus}'\nboard = 'stm32f407g-disc1'\ngateway-token-file = 'token'\npoll-least = 1\n");
+    folder.write("token", b"g\n");
+    for (number, id) in ids.iter().enumerate() {
+        text += &format!("[[device]]\ncontroller-id = '{id}'\nnode = {}\n", number + 5);
+    }
+    let path = folder.path("agent.toml");
+    Config::parse(&text, path.parent().unwrap_or(Path::new("")), Some(&server.url), None).unwrap()
+}
+
+fn options() -> Options {
+    let ms = Duration::from_millis;
+    Options::default()
+        .once(true)
+        .times(Times::default().backoff_first(ms(50)).backoff_most(ms(200)).tell(ms(1)))
+}
+
+fn serve(config: &Config, options: &Options) -> (Ended, String) {
+    let said = Mutex::new(String::new());
+    let tell = |message: &Said| {
+        *said.lock().unwrap() += &format!("{}: {}\n", message.controller, message.text);
+    };
+    let open = |url: &str| Link::open(url, None).map_err(|error| error.to_string());
+    let buses = Buses::new(&open, options.cancelled.clone());
+    let ended = run(config, options, &buses, &tell).unwrap();
+    (ended, said.into_inner().unwrap())
+}
+
+fn crc(coflash: &Coflash<'_>, node: &str) -> String {
+    coflash.json(&["read", "1F56/1", "-N", node])["hex"].as_str().unwrap().to_string()
+}
+
+#[test]
+fn two_devices_are_updated_and_the_third_ones_silence_is_told() {
+    let folder = Folder::below("agent");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "2", "--flash", "instant", "--stand-in"]);
+    let server = Server::start(&IDS);
+    for (number, id) in IDS.iter().enumerate() {
+        server.assign(id, Action::new(number as u64 + 1, &file(0xA5)));
+    }
+    let (ended, said) = serve(&config(&server, nodes.url(), &folder, &IDS), &options());
+    assert_eq!((ended.updated, ended.failed, ended.unserved), (2, 1, 0), "{said}");
+    for id in &IDS[..2] {
+        let action = server.action(id);
+        assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
+        assert!(action.details("proceeding").contains("erase the old program"), "{action:?}");
+        assert!(action.details("closed").contains("done in"), "{action:?}");
+        assert_eq!(server.state().targets[*id].attributes["program_1_crc"].as_str().unwrap().len(), 9);
+    }
+    let action = server.action(IDS[2]);
+    assert_eq!(action.result.as_deref(), Some("failure"));
+    let details = action.details("closed");
+    assert!(
+        details.contains("node 7 does not answer") && details.contains("it was not changed"),
+        "{details}"
+    );
+    assert!(details.contains("what to do: "), "{details}");
+    // What is in the flash is the file, byte for byte.
+    for serial in ["1.flash", "2.flash"] {
+        let flash = folder.read(serial);
+        assert!(flash[0x1_0000..0x1_0000 + 40 * 1024] == program(0xA5), "{serial}");
+    }
+}
+
+#[test]
+fn nothing_is_started_that_was_not_verified() {
+    let folder = Folder::below("agent-lies");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
+    let server = Server::start(&IDS);
+    let mut altered = file(0xA5);
+    altered.content[5000] ^= 1;
+    let longer = File { content: [program(0xA5), vec![0]].concat(), ..file(0xA5) };
+    // It is a file, and it cannot be a program.
+    let zeros = File::new("program.bin", &[0; 4096]);
+    for (number, (id, file)) in IDS.iter().zip([altered, longer, zeros]).enumerate() {
+        server.assign(id, Action::new(number as u64 + 1, &file));
+    }
+    let (ended, said) = serve(&config(&server, nodes.url(), &folder, &IDS), &options());
+    assert_eq!((ended.updated, ended.failed), (0, 3), "{said}");
+    let coflash = Coflash::new(&folder, &nodes);
+    for (node, serial) in [("5", "1.flash"), ("6", "2.flash"), ("7", "3.flash")] {
+        assert!(folder.read(serial) == vec![0xFF; 1 << 20], "{serial} was changed");
+        assert_eq!(crc(&coflash, node), "00000000");
+    }
+    for (id, words) in IDS.iter().zip(["SHA-256", "has announced", "what to do"]) {
+        let action = server.action(id);
+        assert!(action.details("closed").contains(words), "{action:?}");
+    }
+}
+
+/// The agent is ended in the middle of an update, when the device has no program.
+#[test]
+fn an_agent_that_was_ended_goes_on() {
+    let folder = Folder::below("agent-restart");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "typical", "--stand-in"]);
+    let server = Server::start(&IDS);
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let endless = options().once(false).cancelled(cancelled.clone());
+    thread::scope(|scope| {
+        let agent = scope.spawn(|| serve(&config, &endless));
+        let begun = |state: &kit::hawkbit::State| {
+            state.targets[IDS[0]].action.as_ref().is_some_and(|action| !action.progress.is_empty())
+        };
+        server.wait("progress", begun);
+        cancelled.store(true, Ordering::Relaxed);
+        agent.join().unwrap();
+    });
+    assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
+    let (ended, said) = serve(&config, &options());
+    assert_eq!(ended.updated, 1, "{said}");
+    let action = server.action(IDS[0]);
+    assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
+    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
+    assert!(folder.read("1.flash")[0x1_0000..0x1_0000 + 40 * 1024] == program(0xA5));
+}
+
+/// The agent died between the end of the update and the report: its state is that of a moment
+/// before. A device that runs the program is not flashed again.
+#[test]
+fn a_device_that_has_kept_the_program_is_not_flashed_again() {
+    let folder = Folder::below("agent-kept");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let server = Server::start(&IDS);
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    assert_eq!(serve(&config, &options()).0.updated, 1);
+    let state = std::fs::read_dir(folder.path("agent-state")).unwrap().flatten().map(|entry| entry.path());
+    let record = state.into_iter().find(|path| {
+        path.to_string_lossy().contains("door-1-") && path.extension().is_some_and(|end| end == "json")
+    });
+    let record = record.unwrap();
+    let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
+    for (kept, byte, starts) in [(true, 0xA5, 0), (false, 0xA5, 1), (true, 0x5A, 1)] {
+        value["ended"] = serde_json::json!([]);
+        value["begun"] = serde_json::json!({ "action": "1", "kept": kept });
+        std::fs::write(&record, value.to_string()).unwrap();
+        server.assign(IDS[0], Action::new(1, &file(byte)));
+        let (ended, said) = serve(&config, &options());
+        assert_eq!(ended.updated, 1, "{said}");
+        let erased = said.matches("erase the old program").count();
+        assert_eq!(erased, starts, "{kept} {byte:X}: {said}");
+        assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
+        assert!(folder.read("1.flash")[0x1_0100] == byte);
+    }
+}
+
+#[test]
+fn a_bus_that_is_not_there_is_waited_for() {
+    let folder = Folder::below("agent-bus");
+    let server = Server::start(&IDS);
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    // A port that nobody serves.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let url = format!("socketcand://127.0.0.1:{port}/can0");
+    let config = config(&server, &url, &folder, &IDS[..1]);
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let endless = options().once(false).cancelled(cancelled.clone());
+    thread::scope(|scope| {
+        let agent = scope.spawn(|| serve(&config, &endless));
+        let waits = |state: &kit::hawkbit::State| {
+            let action = state.targets[IDS[0]].action.as_ref();
+            action.is_some_and(|action| action.details("proceeding").contains("the update waits"))
+        };
+        server.wait("a message", waits);
+        let listen = format!("127.0.0.1:{port}");
+        let arguments = ["--listen", &listen, "--node", "5", "--flash", "instant", "--stand-in"];
+        let node = crate::bus::node(&folder, &arguments);
+        let ended = |state: &kit::hawkbit::State| {
+            state.targets[IDS[0]].action.as_ref().is_some_and(|action| action.result.is_some())
+        };
+        server.wait("the end", ended);
+        cancelled.store(true, Ordering::Relaxed);
+        agent.join().unwrap();
+        drop(node);
+    });
+    assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
+}

@@ -1,0 +1,407 @@
+//! Every command of `coflash` that talks to a device, against nodes over a real socket. (`nodes.rs`
+//! uses some commands itself; `convert`, `inspect`, `completions` and `man` talk to no device.)
+
+use std::io::Write;
+use std::net::TcpStream;
+use std::process::Command;
+use std::sync::mpsc::RecvTimeoutError;
+use std::time::Duration;
+
+use crate::bus::{Coflash, Folder, Nodes};
+use serde_json::{json, Value};
+
+/// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
+/// inside, Thumb bit set.
+fn program(first: u8) -> Vec<u8> {
+    let mut bytes = vec![first; 200 * 1024];
+    bytes[..8].copy_from_slice(&crate::bus::VECTORS);
+    bytes
+}
+
+const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
+
+fn folder(test: &str) -> Folder {
+    let folder = Folder::below(test);
+    folder.write("program.bin", &program(0xA5));
+    folder
+}
+
+/// Bytes of the program's region that are not erased.
+fn rest(folder: &Folder) -> usize {
+    folder.read("1.flash")[0x1_0000..].iter().filter(|byte| **byte != 0xFF).count()
+}
+
+#[test]
+fn the_steps_of_an_update_one_by_one() {
+    let folder = folder("steps");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let on = |words: &[&str]| coflash.done(&[words, &["-N", "5"]].concat());
+    // No program yet: the manual's "no valid program" (1F57h = 02h), with coflash's number.
+    let refused = coflash.run(&["start", "-N", "5"]);
+    assert_eq!(refused.exit, 7, "{}", refused.err);
+    assert!(refused.err.contains("60000014"), "{}", refused.err);
+    on(FLASH);
+    assert!(on(&["status"]).contains("running"));
+    assert_eq!(on(&["enter"]), "node 5: the bootloader is running\n");
+    assert_eq!(on(&["enter"]), "node 5: the bootloader is running already\n");
+    assert!(on(&["withdraw"]).contains("no longer released for autostart"));
+    // START is then a trial, and after the next reset the device stays in the bootloader.
+    assert!(on(&["start"]).contains("an application"));
+    nodes.await_line("serial 1, node 5: would start program 1, on trial");
+    on(&["reset"]);
+    nodes.await_line("serial 1, node 5: bootloader (Unsigned)");
+    assert_eq!(
+        on(&["release"]),
+        "node 5: program 1 is released for autostart: it starts by itself after a reset\n"
+    );
+    assert!(on(&["start"]).contains("an application"));
+    // The application is called back before the erase; then nothing is left of it.
+    assert!(rest(&folder) > 190 * 1024);
+    assert!(on(&["erase"]).starts_with("node 5: program 1 is erased, in "));
+    assert_eq!(rest(&folder), 0, "erased, not only marked");
+    let status = coflash.json(&["status", "-N", "5"]);
+    assert_eq!((&status["crc"], &status["bootloader"]), (&json!(0), &json!(true)));
+    let refused = coflash.run(&["release", "-N", "5"]);
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert_ne!(coflash.json(&["status", "-N", "5"])["status"]["error"], Value::Null);
+    assert_eq!(coflash.json(&["status", "--clear", "-N", "5"])["status"]["error"], Value::Null);
+    assert_eq!(on(&["reset"]), "back on the bus: node 5\n");
+}
+
+/// The erase of a program on flash with realistic times.
+#[test]
+fn erasing_waits_for_the_flash() {
+    let folder = folder("erase");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--board", "stm32f407g-disc1-two"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let two = ["-I", "binary", "--board", "stm32f407g-disc1-two", "-N", "5"];
+    coflash.done(&[&["flash", "program.bin", "--no-start"][..], &two].concat());
+    let erased = coflash.json(&["erase", "-N", "5"]);
+    assert_eq!(rest(&folder), 0);
+    // 200 KiB lie in sectors 4 to 6: 550 ms and two times a second, by the datasheet.
+    assert!(erased["seconds"].as_f64().unwrap() >= 2.55, "{erased}");
+}
+
+/// If a device refuses a read, the message contains the abort code (06010001h: the object is
+/// write-only) in words.
+#[test]
+fn the_program_cannot_be_read_back() {
+    let folder = folder("read");
+    let nodes = Nodes::start(&folder, &["--node", "5"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "-o", "back.bin"]);
+    assert_eq!(refused.exit, 6);
+    assert!(refused.err.contains("node 5 refuses reading 1F50h/1: abort 06010001h"), "{}", refused.err);
+    assert!(!folder.path("back.bin").exists());
+}
+
+#[test]
+fn an_update_in_all_its_ways() {
+    let folder = folder("ways");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let board = ["--board", "stm32f407g-disc1"];
+    let region = ["--start-address", "0x08010000", "--end-address", "0x0801FFFF"];
+    let ways: [(&[&str], &[&str]); 6] = [
+        (&board, &["--segmented", "--no-start"]),
+        (&board, &["--no-trial", "--verify", "--check-target"]),
+        // The spellings of the manual's tools.
+        (
+            &board,
+            &["--prog_no", "1", "--chk_run", "--sdo_timeout", "1000", "--repeats", "5", "--delay", "50"],
+        ),
+        (&board, &["--block-size", "0x4000", "--block-repeats", "2"]),
+        (&board, &["--chk_tgt", "1", "--timeout", "700", "--verify"]),
+        (&region, &["--block-size", "64"]),
+    ];
+    for (number, (place, way)) in (1..).zip(ways) {
+        folder.write("program.bin", &program(number));
+        let update = ["flash", "program.bin", "-I", "binary", "--vid", "0", "--pid", "0", "-N", "5"];
+        coflash.done(&[&update[..], place, way].concat());
+        let file = folder.read("1.flash");
+        assert_eq!(file[0x1_0000..0x1_1000], program(number)[..0x1000], "{way:?}");
+    }
+    // The last one was cut off at the given address.
+    assert!(folder.read("1.flash")[0x2_0000..].iter().all(|byte| *byte != 6));
+}
+
+#[test]
+fn a_job_file_serves_its_devices_and_reports() {
+    let folder = folder("job");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&["convert", "program.bin", "program.blk", "-I", "binary", "--board", "stm32f407g-disc1"]);
+    folder.write(
+        "job.toml",
+        b"image = 'program.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nstart = false\n\
+          [[device]]\nlss = { vendor = 0, product = 0, revision = 0x10000, serial = 3 }\nnode = 20\nstart = false\n\
+          [[device]]\nnode = 99\n",
+    );
+    let words = ["flash", "--job", "job.toml", "--report", "report.json", "--sdo-timeout", "200"];
+    let done = coflash.run(&words);
+    assert_eq!(done.exit, 8, "one is not there: {}{}", done.out, done.err);
+    let report: Value = serde_json::from_slice(&folder.read("report.json")).unwrap();
+    let of = |node: u8| {
+        let devices = report["devices"].as_array().unwrap();
+        devices.iter().find(|device| device["node"] == node).unwrap_or_else(|| panic!("{report}"))
+    };
+    for node in [5, 6, 20] {
+        assert!(of(node)["error"].is_null(), "{report}");
+    }
+    assert!(!of(99)["error"].is_null(), "{report}");
+    for serial in [1, 2, 3] {
+        assert_eq!(folder.read(&format!("{serial}.flash"))[0x1_0000..0x1_1000], program(0xA5)[..0x1000]);
+    }
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "5"])["number"], 1);
+    assert_eq!(coflash.json(&["read", "1F51/1", "-N", "6"])["number"], 0);
+}
+
+#[test]
+fn scan_monitor_and_shell_hear_the_nodes() {
+    let folder = folder("hear");
+    let nodes =
+        Nodes::start(&folder, &["--node", "5", "--count", "2", "--heartbeat", "50", "--flash", "instant"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let scan = coflash.json(&["scan", "--listen-only", "--listen", "500"]);
+    let found: Vec<&Value> = scan["nodes"].as_array().unwrap().iter().map(|node| &node["node"]).collect();
+    assert_eq!(found, [5, 6]);
+    let said = coflash.done(&["monitor", "--count", "3", "-N", "6"]);
+    assert_eq!(said.lines().count(), 3, "{said}");
+    assert!(said.lines().all(|line| line.contains("node 6: heartbeat, pre-operational")), "{said}");
+    let said = coflash.typed(&["shell"], "info -N 5\nread 1018/4 -N 6\nnonsense\nreset -N 5\n");
+    assert_eq!(said.exit, 2, "typed by a script, the first that fails is the last: {}", said.err);
+    assert!(said.out.contains("serial number     00000001h"), "{}{}", said.out, said.err);
+    assert!(said.out.contains("node 6, 1018h/4: 2 (00000002h)"), "{}{}", said.out, said.err);
+    // Traffic of the bus, recorded and shown again.
+    coflash.done(&["read", "1018/4", "-N", "6", "--trace", "bus.log"]);
+    let said = coflash.done(&["monitor", "--replay", "bus.log"]);
+    assert!(said.contains("to node 6: read 1018h/4 (serial number)"), "{said}");
+}
+
+/// Ctrl-C at any point of the update; the same command again, at once, completes it.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_update_is_started_again_at_once() {
+    let folder = folder("interrupt");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let update = [FLASH, &["-N", "5", "-v"]].concat();
+    // At the beginning, while blocks are written and sectors erased, and near the end.
+    for (version, until) in (1..).zip(["erase the old program", "10 %", "40 %", "90 %"]) {
+        folder.write("program.bin", &program(version));
+        let running = coflash.spawn(&update);
+        running.await_text(until);
+        let interrupted = Command::new("kill").args(["-INT", &running.id().to_string()]).status().unwrap();
+        assert!(interrupted.success());
+        let done = running.wait();
+        assert_eq!(done.exit, 130, "{until}: {}{}", done.out, done.err);
+        assert!(done.err.contains("run the same command again"), "{}", done.err);
+        coflash.done(&update);
+        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(version), "{until}");
+    }
+}
+
+#[test]
+fn no_bus_no_node_no_sense() {
+    let folder = folder("nobody");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    // Each command talks to its own node: an update notices other clients of its node.
+    let quick =
+        |number: usize| ["--sdo-timeout".to_string(), "50".into(), "-N".into(), (9 + number).to_string()];
+    let commands: [&[&str]; 8] =
+        [&["info"], &["status"], &["start"], &["enter"], &["erase"], &["release"], &["withdraw"], FLASH];
+    let running = commands.iter().enumerate().map(|(number, command)| {
+        let quick = quick(number);
+        coflash.spawn(&[command, &quick.each_ref().map(String::as_str)[..]].concat())
+    });
+    let running: Vec<_> = running.collect();
+    for (number, (running, command)) in running.into_iter().zip(commands).enumerate() {
+        let done = running.wait();
+        assert_eq!(done.exit, 5, "{command:?}: {}{}", done.out, done.err);
+        assert!(done.err.contains(&format!("node {} does not answer", 9 + number)), "{}", done.err);
+    }
+    let done = coflash.run(&["info", "-N", "5", "--bus", "socketcand://127.0.0.1:1/can0"]);
+    assert_eq!(done.exit, 4, "{}", done.err);
+    let elsewhere = format!("socketcand://{}/can7", nodes.address());
+    let done = coflash.run(&["info", "-N", "5", "--bus", &elsewhere]);
+    assert_eq!(done.exit, 4, "{}", done.err);
+    assert!(done.err.contains("the only bus is can0"), "{}", done.err);
+    // A program number that the device does not have.
+    let done = coflash.run(&[FLASH, &["-P", "1", "-N", "5", "--no-start"]].concat());
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let done = coflash.run(&["start", "-N", "5", "-P", "2"]);
+    assert_eq!(done.exit, 7, "{}{}", done.out, done.err);
+}
+
+/// Two hosts talk to one node: the second one notices before it changes anything, by the lock of
+/// the first or by its requests, and the first one completes.
+#[test]
+fn a_second_host_on_the_same_node_leaves_it_alone() {
+    let folder = folder("two-hosts");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let elsewhere = folder.path("elsewhere");
+    std::fs::create_dir_all(&elsewhere).unwrap();
+    let update = [FLASH, &["-N", "5", "-v", "--command-timeout", "5000"]].concat();
+    for (round, locks) in [(1, None), (2, Some(&elsewhere))] {
+        folder.write("program.bin", &program(round));
+        let first = coflash.spawn(&update);
+        first.await_text("10 %");
+        let second = match locks {
+            None => coflash.spawn(&update),
+            Some(locks) => coflash.spawn_at(&update, locks),
+        };
+        let done = second.wait();
+        assert_eq!(done.exit, 6, "{}{}", done.out, done.err);
+        let how = if locks.is_none() {
+            "another coflash on this computer, process "
+        } else {
+            "another tool is using"
+        };
+        assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
+        assert!(!done.out.contains("erase"), "{}", done.out);
+        let done = first.wait();
+        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(round));
+    }
+    // A process that has ended holds no lock.
+    coflash.done(&update);
+}
+
+/// Requests of another client on the same bus.
+#[test]
+fn a_client_that_asks_the_node_keeps_an_update_from_beginning() {
+    let folder = folder("two-clients");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let (stop, stopped) = std::sync::mpsc::channel::<()>();
+    let (ready, is_ready) = std::sync::mpsc::channel();
+    let address = nodes.address().to_owned();
+    let asks = std::thread::spawn(move || {
+        let mut stream = TcpStream::connect(address).unwrap();
+        assert_eq!(crate::bus::message(&mut stream), "< hi >");
+        stream.write_all(b"< open can0 >").unwrap();
+        assert_eq!(crate::bus::message(&mut stream), "< ok >");
+        ready.send(()).unwrap();
+        // Reads 1008h.
+        while stopped.recv_timeout(Duration::from_millis(50)) == Err(RecvTimeoutError::Timeout) {
+            stream.write_all(b"< send 605 8 40 8 10 0 0 0 0 0 >").unwrap();
+        }
+    });
+    is_ready.recv().unwrap();
+    let refused = coflash.run(&[FLASH, &["-N", "5"]].concat());
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert!(refused.err.contains("another tool is using node 5"), "{}", refused.err);
+    assert!(!refused.out.contains("erase"), "{}", refused.out);
+    drop(stop);
+    asks.join().unwrap();
+    coflash.done(&[FLASH, &["-N", "5"]].concat());
+}
+
+/// Another client fills the bus, also with frames that look like answers of other nodes, and with
+/// invalid ones.
+#[test]
+fn frames_of_others_are_passed_over() {
+    let folder = folder("noise");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let (stop, stopped) = std::sync::mpsc::channel::<()>();
+    let address = nodes.address().to_owned();
+    let noise = std::thread::spawn(move || {
+        let mut stream = TcpStream::connect(address).unwrap();
+        assert_eq!(crate::bus::message(&mut stream), "< hi >");
+        stream.write_all(b"< open can0 >").unwrap();
+        assert_eq!(crate::bus::message(&mut stream), "< ok >");
+        // Answers of node 6; an SDO frame that is too short; a heartbeat of five bytes; a 29-bit
+        // frame with an answer's number; PDOs.
+        let frames = b"< send 586 8 60 50 1F 1 0 0 0 0 >< send 586 8 80 50 1F 1 0 0 0 8 >< send 585 3 60 50 1F >\
+                       < send 705 5 0 0 0 0 0 >< send 00000585 8 80 50 1F 1 0 0 0 8 >< send 185 8 1 2 3 4 5 6 7 8 >";
+        let mut rounds = 0;
+        while stopped.recv_timeout(Duration::from_millis(1)) == Err(RecvTimeoutError::Timeout) {
+            stream.write_all(frames).unwrap();
+            rounds += 1;
+        }
+        rounds
+    });
+    coflash.done(&[FLASH, &["-N", "5", "--verify"]].concat());
+    drop(stop);
+    assert!(noise.join().unwrap() > 10);
+    assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
+}
+
+/// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash names
+/// the dialect.
+#[test]
+fn dialects_are_found_out_or_named() {
+    let folder = folder("dialects");
+    let stand_in = ["--node", "5", "--flash", "instant", "--stand-in"];
+    {
+        let nodes = Nodes::start(&folder, &stand_in);
+        let coflash = Coflash::new(&folder, &nodes);
+        assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "block");
+        for dialect in ["raw", "hex"] {
+            let done = coflash.json(&[FLASH, &["-N", "5", "--dialect", dialect, "--verify"]].concat());
+            assert_eq!(done["dialect"], dialect);
+            assert_eq!(done["running"], 0, "{done}");
+        }
+        assert_eq!(folder.read("1.flash")[0x1_0000..][..200 * 1024], program(0xA5));
+    }
+    let nodes =
+        Nodes::start(&folder, &[&stand_in[..], &["--serial", "2", "--profile", "esacademy"]].concat());
+    let coflash = Coflash::new(&folder, &nodes);
+    assert_eq!(coflash.json(&["info", "-N", "5"])["dialect"], "esacademy");
+    let refused = coflash.run(&[FLASH, &["-N", "5", "--unlock", "OPEN"]].concat());
+    assert_eq!(refused.exit, 6, "{}", refused.err);
+    assert!(
+        refused.err.contains("password") && refused.err.contains("it was not changed"),
+        "{}",
+        refused.err
+    );
+    // It accepts none for half a second.
+    std::thread::sleep(Duration::from_millis(700));
+    let done = coflash.json(&[FLASH, &["-N", "5", "--unlock", "INIT"]].concat());
+    assert_eq!((&done["dialect"], &done["running"]), (&json!("esacademy"), &json!(0)));
+    // The password would erase the program that is to be read.
+    let refused = coflash.run(&["read", "1F50/1", "-N", "5", "--dialect", "esacademy", "--unlock", "INIT"]);
+    assert_eq!(refused.exit, 2, "{}", refused.err);
+}
+
+/// The program with the label that a lift needs, for vendor-ID and product code 0. Its check word
+/// is the fold of the seven words before, implemented again here.
+fn labelled() -> Vec<u8> {
+    let mut words = [0_u32; 7];
+    words[0] = u32::from_le_bytes(*b"CBL1");
+    let fold = words
+        .iter()
+        .fold(0xC0B0_07A5_u32, |fold, word| (fold.rotate_left(5) ^ word).wrapping_mul(0x9E37_79B1));
+    let mut image = program(0xA5);
+    for (place, word) in image[0x1E0..0x200].chunks_mut(4).zip(words.into_iter().chain([!fold])) {
+        place.copy_from_slice(&word.to_le_bytes());
+    }
+    image
+}
+
+/// The bootloader of a lift always has the same node-ID; its program can be saved.
+#[test]
+fn a_lift_is_updated_and_saved() {
+    let folder = folder("lift");
+    let two = ["--board", "stm32f407g-disc1-two"];
+    let options = ["--node", "5", "--flash", "instant", "--stand-in", "--stay", "--profile", "lift"];
+    let nodes = Nodes::start(&folder, &[&options[..], &two].concat());
+    let coflash = Coflash::new(&folder, &nodes);
+    let on = ["-N", "126", "--unlock", "coboot"];
+    assert_eq!(coflash.json(&["info", "-N", "126"])["dialect"], "lift");
+    let locked = coflash.run(&["read", "1F50/1", "-N", "126"]);
+    assert_eq!(locked.exit, 6, "{}", locked.err);
+    let without = coflash.run(&[&["flash", "program.bin", "-I", "binary", "-N", "126"][..], &two].concat());
+    assert_eq!(without.exit, 2, "{}", without.err);
+    assert!(without.err.contains("--unlock"), "{}", without.err);
+    let image = labelled();
+    folder.write("lift.bin", &image);
+    let flash = ["flash", "lift.bin", "-I", "binary", "--no-start"];
+    assert_eq!(coflash.json(&[&flash[..], &two, &on].concat())["dialect"], "lift");
+    coflash.done(&[&["read", "1F50/1", "-o", "saved.bin"][..], &on].concat());
+    assert_eq!(folder.read("saved.bin"), image);
+}

@@ -1,0 +1,13 @@
+//! Nodes as their users run them, with the host tool and its library; and the update in virtual time
+//! with cuts.
+
+mod agent;
+mod bus;
+mod commands;
+mod conform;
+mod cut;
+mod cuts;
+mod nodes;
+mod pages;
+mod production_line;
+mod service;
