@@ -1,6 +1,5 @@
 //! A thread for each device, which joins the state machine, the server and the bus.
 
-use std::fmt;
 use std::fs::{self, File, TryLockError};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -125,16 +124,9 @@ pub struct Ended {
 }
 
 /// The reason why an agent cannot start, in words.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
 pub struct CannotStart(String);
-
-impl fmt::Display for CannotStart {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for CannotStart {}
 
 /// How long a thread sleeps before it looks whether the run is to end.
 const TICK: Duration = Duration::from_millis(200);
@@ -171,7 +163,7 @@ pub fn run(
     tell: &(dyn Fn(&Said) + Sync),
 ) -> Result<Ended, CannotStart> {
     let folder = &config.state;
-    let unusable = |error: &dyn fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
+    let unusable = |error: &dyn std::fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
     let store = Store::new(folder).map_err(|error| unusable(&error))?;
     let _lock = lock(folder.join("agent.lock")).map_err(|why| unusable(&why))?;
     let Times { silent, request, .. } = options.times;

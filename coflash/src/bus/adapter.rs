@@ -1,6 +1,5 @@
 //! The trait for a CAN bus, and the errors that an adapter can report.
 
-use std::fmt;
 use std::io;
 use std::time::Duration;
 
@@ -132,9 +131,10 @@ pub(super) const NO_SCHEME: &str = "it has no ':' after the adapter's name";
 pub(super) const NO_ADAPTER: &str = "there is no such adapter";
 
 /// The errors of an adapter.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum AdapterError {
     /// The URL names no adapter.
+    #[error("bus '{url}': {why}")]
     Url {
         /// The URL.
         url: String,
@@ -142,6 +142,7 @@ pub enum AdapterError {
         why: String,
     },
     /// The adapter is missing, or it denies access.
+    #[error("{adapter} cannot be opened: {source}")]
     Open {
         /// The adapter's name.
         adapter: String,
@@ -149,6 +150,7 @@ pub enum AdapterError {
         source: io::Error,
     },
     /// The adapter is missing, denies access or lacks its driver, and the reason is known.
+    #[error("{adapter} cannot be opened: {what}")]
     Unusable {
         /// The adapter's name.
         adapter: String,
@@ -160,6 +162,7 @@ pub enum AdapterError {
         in_use: bool,
     },
     /// The adapter accepts no more frames, because its queued frames do not reach the bus.
+    #[error("{adapter} accepts no more frames: its queued frames do not reach the bus")]
     Stuck {
         /// The adapter's name.
         adapter: String,
@@ -167,6 +170,7 @@ pub enum AdapterError {
         health: Health,
     },
     /// The adapter broke its protocol.
+    #[error("{adapter} answered unexpectedly: {said}")]
     Protocol {
         /// The adapter's name.
         adapter: String,
@@ -174,6 +178,7 @@ pub enum AdapterError {
         said: String,
     },
     /// The adapter was connected and is gone, or it accepts no more frames.
+    #[error("{adapter} is gone: {source}")]
     Lost {
         /// The adapter's name.
         adapter: String,
@@ -181,6 +186,7 @@ pub enum AdapterError {
         source: io::Error,
     },
     /// A gateway does not answer, or it refuses a request for a reason of its own.
+    #[error("{adapter}: {what}")]
     Gateway {
         /// The gateway's name.
         adapter: String,
@@ -274,34 +280,5 @@ impl AdapterError {
         advice: impl Into<String>,
     ) -> Self {
         Self::Unusable { adapter: adapter.into(), what: what.into(), advice: advice.into(), in_use: false }
-    }
-}
-
-impl fmt::Display for AdapterError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Url { url, why } => write!(f, "bus '{url}': {why}"),
-            Self::Open { adapter, source } => write!(f, "{adapter} cannot be opened: {source}"),
-            Self::Unusable { adapter, what, .. } => write!(f, "{adapter} cannot be opened: {what}"),
-            Self::Stuck { adapter, .. } => {
-                write!(f, "{adapter} accepts no more frames: its queued frames do not reach the bus")
-            }
-            Self::Protocol { adapter, said } => write!(f, "{adapter} answered unexpectedly: {said}"),
-            Self::Lost { adapter, source } => write!(f, "{adapter} is gone: {source}"),
-            Self::Gateway { adapter, what } => write!(f, "{adapter}: {what}"),
-        }
-    }
-}
-
-impl std::error::Error for AdapterError {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        match self {
-            Self::Open { source, .. } | Self::Lost { source, .. } => Some(source),
-            Self::Url { .. }
-            | Self::Unusable { .. }
-            | Self::Stuck { .. }
-            | Self::Protocol { .. }
-            | Self::Gateway { .. } => None,
-        }
     }
 }

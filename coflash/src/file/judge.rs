@@ -4,8 +4,6 @@
 //! The checks are not stricter than the device's, with two exceptions: an image at the start of the
 //! flash is a bootloader and not a program, and a reset vector must point into the image.
 
-use std::fmt;
-
 use super::image::Image;
 use super::range::AddressRange;
 
@@ -22,17 +20,25 @@ const STACKS: [AddressRange; 2] = [
 ];
 
 /// Why an image cannot be a program.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
     /// It begins at the address of the bootloader.
+    #[error("begins at the start of the flash, as a bootloader does and a program does not")]
     Bootloader,
     /// All its bytes have this value, 00h or FFh.
+    #[error("is not a program: all its bytes are {0:02X}h")]
     Blank(u8),
     /// It does not contain the first two vectors.
+    #[error("is not a program: it does not begin with an initial stack pointer and a reset vector")]
     NoVectors,
     /// The first word cannot be an initial stack pointer.
+    #[error(
+        "is not a program: its first word, {0:08X}h, is not an initial stack pointer (a multiple \
+         of 8 in the RAM)"
+    )]
     StackPointer(u32),
     /// The second word does not point into the program.
+    #[error("is not a program: its reset vector is {vector:08X}h, outside {range}")]
     ResetVector {
         /// The reset vector.
         vector: u32,
@@ -41,6 +47,7 @@ pub enum Fault {
     },
     /// The reset vector points into the program, but its bit 0 is clear: this CPU only executes
     /// Thumb code.
+    #[error("is not a program: its reset vector is {0:08X}h, without the Thumb bit")]
     NotThumb(u32),
 }
 
@@ -62,32 +69,6 @@ impl Fault {
         }
     }
 }
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Bootloader => {
-                f.write_str("begins at the start of the flash, as a bootloader does and a program does not")
-            }
-            Self::Blank(byte) => write!(f, "is not a program: all its bytes are {byte:02X}h"),
-            Self::NoVectors => {
-                f.write_str("is not a program: it does not begin with an initial stack pointer and a reset vector")
-            }
-            Self::StackPointer(word) => write!(
-                f,
-                "is not a program: its first word, {word:08X}h, is not an initial stack pointer (a multiple of 8 in the RAM)"
-            ),
-            Self::ResetVector { vector, range } => {
-                write!(f, "is not a program: its reset vector is {vector:08X}h, outside {range}")
-            }
-            Self::NotThumb(vector) => {
-                write!(f, "is not a program: its reset vector is {vector:08X}h, without the Thumb bit")
-            }
-        }
-    }
-}
-
-impl std::error::Error for Fault {}
 
 /// Checks an image with a program that starts at `start`; 0 for an image without addresses.
 ///

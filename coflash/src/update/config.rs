@@ -1,7 +1,5 @@
 //! The configuration file, which contains defaults for options.
 
-use std::fmt;
-
 use super::toml_line::line_of;
 
 /// The value of a setting.
@@ -14,24 +12,15 @@ pub enum Setting {
 }
 
 /// An error in a configuration file.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
     /// The file is not TOML; with the number of the line.
+    #[error("line {0}: {1}")]
     Line(usize, String),
     /// A setting is not permitted.
+    #[error("{0}")]
     Setting(String),
 }
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Line(line, what) => write!(f, "line {line}: {what}"),
-            Self::Setting(what) => f.write_str(what),
-        }
-    }
-}
-
-impl std::error::Error for Fault {}
 
 /// Parses a configuration file into options with their values. `is_switch` returns whether an
 /// option is a switch without a value, or `None` for an unknown option.

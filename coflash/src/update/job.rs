@@ -1,6 +1,5 @@
 //! The job file of `coflash flash --job`: the devices and their programs.
 
-use std::fmt;
 use std::path::{Path, PathBuf};
 
 use canopen::NodeId;
@@ -73,24 +72,15 @@ pub struct Entry {
 }
 
 /// An error in a job file, with its place.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
     /// In this line.
+    #[error("line {0}: {1}")]
     Line(usize, String),
     /// In the device of this number, counted from 1.
+    #[error("device {0}: {1}")]
     Device(usize, String),
 }
-
-impl fmt::Display for Fault {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Line(line, what) => write!(f, "line {line}: {what}"),
-            Self::Device(number, what) => write!(f, "device {number}: {what}"),
-        }
-    }
-}
-
-impl std::error::Error for Fault {}
 
 /// Parses a job file in this folder. The result has at least one device. Each device has an image,
 /// and a unique node-ID or LSS address.

@@ -1,13 +1,12 @@
 //! Loads a library and finds its functions.
 
-use std::fmt;
-
 use libloading::Library;
 
 /// Why a library cannot be used.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum LoadError {
     /// None of its files exists or can be loaded.
+    #[error("the library {} cannot be loaded ({why})", files.join(" or "))]
     Missing {
         /// The file names that were tried, in this order.
         files: Vec<String>,
@@ -15,6 +14,7 @@ pub enum LoadError {
         why: String,
     },
     /// The library lacks a required function: it is an old version, or another library.
+    #[error("the library {file} has no function {symbol}")]
     Old {
         /// The file.
         file: String,
@@ -22,19 +22,6 @@ pub enum LoadError {
         symbol: &'static str,
     },
 }
-
-impl fmt::Display for LoadError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Missing { files, why } => {
-                write!(f, "the library {} cannot be loaded ({why})", files.join(" or "))
-            }
-            Self::Old { file, symbol } => write!(f, "the library {file} has no function {symbol}"),
-        }
-    }
-}
-
-impl std::error::Error for LoadError {}
 
 /// A loaded library, and its file name.
 pub(crate) struct Loaded {
