@@ -61,7 +61,7 @@ fn crc(coflash: &Coflash<'_>, node: &str) -> String {
 
 #[test]
 fn two_devices_are_updated_and_the_third_ones_silence_is_told() {
-    let folder = Folder::below("agent");
+    let folder = Folder::new("agent");
     let nodes = Nodes::start(&folder, &["--node", "5", "--count", "2", "--flash", "instant", "--stand-in"]);
     let server = Server::start(&IDS);
     for (number, id) in IDS.iter().enumerate() {
@@ -93,7 +93,7 @@ fn two_devices_are_updated_and_the_third_ones_silence_is_told() {
 
 #[test]
 fn nothing_is_started_that_was_not_verified() {
-    let folder = Folder::below("agent-lies");
+    let folder = Folder::new("agent-lies");
     let nodes = Nodes::start(&folder, &["--node", "5", "--count", "3", "--flash", "instant", "--stand-in"]);
     let server = Server::start(&IDS);
     let mut altered = file(0xA5);
@@ -120,7 +120,7 @@ fn nothing_is_started_that_was_not_verified() {
 /// The agent is ended in the middle of an update, when the device has no program.
 #[test]
 fn an_agent_that_was_ended_goes_on() {
-    let folder = Folder::below("agent-restart");
+    let folder = Folder::new("agent-restart");
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "typical", "--stand-in"]);
     let server = Server::start(&IDS);
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
@@ -149,7 +149,7 @@ fn an_agent_that_was_ended_goes_on() {
 /// before. A device that runs the program is not flashed again.
 #[test]
 fn a_device_that_has_kept_the_program_is_not_flashed_again() {
-    let folder = Folder::below("agent-kept");
+    let folder = Folder::new("agent-kept");
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let server = Server::start(&IDS);
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
@@ -177,7 +177,7 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
 
 #[test]
 fn a_bus_that_is_not_there_is_waited_for() {
-    let folder = Folder::below("agent-bus");
+    let folder = Folder::new("agent-bus");
     let server = Server::start(&IDS);
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
     // A port that nobody serves.

@@ -21,7 +21,7 @@ fn program(first: u8) -> Vec<u8> {
 const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
 
 fn folder(test: &str) -> Folder {
-    let folder = Folder::below(test);
+    let folder = Folder::new(test);
     folder.write("program.bin", &program(0xA5));
     folder
 }

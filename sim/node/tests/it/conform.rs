@@ -223,7 +223,7 @@ fn ids(lines: &[String]) -> Vec<&str> {
 }
 
 fn device(test: &str) -> (Folder, Nodes) {
-    let folder = Folder::below(test);
+    let folder = Folder::new(test);
     let nodes = Nodes::start(&folder, &["--node", "1", "--flash", "instant", "--heartbeat", "50"]);
     (folder, nodes)
 }

@@ -26,7 +26,7 @@ fn station(url: &str, folder: &Folder, words: &[&str]) -> (i32, Vec<Value>) {
 
 #[test]
 fn a_fresh_device_gets_its_node_id_and_its_program() {
-    let folder = Folder::below("production-line");
+    let folder = Folder::new("production-line");
     folder.write("program.hex", program().as_bytes());
     let nodes =
         Nodes::start(&folder, &["--unconfigured", "--serial", "77", "--flash", "instant", "--stand-in"]);
@@ -51,7 +51,7 @@ fn a_fresh_device_gets_its_node_id_and_its_program() {
 
 #[test]
 fn the_exit_code_says_whose_turn_it_is() {
-    let folder = Folder::below("production-line-bad");
+    let folder = Folder::new("production-line-bad");
     folder.write("program.hex", program().as_bytes());
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
     // Without a stand-in nothing answers for the started program: a defective device.
