@@ -34,7 +34,13 @@ pub fn run(mut args: Args) -> Outcome {
     let chips: Vec<_> = chips.iter().map(|chip| chip.chip).collect();
     println!("{}", chips.join(", "));
     let mut test = process::cargo("test");
-    test.args(build::tests_args(DEFAULT)).args(["--test=porting", "--", "--ignored", "--nocapture"]);
+    test.args(build::tests_args(DEFAULT)).args([
+        "--test=port",
+        "--",
+        "porting::",
+        "--ignored",
+        "--nocapture",
+    ]);
     process::run(test.env("COBOOT_CHIPS", chips.join(",")))
 }
 

@@ -5,12 +5,19 @@
 //! | [`decision`] | bootloader or program, after every reset | records, no flash |
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
-//! | `unseal` | sealed images: authentic, deciphered, unpacked (feature `sealed`) | the format, no object |
-//! | `programmer` | erase, write, read back, verify | pieces and flash, no format, no object |
+//! | [`unseal`] | sealed images: authentic, deciphered, unpacked (feature `sealed`) | the format, no object |
+//! | `programmer` | erase, write, read back, verify; with sealed images, unpack | pieces and flash, no object |
+//! | `sequence` | sectors to erase and words to program, one operation at a time | |
 //! | [`store`] | everything non-volatile | the journal |
-//! | [`control`] | 1F51h, 1F57h, sessions: the rules that tie the three together | all of them |
+//! | [`control`] | 1F51h, 1F57h: the rules that tie the three together | all of them |
+//! | `session` | the state of a program's download | |
+//! | `resume` | what goes on after a cut, and blocks that come twice | block files |
+//! | `refusal` | a refusal: the status in 1F57h, and the abort for the client | |
 //! | [`bootloader`] | the object dictionary over it | objects |
+//! | `stored_version` | 100Ah: the version text, searched in a stored program | |
 //! | [`program`] | the proof that a program may be started | |
+//! | `keys` | whether the device has keys, and so takes only sealed programs | |
+//! | [`crc`] | the CRCs of block file, program and journal | |
 //! | [`policy`], [`profile`] | what a product may choose | |
 //! | [`flash`] | the seam to the flash | |
 #![no_std]

@@ -3,8 +3,9 @@
 //!
 //! Pieces wait in a queue. The programmer erases sectors before the pieces need them, writes each
 //! piece and reads it back, and computes the CRC of the program at the end. It also writes what the
-//! store needs. It knows pieces, addresses and program numbers, but no formats, objects or
-//! commands.
+//! store needs. It knows pieces, addresses and program numbers, but no objects or commands. Of the
+//! formats it knows one thing: the data of a sealed image come from the [`Unsealer`] and not from the
+//! queue.
 //!
 //! **Data are not changed while a record for them is valid**: [`Programmer::open`] and
 //! [`Programmer::void`] only note that a record must be removed, and until it is removed, nothing

@@ -1,6 +1,6 @@
-//! The interface between the queue, the flash and sealed images: the only place that depends on the
-//! feature `sealed`. Without the feature, there is no code for sealed images, and every question is
-//! answered with no.
+//! Sealed images between the queue and the flash: an image is verified, deciphered and unpacked here.
+//! Without the feature `sealed`, there is no code for sealed images, and every question is answered
+//! with no. Other modules depend on the feature, too: where they ask what only a sealed image has.
 
 #[cfg(not(feature = "sealed"))]
 mod absent;
