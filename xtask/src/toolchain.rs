@@ -5,9 +5,15 @@ use std::process::{Command, Stdio};
 
 use crate::{process, workspace, Outcome};
 
-/// The Rust toolchain of a release. Size and bytes of the firmware depend on it
-/// (docs/adr/0018-toolchain-of-a-release.md); `.github/workflows` installs it.
-pub const RELEASE: &str = "1.95.0";
+/// The file that names the toolchain of a release, for rustup and for us. Size and bytes of the
+/// firmware depend on it (docs/adr/0018-toolchain-of-a-release.md).
+const FILE: &str = include_str!("../../rust-toolchain.toml");
+
+/// The version of Rust that a release is made with.
+fn release() -> &'static str {
+    let channel = FILE.lines().find_map(|line| line.strip_prefix("channel = \"")?.strip_suffix('"'));
+    channel.expect("rust-toolchain.toml names a channel")
+}
 
 /// The line of `rustc --version` of the compiler that cargo uses here.
 pub fn line() -> String {
@@ -22,13 +28,15 @@ pub fn line() -> String {
 /// When it is another one; with what that means and what to do.
 pub fn check(line: &str) -> Outcome {
     let version = line.split_whitespace().nth(1).unwrap_or("unknown");
-    if version == RELEASE {
+    let release = release();
+    if version == release {
         return Ok(());
     }
     Err(format!(
-        "this is Rust {version}. A release is made with {RELEASE}: with another one the firmware has other bytes and \
-         another size. `rustup toolchain install {RELEASE} --profile minimal` installs it, and `cargo +{RELEASE} xtask` \
-         uses it."
+        "this is Rust {version}. A release is made with {release}, which rust-toolchain.toml names: with another one \
+         the firmware has other bytes and another size. rustup installs and uses it by itself; here something else \
+         chose the compiler: RUSTUP_TOOLCHAIN, `cargo +TOOLCHAIN`, RUSTC, or a Rust that is not rustup's. `rustup toolchain \
+         install {release} --profile minimal` installs it, and `cargo +{release} xtask` uses it."
     ))
 }
 
@@ -46,16 +54,20 @@ mod tests {
 
     #[test]
     fn only_the_compiler_of_a_release_passes() {
-        assert_eq!(check(&format!("rustc {RELEASE} (59807616e 2026-04-14)")), Ok(()));
+        let release = release();
+        assert_eq!(check(&format!("rustc {release} (59807616e 2026-04-14)")), Ok(()));
         for other in ["rustc 1.94.0 (4a4ef493e 2026-03-02)", "rustc 1.95.0-nightly", "unknown", ""] {
-            assert!(check(other).is_err_and(|words| words.contains(RELEASE)), "{other}");
+            assert!(check(other).is_err_and(|words| words.contains(release)), "{other}");
         }
     }
 
+    /// No workflow chooses another one for the jobs of the repository: the file does.
     #[test]
     fn the_workflow_of_a_release_has_its_compiler() {
-        let file = workspace::root().join(".github/workflows/release.yml");
-        let workflow = fs::read_to_string(file).unwrap();
-        assert!(workflow.contains(&format!("RUSTUP_TOOLCHAIN: \"{RELEASE}\"")), "{RELEASE}");
+        for name in ["release.yml", "ci.yml", "nightly.yml", "site.yml"] {
+            let workflow =
+                fs::read_to_string(workspace::root().join(".github/workflows").join(name)).unwrap();
+            assert!(!workflow.contains("RUSTUP_TOOLCHAIN") && !workflow.contains("cargo +"), "{name}");
+        }
     }
 }
