@@ -4,10 +4,12 @@
 
 use std::fs::{self, File};
 use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
+
+use kit::folder::Folder;
 
 /// The time after which a run counts as hanging, on the wall clock. It may build everything.
 const PATIENCE: Duration = Duration::from_secs(1800);
@@ -67,12 +69,6 @@ impl Drop for Board {
     }
 }
 
-fn folder(name: &str) -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
-    fs::create_dir_all(&folder).unwrap();
-    folder
-}
-
 /// Runs the job; whether it succeeded, and what it printed.
 fn hil(folder: &Path, words: &[&str]) -> (bool, String) {
     let said = folder.join("said.txt");
@@ -98,10 +94,9 @@ fn hil(folder: &Path, words: &[&str]) -> (bool, String) {
 #[test]
 fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
     let board = Board::new();
-    let folder = folder("hil");
+    let folder = Folder::new(env!("CARGO_TARGET_TMPDIR"), "hil");
     let (probe, relay) = (board.probe(&folder), board.relay());
     let report = folder.join("report.json");
-    let _ = fs::remove_file(&report);
     let words = ["--bus", &board.bus, "--probe", &probe, "--power-command", &relay, "--json"];
     let (good, said) = hil(&folder, &[&words[..], &[report.to_str().unwrap()]].concat());
     assert!(good, "{said}");
