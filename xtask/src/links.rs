@@ -7,8 +7,14 @@ use std::path::{Component, Path, PathBuf};
 use crate::{workspace, Outcome};
 
 /// The pages outside `docs/` and `examples/`.
-pub const ELSEWHERE: [&str; 5] =
-    ["README.md", "CHANGELOG.md", "LICENSES.md", "SECURITY.md", "coflash/python/README.md"];
+pub const ELSEWHERE: [&str; 6] = [
+    "README.md",
+    "CHANGELOG.md",
+    "CONTRIBUTING.md",
+    "LICENSES.md",
+    "SECURITY.md",
+    "coflash/python/README.md",
+];
 
 /// A link within the repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -103,17 +109,16 @@ pub fn faults() -> Outcome<Vec<String>> {
     Ok(all()?.iter().filter_map(fault).collect())
 }
 
-/// The lines of a page outside code blocks, with their numbers; code within a line is blanked.
-fn prose(text: &str) -> Vec<(usize, String)> {
+/// The lines of a page outside code blocks, with their numbers, each cut at the backticks: the
+/// second, fourth and so on of the parts are code.
+pub fn prose(text: &str) -> Vec<(usize, Vec<&str>)> {
     let mut is_code = false;
     let mut prose = Vec::new();
     for (number, line) in (1..).zip(text.lines()) {
         if line.trim_start().starts_with("```") {
             is_code = !is_code;
         } else if !is_code {
-            let parts = line.split('`').enumerate();
-            let parts: Vec<_> = parts.map(|(at, part)| if at % 2 == 0 { part } else { "" }).collect();
-            prose.push((number, parts.join("`")));
+            prose.push((number, line.split('`').collect()));
         }
     }
     prose
@@ -122,7 +127,8 @@ fn prose(text: &str) -> Vec<(usize, String)> {
 /// The links of a page within the repository. The target of a link must be in one line.
 pub fn of_page(page: &Path, text: &str) -> Vec<Link> {
     let mut links = Vec::new();
-    for (number, line) in prose(text) {
+    for (number, parts) in prose(text) {
+        let line = parts.into_iter().step_by(2).collect::<Vec<_>>().join("``");
         for (at, _) in line.match_indices("](") {
             let Some((target, _)) = line[at + 2..].split_once(')') else { continue };
             if target.contains("://") || target.starts_with("mailto:") {
@@ -141,7 +147,7 @@ pub fn of_page(page: &Path, text: &str) -> Vec<Link> {
 }
 
 /// The path without `..`.
-fn plain(path: &Path) -> PathBuf {
+pub fn plain(path: &Path) -> PathBuf {
     let mut plain = PathBuf::new();
     for part in path.components() {
         match part {
@@ -211,6 +217,15 @@ mod tests {
             headings(page),
             ["1f51h-commands", "read-and-write", "canopennodes-canopend", "read-and-write-1"]
         );
+    }
+
+    #[test]
+    fn every_decision_is_in_their_list() {
+        let page = Path::new("docs/decisions.md");
+        let listed: Vec<_> = of_page(page, &text(page).unwrap()).into_iter().map(|link| link.file).collect();
+        let mut decisions = within(Path::new("docs/adr")).unwrap();
+        decisions.sort();
+        assert_eq!(listed, decisions);
     }
 
     #[test]

@@ -44,6 +44,8 @@ mod pack;
 mod package;
 mod pairs;
 mod parts;
+#[cfg(test)]
+mod paths;
 mod portable;
 mod powercut;
 mod process;
