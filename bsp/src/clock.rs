@@ -50,13 +50,13 @@ impl ClockTree {
         self.sysclk() / self.apb1
     }
 
-    /// Returns the tree if the board's chip can run with it.
+    /// Returns the tree if a chip with these limits can run with it.
     ///
     /// # Panics
     /// At compile time, with the message of the broken rule.
     #[must_use]
-    pub const fn checked(self) -> Self {
-        match self.check(&crate::CHIP.line.limits()) {
+    pub const fn checked(self, limits: &Limits) -> Self {
+        match self.check(limits) {
             Ok(()) => self,
             Err(rule) => panic!("{}", rule),
         }
@@ -126,161 +126,6 @@ impl ClockTree {
 /// Whether a bus can have this divider.
 const fn is_divider(value: u32) -> bool {
     value >= 1 && value <= 16 && value.is_power_of_two()
-}
-
-#[cfg(target_arch = "arm")]
-pub(crate) use registers::raise_voltage;
-
-/// The clock tree in the registers of the chip.
-#[cfg(target_arch = "arm")]
-mod registers {
-    use cortex_m::peripheral::SCB;
-    use shared_abi::reset;
-    use stm32f4xx_hal::pac;
-
-    use super::{ClockTree, Source, HSI};
-    use crate::{CHIP, SYSCLK};
-
-    const HSEON: u32 = 1 << 16;
-    const HSERDY: u32 = 1 << 17;
-    const HSEBYP: u32 = 1 << 18;
-    const PLLON: u32 = 1 << 24;
-    const PLLRDY: u32 = 1 << 25;
-    /// RCC_CFGR: the system clock in use, as the chip reports it.
-    const SWS_PLL: u32 = 0b10 << 2;
-    const SWS: u32 = 0b11 << 2;
-    /// Number of checks of a crystal or of the regulator before it is given up: at 16 MHz and 8
-    /// cycles a check this is 50 ms, ten times the start-up time of a crystal.
-    const PATIENCE: u32 = 100_000;
-
-    impl ClockTree {
-        /// Runs the core from the PLL. If the crystal does not start, the PLL uses the internal
-        /// oscillator until the next reset: a device that is hard to reach is better than an
-        /// unreachable one.
-        pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
-            // The PLL cannot be changed while it runs (section 7.3.2).
-            if rcc.cr().read().bits() & PLLON != 0 {
-                self.slow_down(rcc);
-            }
-            let mut source = Source::Internal;
-            if wanted == Source::Crystal {
-                // The bypass can be selected only while the oscillator is off (section 7.3.1).
-                if self.hse_bypass {
-                    set(rcc, HSEBYP);
-                }
-                set(rcc, HSEON);
-                if (0..PATIENCE).any(|_| rcc.cr().read().bits() & HSERDY != 0) {
-                    source = Source::Crystal;
-                }
-            }
-            let (from, bit) = match source {
-                Source::Internal => (HSI, 0),
-                Source::Crystal => (self.hse, 1 << 22),
-            };
-            let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
-            // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
-            // keep their reset values.
-            rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
-            raise_voltage(rcc);
-            set(rcc, PLLON);
-            latency(self.wait_states);
-            while rcc.cr().read().bits() & PLLRDY == 0 {}
-            await_voltage();
-            // SAFETY: valid dividers of the buses, and the PLL as system clock.
-            rcc.cfgr().write(|w| unsafe {
-                w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10)
-            });
-            while rcc.cfgr().read().bits() & SWS != SWS_PLL {}
-            source
-        }
-
-        /// Restores the clocks of the reset state.
-        pub fn slow_down(&self, rcc: &pac::RCC) {
-            // SAFETY: the reset value.
-            rcc.cfgr().write(|w| unsafe { w.bits(0) });
-            while rcc.cfgr().read().bits() & SWS != 0 {}
-            // SAFETY: the reset values; nothing uses the PLL or the crystal any more.
-            rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
-            while rcc.cr().read().bits() & PLLRDY != 0 {}
-            // SAFETY: the reset value.
-            rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
-            lower_voltage(rcc);
-            latency(0);
-        }
-    }
-
-    /// Whether the core is faster than the regulator's scale after a reset allows.
-    const NEEDS_SCALE_1: bool = SYSCLK > CHIP.line.limits().sysclk_after_reset;
-    /// PWR_CR.VOS of the STM32F412, F413 and F423: scale 1, and scale 2 of the reset state. It
-    /// takes effect with the PLL, which must be off when it is written (RM0402 and RM0430, PWR_CR).
-    const VOS: u32 = 0b11 << 14;
-    const VOS_SCALE_2: u32 = 0b10 << 14;
-    const PWREN: u32 = 1 << 28;
-
-    /// Raises the regulator to scale 1, if the board needs that. The PLL must be off.
-    pub(crate) fn raise_voltage(rcc: &pac::RCC) {
-        if NEEDS_SCALE_1 {
-            voltage(rcc, VOS);
-        }
-    }
-
-    /// Waits until the regulator has reached its scale; that happens when the PLL runs. If it does
-    /// not reach it, the chip resets: the core must not run faster than the scale allows, and a
-    /// supply that was too weak can be better after the reset.
-    fn await_voltage() {
-        /// PWR_CSR.
-        const VOSRDY: u32 = 1 << 14;
-        // SAFETY: reading this register changes nothing.
-        let is_ready = || unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY != 0;
-        if NEEDS_SCALE_1 && !(0..PATIENCE).any(|_| is_ready()) {
-            SCB::sys_reset();
-        }
-    }
-
-    /// Restores the regulator's reset state. The PLL must be off.
-    fn lower_voltage(rcc: &pac::RCC) {
-        if NEEDS_SCALE_1 {
-            voltage(rcc, VOS_SCALE_2);
-            // SAFETY: the power controller's clock is off after a reset.
-            rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() & !PWREN) });
-        }
-    }
-
-    fn voltage(rcc: &pac::RCC, scale: u32) {
-        // SAFETY: it enables the clock of the power controller and leaves the others on.
-        rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PWREN) });
-        // SAFETY: nothing else uses it; only the scale in its register is written.
-        let pwr = unsafe { pac::PWR::steal() };
-        // SAFETY: a scale that the line has (1 or 2); the other bits stay.
-        pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !VOS | scale) });
-    }
-
-    fn set(rcc: &pac::RCC, bit: u32) {
-        // SAFETY: it sets a bit of CR and leaves the others set.
-        rcc.cr().modify(|r, w| unsafe { w.bits(r.bits() | bit) });
-    }
-
-    /// Sets the wait states of the flash; the rest of its access control stays. The new value is
-    /// valid when it reads back (section 3.5.1).
-    fn latency(wait_states: u32) {
-        // SAFETY: this module owns the wait states in the access control register; the flash driver
-        // does not change them, and no other priority runs while clocks change.
-        let acr = unsafe { &*pac::FLASH::ptr() }.acr();
-        // SAFETY: 0 to 15.
-        acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
-        while acr.read().bits() & 0xF != wait_states {}
-    }
-
-    /// The code of a divider in PPRE1 and PPRE2.
-    const fn prescaler(divider: u32) -> u32 {
-        match divider {
-            2 => 0b100,
-            4 => 0b101,
-            8 => 0b110,
-            16 => 0b111,
-            _ => 0,
-        }
-    }
 }
 
 #[cfg(test)]

@@ -6,8 +6,10 @@ use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::{Config, Rcc, RccExt};
 
 use crate::can_controllers::Take;
-use crate::clock::raise_voltage;
-use crate::{CanController, Facts, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, FACTS, LAYOUT, SYSCLK};
+use crate::facts::{
+    self, CanController, Facts, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, FACTS, LAYOUT, SYSCLK,
+};
+use crate::pll::raise_voltage;
 
 /// The LED that blinks while the device works.
 pub type Led = Pin<{ FACTS.led.0 }, { FACTS.led.1 }, Output>;
@@ -20,13 +22,13 @@ pub struct Board {
     pub led: Led,
     /// The UART with its pins; it is on, at the board's bit rate.
     #[cfg(feature = "uart")]
-    pub uart: crate::uart::Port<crate::UartController>,
+    pub uart: crate::uart::Port<facts::UartController>,
 }
 
 /// Sets the board's pins up.
 #[must_use]
 pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
-    const STANDBY: crate::Pin = match FACTS.can_standby {
+    const STANDBY: facts::Pin = match FACTS.can_standby {
         Some((pin, _)) => pin,
         None => FACTS.led,
     };
@@ -40,7 +42,7 @@ pub fn init(rcc: &mut Rcc, can1: pac::CAN1) -> Board {
     #[cfg(feature = "uart")]
     let uart = {
         // SAFETY: only this function takes the UART, and it takes the only CAN1.
-        let uart = unsafe { crate::UartController::steal() };
+        let uart = unsafe { facts::UartController::steal() };
         let transmit = pin::<{ FACTS.uart_pins.transmit.0 }, { FACTS.uart_pins.transmit.1 }>(&can1);
         let receive = pin::<{ FACTS.uart_pins.receive.0 }, { FACTS.uart_pins.receive.1 }>(&can1);
         crate::uart::Port::new(uart, (transmit, receive), rcc)
@@ -66,10 +68,10 @@ fn pin<const PORT: char, const NUMBER: u8>(_: &pac::CAN1) -> Pin<PORT, NUMBER> {
 
 /// Enables and resets the ports of the board's pins.
 fn reset_ports(rcc: &mut Rcc) {
-    const fn bit(pin: crate::Pin) -> u32 {
+    const fn bit(pin: facts::Pin) -> u32 {
         1 << (pin.0 as u32 - 'A' as u32)
     }
-    const fn bits(pins: crate::Pins) -> u32 {
+    const fn bits(pins: facts::Pins) -> u32 {
         bit(pins.transmit) | bit(pins.receive)
     }
     const PORTS: u32 = bit(FACTS.led)

@@ -15,305 +15,43 @@ pub mod clock;
 pub mod debugger;
 #[cfg(target_arch = "arm")]
 mod drivers;
+mod identity;
 pub mod line;
+#[cfg(all(target_arch = "arm", feature = "debugger"))]
+mod memory;
 #[cfg(all(target_arch = "arm", feature = "monitor"))]
 pub mod monitor;
+#[cfg(target_arch = "arm")]
+mod pll;
+#[cfg(target_arch = "arm")]
+mod port;
 #[cfg(any(feature = "uart", not(target_arch = "arm")))]
 pub mod ring;
 #[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
+#[macro_use]
 pub mod uart;
+// The facts use the macro of the UART.
+mod facts;
 #[cfg(all(target_arch = "arm", feature = "virtual-can"))]
 pub mod virtual_can;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 
-/// Selects the board's CAN controller for coboot, CAN1 or CAN2.
-///
-/// The tasks of a program are bound to CAN1's interrupts for either controller: with CAN2, the
-/// handlers of CAN2's interrupts call the tasks' entries. [`init`] gives both the same priority
-/// ([`can_controllers`]), so that neither interrupts the other.
-macro_rules! can_controller {
-    (CAN1) => {
-        can_controller!(1, CAN1);
-    };
-    (CAN2) => {
-        can_controller!(2, CAN2);
-        can_controller!(CAN2_TX is CAN1_TX);
-        can_controller!(CAN2_RX0 is CAN1_RX0);
-    };
-    ($number:literal, $can:ident) => {
-        /// The number of the CAN controller that coboot talks through.
-        pub const CAN_CONTROLLER: u8 = $number;
-
-        /// The CAN controller that coboot talks through.
-        #[cfg(target_arch = "arm")]
-        pub type CanController = stm32f4xx_hal::can::Can<stm32f4xx_hal::pac::$can>;
-    };
-    ($interrupt:ident is $task:ident) => {
-        #[cfg(target_arch = "arm")]
-        #[no_mangle]
-        #[allow(non_snake_case)]
-        extern "C" fn $interrupt() {
-            extern "C" {
-                fn $task();
-            }
-            // SAFETY: it calls the handler of the program as the core would: at the priority of the
-            // handler's own interrupt.
-            unsafe { $task() }
-        }
-    };
-}
-
-/// Selects the board's USART; its interrupt has the same name.
-macro_rules! uart {
-    ($usart:ident) => {
-        /// The UART. It is set up with the feature `uart` alone.
-        #[cfg(target_arch = "arm")]
-        pub type UartController = stm32f4xx_hal::pac::$usart;
-
-        #[cfg(all(target_arch = "arm", feature = "uart"))]
-        #[no_mangle]
-        #[allow(non_snake_case)]
-        extern "C" fn $usart() {
-            crate::uart::interrupted();
-        }
-    };
-}
-
-use clock::ClockTree;
-use shared_abi::geometry::Geometry;
-use shared_abi::layout::Layout;
-
-// The board's file in `boards/`, and the name of its memory map (build.rs).
-include!(concat!(env!("OUT_DIR"), "/board.rs"));
-
-/// The chip on the board.
-const CHIP: &Geometry = BOARD.chip;
-
-/// The facts of a board: the constant `FACTS` of its file in `boards/`.
-#[derive(Clone, Copy, Debug)]
-pub struct Facts {
-    /// The identity that the device reports.
-    pub identity: Identity,
-    /// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
-    /// layer setting services (LSS).
-    pub node_id: u8,
-    /// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it
-    /// by listening.
-    pub bit_rate: u32,
-    /// How the clocks are made.
-    pub clock_tree: ClockTree,
-    /// The pin that asks for the bootloader after a reset, if the board has one.
-    pub entry_strap: Option<Strap>,
-    /// The pin of the LED that blinks while the device works.
-    pub led: Pin,
-    /// The pins of the CAN controller.
-    pub can_pins: Pins,
-    /// The pin that takes the CAN transceiver out of standby, and the level that does it: high, or
-    /// low.
-    pub can_standby: Option<(Pin, bool)>,
-    /// The pins of the UART.
-    pub uart_pins: Pins,
-    /// Bit rate of the UART, in bit/s.
-    pub uart_bit_rate: u32,
-}
-
-/// A pin of the chip: its port, `'A'` and on, and its number in the port, 0 to 15.
-pub type Pin = (char, u8);
-
-/// The pins of a controller with two lines.
-#[derive(Clone, Copy, Debug)]
-pub struct Pins {
-    /// The line that the chip drives.
-    pub transmit: Pin,
-    /// The line that the chip reads.
-    pub receive: Pin,
-}
-
-/// The entry strap: a pin that asks for the bootloader after a reset.
-///
-/// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks for the bootloader only
-/// if it is pressed each time: a spike must not keep a device from its program, and a user who
-/// wants the bootloader holds the strap.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Strap {
-    /// Its port, `'A'` and on.
-    pub port: char,
-    /// The pin's number in the port, 0 to 15.
-    pub pin: u8,
-    /// The level that asks for the bootloader: high, or low.
-    pub pressed: bool,
-    /// The chip's resistor (about 40 kΩ) that holds the pin at the other level. It is on while the
-    /// strap is read.
-    pub pull: Pull,
-}
-
-/// A resistor in the chip at a pin (`GPIOx_PUPDR`).
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Pull {
-    /// None: the board has one.
-    None,
-    /// To the supply.
-    Up,
-    /// To ground.
-    Down,
-}
-
-impl Strap {
-    /// How often the strap is read.
-    pub const SAMPLES: u32 = 4;
-
-    /// Whether the chip has this pin, and the resistor does not hold it at the pressed level.
-    const fn is_possible(&self, ports: u8) -> bool {
-        let port = (self.port as u32).wrapping_sub('A' as u32);
-        let holds = match self.pull {
-            Pull::None => !self.pressed,
-            Pull::Up => true,
-            Pull::Down => false,
-        };
-        port < ports as u32 && self.pin < 16 && holds != self.pressed
-    }
-}
-
-/// The identity that the device reports.
-pub const IDENTITY: Identity = FACTS.identity;
-/// Node-ID of a device that has no other one stored ([`Facts::node_id`]).
-pub const NODE_ID: u8 = FACTS.node_id;
-/// Bit rate of a device that has no other one stored ([`Facts::bit_rate`]).
-pub const BIT_RATE: u32 = FACTS.bit_rate;
-/// How the clocks are made; the chip can run with them.
-pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked();
-/// The pin that asks for the bootloader after a reset.
-pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
-
-/// The core's clock, in Hz.
-pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
-/// Clock of the CAN controller in Hz: the clock of APB1.
-pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
-
-/// The memory layout of this board: the owner of each address. On the chip it has no names, because
-/// nothing reads them there.
-#[cfg(target_arch = "arm")]
-pub const LAYOUT: &Layout = {
-    const CHIP: Geometry = Geometry { chip: "", ..*BOARD.chip };
-    const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*BOARD };
-    &NAMELESS
-};
-/// The memory layout of this board: the owner of each address.
-#[cfg(not(target_arch = "arm"))]
-pub const LAYOUT: &Layout = BOARD;
-
-pub use board::*;
-
-const _: () = assert!(
-    BIT_RATE == 0 || can::BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
-    "board: the clock of the CAN controller (APB1) cannot make bit_rate"
-);
-const _: () = assert!(
-    match ENTRY_STRAP {
-        Some(strap) => strap.is_possible(CHIP.ports),
-        None => true,
-    },
-    "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`"
-);
-
-/// Compares the chip of the HAL and its PAC with the chip of the board.
-#[cfg(target_arch = "arm")]
-mod chip_check {
-    use super::{pac, CHIP};
-
-    const fn len<T, const N: usize>(_: *const [T; N]) -> u16 {
-        N as u16
-    }
-
-    const PAC: u16 = len(&raw const pac::__INTERRUPTS);
-    const EXPECTED: u16 = CHIP.line.pac_interrupts();
-
-    const _: () = assert!(PAC == EXPECTED, "{}", MESSAGE);
-
-    const TEXT: [u8; 91] = with_numbers(
-        *b"board: the PAC has ### interrupt lines, the chip ###: the feature of bsp names another line",
-        [PAC, EXPECTED],
-    );
-    const MESSAGE: &str = match core::str::from_utf8(&TEXT) {
-        Ok(text) => text,
-        Err(_) => unreachable!(),
-    };
-
-    /// Replaces each `###` by a number of three digits.
-    const fn with_numbers<const N: usize>(mut text: [u8; N], numbers: [u16; 2]) -> [u8; N] {
-        let (mut at, mut next) = (0, 0);
-        while at < N {
-            if text[at] == b'#' {
-                text[at] = b'0' + (numbers[next] / 100 % 10) as u8;
-                text[at + 1] = b'0' + (numbers[next] / 10 % 10) as u8;
-                text[at + 2] = b'0' + (numbers[next] % 10) as u8;
-                next += 1;
-                at += 2;
-            }
-            at += 1;
-        }
-        text
-    }
-}
-
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
-/// The port for frames: the CAN controller, or the UART instead of it.
-#[cfg(all(target_arch = "arm", not(feature = "virtual-can")))]
-pub type CanPort = can::Port<CanController>;
-/// The port for frames: the CAN controller, or the UART instead of it.
-#[cfg(all(target_arch = "arm", feature = "virtual-can"))]
-pub type CanPort = virtual_can::Port;
+pub use facts::*;
+pub use identity::{serial_number, unique_id, Identity};
+#[cfg(target_arch = "arm")]
+pub use port::CanPort;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal::pac;
-
-/// The device's identity in 1008h–100Ah and 1018h, for bootloader and application.
-#[derive(Clone, Copy, Debug)]
-pub struct Identity {
-    /// 1018h/1, assigned by CiA; 0 for none.
-    pub vendor_id: u32,
-    /// 1018h/2.
-    pub product_code: u32,
-    /// 1018h/3: major in the upper half, minor in the lower.
-    pub revision: u32,
-    /// 1008h.
-    pub device_name: &'static str,
-    /// 1009h.
-    pub hardware_version: &'static str,
-}
-
-/// The chip's 96-bit unique identifier (RM0090 section 39.1).
-#[inline(always)]
-fn unique_words() -> [u32; 3] {
-    const UNIQUE_ID: *const [u32; 3] = 0x1FFF_7A10 as *const _;
-    // SAFETY: the unique identifier is a read-only word-aligned part of every STM32F4.
-    unsafe { UNIQUE_ID.read_volatile() }
-}
-
-/// The chip's 96-bit unique identifier (RM0090 section 39.1), with its bytes in the order of the
-/// memory.
-#[must_use]
-pub fn unique_id() -> [u8; 12] {
-    let mut bytes = [0; 12];
-    for (bytes, word) in bytes.chunks_exact_mut(4).zip(unique_words()) {
-        bytes.copy_from_slice(&word.to_le_bytes());
-    }
-    bytes
-}
 
 /// The count of the system timer, which runs with the clock of the core.
 #[cfg(target_arch = "arm")]
 #[must_use]
 pub fn cycles() -> u32 {
     cortex_m::peripheral::SYST::get_current()
-}
-
-/// Serial number of the device (1018h/4): a fold of the chip's unique identifier.
-#[must_use]
-pub fn serial_number() -> u32 {
-    shared_abi::check_word(&unique_words())
 }

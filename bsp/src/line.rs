@@ -4,7 +4,7 @@
 use canopen::BitRate;
 
 use crate::can::BitTiming;
-use crate::CAN_CLOCK;
+use crate::facts::CAN_CLOCK;
 
 /// The bit timing of the board's CAN controller for each bit rate; `None` if there is none.
 pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
@@ -31,7 +31,7 @@ mod port {
 
     use super::TIMINGS;
     use crate::can::{Errors, Mode};
-    use crate::CanPort;
+    use crate::port::CanPort;
 
     /// Empties the controller's FIFO, which holds three frames. `take` returns whether there was
     /// room for a frame; without room the frame is lost. The client repeats it after its time-out,

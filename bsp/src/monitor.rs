@@ -23,7 +23,7 @@
 use core::arch::{asm, naked_asm};
 use core::sync::atomic::{compiler_fence, AtomicU32, Ordering};
 
-use crate::debugger;
+use crate::memory;
 
 const FP_CTRL: u32 = 0xE000_2000;
 /// Code comparators 0 to 5; the Cortex-M4 has these six.
@@ -127,7 +127,7 @@ pub unsafe extern "C" fn __pre_init() {
 /// the bus. A stop makes the interrupt with the number `interrupt` pending; its task reports the
 /// stop by [`take_stop`].
 pub fn arm(priority: u8, interrupt: u16) {
-    if debugger::is_locked() {
+    if memory::is_locked() {
         return;
     }
     TELLER.store(interrupt.into(), Ordering::Relaxed);
@@ -341,7 +341,7 @@ enum Instruction {
 impl Instruction {
     fn at(pc: u32) -> Self {
         let mut code = [0; 4];
-        if debugger::read(pc, &mut code).is_err() {
+        if memory::read(pc, &mut code).is_err() {
             return Self::Other;
         }
         let [a, b, c, d] = code;

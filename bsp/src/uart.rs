@@ -17,6 +17,22 @@ pub const fn divider(clock: u32, bit_rate: u32) -> Option<u16> {
     Some(divider as u16)
 }
 
+/// Selects the board's USART; its interrupt has the same name.
+macro_rules! uart {
+    ($usart:ident) => {
+        /// The UART. It is set up with the feature `uart` alone.
+        #[cfg(target_arch = "arm")]
+        pub type UartController = stm32f4xx_hal::pac::$usart;
+
+        #[cfg(all(target_arch = "arm", feature = "uart"))]
+        #[no_mangle]
+        #[allow(non_snake_case)]
+        extern "C" fn $usart() {
+            crate::uart::interrupted();
+        }
+    };
+}
+
 #[cfg(all(target_arch = "arm", feature = "uart"))]
 pub use drivers::*;
 
@@ -32,7 +48,7 @@ mod drivers {
     use stm32f4xx_hal::serial::Instance;
 
     use crate::clock::ClockTree;
-    use crate::{CLOCK_TREE, FACTS};
+    use crate::facts::{UartController, CLOCK_TREE, FACTS};
 
     /// A USART that a board may choose.
     pub trait Controller: Instance<RB = usart1::RegisterBlock> {
@@ -66,11 +82,11 @@ mod drivers {
     }
 
     /// The divider of the board's UART.
-    const DIVIDER: u16 =
-        match super::divider(clock::<crate::UartController>(&CLOCK_TREE), FACTS.uart_bit_rate) {
-            Some(divider) => divider,
-            None => panic!("board: the clock of the UART cannot make uart_bit_rate"),
-        };
+    const DIVIDER: u16 = match crate::uart::divider(clock::<UartController>(&CLOCK_TREE), FACTS.uart_bit_rate)
+    {
+        Some(divider) => divider,
+        None => panic!("board: the clock of the UART cannot make uart_bit_rate"),
+    };
 
     /// A USART with its pins.
     pub struct Port<U: Controller> {
@@ -169,7 +185,7 @@ mod drivers {
     pub fn on_interrupt(handler: fn()) {
         interrupt::free(|cs| HANDLER.borrow(cs).set(Some(handler)));
         // SAFETY: no code masks this interrupt to protect data that the handler uses.
-        unsafe { NVIC::unmask(<crate::UartController as Controller>::INTERRUPT) };
+        unsafe { NVIC::unmask(<UartController as Controller>::INTERRUPT) };
     }
 
     /// The handler in the UART's vector.

@@ -7,10 +7,11 @@ use embedded_can::{Frame, Id};
 use stm32f4xx_hal::pac::Interrupt;
 
 use crate::can::{BitTiming, Errors, Lost, Mode};
+use crate::facts::UartController;
+use crate::identity::serial_number;
 use crate::ring::{Inbox, Ring};
 use crate::slcan::{self, Slcan, END, FRAME_TEXT};
 use crate::uart::{self, Received};
-use crate::UartController;
 
 /// Bytes from the host that wait: room for nine frames, so that a task may take some time.
 static RECEIVED: Inbox<256> = Inbox::new();
@@ -34,7 +35,7 @@ impl Port {
     pub fn new(uart: uart::Port<UartController>) -> Self {
         let mut port = Self {
             uart,
-            slcan: Slcan::new(crate::serial_number() as u16),
+            slcan: Slcan::new(serial_number() as u16),
             accepted: None,
             lost: Lost::default(),
             heard: false,

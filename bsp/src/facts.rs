@@ -1,0 +1,220 @@
+//! The facts of the board, and what follows from them.
+
+use shared_abi::geometry::Geometry;
+use shared_abi::layout::Layout;
+
+use crate::can::BitTiming;
+use crate::clock::ClockTree;
+use crate::identity::Identity;
+
+/// Selects the board's CAN controller for coboot, CAN1 or CAN2.
+///
+/// The tasks of a program are bound to CAN1's interrupts for either controller: with CAN2, the
+/// handlers of CAN2's interrupts call the tasks' entries. [`init`](crate::init) gives both the same
+/// priority ([`can_controllers`](crate::can_controllers)), so that neither interrupts the other.
+macro_rules! can_controller {
+    (CAN1) => {
+        can_controller!(1, CAN1);
+    };
+    (CAN2) => {
+        can_controller!(2, CAN2);
+        can_controller!(CAN2_TX is CAN1_TX);
+        can_controller!(CAN2_RX0 is CAN1_RX0);
+    };
+    ($number:literal, $can:ident) => {
+        /// The number of the CAN controller that coboot talks through.
+        pub const CAN_CONTROLLER: u8 = $number;
+
+        /// The CAN controller that coboot talks through.
+        #[cfg(target_arch = "arm")]
+        pub type CanController = stm32f4xx_hal::can::Can<stm32f4xx_hal::pac::$can>;
+    };
+    ($interrupt:ident is $task:ident) => {
+        #[cfg(target_arch = "arm")]
+        #[no_mangle]
+        #[allow(non_snake_case)]
+        extern "C" fn $interrupt() {
+            extern "C" {
+                fn $task();
+            }
+            // SAFETY: it calls the handler of the program as the core would: at the priority of the
+            // handler's own interrupt.
+            unsafe { $task() }
+        }
+    };
+}
+
+// The board's file in `boards/`, and the name of its memory map (build.rs).
+include!(concat!(env!("OUT_DIR"), "/board.rs"));
+
+/// The chip on the board.
+pub(crate) const CHIP: &Geometry = BOARD.chip;
+
+/// The facts of a board: the constant `FACTS` of its file in `boards/`.
+#[derive(Clone, Copy, Debug)]
+pub struct Facts {
+    /// The identity that the device reports.
+    pub identity: Identity,
+    /// Node-ID of a device that has no other one stored, 1 to 127; 255 for a device that waits for
+    /// layer setting services (LSS).
+    pub node_id: u8,
+    /// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it
+    /// by listening.
+    pub bit_rate: u32,
+    /// How the clocks are made.
+    pub clock_tree: ClockTree,
+    /// The pin that asks for the bootloader after a reset, if the board has one.
+    pub entry_strap: Option<Strap>,
+    /// The pin of the LED that blinks while the device works.
+    pub led: Pin,
+    /// The pins of the CAN controller.
+    pub can_pins: Pins,
+    /// The pin that takes the CAN transceiver out of standby, and the level that does it: high, or
+    /// low.
+    pub can_standby: Option<(Pin, bool)>,
+    /// The pins of the UART.
+    pub uart_pins: Pins,
+    /// Bit rate of the UART, in bit/s.
+    pub uart_bit_rate: u32,
+}
+
+/// A pin of the chip: its port, `'A'` and on, and its number in the port, 0 to 15.
+pub type Pin = (char, u8);
+
+/// The pins of a controller with two lines.
+#[derive(Clone, Copy, Debug)]
+pub struct Pins {
+    /// The line that the chip drives.
+    pub transmit: Pin,
+    /// The line that the chip reads.
+    pub receive: Pin,
+}
+
+/// The entry strap: a pin that asks for the bootloader after a reset.
+///
+/// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks for the bootloader only
+/// if it is pressed each time: a spike must not keep a device from its program, and a user who
+/// wants the bootloader holds the strap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Strap {
+    /// Its port, `'A'` and on.
+    pub port: char,
+    /// The pin's number in the port, 0 to 15.
+    pub pin: u8,
+    /// The level that asks for the bootloader: high, or low.
+    pub pressed: bool,
+    /// The chip's resistor (about 40 kΩ) that holds the pin at the other level. It is on while the
+    /// strap is read.
+    pub pull: Pull,
+}
+
+/// A resistor in the chip at a pin (`GPIOx_PUPDR`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pull {
+    /// None: the board has one.
+    None,
+    /// To the supply.
+    Up,
+    /// To ground.
+    Down,
+}
+
+impl Strap {
+    /// How often the strap is read.
+    pub const SAMPLES: u32 = 4;
+
+    /// Whether the chip has this pin, and the resistor does not hold it at the pressed level.
+    const fn is_possible(&self, ports: u8) -> bool {
+        let port = (self.port as u32).wrapping_sub('A' as u32);
+        let holds = match self.pull {
+            Pull::None => !self.pressed,
+            Pull::Up => true,
+            Pull::Down => false,
+        };
+        port < ports as u32 && self.pin < 16 && holds != self.pressed
+    }
+}
+
+/// The identity that the device reports.
+pub const IDENTITY: Identity = FACTS.identity;
+/// Node-ID of a device that has no other one stored ([`Facts::node_id`]).
+pub const NODE_ID: u8 = FACTS.node_id;
+/// Bit rate of a device that has no other one stored ([`Facts::bit_rate`]).
+pub const BIT_RATE: u32 = FACTS.bit_rate;
+/// How the clocks are made; the chip can run with them.
+pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&CHIP.line.limits());
+/// The pin that asks for the bootloader after a reset.
+pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
+
+/// The core's clock, in Hz.
+pub const SYSCLK: u32 = CLOCK_TREE.sysclk();
+/// Clock of the CAN controller in Hz: the clock of APB1.
+pub const CAN_CLOCK: u32 = CLOCK_TREE.apb1_clock();
+
+/// The memory layout of this board: the owner of each address. On the chip it has no names, because
+/// nothing reads them there.
+#[cfg(target_arch = "arm")]
+pub const LAYOUT: &Layout = {
+    const CHIP: Geometry = Geometry { chip: "", ..*BOARD.chip };
+    const NAMELESS: Layout = Layout { board: "", chip: &CHIP, ..*BOARD };
+    &NAMELESS
+};
+/// The memory layout of this board: the owner of each address.
+#[cfg(not(target_arch = "arm"))]
+pub const LAYOUT: &Layout = BOARD;
+
+pub use board::*;
+
+const _: () = assert!(
+    BIT_RATE == 0 || BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
+    "board: the clock of the CAN controller (APB1) cannot make bit_rate"
+);
+const _: () = assert!(
+    match ENTRY_STRAP {
+        Some(strap) => strap.is_possible(CHIP.ports),
+        None => true,
+    },
+    "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`"
+);
+
+/// Compares the chip of the HAL and its PAC with the chip of the board.
+#[cfg(target_arch = "arm")]
+mod chip_check {
+    use stm32f4xx_hal::pac;
+
+    use crate::facts::CHIP;
+
+    const fn len<T, const N: usize>(_: *const [T; N]) -> u16 {
+        N as u16
+    }
+
+    const PAC: u16 = len(&raw const pac::__INTERRUPTS);
+    const EXPECTED: u16 = CHIP.line.pac_interrupts();
+
+    const _: () = assert!(PAC == EXPECTED, "{}", MESSAGE);
+
+    const TEXT: [u8; 91] = with_numbers(
+        *b"board: the PAC has ### interrupt lines, the chip ###: the feature of bsp names another line",
+        [PAC, EXPECTED],
+    );
+    const MESSAGE: &str = match core::str::from_utf8(&TEXT) {
+        Ok(text) => text,
+        Err(_) => unreachable!(),
+    };
+
+    /// Replaces each `###` by a number of three digits.
+    const fn with_numbers<const N: usize>(mut text: [u8; N], numbers: [u16; 2]) -> [u8; N] {
+        let (mut at, mut next) = (0, 0);
+        while at < N {
+            if text[at] == b'#' {
+                text[at] = b'0' + (numbers[next] / 100 % 10) as u8;
+                text[at + 1] = b'0' + (numbers[next] / 10 % 10) as u8;
+                text[at + 2] = b'0' + (numbers[next] % 10) as u8;
+                next += 1;
+                at += 2;
+            }
+            at += 1;
+        }
+        text
+    }
+}
