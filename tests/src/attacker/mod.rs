@@ -23,6 +23,7 @@
 //! have `tests/sealed/attacker.rs`.
 
 pub mod board;
+mod broken;
 pub mod line;
 mod masters;
 pub mod model;
@@ -39,14 +40,12 @@ use canopen::{CobId, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 use shared_abi::geometry::Region;
 
+pub use broken::Broken;
 use kit::random::Random;
 use model::{Ask, Model, Node, NO_NODE};
 use setup::{Image, Setup};
 use target::{Happened, PowerCut, Target, View};
 
-/// The longest time from a request to its answer in virtual time, in us: the request, the answer, a
-/// heartbeat and some emergencies of 1.1 ms each at 125 kbit/s, and two ticks of the device.
-pub const ANSWER_US: u64 = 15_000;
 /// The longest way back from bus-off (`tests/device/hostile_bus.rs`), in us.
 const BUS_OFF_US: u64 = 5_400_000;
 /// A device has started, and a rescue window is over, in us.
@@ -57,37 +56,6 @@ const WORK_US: u64 = 40_000_000;
 /// A device with a password waits with a reset until no wrong password delays the next attempt
 /// (`core/canopen/src/password.rs`), in us.
 const PASSWORD_US: u64 = 33_000_000;
-
-/// A broken rule, with details.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Broken {
-    /// No answer in time, or one that nobody asked for.
-    Answer(String),
-    /// Node parameters that no master stored.
-    Parameters(String),
-    /// A program that nobody asked to change.
-    Program(String),
-    /// A record that is not true.
-    Record(String),
-    /// A reset that nobody asked for.
-    Reset(String),
-    /// Another one.
-    Other(String),
-}
-
-impl fmt::Display for Broken {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (rule, what) = match self {
-            Self::Answer(what) => ("answers", what),
-            Self::Parameters(what) => ("node parameters stay", what),
-            Self::Program(what) => ("programs stay", what),
-            Self::Record(what) => ("records are true", what),
-            Self::Reset(what) => ("no reset unasked", what),
-            Self::Other(what) => ("device", what),
-        };
-        write!(f, "{rule}: {what}")
-    }
-}
 
 /// The counts of an attack.
 #[derive(Clone, Copy, Debug, Default)]

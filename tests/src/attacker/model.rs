@@ -7,7 +7,7 @@ use canopen::lss::LssAddress;
 use canopen::Frame;
 use embedded_can::Frame as _;
 
-use super::Broken;
+use super::broken::Broken;
 
 /// The start of a change of a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]

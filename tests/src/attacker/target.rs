@@ -40,6 +40,10 @@ pub enum PowerCut {
     Operation(u64),
 }
 
+/// The longest time from a request to its answer in virtual time, in us: the request, the answer, a
+/// heartbeat and some emergencies of 1.1 ms each at 125 kbit/s, and two ticks of the device.
+pub const ANSWER_US: u64 = 15_000;
+
 /// A device in virtual time, on a bus with two masters.
 pub trait Target {
     /// The memory layout of the device.
@@ -47,7 +51,7 @@ pub trait Target {
 
     /// The longest time from a request to its answer, in us.
     fn answer_us(&self) -> u64 {
-        super::ANSWER_US
+        ANSWER_US
     }
 
     /// Noise below the level of frames, where there is one.

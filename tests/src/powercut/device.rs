@@ -23,6 +23,11 @@ use shared_abi::layout::Layout;
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
 
+/// Seed of the program before an update.
+pub const OLD: u8 = 0xA3;
+/// Seed of the new program.
+pub const NEW: u8 = 0xB7;
+
 /// Two programs; setups with one program use the first.
 pub static LAYOUT: Layout = TWO_PROGRAMS;
 
@@ -455,7 +460,7 @@ impl Store {
             Some(Bug::EraseBeforeInvalidating) => Self::Instead(journal, None),
             Some(Bug::TouchedForgotten) => Self::Forgetful(journal),
             Some(Bug::SignatureBeforeData) => {
-                let new = image(1, super::scenario::NEW);
+                let new = image(1, NEW);
                 let record = ProgramRecord {
                     size: new.len() as u32,
                     crc: crc32(&new),

@@ -108,7 +108,7 @@ impl Report {
             Ok(outcome) => {
                 let outcome = match outcome {
                     Outcome::Bootloader => "bootloader",
-                    Outcome::Runs(super::scenario::OLD) => "old program",
+                    Outcome::Runs(super::device::OLD) => "old program",
                     Outcome::Runs(_) => "new program",
                 };
                 *self.outcomes.entry(outcome.into()).or_default() += 1;

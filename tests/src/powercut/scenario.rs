@@ -7,12 +7,7 @@ use boot_core::store::NodeParameters;
 
 use kit::ihex::intel_hex;
 
-use super::device::{image, Device, Outcome, BOARD_NODE, LAYOUT, PRODUCT_CODE, VENDOR_ID};
-
-/// Seed of the program before an update.
-pub const OLD: u8 = 0xA3;
-/// Seed of the new program.
-pub const NEW: u8 = 0xB7;
+use super::device::{image, Bug, Device, Outcome, BOARD_NODE, LAYOUT, NEW, OLD, PRODUCT_CODE, VENDOR_ID};
 
 const START_OLD: Outcome = Outcome::Runs(OLD);
 const START_NEW: Outcome = Outcome::Runs(NEW);
@@ -55,7 +50,7 @@ pub struct Scenario {
 
 impl Scenario {
     /// The prepared device.
-    pub fn device(&self, bug: Option<super::Bug>) -> Device {
+    pub fn device(&self, bug: Option<Bug>) -> Device {
         let mut device = Device::new(bug);
         (self.prepare)(&mut device);
         device.power_on();

@@ -7,20 +7,12 @@ use shared_abi::geometry::Region;
 use boot_core::crc32;
 use boot_core::store::{Journal, ProgramRecord};
 
-use super::story::{Outcome, Seen, Story};
-use super::BOOT_MS;
+use super::story::{program_flash, Outcome, Seen, Story, BOOT_MS};
 use crate::bench::Bench;
 use crate::firmware;
 use kit::model::ModelFlash;
 
 const VERSION: Address = Address::new(0x100A, 0);
-
-/// The flash from the start of the first program on.
-#[must_use]
-pub fn program_flash(flash: &[u8]) -> &[u8] {
-    let board = firmware::board();
-    &flash[(board.programs[0].base - board.chip.flash.base) as usize..]
-}
 
 /// The power returns; returns what the board does then.
 ///

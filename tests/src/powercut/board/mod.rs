@@ -23,16 +23,15 @@ use emulator::machine::{Cells, Cut, Operation};
 
 use super::point::{self, At};
 use super::points::{Report, TOLD};
-use crate::bench::{Bench, RESCUE_WINDOW_MS};
+use crate::bench::Bench;
 use crate::firmware;
 use look::{look, observe};
+use story::BOOT_MS;
 pub use story::{Outcome, Scenario, Seen, Story, SCENARIOS};
 
 mod look;
 pub mod story;
 
-/// A board with a program, confirmed or not, runs it within this time, in ms.
-const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
 /// The prefix of the name of a point.
 pub const NAME: &str = "board";
 /// The number of looks at a flash with bits between 0 and 1: they read differently each time.

@@ -11,9 +11,18 @@ use coflash::update::{flash, FlashOptions, Program};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
-use super::BOOT_MS;
-use crate::bench::{Bench, NODE};
+use crate::bench::{Bench, NODE, RESCUE_WINDOW_MS};
 use crate::{firmware, sealed_board};
+
+/// A board with a program, confirmed or not, runs it within this time, in ms.
+pub const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
+
+/// The flash from the start of the first program on.
+#[must_use]
+pub fn program_flash(flash: &[u8]) -> &[u8] {
+    let board = firmware::board();
+    &flash[(board.programs[0].base - board.chip.flash.base) as usize..]
+}
 
 /// The highest bit rate. It is stored in the device and differs from the default, so a device that
 /// answers has kept its parameters.
@@ -335,7 +344,7 @@ fn program_of(image: &str) -> Result<Vec<u8>, String> {
     let chip = firmware::board().chip;
     let mut machine = Machine::new(chip, Options::default()).map_err(|error| error.to_string())?;
     machine.load(&firmware::elf(image)).map_err(|error| error.to_string())?;
-    let bytes = super::look::program_flash(machine.flash());
+    let bytes = program_flash(machine.flash());
     let used = bytes.iter().rposition(|byte| *byte != 0xFF).map_or(0, |last| last + 1);
     Ok(bytes[..used].to_vec())
 }
