@@ -5,6 +5,24 @@
 //! xtask new-board`. All boards share the rest of the crate.
 //!
 //! On the host the crate has the values of a board, without the drivers.
+//!
+//! | file | what it does |
+//! |---|---|
+//! | `boards/` | the facts of each board |
+//! | `facts.rs` | what a board says about itself, what follows from it, and the checks of it |
+//! | `identity.rs` | who the device is: 1008h to 100Ah, 1018h, and the chip's unique identifier |
+//! | [`clock`] | the clock tree: its rules |
+//! | `pll.rs` | the clock tree in the registers of the chip, and the regulator |
+//! | `drivers.rs` | the set-up that is the same for every board: clocks, pins, entry strap |
+//! | [`can`] | bxCAN: bit timing, filters, send, receive, errors |
+//! | `can_controllers.rs` | the use of CAN2 in place of CAN1 |
+//! | [`uart`] | a UART without waiting |
+//! | [`ring`], [`slcan`], `virtual_can.rs` | CAN over the UART, in the SLCAN protocol (feature `virtual-can`) |
+//! | `port.rs` | the port for frames: the CAN controller, or the UART |
+//! | [`line`](mod@line) | what a CANopen slave wants of its port |
+//! | `watchdog.rs` | the independent watchdog |
+//! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
+//! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
 #![cfg_attr(not(test), no_std)]
 
 pub mod can;

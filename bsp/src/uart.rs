@@ -82,7 +82,8 @@ mod drivers {
     }
 
     /// The divider of the board's UART.
-    const DIVIDER: u16 = match crate::uart::divider(clock::<UartController>(&CLOCK_TREE), FACTS.uart_bit_rate) {
+    const DIVIDER: u16 = match crate::uart::divider(clock::<UartController>(&CLOCK_TREE), FACTS.uart_bit_rate)
+    {
         Some(divider) => divider,
         None => panic!("board: the clock of the UART cannot make uart_bit_rate"),
     };

@@ -21,8 +21,8 @@ usage: cargo xtask arrows
 Checks the dependencies between the crates against the rules in xtask/src/arrows.rs; that the
 emulator takes nothing but the geometry of the silicon from shared-abi (its program the names of
 the boards, too); that the pure crates
-forbid unsafe code; and that the modules of a crate do not use each other in circles (nor, in
-coflash, its files), those of boot-core and coflash no others than xtask/src/rooms.rs allows; and that everything is there that
+forbid unsafe code; that neither modules nor files of a crate use each other in circles, and those of
+boot-core and coflash no others than xtask/src/rooms.rs allows; and that everything is there that
 the owner of the product ordered by name (xtask/src/ordered.rs).
 ";
 

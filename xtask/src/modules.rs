@@ -19,11 +19,13 @@ pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
         sources.iter().filter_map(|(path, text)| Some((module(path)?, text.as_str()))).collect();
     let known: BTreeSet<Module> = modules.iter().map(|(module, _)| module.clone()).collect();
     let krate = krate.replace('-', "_");
+    let programs: Vec<Module> = sources.iter().filter_map(|(path, _)| program(path)).collect();
     let mut graph = Graph::new();
     for (own, text) in &modules {
         let uses = graph.entry(own.clone()).or_default();
+        let root = programs.iter().find(|folder| own.starts_with(folder)).map_or(&[][..], Vec::as_slice);
         for path in paths(&code(text)) {
-            let Some(target) = resolve(&path, own, &krate, &known) else { continue };
+            let Some(target) = resolve(&path, own, root, &krate, &known) else { continue };
             if target != *own {
                 uses.insert(target);
             }
@@ -32,13 +34,20 @@ pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
     graph
 }
 
+/// The folder of a program beside the crate's own, from the path of its `main.rs`: `crate::` is this
+/// folder in its files.
+fn program(path: &str) -> Option<Module> {
+    Some(path.strip_suffix("/main.rs")?.split('/').map(str::to_owned).collect())
+}
+
 /// The module of a file; `None` for the root of a binary, which no other file can use.
 fn module(path: &str) -> Option<Module> {
     let path = path.strip_suffix(".rs")?;
-    if path == "main" || path.starts_with("bin/") {
+    let mut parts: Module = path.split('/').map(str::to_owned).collect();
+    let is_in_bin = parts.len() == 2 && parts[0] == "bin";
+    if is_in_bin || parts.last().is_some_and(|last| last == "main") {
         return None;
     }
-    let mut parts: Module = path.split('/').map(str::to_owned).collect();
     if parts.last().is_some_and(|last| last == "mod" || last == "lib" && path == "lib") {
         parts.pop();
     }
@@ -139,8 +148,14 @@ fn is_name(token: &str) -> bool {
     token.starts_with(|letter: char| letter.is_alphabetic() || letter == '_')
 }
 
-/// The file of a path: the longest part of the path that is a module.
-fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module>) -> Option<Module> {
+/// The file of a path: the longest part of the path that is a module. `root` is where `crate::` leads.
+fn resolve(
+    path: &[String],
+    own: &[String],
+    root: &[String],
+    krate: &str,
+    known: &BTreeSet<Module>,
+) -> Option<Module> {
     let mut at = own.to_vec();
     let mut rest = path;
     match rest.first().map(String::as_str)? {
@@ -151,7 +166,11 @@ fn resolve(path: &[String], own: &[String], krate: &str, known: &BTreeSet<Module
                 rest = &rest[1..];
             }
         }
-        name if name == "crate" || name == krate => {
+        "crate" => {
+            at = root.to_vec();
+            rest = &rest[1..];
+        }
+        name if name == krate => {
             at.clear();
             rest = &rest[1..];
         }

@@ -1,8 +1,8 @@
 //! The rooms of a crate: its top-level modules, and which of them use which.
 //!
-//! Three checks: the permitted uses of each room of `boot-core` and of `coflash`, so that a format
-//! cannot reach the flash and a file does not depend on a device; that no rooms of a crate use each
-//! other in a circle; and that no files of `coflash` do.
+//! Two checks: the permitted uses of each room of `boot-core` and of `coflash`, so that a format
+//! cannot reach the flash and a file does not depend on a device; and that in no crate rooms or files
+//! use each other in a circle.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -81,26 +81,6 @@ const COFLASH: &[Rule] = &[
 /// The dependencies of `coflash` that a room may use only if its row lists them.
 const OURS: [&str; 2] = ["canopen", "shared_abi"];
 
-/// The crates that are checked for circles of rooms. The circles of the others are known:
-/// `emulator` (cpu, machine).
-pub const WITHOUT_CIRCLES: &[&str] = &[
-    "bootloader",
-    "boot-core",
-    "canopen",
-    "coboot-app",
-    "coboot-linker",
-    "coboot-node",
-    "coflash",
-    "shared-abi",
-    "xtask",
-];
-
-/// Known circles that are still to be resolved: the crate, and its use that is permitted.
-const KNOWN: &[(&str, &str, &str)] = &[("shared-abi", "callgate", "layout"), ("xtask", "size", "build")];
-
-/// The crates that are checked for circles of files, too.
-const FILES_WITHOUT_CIRCLES: &[&str] = &["coflash"];
-
 /// For each room, the rooms that it uses.
 pub type Graph = BTreeMap<String, BTreeSet<String>>;
 
@@ -156,15 +136,9 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     let files = modules::graph(name, sources);
     let rooms = graph(&files);
     let mut broken = Vec::new();
-    let mut untied = rooms.clone();
-    for (_, from, to) in KNOWN.iter().filter(|(krate, ..)| *krate == name) {
-        if let Some(uses) = untied.get_mut(*from) {
-            uses.remove(*to);
-        }
-    }
-    if let Some(circle) = circle(&untied).filter(|_| WITHOUT_CIRCLES.contains(&name)) {
+    if let Some(circle) = circle(&rooms) {
         broken.push(format!("{name}: these modules use each other in a circle: {}", circle.join(" -> ")));
-    } else if let Some(circle) = circle(&by_name(&files)).filter(|_| FILES_WITHOUT_CIRCLES.contains(&name)) {
+    } else if let Some(circle) = circle(&by_name(&files)) {
         broken.push(format!("{name}: these files use each other in a circle: {}", circle.join(" -> ")));
     }
     let (rules, rooms) = match name {
@@ -192,7 +166,7 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     broken
 }
 
-/// The graph of the files in the form for [`circle`], without the root, which may use all files.
+/// The graph of the files in the form for [`circle`].
 fn by_name(files: &modules::Graph) -> Graph {
     let name = |module: &modules::Module| match module.as_slice() {
         [] => "(root)".to_owned(),
@@ -284,8 +258,35 @@ mod tests {
             ("bus/adapter.rs", ""),
         ]);
         let words = "these files use each other in a circle: bus::hub -> bus::port";
-        assert_eq!(broken("coflash", &all), [format!("coflash: {words}")]);
-        assert_eq!(broken("emulator", &all), [""; 0]);
+        for krate in ["coflash", "emulator"] {
+            assert_eq!(broken(krate, &all), [format!("{krate}: {words}")]);
+        }
+    }
+
+    #[test]
+    fn rooms_that_use_each_other_are_told_in_every_crate() {
+        let all = sources(&[
+            ("a/mod.rs", ""),
+            ("a/one.rs", "use crate::b::X;"),
+            ("a/two.rs", ""),
+            ("b.rs", "use crate::a::two::Y;"),
+        ]);
+        let words = "these modules use each other in a circle: a -> b";
+        assert_eq!(broken("emulator", &all), [format!("emulator: {words}")]);
+    }
+
+    /// The firmware has a second program in a folder of its own.
+    #[test]
+    fn files_of_a_program_in_a_folder_are_files_of_the_crate() {
+        let all = sources(&[
+            ("main.rs", "mod services;"),
+            ("services.rs", ""),
+            ("resident/main.rs", "mod stage; mod storing; fn main() { stage::run() }"),
+            ("resident/stage.rs", "use crate::storing;"),
+            ("resident/storing.rs", "use crate::stage::Stage;"),
+        ]);
+        let words = "these files use each other in a circle: resident::stage -> resident::storing";
+        assert_eq!(broken("bootloader", &all), [format!("bootloader: {words}")]);
     }
 
     #[test]
