@@ -87,7 +87,8 @@ const KIT: &str = "kit";
 const MAY_CONTAIN_KIT: &[&str] = &["coboot-tests", "xtask"];
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
-const PURE: &[&str] = &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "xtask"];
+const PURE: &[&str] =
+    &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "kit", "xtask"];
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

@@ -32,10 +32,10 @@ const PACKAGES: [&str; 5] = ["coboot-abi", "coboot-canopen", "coboot-core", "cob
 const SEALED: &str = r"/(unseal|intake/sealed)\b";
 /// The options for them. Their tests are in another crate, too, where cargo-mutants does not look for
 /// them before the first change.
-const WITH_SEALED: &str =
-    "--features=coboot-core/sealed --test-package=coboot-core,coboot-tests --baseline=skip \
-                           --timeout=300 --build-timeout=1200 --cargo-arg=--test=it --cargo-arg=--test=sealed --cargo-test-arg=-- \
-                           --cargo-test-arg=objects::";
+const WITH_SEALED: &str = "--features=coboot-core/sealed --test-package=coboot-core,coboot-tests \
+                           --baseline=skip --timeout=300 --build-timeout=1200 \
+                           --cargo-arg=--test=it --cargo-arg=--test=sealed \
+                           --cargo-test-arg=-- --cargo-test-arg=objects::";
 
 pub fn run(mut args: Args) -> Outcome {
     let (package, base, shard) = (args.value("--package")?, args.value("--in-diff")?, args.value("--shard")?);

@@ -12,13 +12,13 @@ use std::time::Duration;
 
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
-use kit::bus::{at, node, Device};
 use coboot_fuzz::Input;
 use coflash::bus::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Means, Outcome};
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::update::Program;
 use embedded_can::Frame as _;
+use kit::bus::{at, node, Device};
 
 /// The most time on the bus for all checks together. A check that transfers a program may take
 /// minutes on a device that is as slow as it may be.

@@ -9,9 +9,9 @@ use canopen::debugger::{Command, Kind, COMMAND, DATA};
 use canopen::sdo::client::{Block, Config, Download, Step, Transfer, Upload};
 use canopen::sdo::SdoError;
 use canopen::{AbortCode, Address};
+use coboot_fuzz::{Input, ENDLESS};
 use kit::bus::{at, node, request};
 use kit::memory::{Target, RAM, SIZE};
-use coboot_fuzz::{Input, ENDLESS};
 
 const REFUSALS: [Option<AbortCode>; 3] =
     [None, Some(AbortCode::LOCAL_CONTROL), Some(AbortCode::INVALID_VALUE)];

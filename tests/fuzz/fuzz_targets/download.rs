@@ -10,9 +10,9 @@ use boot_core::control::{Downloader, Policy, Step};
 use boot_core::store::Journal;
 use boot_core::unseal::Room;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
-use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::Input;
 use coflash::file::block_file::{Block, CRC};
+use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::layout::Layout;
 
 static LAYOUT: Layout = ONE_PROGRAM;

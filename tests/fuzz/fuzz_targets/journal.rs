@@ -6,8 +6,8 @@
 
 use boot_core::flash::run;
 use boot_core::store::{Journal, Key, Parameters};
-use kit::model::ModelFlash;
 use coboot_fuzz::Input;
+use kit::model::ModelFlash;
 use shared_abi::geometry::{Geometry, Region, SectorRun, STM32F407VG};
 
 static CHIP: Geometry = Geometry {

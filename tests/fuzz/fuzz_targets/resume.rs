@@ -21,10 +21,10 @@ use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA, SECOND_SERVER};
 use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, Step, Transfer};
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
-use kit::boot::Boot;
-use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use coboot_fuzz::{is_eighth, Input};
 use coflash::file::block_file::{Block, CRC};
+use kit::boot::Boot;
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 

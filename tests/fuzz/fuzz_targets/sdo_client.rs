@@ -6,8 +6,8 @@
 
 use canopen::sdo::client::{Block, Config, Download, Sink, Step, Transfer, Upload};
 use canopen::{AbortCode, Address, CobId, Frame};
-use kit::bus::{at, node, response};
 use coboot_fuzz::{Input, ENDLESS};
+use kit::bus::{at, node, response};
 
 const AT: Address = Address::new(0x2000, 0);
 

@@ -11,8 +11,8 @@ use canopen::node::{Config, NmtPolicy, Node};
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Upload};
 use canopen::sdo::server::Config as SdoConfig;
 use canopen::{Address, CobId, Frame};
-use kit::bus::{at, node, request, Device};
 use coboot_fuzz::{drain, run, Input};
+use kit::bus::{at, node, request, Device};
 
 /// Existing objects of every type and access, for frames that pass the first checks.
 const INDICES: [u16; 10] = [0x1000, 0x1008, 0x1017, 0x1018, 0x1F50, 0x1F51, 0x2000, 0x2001, 0x2002, 0x2003];

@@ -12,8 +12,8 @@ use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transf
 use canopen::sdo::server::Config as SdoConfig;
 use canopen::sdo::SdoError;
 use canopen::{Address, Frame};
-use kit::bus::{at, node, Device};
 use coboot_fuzz::Input;
+use kit::bus::{at, node, Device};
 
 const AT: Address = Address::new(0x2000, 0);
 

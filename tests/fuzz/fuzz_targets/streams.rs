@@ -16,9 +16,9 @@ use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{ENABLE_FLASH, PROGRAM_CONTROL, PROGRAM_DATA, UNLOCK, UNLOCK_FIRMWARE};
 use canopen::{AbortCode, Address, BitRate, Instant, NodeId};
+use coboot_fuzz::Input;
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
-use coboot_fuzz::Input;
 use shared_abi::layout::Layout;
 
 static LAYOUT: Layout = TWO_PROGRAMS;

@@ -15,6 +15,8 @@
 //! | [`bench`] | feature `boot`: a bootloader on that flash, and the actions of a host |
 //! | [`rig`] | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
+#![forbid(unsafe_code)]
+
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod bench;
