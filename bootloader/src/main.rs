@@ -260,33 +260,33 @@ mod app {
         let status = can.lock(line::status);
         let finishing = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
-            let device = debugger.attach(bootloader);
-            #[cfg(feature = "debugger")]
-            let device = &mut { device };
-            slave.observe(status, now, device);
-            // The slave sends what it has before it handles requests: a frame without room (a
-            // heartbeat on a busy bus) must not delay the requests.
-            carry_out(slave, &mut can, now, device);
-            // The request that the application left comes first, now that the boot-up is on its
-            // way.
-            let Owed { program, value, node_id } = core::mem::replace(owed, Owed::NOTHING);
-            let asked = NodeId::new(node_id).map(|node| {
-                Frame::full(CobId::sdo_request(node), [0x2F, 0x51, 0x1F, program, value, 0, 0, 0])
-            });
-            let mut next = asked.or_else(|| to_handle.dequeue());
-            while let Some(frame) = next {
-                log::received(&frame);
-                // The filters pass only NMT and frames for this device or for layer setting
-                // services (LSS). All but NMT end the rescue window.
-                if frame.cob_id() != Some(CobId::NMT) {
-                    *held = None;
-                }
-                if slave.handle(&frame, now, device) {
-                    *pending_reset = PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
-                }
+            debugger.with(bootloader, |device| {
+                slave.observe(status, now, device);
+                // The slave sends what it has before it handles requests: a frame without room (a
+                // heartbeat on a busy bus) must not delay the requests.
                 carry_out(slave, &mut can, now, device);
-                next = to_handle.dequeue();
-            }
+                // The request that the application left comes first, now that the boot-up is on its
+                // way.
+                let Owed { program, value, node_id } = core::mem::replace(owed, Owed::NOTHING);
+                let asked = NodeId::new(node_id).map(|node| {
+                    Frame::full(CobId::sdo_request(node), [0x2F, 0x51, 0x1F, program, value, 0, 0, 0])
+                });
+                let mut next = asked.or_else(|| to_handle.dequeue());
+                while let Some(frame) = next {
+                    log::received(&frame);
+                    // The filters pass only NMT and frames for this device or for layer setting
+                    // services (LSS). All but NMT end the rescue window.
+                    if frame.cob_id() != Some(CobId::NMT) {
+                        *held = None;
+                    }
+                    if slave.handle(&frame, now, device) {
+                        *pending_reset =
+                            PendingReset { wanted: true, request: BootRequest::PowerOn, at: None };
+                    }
+                    carry_out(slave, &mut can, now, device);
+                    next = to_handle.dequeue();
+                }
+            });
             if let Some(request) = bootloader.take_boot_request() {
                 *pending_reset = PendingReset { wanted: true, request, at: None };
             }

@@ -22,15 +22,15 @@ impl Debugger {
         Self(debugger::Debugger::new(Chip))
     }
 
-    /// The device with the interface in front of it.
-    pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> Debugged<'a, D, Chip> {
+    /// Does something with the device, with the interface in front of it.
+    pub fn with<D, R>(&mut self, device: &mut D, action: impl FnOnce(&mut Debugged<'_, D, Chip>) -> R) -> R {
         #[cfg(feature = "monitor")]
         if let Some((kind, address)) = crate::monitor::take_stop() {
             if let Some(stop) = debugger::Stop::from_number(kind) {
                 self.0.stopped(stop, address);
             }
         }
-        self.0.attach(device)
+        action(&mut self.0.attach(device))
     }
 }
 

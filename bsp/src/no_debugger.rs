@@ -17,8 +17,9 @@ impl Debugger {
         Self
     }
 
-    /// The device itself, unchanged.
-    pub fn attach<'a, D>(&'a mut self, device: &'a mut D) -> &'a mut D {
-        device
+    /// Does something with the device itself.
+    #[inline(always)]
+    pub fn with<D, R>(&mut self, device: &mut D, action: impl FnOnce(&mut D) -> R) -> R {
+        action(device)
     }
 }

@@ -166,19 +166,13 @@ mod app {
             return;
         }
         let status = can.lock(line::status);
-        let debugged = debugger.attach(device);
-        #[cfg(feature = "debugger")]
-        let debugged = &mut { debugged };
-        slave.observe(status, now, debugged);
+        debugger.with(device, |device| slave.observe(status, now, device));
         loop {
-            let debugged = debugger.attach(device);
-            #[cfg(feature = "debugger")]
-            let debugged = &mut { debugged };
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
             // waiting behind it.
-            carry_out(slave, &mut can, now, debugged);
+            debugger.with(device, |device| carry_out(slave, &mut can, now, device));
             let Some(frame) = to_handle.dequeue() else { return };
-            if slave.handle(&frame, now, debugged) {
+            if debugger.with(device, |device| slave.handle(&frame, now, device)) {
                 device.application.control.restart(now.as_millis());
             }
             device.application.leave_owed(slave);
