@@ -14,7 +14,7 @@ const ELSEWHERE: [&str; 4] =
 /// Every file of the repository outside [`FOREIGN`], as a path from its root.
 fn files() -> Vec<PathBuf> {
     let root = workspace::root();
-    let (mut files, mut folders) = (Vec::new(), vec![root.clone()]);
+    let (mut files, mut folders) = (Vec::new(), vec![root.to_owned()]);
     while let Some(folder) = folders.pop() {
         for entry in fs::read_dir(folder).unwrap().flatten() {
             let path = entry.path();
