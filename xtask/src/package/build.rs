@@ -9,7 +9,7 @@ use super::{copy, notices, remove, unreadable, write, Release, LINUX};
 use crate::{process, setup, workspace, Outcome};
 
 /// Cargo's profile of the released programs.
-const PROFILE: &str = "dist";
+pub const PROFILE: &str = "dist";
 
 /// Builds `coflash` from the workspace at `root`.
 ///

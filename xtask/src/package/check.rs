@@ -2,12 +2,10 @@
 
 use std::fs;
 use std::io::{BufRead as _, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use super::{
-    build, deb, package_crates, remove, unreadable, unwritable, write, Release, LINUX, SUMS, VERSION,
-};
+use super::{build, package_crates, remove, unreadable, unwritable, write, Release, LINUX, SUMS, VERSION};
 use crate::setup::{self, Setup};
 use crate::{process, workspace, Outcome};
 
@@ -96,7 +94,7 @@ fn debian(release: &Release, root: &Path) -> Outcome {
     process::run(
         Command::new("bash").arg("-n").arg(root.join("usr/share/bash-completion/completions/coflash")),
     )?;
-    let pages = deb::files(&root.join("usr/share/man/man1"))?;
+    let pages = files(&root.join("usr/share/man/man1"))?;
     process::run(Command::new("gzip").arg("--test").args(&pages))?;
     // The page of the program, and one for each of its commands.
     let names: Vec<_> = pages.iter().filter_map(|page| page.file_name()?.to_str()).collect();
@@ -106,7 +104,7 @@ fn debian(release: &Release, root: &Path) -> Outcome {
         }
     }
     process::run(&mut dpkg(&["--purge", "coflash"]))?;
-    let left: Vec<_> = deb::files(root)?.into_iter().filter(|file| !file.starts_with(&base)).collect();
+    let left: Vec<_> = files(root)?.into_iter().filter(|file| !file.starts_with(&base)).collect();
     if let Some(file) = left.first() {
         return Err(format!("{} is left over when the package is removed.", file.display()));
     }
@@ -277,6 +275,21 @@ fn foreign_libraries(listing: &str) -> Outcome {
         Some(foreign) => Err(format!("the program for Windows needs {foreign}, which no Windows has.")),
         None => Ok(()),
     }
+}
+
+/// All files below a folder.
+fn files(folder: &Path) -> Outcome<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for path in fs::read_dir(folder).map_err(|error| unreadable(folder, &error))?.flatten() {
+        let path = path.path();
+        if path.is_dir() {
+            found.extend(files(&path)?);
+        } else {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
 }
 
 fn unpack(archive: &Path, into: &Path) -> Outcome {
