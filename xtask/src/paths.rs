@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use crate::{links, workspace};
 
 /// Folders without our files, and pages about the past, which use old names.
-const FOREIGN: [&str; 5] = ["target", ".git", "corpus", "node_modules", "adr"];
+const FOREIGN: [&str; 4] = ["target", ".git", "node_modules", "adr"];
 /// Files that are not in the repository: those of a user, of a package, and what a job makes.
 const ELSEWHERE: [&str; 4] =
     ["coflash/coflash.toml", ".vscode/launch.json", "udev/70-coflash.rules", "docs/evidence.md"];
@@ -19,7 +19,7 @@ fn files() -> Vec<PathBuf> {
         for entry in fs::read_dir(folder).unwrap().flatten() {
             let path = entry.path();
             if !path.is_dir() {
-                files.push(path.strip_prefix(&root).unwrap().to_owned());
+                files.push(path.strip_prefix(root).unwrap().to_owned());
             } else if !FOREIGN.iter().any(|name| path.ends_with(name)) {
                 folders.push(path);
             }
@@ -29,14 +29,15 @@ fn files() -> Vec<PathBuf> {
 }
 
 /// The word as a path, if it is one: with a slash and a small letter, and without a blank. What
-/// `cargo` builds is none.
+/// `cargo` and CMake build is none.
 fn path_of(word: &str) -> Option<&str> {
     let word = word.trim_end_matches('/');
     let is_path = word.chars().all(|c| c.is_ascii_alphanumeric() || "_.-/".contains(c))
         && word.contains('/')
         && !word.starts_with('/')
         && word.contains(|c: char| c.is_ascii_lowercase());
-    (is_path && !word.starts_with("target/")).then_some(word)
+    let is_built = word.starts_with("target/") || word.starts_with("build/");
+    (is_path && !is_built).then_some(word)
 }
 
 /// Whether a file has this path, or is in this folder: from the root or from the page's folder on, or
