@@ -94,7 +94,7 @@ fn hil(folder: &Path, words: &[&str]) -> (bool, String) {
 #[test]
 fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
     let board = Board::new();
-    let folder = Folder::new(env!("CARGO_TARGET_TMPDIR"), "hil");
+    let folder = Folder::below(env!("CARGO_TARGET_TMPDIR"), "hil");
     let (probe, relay) = (board.probe(&folder), board.relay());
     let report = folder.join("report.json");
     let words = ["--bus", &board.bus, "--probe", &probe, "--power-command", &relay, "--json"];
