@@ -6,6 +6,8 @@ use kit::rig::{program, Rig, Setup, AT_ONCE_2, PRODUCT_CODE, STANDARD_1, STANDAR
 use shared_abi::geometry::Region;
 
 const CLEAR: u8 = 0x03;
+/// No sector.
+const NONE: [u32; 0] = [];
 const BUSY: u32 = 1;
 const MAN_BUSY: AbortCode = AbortCode(0x0800_0022);
 
@@ -46,16 +48,16 @@ fn clear(rig: &mut Rig, number: u8) -> Vec<u32> {
 #[test]
 fn a_second_clear_erases_what_was_written_since_the_last_one() {
     let mut rig = Rig::new(&STANDARD_1, 1024);
-    assert_eq!(clear(&mut rig, 1), [], "a new device");
+    assert_eq!(clear(&mut rig, 1), NONE, "a new device");
     rig.install(1, &raw(&STANDARD_1, 1, 100));
     assert_eq!(clear(&mut rig, 1), sectors(100));
-    assert_eq!(clear(&mut rig, 1), []);
+    assert_eq!(clear(&mut rig, 1), NONE);
     // Across resets.
     rig.install(1, &raw(&STANDARD_1, 1, 3000));
     rig.reset();
     assert_eq!(clear(&mut rig, 1), sectors(3000));
     rig.reset();
-    assert_eq!(clear(&mut rig, 1), []);
+    assert_eq!(clear(&mut rig, 1), NONE);
     // After a smaller program, the rest of the larger one is still in flash; released and
     // confirmed.
     rig.install(1, &raw(&STANDARD_1, 1, 5000));
@@ -69,7 +71,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     holey[1000..].fill(0xFF);
     rig.install(1, &holey);
     assert_eq!(clear(&mut rig, 1), sectors(1000));
-    assert_eq!(clear(&mut rig, 1), []);
+    assert_eq!(clear(&mut rig, 1), NONE);
     // A debugger has written something to the last sector.
     rig.chip.model().poke(0x0800_43FC, &[0x7F]);
     assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
@@ -87,7 +89,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
             rig.reset();
         }
         assert_eq!(clear(&mut rig, 1), sectors(0x3C00));
-        assert_eq!(clear(&mut rig, 1), []);
+        assert_eq!(clear(&mut rig, 1), NONE);
     }
 }
 
@@ -99,7 +101,7 @@ fn every_clear_that_erases_does_so() {
     rig.install(2, &raw(&STANDARD_2, 2, 1500));
     assert_eq!(clear(&mut rig, 2), [0x0800_2400]);
     assert_eq!((rig.state(1), rig.state(2)), (0, 3));
-    assert_eq!(clear(&mut rig, 2), []);
+    assert_eq!(clear(&mut rig, 2), NONE);
     assert_eq!(clear(&mut rig, 1), sectors(1500));
     let mut rig = Rig::new(&AT_ONCE_2, 1024);
     rig.install(1, &raw(&STANDARD_2, 1, 1500));
@@ -110,7 +112,7 @@ fn every_clear_that_erases_does_so() {
     assert_eq!(erased(&rig, 1), sectors(1500));
     rig.command(1, CLEAR).unwrap();
     rig.settle();
-    assert_eq!(erased(&rig, 1), []);
+    assert_eq!(erased(&rig, 1), NONE);
 }
 
 /// The task that answers the bus waits for a step.
@@ -168,7 +170,7 @@ fn after_a_power_cut_a_second_clear_leaves_nothing_half_erased() {
                 clear(&mut rig, 1);
                 assert!(rig.chip.model().is_stable(STANDARD_1.region(1)), "{cut:?} in operation {number}");
                 rig.reset();
-                assert_eq!(clear(&mut rig, 1), []);
+                assert_eq!(clear(&mut rig, 1), NONE);
             }
         }
     }

@@ -114,7 +114,7 @@ fn each_program_has_its_own_values_and_no_other_exists() {
             assert_eq!(rig.state(number), 0);
             assert_eq!(rig.identification(number), crc32(image));
             // The label of an image has its number as version.
-            assert_eq!(rig.word(0x2005, number), number.into());
+            assert_eq!(rig.word(0x2005, number), u32::from(number));
             let region = STANDARD_2.region(number);
             let value = [region.base.to_le_bytes(), region.size.to_le_bytes()].concat();
             assert_eq!(read(&mut rig, 0x2004, number), Ok(value));
