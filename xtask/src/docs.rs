@@ -183,9 +183,12 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
             // The other arguments go to cargo test.
             "--test" if job == "test" => {
                 let name = words.next().unwrap_or_default();
-                let is_test =
-                    |krate: &&str| workspace::root().join(krate).join(format!("tests/{name}.rs")).exists();
-                if !["tests", "coflash", "sim/node", "core/canopen", "core/boot-core"].iter().any(is_test) {
+                let is_program = |krate: &&str| {
+                    let files = [format!("{name}/main.rs"), format!("tests/{name}.rs")];
+                    files.iter().any(|file| workspace::root().join(krate).join(file).exists())
+                };
+                if !["tests", "coflash", "sim/node", "core/canopen", "core/boot-core"].iter().any(is_program)
+                {
                     return Some(format!("there is no test {name}"));
                 }
             }
