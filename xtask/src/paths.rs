@@ -8,8 +8,13 @@ use crate::{links, workspace};
 /// Folders without our files, and pages about the past, which use old names.
 const FOREIGN: [&str; 4] = ["target", ".git", "node_modules", "adr"];
 /// Files that are not in the repository: those of a user, of a package, and what a job makes.
-const ELSEWHERE: [&str; 4] =
-    ["coflash/coflash.toml", ".vscode/launch.json", "udev/70-coflash.rules", "docs/evidence.md"];
+const ELSEWHERE: [&str; 5] = [
+    "coflash/coflash.toml",
+    ".vscode/launch.json",
+    "udev/70-coflash.rules",
+    "docs/evidence.md",
+    "build/app.elf",
+];
 
 /// Every file of the repository outside [`FOREIGN`], as a path from its root.
 fn files() -> Vec<PathBuf> {
