@@ -112,8 +112,8 @@ pub fn run(mut args: Args) -> Outcome {
     if part.is_some() && !all {
         return Err("--part goes with --all.".into());
     }
-    let stages: Vec<&Stage> = match part {
-        Some(part) => share(&part)?,
+    let stages: Vec<&Stage> = match &part {
+        Some(part) => share(part)?,
         None if all => STAGES.iter().collect(),
         None => STAGES.iter().filter(|stage| stage.name == if for_ci { "ci" } else { "product" }).collect(),
     };
@@ -140,14 +140,15 @@ pub fn run(mut args: Args) -> Outcome {
     }
 
     let started = Instant::now();
-    let name = if all {
-        "tests-all"
-    } else if for_ci {
-        "tests-ci"
-    } else {
-        "tests"
+    // Each part of a run has a record of its own; the page adds them up.
+    let name = match &part {
+        Some(part) => format!("tests-all-{}", part.replace('/', "-")),
+        None if all => "tests-all".into(),
+        None if for_ci => "tests-ci".into(),
+        None if chosen_board => format!("tests-{}", board.board),
+        None => "tests".to_owned(),
     };
-    evidence::begin(name)?;
+    evidence::begin(&name)?;
     let mut summary = Summary::default();
     if chosen_board {
         on_board(board, Tier::All, &mut summary, |_, _| true)?;
@@ -160,7 +161,7 @@ pub fn run(mut args: Args) -> Outcome {
             }
         }
     }
-    evidence::record(name, summary.as_json())?;
+    evidence::record(&name, summary.as_json())?;
     println!();
     for name in summary.failed() {
         println!("FAILED: {name}");

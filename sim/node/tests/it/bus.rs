@@ -133,7 +133,7 @@ impl Drop for Running {
 
 /// `coboot-node` in the folder of a test.
 pub fn node(folder: &Folder, arguments: &[&str]) -> Running {
-    Running::start(Command::new(env!("CARGO_BIN_EXE_coboot-node")).args(arguments).current_dir(&*folder.0))
+    Running::start(Command::new(env!("CARGO_BIN_EXE_coboot-node")).args(arguments).current_dir(&folder.0))
 }
 
 /// Running nodes.
@@ -200,7 +200,7 @@ impl<'a> Coflash<'a> {
         Running::start(
             Command::new(program())
                 .args(arguments)
-                .current_dir(&*self.folder.0)
+                .current_dir(&self.folder.0)
                 .env("COFLASH_BUS", self.url)
                 .env("XDG_CONFIG_HOME", &nowhere)
                 .env("XDG_STATE_HOME", &nowhere)
