@@ -211,7 +211,7 @@ fn scan_finds_who_answers_and_who_is_heard() {
     let scan = |options: &[&str]| {
         let (bus, server) = serve(devices());
         let done = coflash(
-            &[&["scan", "--bus", &bus, "--listen", "50", "--sdo-timeout", "50"][..], options].concat(),
+            &[&["scan", "--bus", &bus, "--listen", "50", "--sdo-timeout", "500"][..], options].concat(),
         );
         assert_eq!(done.exit, 0, "{}", done.err);
         (done.out, server.join().unwrap())
