@@ -35,19 +35,54 @@ const fn later(program: &'static str, tests: &'static str, tier: Tier, why: &'st
 
 /// The reason of tests on a board whose images `cargo xtask test` does not build.
 const TWO: &str = "images of the board with two programs";
+/// The reason of a second client of others.
+const OTHERS: &str = "one more client of others";
 
 /// What runs later, in the order of the programs.
 pub const LATER: &[Later] = &[
-    later("foreign", "ui::", Tier::Ci, "Chromium"),
-    later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
-    later("port", "porting::", Tier::All, "builds a copy of the repository"),
+    later("coboot-kit/abi", "header::it_compiles_for_the_chip", Tier::Ci, "arm-none-eabi-gcc"),
+    later("device", "application::", Tier::Ci, "builds an application anew, 2 minutes"),
+    later("device", "c_application::the_other_program", Tier::Ci, TWO),
+    later("device", "image::gdb_loads_it", Tier::Ci, "gdb"),
+    later("update", "attacker::", Tier::Ci, TWO),
+    later("update", "coflash_dialects::the_profile_of_lifts", Tier::Ci, TWO),
+    later("update", "dialects::a_lift", Tier::Ci, TWO),
+    later("update", "fleet::", Tier::Ci, "groups of devices, 3 minutes"),
+    later("update", "powercut_board::", Tier::Ci, "the sample on the built firmware, 2 minutes"),
+    later("update", "streams::", Tier::Ci, "whole programs at the slowest flash, 2 minutes"),
     later("update", "two_programs::", Tier::Ci, TWO),
+    later("foreign", "block_upload::", Tier::Ci, OTHERS),
+    later("foreign", "eds::", Tier::Ci, OTHERS),
+    later("foreign", "examples::", Tier::All, "builds a project of each tool chain"),
+    later("foreign", "gdb_door::", Tier::Ci, "gdb"),
+    later("foreign", "peers::", Tier::Ci, OTHERS),
+    later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
+    later("foreign", "ui::", Tier::Ci, "Chromium"),
+    later("foreign", "zencan::", Tier::Ci, OTHERS),
+    later("port", "matrix::", Tier::Ci, TWO),
+    later("port", "porting::", Tier::All, "builds a copy of the repository"),
     later("xtask", "", Tier::Ci, "the repository and its pages, not the product"),
+    later("xtask/hil", "", Tier::All, "builds and flashes for 4 minutes"),
 ];
 
 /// Test modules that take longest, the slowest first: they begin first, so that no core waits for
 /// one of them at the end.
-pub const SLOW: &[&str] = &["powercut::", "fleet::", "conform::", "clients::"];
+pub const SLOW: &[&str] = &[
+    "powercut::",
+    "fleet::",
+    "powercut_board::",
+    "streams::",
+    "application::",
+    "ui::",
+    "device::",
+    "conform::",
+    "resume::",
+    "refusals::",
+    "program_control::",
+    "attacker::",
+    "throughput::",
+    "clients::",
+];
 
 /// The images of a board that the tests of a tier need.
 pub struct Images {
