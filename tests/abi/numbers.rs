@@ -73,7 +73,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("RESET_BROWN_OUT", ResetCause::BrownOut as u32),
         ("CALLGATE_MAGIC", callgate::MAGIC),
         ("CALLGATE_ABI_VERSION", callgate::ABI_VERSION.into()),
-        ("CALLGATE_TABLE_SIZE", callgate::TABLE_SIZE.into()),
+        ("CALLGATE_TABLE_SIZE", callgate::TABLE_SIZE),
         ("CALLGATE_STACK", callgate::STACK),
         ("SELECTOR_CRC32", Selector::Crc32 as u32),
         ("SELECTOR_READ_NODE", Selector::ReadNode as u32),

@@ -31,13 +31,15 @@ impl Ui {
             return Err(Failure::usage("the page keeps the log of the frames itself", advice));
         }
         let end = cancelled()?;
-        let mut options = Options::default();
-        options.bus = context.bus.clone();
-        options.port = self.port;
-        options.kinds = context.kinds();
-        options.sdo_ids = match (context.sdo_request, context.sdo_response) {
-            (None, None) => None,
-            (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),
+        let options = Options {
+            bus: context.bus.clone(),
+            port: self.port,
+            kinds: context.kinds(),
+            sdo_ids: match (context.sdo_request, context.sdo_response) {
+                (None, None) => None,
+                (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),
+            },
+            ..Options::default()
         };
         let server = Server::new(options).map_err(|error| {
             Failure::system(format!("port {} of 127.0.0.1 cannot be served: {error}", self.port))

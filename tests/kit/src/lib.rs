@@ -15,6 +15,7 @@
 //! | [`bench`] | feature `boot`: a bootloader on that flash, and the actions of a host |
 //! | [`rig`] | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
+#![allow(clippy::new_without_default, reason = "a device that has booted is no default value")]
 #![forbid(unsafe_code)]
 
 #[cfg(feature = "boot")]

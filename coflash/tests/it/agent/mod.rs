@@ -74,7 +74,7 @@ fn config(server: &Server, folder: &Folder, ids: &[&str]) -> Config {
         let node = number + 1;
         text += &format!("[[device]]\ncontroller-id = '{id}'\nnode = {node}\ntoken-file = '{id}'\n");
     }
-    Config::parse(&text, &folder, None, None).unwrap()
+    Config::parse(&text, folder, None, None).unwrap()
 }
 
 fn options() -> Options {
@@ -289,7 +289,7 @@ fn a_wrong_token_is_said_and_not_shown() {
 fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String) {
     let output = crate::tool::command()
         .args(arguments)
-        .current_dir(&folder)
+        .current_dir(folder)
         .env("TOKEN_OF_THE_DOOR", "t-door")
         .output()
         .unwrap();
