@@ -6,7 +6,7 @@
 //! | [`machine`] | one board: power, reset, time, images, the debugger's control |
 //! | [`cpu`] | the Cortex-M4: Unicorn runs the instructions, the module handles the exceptions |
 //! | [`chip`] | the chip around the CPU: memories, peripherals, clocks, the address map |
-//! | [`slice`] | what chip and CPU loop have to say to each other |
+//! | [`slice`](mod@slice) | what chip and CPU loop have to say to each other |
 //! | [`cortex`] | exceptions, system control block, SysTick, breakpoint unit |
 //! | [`periph`] | the peripherals except CAN; [`peripheral`] is their interface to the chip |
 //! | [`bxcan`] | the CAN controllers |

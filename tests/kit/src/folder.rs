@@ -10,7 +10,7 @@ use std::{process, thread};
 /// fails: then it can be looked at.
 pub struct Folder(PathBuf);
 
-/// A [`Folder`](folder::Folder) for a test outside of its crate, in cargo's folder for such tests.
+/// A [`Folder`](crate::folder::Folder) for a test outside of its crate, in cargo's folder for such tests.
 #[macro_export]
 macro_rules! folder {
     ($name:expr) => {

@@ -3,17 +3,17 @@
 //!
 //! | module | what it has |
 //! |---|---|
-//! | [`random`] | random numbers by a seed |
-//! | [`folder`](mod@folder) | a folder of a test's own |
-//! | [`ihex`] | Intel HEX as tools write it |
-//! | [`pages`] | the commands on the pages of the documentation |
-//! | [`hawkbit`] | feature `hawkbit`: a hawkBit server with faults |
-//! | [`bus`] | feature `bus`: a CANopen device with a domain, and frames to it and from it |
-//! | [`memory`] | feature `debugger`: a device with the debugger interface, and its memory |
-//! | [`model`] | feature `boot`: a strict flash that loses power on demand |
-//! | [`boot`] | feature `boot`: the one way to make a bootloader |
-//! | [`bench`] | feature `boot`: a bootloader on that flash, and the actions of a host |
-//! | [`rig`] | feature `boot`: a bootloader of any profile, driven by its objects alone |
+//! | `random` | random numbers by a seed |
+//! | `folder` | a folder of a test's own |
+//! | `ihex` | Intel HEX as tools write it |
+//! | `pages` | the commands on the pages of the documentation |
+//! | `hawkbit` | feature `hawkbit`: a hawkBit server with faults |
+//! | `bus` | feature `bus`: a CANopen device with a domain, and frames to it and from it |
+//! | `memory` | feature `debugger`: a device with the debugger interface, and its memory |
+//! | `model` | feature `boot`: a strict flash that loses power on demand |
+//! | `boot` | feature `boot`: the one way to make a bootloader |
+//! | `bench` | feature `boot`: a bootloader on that flash, and the actions of a host |
+//! | `rig` | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
 #![allow(clippy::new_without_default, reason = "a device that has booted is no default value")]
 #![forbid(unsafe_code)]

@@ -6,11 +6,11 @@ use crate::flash::{Flash, FlashFault, Next};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Key {
-    /// The record of a program (1 to 254), see [`ProgramRecord`].
+    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord).
     Program(u8),
     /// The number of consecutive times that the application ended without a request.
     CrashCount,
-    /// Node-ID and bit rate, see [`NodeParameters`].
+    /// Node-ID and bit rate, see [`NodeParameters`](super::NodeParameters).
     Node,
     /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
     /// accepts, and the counter of the installed program. This value survives the program's record.
@@ -59,7 +59,7 @@ pub enum StoreError {
     Device,
 }
 
-/// A place for parameters: the [`Journal`] in flash, or a part of the board (an EEPROM), which may
+/// A place for parameters: the [`Journal`](super::Journal) in flash, or a part of the board (an EEPROM), which may
 /// ignore the flash.
 ///
 /// An implementation must guarantee two properties: after a power cut at any time,

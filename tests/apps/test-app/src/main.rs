@@ -30,7 +30,7 @@ const VERSION: &str = if IS_VERSION_2 { "2.0.0" } else { "1.0.0" };
 /// 100Ah as update tools find it in the image (CiA 814-1 clause 6.5).
 #[used]
 static MARKED_VERSION: &str =
-    if IS_VERSION_2 { "$CANopenSoftwareVersion\02.0.0\0" } else { "$CANopenSoftwareVersion\01.0.0\0" };
+    if IS_VERSION_2 { "$CANopenSoftwareVersion\x002.0.0\0" } else { "$CANopenSoftwareVersion\x001.0.0\0" };
 
 // Whom this image is for, at the place where the bootloader looks before it takes a raw image or HEX
 // file.
