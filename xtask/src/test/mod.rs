@@ -35,7 +35,7 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
                   that end by themselves
   --part K/N      with --all: the K-th of N parts that take about the same time
   --list          the tests that wait for --ci or --all, and why
-  --board BOARD   every test that runs firmware, with that of this board
+  --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   --yes           installs what is missing with sudo
   WORDS           go to cargo test, for one kind of test:
                   `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
@@ -107,7 +107,7 @@ pub fn run(mut args: Args) -> Outcome {
     let part = args.value("--part")?;
     let words = args.rest();
     if for_ci && all || (for_ci || all) && (chosen_board || !words.is_empty()) {
-        return Err("--ci, --all, --board and words for cargo test do not go together.".into());
+        return Err("--ci and --all go with nothing else.".into());
     }
     if part.is_some() && !all {
         return Err("--part goes with --all.".into());
@@ -132,10 +132,17 @@ pub fn run(mut args: Args) -> Outcome {
     room()?;
     let _alone = alone()?;
     if !words.is_empty() {
-        build_images(Tier::Product)?;
+        // With a board: its images, and the programs that are compiled for it.
+        let own = if chosen_board {
+            build::boards(&[(board, &[])])?;
+            build::tests_args(board)
+        } else {
+            build_images(Tier::Product)?;
+            Vec::new()
+        };
         programs_of_ours()?;
         let mut cargo = process::cargo("test");
-        cargo.current_dir(workspace::root()).args(words).envs(variables(board));
+        cargo.current_dir(workspace::root()).args(own).args(words).envs(variables(board));
         return process::run(&mut cargo);
     }
 
