@@ -132,6 +132,7 @@ pub fn table() -> String {
             Tier::Ci => "`.ci/run`",
             Tier::All => "`--all`",
         };
+        let program = program.replace('/', "::");
         table += &format!("| `{program}{colons}{}` | {by} | {why} |\n", tests.trim_end_matches("::"));
     }
     table
