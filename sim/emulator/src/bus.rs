@@ -82,6 +82,9 @@ pub struct Record {
     /// Its transmitter's place among the nodes; `None` for a frame that an injected fault repeats
     /// or delays.
     pub from: Option<usize>,
+    /// The nodes that read the frame to its end, one bit for each place. A node that starts, is
+    /// bus-off or has another bit rate is not among them.
+    pub readers: u64,
     /// The result.
     pub outcome: Outcome,
 }
@@ -686,7 +689,11 @@ impl Bus {
         for node in nodes {
             node.event(BusEvent::Ended, self.now);
         }
-        let record = Record { start: flight.start, end, frame: flight.frame, from: flight.from, outcome };
+        let readers = flight.receivers.iter().filter(|party| party.in_tune);
+        let readers =
+            readers.fold(0, |readers, party| readers | 1u64.checked_shl(party.node as u32).unwrap_or(0));
+        let Flight { start, frame, from, .. } = *flight;
+        let record = Record { start, end, frame, from, readers, outcome };
         for sink in &mut self.sinks {
             sink(&record);
         }

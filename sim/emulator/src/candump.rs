@@ -132,6 +132,7 @@ mod tests {
             end: Time(12_345_678_999_999),
             frame: Frame::standard(0x601, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]).unwrap(),
             from: Some(0),
+            readers: 0b10,
             outcome,
         }
     }

@@ -77,7 +77,11 @@ impl Target for Board {
         let frames = self.bench.take_records().into_iter().map(|record| {
             let happened = match record.outcome {
                 Outcome::Good => match convert(&record.frame) {
-                    Some(frame) => Happened::Frame { by_device: record.from == Some(device), frame },
+                    Some(frame) if record.from == Some(device) => Happened::Frame { by_device: true, frame },
+                    Some(frame) if record.readers >> device & 1 == 1 => {
+                        Happened::Frame { by_device: false, frame }
+                    }
+                    Some(frame) => Happened::Missed(frame),
                     None => Happened::Error,
                 },
                 Outcome::KeptBack | Outcome::Bad(_) => Happened::Error,

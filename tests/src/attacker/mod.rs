@@ -267,6 +267,10 @@ impl Attack {
                         self.model.sent(&frame, at);
                     }
                 }
+                Happened::Missed(frame) => {
+                    self.tell(format!("{:>12.3} ~> {frame}", at as f64 / 1000.0));
+                    self.summary.frames += 1;
+                }
                 Happened::Error => {
                     self.summary.errors += 1;
                     self.in_doubt = true;

@@ -18,6 +18,8 @@ pub enum Happened {
         /// The frame.
         frame: Frame,
     },
+    /// A good frame of a master was on the bus, and the device was not: it starts, or is bus-off.
+    Missed(Frame),
     /// A frame was destroyed.
     Error,
     /// The device made a reset by itself.

@@ -2,7 +2,7 @@
 
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
-use boot_core::flash::run;
+use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use kit::model::ModelFlash;
@@ -111,6 +111,38 @@ fn without_signature_a_program_starts_as_a_trial_alone() {
         assert_eq!(decide(&trial, &policy, |_| unsigned()), expected);
         let expected = BootDecision::Start { program: signed().unwrap(), trial: false };
         assert_eq!(decide(&trial, &policy, |_| signed()), expected, "a signed program is on no trial");
+    }
+}
+
+/// A record that is longer than its program's flash is no program, even if the CRC of what follows
+/// there is right: one bit of a size must not let the check read into another region.
+#[test]
+fn a_program_ends_inside_its_region() {
+    let region = LAYOUT.programs[0];
+    let verified = |size: u32| {
+        let mut flash = ModelFlash::new(LAYOUT.chip);
+        let vectors = [0x2001_FFC0_u32, region.base + 0x189].map(u32::to_le_bytes).concat();
+        flash.poke(region.base, &vectors);
+        let mut bytes = vec![0; size as usize];
+        flash.read(region.base, &mut bytes);
+        let record = ProgramRecord {
+            #[cfg(feature = "sealed")]
+            seal: None,
+            size,
+            crc: boot_core::crc32(&bytes),
+            signed: true,
+            confirmed: true,
+            version: 0,
+            half_erased: false,
+        };
+        let mut journal = Journal::open(&flash, LAYOUT.parameters);
+        journal.store(Key::Program(1), record.value());
+        run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+        verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1).map(|_| ())
+    };
+    assert_eq!(verified(region.size), Ok(()));
+    for more in [1, 4, 1024, 1025, 0x1_0000] {
+        assert_eq!(verified(region.size + more), Err(Invalid::Size), "{more} bytes too long");
     }
 }
 

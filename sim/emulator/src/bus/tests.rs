@@ -251,6 +251,8 @@ fn a_controller_joins_after_eleven_recessive_bits() {
     bench.run(500);
     assert_eq!(bench.read(0, 0x0C) & 3, 1, "it has the second frame and not the first");
     assert_eq!(bench.read(0, 0x1B0), 0x080 << 21);
+    let readers: Vec<_> = bench.log.borrow().iter().map(|record| record.readers).collect();
+    assert_eq!(readers, [0b100, 0b101], "and so says the record");
 }
 
 #[test]

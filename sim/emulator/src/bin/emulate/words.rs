@@ -95,7 +95,7 @@ mod tests {
 
     fn say(words: &mut Words, id: u16, data: &[u8], outcome: Outcome) -> String {
         let frame = Frame::standard(id, data).unwrap();
-        let record = Record { start: Time(0), end: Time(0), frame, from: None, outcome };
+        let record = Record { start: Time(0), end: Time(0), frame, from: None, readers: 0, outcome };
         words.of(&record).unwrap_or_default()
     }
 
