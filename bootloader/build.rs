@@ -6,8 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-include!("../linker/packs_well.rs");
-
+use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{Image, Layout};
 
 fn main() {
@@ -16,6 +15,15 @@ fn main() {
     let template = if has("RESIDENT") { "resident.x" } else { "bootloader.x" };
     let out = PathBuf::from(env::var_os("OUT_DIR").expect("cargo sets OUT_DIR"));
     coboot_linker::write_memory(layout, Image::Bootloader, &out).unwrap_or_else(|error| panic!("{error}"));
+    assert!(
+        layout.home.is_some() || !has("SEALED"),
+        "{} has the compact map, which has no key block: sealed images need a split one (docs/porting.md)",
+        layout.board
+    );
+    // Both parts have it: the header of the RAM image, and the resident part that reads the header.
+    let identity = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(Toml(layout).to_string().as_bytes());
+    let text = format!("/// The identity of the board: see `shared_abi::ram_image::Header::board`.\npub const BOARD_IDENTITY: u32 = {identity:#010x};\n");
+    fs::write(out.join("board_identity.rs"), text).expect("OUT_DIR is writable");
 
     let package = PathBuf::from(env::var_os("CARGO_MANIFEST_DIR").expect("cargo sets it"));
     let templates = package.join("../linker");
@@ -25,9 +33,6 @@ fn main() {
     coboot_linker::link(&out, template);
     // Functions with identical code are merged.
     println!("cargo:rustc-link-arg-bins=--icf=all");
-    // Similar functions are placed near each other, so that copies in the compressed image have
-    // short distances. (The image is compressed; it also copies from the resident part.)
-    println!("cargo:rustc-link-arg-bins=--bp-compression-sort=function");
     if template == "bootloader.x" && has("LOG_DEFMT") {
         // The linker script for the log strings of `defmt`: they are in the ELF file, not on the
         // chip.
@@ -101,11 +106,11 @@ fn resident(package: &Path, out: &Path, layout: &Layout, product: &str) {
     let triple = env::var("TARGET").expect("cargo sets it");
 
     let mut cargo = Command::new(env::var_os("CARGO").expect("cargo sets it"));
-    cargo.current_dir(&workspace).args(["rustc", "--quiet", "--package=bootloader", "--bin=resident"]);
+    cargo.current_dir(&workspace).args(["build", "--quiet", "--package=bootloader", "--bin=resident"]);
     cargo.args(["--profile=firmware", "--no-default-features", "--target", &triple, "--features"]);
     cargo.arg(features.join(",")).arg("--target-dir").arg(&target);
     cargo.arg("--config").arg(format!("env.COBOOT_PRODUCT.value={product:?}"));
-    cargo.args(["--config", "env.COBOOT_PRODUCT.force=true", "--", PACKS_WELL]);
+    cargo.args(["--config", "env.COBOOT_PRODUCT.force=true"]);
     // The inner build keeps these settings; all others concern only the outer build.
     let own = ["CARGO_HOME", "CARGO_MAKEFLAGS", "CARGO_NET_OFFLINE"];
     let told = env::vars_os().map(|(name, _)| name).filter(|name| {
@@ -118,5 +123,10 @@ fn resident(package: &Path, out: &Path, layout: &Layout, product: &str) {
     let status = cargo.status().expect("cargo can be started");
     assert!(status.success(), "the resident part of the bootloader does not build");
     let built = target.join(&triple).join("firmware").join("resident");
-    fs::copy(&built, out.join("resident.bin")).expect("the resident part was built");
+    let bytes = fs::read(&built).expect("the resident part was built");
+    // Its Reset is the second vector (PM0214 section 2.3.4).
+    let reset = bytes.get(4..8).and_then(|word| word.try_into().ok()).map(u32::from_le_bytes);
+    let reset = reset.expect("the resident part begins with its vectors");
+    println!("cargo:rustc-link-arg-bin=bootloader=--defsym=__resident_reset={reset:#x}");
+    fs::write(out.join("resident.bin"), bytes).expect("OUT_DIR is writable");
 }

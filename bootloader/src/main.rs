@@ -5,10 +5,9 @@
 //! | `main.rs` | the tasks: it only connects the other parts | no |
 //! | `product.rs` | the choices that a product has; it makes them in `products/` | no |
 //! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
-//! | `start.rs` | from the reset to the boot stage, and to `init` below | start-up |
+//! | `start.rs` | the resident part's bytes, the header of the RAM image, the boot report | handoff |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
 //! | `services.rs`, `storage.rs` | the services of the resident part, and their use | its ABI |
-//! | `boot_report.rs` | the boot stage's report to the RAM part | no |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
 //! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
@@ -17,7 +16,6 @@
 #![no_std]
 #![no_main]
 
-mod boot_report;
 mod flash_controller;
 mod log;
 mod memory;
@@ -53,6 +51,7 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::Step;
+    use boot_core::decision::StayReason;
     use boot_core::store::NodeParameters;
     use boot_core::unseal::Room;
     use bsp::clock::Source;
@@ -62,6 +61,7 @@ mod app {
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
+    use shared_abi::boot_report::BootReport;
     use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
     use super::{product, start, Mono};
@@ -73,6 +73,16 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
+    /// What a debugger's start of the image alone comes to: it stays, without node-ID.
+    const NO_REPORT: BootReport = BootReport {
+        reason: StayReason::Fault.code(),
+        held_program: 0,
+        window_ms: 0,
+        owed: Owed::NOTHING,
+        returned: 0,
+        node_id: product::NO_NODE_ID,
+        bit_rate: BitRate::Auto as u8,
+    };
     /// Frames that can wait for the protocol task. The task has a higher priority than all work
     /// that takes long, so only few frames wait.
     const RX_QUEUE: usize = 32;
@@ -153,7 +163,7 @@ mod app {
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         let parameters = Store::open(cx.local.store);
-        let report = start::boot_report();
+        let report = start::boot_report().unwrap_or(NO_REPORT);
         let node = NodeParameters {
             id: NodeId::new(report.node_id),
             // The boot stage reports only bit rates that the CAN controller can be set to.

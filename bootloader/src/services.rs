@@ -13,10 +13,9 @@ use boot_core::store::{Key, Value};
 use shared_abi::callgate::TABLE_SIZE;
 use shared_abi::geometry::Sector;
 
-/// Offset of the services from the callgate's table: they follow the entries of the boot stage and
-/// the fault handler (`resident/main.rs`).
+/// Offset of the services from the callgate's table, which they follow (`resident/main.rs`).
 #[allow(dead_code, reason = "the resident part lays them there by its header")]
-pub const OFFSET: u32 = TABLE_SIZE + 8;
+pub const OFFSET: u32 = TABLE_SIZE;
 
 /// The services.
 #[repr(C)]

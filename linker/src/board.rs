@@ -40,8 +40,11 @@ struct File {
     board: String,
     bootloader: Region,
     callgate_offset: u32,
+    home: Option<Region>,
     parameters: [Region; 2],
+    data: Option<Region>,
     programs: Vec<Region>,
+    staging: Option<Region>,
     ram: Region,
     handoff: Region,
     warm_start: Region,
@@ -101,8 +104,11 @@ pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
         chip,
         bootloader: file.bootloader.into(),
         callgate_offset: file.callgate_offset,
+        home: file.home.map(Into::into),
         parameters: file.parameters.map(Into::into),
+        data: file.data.map(Into::into),
         programs: programs.leak(),
+        staging: file.staging.map(Into::into),
         ram: file.ram.into(),
         handoff: file.handoff.into(),
         warm_start: file.warm_start.into(),
@@ -140,12 +146,12 @@ mod tests {
         let good = Toml(&stm32f429i_disc1::LAYOUT).to_string();
         for (from, to, words) in [
             (
-                "programs = [\n  { base = 0x08010000",
-                "programs = [\n  { base = 0x0800c000",
+                "programs = [\n  { base = 0x08020000",
+                "programs = [\n  { base = 0x0801c000",
                 "a program must start and end at sector borders",
             ),
             (
-                "programs = [\n  { base = 0x08010000, size = 0x1f0000 },",
+                "programs = [\n  { base = 0x08020000, size = 0x1e0000 },",
                 "programs = [",
                 "there must be 1 to 254 programs",
             ),
@@ -178,6 +184,13 @@ mod tests {
             ("sram = { base = 0x20000000", "sram = { base = 0x20000004", "whole pages of 4 KiB"),
             ("board = \"stm32f429i-disc1\"", "board = \"a\\u001bb\"", "printable ASCII"),
             ("callgate-offset = 0x40", "callgate-offset = -1", "line 4: "),
+            ("home = { base = 0x08010000", "home = { base = 0x0800c000", "the home of the RAM image must start"),
+            ("data = { base = 0x0800c000", "data = { base = 0x08008000", "the data region overlaps a parameter"),
+            (
+                "data = {",
+                "staging = { base = 0x08020000, size = 0x1e0000 }\ndata = {",
+                "the staging region must be the last sector",
+            ),
             ("ports = 11", "ports = 11\nspeed = 5", "speed"),
             ("[chip]", "[chap]", "chap"),
         ] {

@@ -16,6 +16,14 @@ impl fmt::Display for Place {
     }
 }
 
+/// A region that not every layout has.
+fn optional(f: &mut fmt::Formatter<'_>, name: &str, region: &Option<Region>) -> fmt::Result {
+    match region {
+        Some(region) => writeln!(f, "    {name}: Some({}),", Place(*region)),
+        None => writeln!(f, "    {name}: None,"),
+    }
+}
+
 impl fmt::Display for Expression<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Layout {
@@ -23,8 +31,11 @@ impl fmt::Display for Expression<'_> {
             chip,
             bootloader,
             callgate_offset,
+            home,
             parameters,
+            data,
             programs,
+            staging,
             ram,
             handoff,
             warm_start,
@@ -50,12 +61,15 @@ impl fmt::Display for Expression<'_> {
         writeln!(f, "        interrupts: {interrupts},\n        ports: {ports},\n    }},")?;
         writeln!(f, "    bootloader: {},", Place(*bootloader))?;
         writeln!(f, "    callgate_offset: {callgate_offset:#x},")?;
+        optional(f, "home", home)?;
         writeln!(f, "    parameters: [{}, {}],", Place(parameters[0]), Place(parameters[1]))?;
+        optional(f, "data", data)?;
         writeln!(f, "    programs: &[")?;
         for program in *programs {
             writeln!(f, "        {},", Place(*program))?;
         }
         writeln!(f, "    ],")?;
+        optional(f, "staging", staging)?;
         writeln!(f, "    ram: {},", Place(*ram))?;
         writeln!(f, "    handoff: {},\n    warm_start: {},", Place(*handoff), Place(*warm_start))?;
         writeln!(f, "}}\n.checked()")

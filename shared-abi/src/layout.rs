@@ -4,6 +4,13 @@
 //! tests and documentation derive theirs from it. [`Layout::checked`] runs when the crate is
 //! compiled: a layout that breaks a rule does not compile, and the compiler's message contains the
 //! rule.
+//!
+//! A layout has one of two maps, by its regions:
+//!
+//! | map | the RAM image of the bootloader | for |
+//! |---|---|---|
+//! | *split* | in a region of its own, [`Layout::home`] | chips of 512 KiB and more; sealed images |
+//! | *compact* | directly after the resident part | those who need the 64 KiB |
 
 use core::fmt;
 
@@ -63,16 +70,23 @@ pub struct Layout {
     pub board: &'static str,
     /// The silicon on it.
     pub chip: &'static Geometry,
-    /// The bootloader's flash. Its vector table is at the base, where the core reads it after a
-    /// reset.
+    /// The flash of the bootloader's resident part. Its vector table is at the base, where the core
+    /// reads it after a reset. In the compact map the RAM image follows in the same region.
     pub bootloader: Region,
     /// The offset of the [`callgate`] table from the base: after the vectors of the core. (The
     /// vectors of interrupts are only in RAM.)
     pub callgate_offset: u32,
+    /// The flash of the bootloader's RAM image in the split map; `None` in the compact map.
+    pub home: Option<Region>,
     /// The two regions of the non-volatile parameters, at least one sector each.
     pub parameters: [Region; 2],
+    /// Flash for the application's own data, which the bootloader never writes.
+    pub data: Option<Region>,
     /// Flash of program 1, 2, … (sub-index of 1F50h, 1F51h, 1F56h, 1F57h).
     pub programs: &'static [Region],
+    /// Flash for a new RAM image of the bootloader: the last sector of the last program, and never
+    /// its only one.
+    pub staging: Option<Region>,
     /// RAM for code and data. Bootloader and application each use all of it.
     pub ram: Region,
     /// The place of the [`handoff`].
@@ -114,6 +128,16 @@ impl Layout {
             }
             f += 1;
         }
+        let optional = [self.home, self.data, self.staging];
+        let mut o = 0;
+        while o < optional.len() {
+            if let Some(region) = optional[o] {
+                if !region.is_possible() {
+                    return Err(REGION);
+                }
+            }
+            o += 1;
+        }
         let mut q = 0;
         while q < self.programs.len() {
             if !self.programs[q].is_possible() {
@@ -129,7 +153,7 @@ impl Layout {
             return Err("the bootloader must end at a sector border");
         }
         if self.bootloader.size <= KEY_BLOCK_SIZE {
-            return Err("the bootloader has no room behind its key block");
+            return Err("the bootloader has no room beside its key block");
         }
         if self.callgate_offset < CORE_VECTORS_SIZE {
             return Err("the callgate overlaps the bootloader's vector table");
@@ -153,6 +177,28 @@ impl Layout {
         if self.parameters[0].overlaps(&self.parameters[1]) {
             return Err("the two parameter regions overlap");
         }
+        if let Some(home) = &self.home {
+            if !chip.is_whole_sectors(home) {
+                return Err("the home of the RAM image must start and end at sector borders");
+            }
+            if home.overlaps(&self.bootloader) {
+                return Err("the home of the RAM image overlaps the bootloader");
+            }
+            if home.overlaps(&self.parameters[0]) || home.overlaps(&self.parameters[1]) {
+                return Err("the home of the RAM image overlaps a parameter region");
+            }
+        }
+        if let Some(data) = &self.data {
+            if !chip.is_whole_sectors(data) {
+                return Err("the data region must start and end at sector borders");
+            }
+            if data.overlaps(&self.bootloader) || overlaps_optional(data, &self.home) {
+                return Err("the data region overlaps the bootloader");
+            }
+            if data.overlaps(&self.parameters[0]) || data.overlaps(&self.parameters[1]) {
+                return Err("the data region overlaps a parameter region");
+            }
+        }
         if self.programs.is_empty() || self.programs.len() > 254 {
             return Err("there must be 1 to 254 programs (sub-indices 1 to 254 of 1F50h)");
         }
@@ -165,8 +211,11 @@ impl Layout {
             if !program.base.is_multiple_of(chip.vector_table_alignment()) {
                 return Err("a program's vector table is not aligned as VTOR demands");
             }
-            if program.overlaps(&self.bootloader) {
+            if program.overlaps(&self.bootloader) || overlaps_optional(program, &self.home) {
                 return Err("a program overlaps the bootloader");
+            }
+            if overlaps_optional(program, &self.data) {
+                return Err("a program overlaps the data region");
             }
             if program.overlaps(&self.parameters[0]) || program.overlaps(&self.parameters[1]) {
                 return Err("a program overlaps a parameter region");
@@ -179,6 +228,19 @@ impl Layout {
                 q += 1;
             }
             p += 1;
+        }
+        if let Some(staging) = &self.staging {
+            if self.home.is_none() {
+                return Err("a staging region needs a home of the RAM image, which the compact map has not");
+            }
+            let last = &self.programs[self.programs.len() - 1];
+            if !chip.is_whole_sectors(staging)
+                || staging.end() != last.end()
+                || staging.base <= last.base
+                || !is_one_sector(chip, staging)
+            {
+                return Err("the staging region must be the last sector of the last program, and not its only one");
+            }
         }
         if !chip.sram.contains(self.ram.base, self.ram.size) {
             return Err("the RAM of the images lies outside the chip's SRAM");
@@ -216,20 +278,24 @@ impl Layout {
         self.bootloader.base + self.callgate_offset
     }
 
-    /// The keys of a sealed device: the last [`KEY_BLOCK_SIZE`] bytes of the bootloader's flash,
-    /// written in production and never by the bootloader.
+    /// The keys of a sealed device: the last [`KEY_BLOCK_SIZE`] bytes of the resident part's flash,
+    /// written in production and never by the bootloader. Only the split map has sealed images.
     #[must_use]
     pub const fn key_block(&self) -> Region {
         Region::new(self.bootloader.end() - KEY_BLOCK_SIZE, KEY_BLOCK_SIZE)
     }
 
-    /// The part of its flash that the bootloader itself may fill: everything except the key block.
+    /// The flash that the resident part may fill, in the compact map together with the RAM image:
+    /// everything except the key block, which the compact map has not.
     #[must_use]
-    pub const fn bootloader_image(&self) -> Region {
-        Region::new(self.bootloader.base, self.bootloader.size - KEY_BLOCK_SIZE)
+    pub const fn resident(&self) -> Region {
+        match self.home {
+            Some(_) => Region::new(self.bootloader.base, self.bootloader.size - KEY_BLOCK_SIZE),
+            None => self.bootloader,
+        }
     }
 
-    /// Flash of program `number` (1 is the first, as in the sub-index).
+    /// The flash of program `number` (1 is the first, as in the sub-index).
     #[must_use]
     pub fn program(&self, number: u8) -> Option<Region> {
         let index = usize::from(number).checked_sub(1)?;
@@ -240,6 +306,20 @@ impl Layout {
     #[must_use]
     pub const fn linker_script(&self, image: Image) -> LinkerScript<'_> {
         LinkerScript { layout: self, image }
+    }
+}
+
+const fn overlaps_optional(region: &Region, other: &Option<Region>) -> bool {
+    match other {
+        Some(other) => region.overlaps(other),
+        None => false,
+    }
+}
+
+const fn is_one_sector(chip: &Geometry, region: &Region) -> bool {
+    match chip.sector_at(region.base) {
+        Some(sector) => sector.region.size == region.size,
+        None => false,
     }
 }
 
@@ -263,7 +343,7 @@ impl fmt::Display for LinkerScript<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let layout = self.layout;
         let (flash, name) = match self.image {
-            Image::Bootloader => (layout.bootloader_image(), "bootloader"),
+            Image::Bootloader => (layout.resident(), "bootloader"),
             Image::Program(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
         };
         writeln!(
@@ -272,9 +352,21 @@ impl fmt::Display for LinkerScript<'_> {
             layout.board
         )?;
         writeln!(f, "MEMORY\n{{")?;
-        writeln!(f, "  FLASH : ORIGIN = {:#010x}, LENGTH = {:#x}", flash.base, flash.size)?;
-        writeln!(f, "  RAM   : ORIGIN = {:#010x}, LENGTH = {:#x}", layout.ram.base, layout.ram.size)?;
+        let home = layout.home.filter(|_| self.image == Image::Bootloader);
+        let memories = [("FLASH", Some(flash)), ("HOME ", home), ("RAM  ", Some(layout.ram))];
+        for (name, region) in memories {
+            if let Some(Region { base, size }) = region {
+                writeln!(f, "  {name} : ORIGIN = {base:#010x}, LENGTH = {size:#x}")?;
+            }
+        }
         writeln!(f, "}}")?;
+        if self.image == Image::Bootloader && home.is_none() {
+            // Compact: the RAM image follows the resident part.
+            writeln!(f, "REGION_ALIAS(\"HOME\", FLASH)")?;
+        }
+        if let Some(home) = home {
+            writeln!(f, "__home = {:#010x};", home.base)?;
+        }
         for (symbol, value) in [
             ("__vector_table_alignment", layout.chip.vector_table_alignment()),
             ("__vector_table_size", layout.chip.vector_table_size()),
@@ -311,17 +403,21 @@ impl fmt::Display for Layout {
         writeln!(f)?;
         writeln!(f, "  {:<14} {:<24} {:>12}   remarks", "region", "addresses", "size")?;
         let map = [
-            ("bootloader", self.bootloader, "vectors of the core, then the callgate"),
-            ("parameters A", self.parameters[0], ""),
-            ("parameters B", self.parameters[1], ""),
+            ("resident part", Some(self.bootloader), "vectors of the core, then the callgate"),
+            ("parameters A", Some(self.parameters[0]), ""),
+            ("parameters B", Some(self.parameters[1]), ""),
+            ("data", self.data, "the application's own"),
+            ("RAM image", self.home, "the rest of the bootloader"),
         ];
+        let map = map.into_iter().filter_map(|(name, region, remark)| Some((name, region?, remark)));
+        let staging = self.staging.map(|region| ("staging", region, "a new RAM image; in the last program"));
         let programs = self.programs.iter().zip(PROGRAM_NAMES).map(|(region, name)| (name, *region, ""));
         let ram = [
             ("RAM", self.ram, "code and data; the application gets all of it"),
             ("handoff", self.handoff, "bootloader -> application"),
             ("warm-start", self.warm_start, "application -> bootloader; the last RAM cell"),
         ];
-        for (name, region, remark) in map.into_iter().chain(programs).chain(ram) {
+        for (name, region, remark) in map.chain(programs).chain(staging).chain(ram) {
             self.row(f, name, region, remark)?;
         }
         writeln!(f, "\n  The callgate is at {}.", Address(self.callgate()))

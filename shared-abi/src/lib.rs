@@ -11,7 +11,8 @@
 //! | [`label`] | the target and version in a program image |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
-//! | [`ram_image`] | the part of the bootloader that runs from RAM, in the form stored in flash |
+//! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
+//! | [`boot_report`] | information from the resident part of the bootloader to its RAM image |
 //! | `reentry` | the return from an application to its bootloader (on the target) |
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
 //! | [`block_file`] | the format of the data for object 1F50h |
@@ -23,6 +24,7 @@
 
 pub mod bit_timing;
 pub mod block_file;
+pub mod boot_report;
 pub mod callgate;
 pub mod geometry;
 pub mod handoff;

@@ -1,69 +1,79 @@
-//! The RAM image: the part of the bootloader that runs from RAM, in the form stored in flash.
+//! The RAM image: the part of the bootloader that runs from RAM, as it is in flash.
 //!
-//! It consists of a [`Header`] and directly after it the stored bytes. The linker writes both with
-//! the bytes uncompressed ([`Method::Raw`], without a CRC); `cargo xtask build` compresses them and
-//! computes the CRC. The boot stage checks the image before it decompresses it, and reports an
-//! error by a [`Damage`] in the warm-start cell.
+//! It is a [`Header`] and directly after it the image, from its vector table on. The resident part
+//! checks it, copies it to the RAM, and enters it as it enters a program: by the two words at its
+//! start. It knows no other address of the image, so any RAM image runs on any resident part that
+//! has the services it needs.
 
-/// Identifies a RAM image, format version 1 ("CBI1" read as little-endian bytes).
-pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI1");
+use crate::geometry::{Region, CORE_VECTORS_SIZE};
+use crate::vectors::VectorTable;
 
-/// Version of the interface between the resident part and the RAM part of the bootloader, in RAM
-/// and by calls. A change of the interface increases it.
-pub const SERVICES_VERSION: u32 = 3;
+/// Identifies a RAM image, format 2 ("CBI2" read as little-endian bytes).
+pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
+
+/// Version of the services that the resident part has. It grows with each entry that is added to
+/// their table; entries are never changed or removed.
+pub const SERVICES_VERSION: u32 = 1;
+
+/// Optional abilities of the resident part, a bit each. None is defined yet.
+pub const FEATURES: u32 = 0;
 
 /// The least number of bytes of RAM after the bootloader's variables that remain for its stack. The
-/// boot stage, which decompresses the image, uses this RAM, too.
+/// boot stage, which copies the image, uses the same RAM.
 pub const LEAST_STACK: u32 = 4096;
 
-/// The header before the stored bytes.
+/// The header before the image: 64 bytes, little-endian. `cargo build` writes everything but the
+/// CRC, which `cargo xtask build` writes.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     /// [`MAGIC`].
     pub magic: u32,
-    /// CRC-32/ISO-HDLC of the bootloader's flash before the header, the rest of the header after
-    /// this word, and the stored bytes. 0 means unchecked, only with [`Method::Raw`].
+    /// CRC-32/ISO-HDLC of the words after this one and of the image. 0 means that nobody has
+    /// computed it (an image for the bench), and it is not checked.
     pub crc: u32,
-    /// [`SERVICES_VERSION`].
+    /// Size of this header in bytes in the lower half, number of the format (0) in the upper one.
+    pub length: u32,
+    /// Bytes of the image.
+    pub size: u32,
+    /// The address in RAM for which the image is linked.
+    pub ram_base: u32,
+    /// The end of the RAM that the image uses.
+    pub ram_end: u32,
+    /// The image needs at least this [`SERVICES_VERSION`].
     pub services: u32,
-    /// The number of a [`Method`].
-    pub method: u32,
-    /// Bytes in flash after the header.
-    pub stored: u32,
-    /// Bytes in RAM, from the start of the image's RAM.
-    pub unpacked: u32,
-}
-
-/// The method by which the bytes are stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u32)]
-pub enum Method {
-    /// Uncompressed, as in RAM.
-    Raw = 0,
-    /// As a ZX0 stream, format version 2 (Einar Saukas), with three changes. Offsets count
-    /// half-words. Their lower part has eight bits, and the length after it has all its own bits. A
-    /// copy from before the output reads from the end of the bootloader's flash before the header,
-    /// and ends there at the latest.
-    ///
-    /// The stream decompresses to the image with absolute calls: in each pair of half-words 11110…
-    /// 11111… (`BL`), the remaining 22 bits of both are the distance in half-words plus half the
-    /// address of the second half-word.
-    Zx0 = 1,
+    /// The image needs these [`FEATURES`].
+    pub features: u32,
+    /// The board: the CRC-32/ISO-HDLC of its layout as TOML ([`crate::layout::toml`]).
+    pub board: u32,
+    /// Vendor-ID, as in 1018h/1.
+    pub vendor: u32,
+    /// Product code, as in 1018h/2.
+    pub product: u32,
+    /// The hardware revisions on which the image runs, a bit each; 0 for all.
+    pub revisions: u32,
+    /// Version, as in 1018h/3: major in the upper half, minor in the lower.
+    pub version: u32,
+    /// Security counter.
+    pub counter: u32,
+    /// 0.
+    pub reserved: [u32; 2],
 }
 
 /// Why the RAM image cannot run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum Damage {
-    /// The header is missing, or contains an unknown method or an impossible size.
+    /// The header is missing, or contains a size or an address that cannot be.
     Header = 1,
-    /// The image is for another [`SERVICES_VERSION`].
+    /// The image needs services or abilities that this resident part has not.
     Services = 2,
     /// The CRC is wrong.
     Crc = 3,
-    /// The stream does not decompress to the size in the header.
-    Stream = 4,
+    /// The image is for another board.
+    Board = 4,
+    /// Its stack pointer or its reset vector points out of its RAM.
+    Vectors = 5,
 }
 
 impl Damage {
@@ -74,46 +84,59 @@ impl Damage {
             1 => Self::Header,
             2 => Self::Services,
             3 => Self::Crc,
-            4 => Self::Stream,
+            4 => Self::Board,
+            5 => Self::Vectors,
             _ => return None,
         })
     }
 }
 
 impl Header {
-    /// Its size in flash in bytes.
+    /// Its size in bytes.
     pub const SIZE: u32 = size_of::<Self>() as u32;
-    /// The offset of the first byte of the header that the CRC covers.
+    /// The offset of the first byte that the CRC covers.
     pub const CRC_FROM: u32 = 8;
 
-    /// Checks a header: `flash` bytes follow it in the bootloader's region, and `ram` bytes are
-    /// available for the decompressed image.
+    /// Checks a header: `flash` bytes follow it in the region of the RAM image, `ram` is the RAM of
+    /// the images, and `board` the identity of this board.
     ///
     /// # Errors
-    /// [`Damage::Header`] or [`Damage::Services`].
-    pub const fn check(&self, flash: u32, ram: u32) -> Result<Method, Damage> {
-        if self.magic != MAGIC {
+    /// [`Damage::Header`], [`Damage::Board`] or [`Damage::Services`].
+    pub const fn check(&self, flash: u32, ram: Region, board: u32) -> Result<(), Damage> {
+        if self.magic != MAGIC || self.length != Self::SIZE {
             return Err(Damage::Header);
         }
-        if self.services != SERVICES_VERSION {
+        if self.board != board {
+            return Err(Damage::Board);
+        }
+        let fits = self.size >= CORE_VECTORS_SIZE
+            && self.size.is_multiple_of(4)
+            && self.size <= flash
+            && self.size <= ram.size - LEAST_STACK
+            && self.ram_base == ram.base
+            && self.ram_end <= ram.end()
+            && self.ram_end > ram.base
+            && self.ram_end - ram.base >= self.size;
+        if !fits || self.reserved[0] != 0 || self.reserved[1] != 0 {
+            return Err(Damage::Header);
+        }
+        if self.services > SERVICES_VERSION || self.features & !FEATURES != 0 {
             return Err(Damage::Services);
         }
-        if self.stored > flash || self.unpacked > ram {
-            return Err(Damage::Header);
-        }
-        const RAW: u32 = Method::Raw as u32;
-        const ZX0: u32 = Method::Zx0 as u32;
-        match self.method {
-            RAW if self.stored == self.unpacked => Ok(Method::Raw),
-            ZX0 => Ok(Method::Zx0),
-            _ => Err(Damage::Header),
-        }
+        Ok(())
     }
 
-    /// Whether the CRC must be checked.
-    #[must_use]
-    pub const fn has_crc(&self) -> bool {
-        self.crc != 0 || self.method != Method::Raw as u32
+    /// Checks the two words at the start of the image.
+    ///
+    /// # Errors
+    /// [`Damage::Vectors`].
+    pub const fn entry(&self, words: [u32; 2]) -> Result<VectorTable, Damage> {
+        let image = Region::new(self.ram_base, self.size);
+        let ram = Region::new(self.ram_base, self.ram_end - self.ram_base);
+        match VectorTable::of_ram_image(words, image, ram) {
+            Some(vectors) => Ok(vectors),
+            None => Err(Damage::Vectors),
+        }
     }
 }
 
@@ -121,46 +144,91 @@ impl Header {
 mod tests {
     use super::*;
 
+    const RAM: Region = Region::new(0x2000_0000, 0x1_FFC0);
+    const BOARD: u32 = 0x1234_5678;
     const SOUND: Header = Header {
         magic: MAGIC,
-        crc: 0x1234_5678,
+        crc: 0,
+        length: 64,
+        size: 0x4000,
+        ram_base: 0x2000_0000,
+        ram_end: 0x2001_FFC0,
         services: SERVICES_VERSION,
-        method: 1,
-        stored: 100,
-        unpacked: 200,
+        features: 0,
+        board: BOARD,
+        vendor: 1,
+        product: 2,
+        revisions: 3,
+        version: 4,
+        counter: 5,
+        reserved: [0; 2],
     };
 
     #[test]
     fn a_header_is_judged() {
-        assert_eq!(SOUND.check(100, 200), Ok(Method::Zx0));
-        assert_eq!(Header { method: 0, unpacked: 100, ..SOUND }.check(100, 200), Ok(Method::Raw));
+        let check = |header: Header| header.check(0x4000, RAM, BOARD);
+        assert_eq!(check(SOUND), Ok(()));
+        assert_eq!(check(Header { services: 0, size: 64, ram_end: 0x2000_0040, ..SOUND }), Ok(()));
         for (header, damage) in [
             (Header { magic: u32::MAX, ..SOUND }, Damage::Header),
+            (Header { magic: u32::from_le_bytes(*b"CBI1"), ..SOUND }, Damage::Header),
+            (Header { length: 24, ..SOUND }, Damage::Header),
+            (Header { length: 64 | 1 << 16, ..SOUND }, Damage::Header),
+            (Header { size: 0, ..SOUND }, Damage::Header),
+            (Header { size: 60, ..SOUND }, Damage::Header),
+            (Header { size: 0x3FFE, ..SOUND }, Damage::Header),
+            (Header { size: 0x4004, ..SOUND }, Damage::Header),
+            (Header { size: u32::MAX & !3, ..SOUND }, Damage::Header),
+            (Header { ram_base: 0x2000_0200, ..SOUND }, Damage::Header),
+            (Header { ram_base: 0x0801_0040, ..SOUND }, Damage::Header),
+            (Header { ram_end: 0x2001_FFC4, ..SOUND }, Damage::Header),
+            (Header { ram_end: 0x2000_0000, ..SOUND }, Damage::Header),
+            (Header { ram_end: 0x2000_3FFC, ..SOUND }, Damage::Header),
+            (Header { ram_end: 0, ..SOUND }, Damage::Header),
+            (Header { reserved: [1, 0], ..SOUND }, Damage::Header),
+            (Header { reserved: [0, 1], ..SOUND }, Damage::Header),
+            (Header { board: !BOARD, ..SOUND }, Damage::Board),
             (Header { services: SERVICES_VERSION + 1, ..SOUND }, Damage::Services),
-            (Header { method: 0, ..SOUND }, Damage::Header),
-            (Header { method: 2, ..SOUND }, Damage::Header),
-            (Header { stored: 101, ..SOUND }, Damage::Header),
-            (Header { stored: u32::MAX, ..SOUND }, Damage::Header),
-            (Header { unpacked: 201, ..SOUND }, Damage::Header),
+            (Header { features: 1 << 31, ..SOUND }, Damage::Services),
         ] {
-            assert_eq!(header.check(100, 200), Err(damage), "{header:?}");
+            assert_eq!(check(header), Err(damage), "{header:?}");
         }
+        let large = Header { size: RAM.size - LEAST_STACK + 4, ..SOUND };
+        assert_eq!(large.check(u32::MAX, RAM, BOARD), Err(Damage::Header), "no room for the stack");
     }
 
-    /// Only the image from the linker has no CRC.
     #[test]
-    fn a_packed_image_has_a_crc() {
-        assert!(SOUND.has_crc());
-        assert!(Header { crc: 0, ..SOUND }.has_crc());
-        assert!(Header { method: 0, ..SOUND }.has_crc());
-        assert!(!Header { crc: 0, method: 0, ..SOUND }.has_crc());
+    fn the_entry_is_inside_its_ram() {
+        let entry = |sp, reset| SOUND.entry([sp, reset]).map(|vectors| (vectors.initial_sp(), vectors.reset()));
+        assert_eq!(entry(0x2001_FFC0, 0x2000_0041), Ok((0x2001_FFC0, 0x2000_0041)));
+        assert_eq!(entry(0x2000_0008, 0x2000_3FFF), Ok((0x2000_0008, 0x2000_3FFF)));
+        for (sp, reset) in [
+            (0x2001_FFC4, 0x2000_0041), // no multiple of 8
+            (0x2001_FFC8, 0x2000_0041), // over the end
+            (0x2000_0000, 0x2000_0041), // no room below
+            (0xFFFF_FFFF, 0x2000_0041),
+            (0x2001_FFC0, 0x2000_0040), // no Thumb bit
+            (0x2001_FFC0, 0x2000_003F), // a vector
+            (0x2001_FFC0, 0x2000_4001), // after its end
+            (0x2001_FFC0, 0x0801_0081), // in flash
+            (0x2001_FFC0, 0xFFFF_FFFF),
+        ] {
+            assert_eq!(entry(sp, reset), Err(Damage::Vectors), "{sp:08X} {reset:08X}");
+        }
     }
 
     #[test]
     fn every_damage_has_a_number() {
-        for damage in [Damage::Header, Damage::Services, Damage::Crc, Damage::Stream] {
-            assert_eq!(Damage::from_number(damage as u8), Some(damage));
+        for number in 1..=5 {
+            assert_eq!(Damage::from_number(number).map(|damage| damage as u8), Some(number));
         }
-        assert_eq!((Damage::from_number(0), Damage::from_number(5)), (None, None));
+        assert_eq!((Damage::from_number(0), Damage::from_number(6)), (None, None));
+    }
+
+    #[test]
+    fn the_header_has_64_bytes() {
+        assert_eq!(size_of::<Header>(), 64);
+        assert_eq!(core::mem::offset_of!(Header, board), 32);
+        assert_eq!(core::mem::offset_of!(Header, reserved), 56);
     }
 }

@@ -1,6 +1,6 @@
 //! Vector tables: the proof that a table was checked, and the jump to it.
 
-use crate::geometry::Region;
+use crate::geometry::{Region, CORE_VECTORS_SIZE};
 use crate::layout::Layout;
 
 /// Why a vector table is refused.
@@ -48,6 +48,20 @@ impl VectorTable {
             return Err(VectorFault::NotThumb);
         }
         Ok(Self { address: program.base, initial_sp, reset })
+    }
+
+    /// Checks the first two words of the bootloader's RAM image: `image` is its place in RAM, and
+    /// `ram` the RAM that it uses. A table in RAM has no more vectors than the image needs.
+    #[must_use]
+    pub(crate) const fn of_ram_image(words: [u32; 2], image: Region, ram: Region) -> Option<Self> {
+        let [initial_sp, reset] = words;
+        let is_stack = initial_sp.is_multiple_of(8) && initial_sp > ram.base && initial_sp <= ram.end();
+        let code = Region::new(image.base + CORE_VECTORS_SIZE, image.size - CORE_VECTORS_SIZE);
+        if is_stack && code.contains(reset & !1, 2) && reset & 1 == 1 {
+            Some(Self { address: image.base, initial_sp, reset })
+        } else {
+            None
+        }
     }
 
     /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
@@ -124,10 +138,10 @@ mod tests {
 
     #[test]
     fn takes_a_plausible_table() {
-        let table = check(0x2001_FFC0, 0x0801_0189).unwrap();
+        let table = check(0x2001_FFC0, 0x0802_0189).unwrap();
         assert_eq!(
             (table.address(), table.initial_sp(), table.reset()),
-            (0x0801_0000, 0x2001_FFC0, 0x0801_0189)
+            (0x0802_0000, 0x2001_FFC0, 0x0802_0189)
         );
         assert!(check(0x1001_0000, 0x080F_FFFF).is_ok(), "a stack in CCM RAM is fine");
     }
@@ -137,18 +151,18 @@ mod tests {
         use VectorFault::{Misaligned, NotThumb, ResetVector, StackPointer};
         for (sp, reset, fault) in [
             (0xFFFF_FFFF, 0xFFFF_FFFF, StackPointer),
-            (0, 0x0801_0189, StackPointer),
-            (0x2000_0000, 0x0801_0189, StackPointer),
-            (0x2001_FFC8, 0x0801_0189, StackPointer),
-            (0x2001_FFBC, 0x0801_0189, StackPointer),
+            (0, 0x0802_0189, StackPointer),
+            (0x2000_0000, 0x0802_0189, StackPointer),
+            (0x2001_FFC8, 0x0802_0189, StackPointer),
+            (0x2001_FFBC, 0x0802_0189, StackPointer),
             (0x2001_FFC0, 0x0800_0189, ResetVector),
             (0x2001_FFC0, 0x0810_0001, ResetVector),
-            (0x2001_FFC0, 0x0801_0001, ResetVector),
-            (0x2001_FFC0, 0x0801_0188, NotThumb),
+            (0x2001_FFC0, 0x0802_0001, ResetVector),
+            (0x2001_FFC0, 0x0802_0188, NotThumb),
         ] {
             assert_eq!(check(sp, reset), Err(fault), "{sp:#x} {reset:#x}");
         }
-        let program = Region::new(0x0801_0100, 0x1000);
-        assert_eq!(VectorTable::check([0x2001_FFC0, 0x0801_0301], program, &LAYOUT), Err(Misaligned));
+        let program = Region::new(0x0802_0100, 0x1000);
+        assert_eq!(VectorTable::check([0x2001_FFC0, 0x0802_0301], program, &LAYOUT), Err(Misaligned));
     }
 }

@@ -12,10 +12,10 @@ use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{Part, Setup};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{pack, process, workspace, Outcome};
+use crate::{process, ram_image, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--unpacked] [--board BOARD] [--yes]
+usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD] [--yes]
 
 Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
 bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
@@ -24,7 +24,6 @@ app-c is the application in C, for each program of the board, and with the tests
   --all           every image of the board and the applications in C: what the tests need
   --product FILE  the product of the bootloaders: a file like bootloader/products/default.rs, or the name
                   of a file there. Its name is in the file of the image (bootloader-NAME.elf) and in 100Ah
-  --unpacked      bootloaders as the linker makes them: the part that runs from RAM is not packed
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
 ";
@@ -156,16 +155,22 @@ impl Variant {
         self.program == 0
     }
 
-    /// The flash region of the image.
-    fn region(&self, board: &Layout) -> Region {
-        board.program(self.program).unwrap_or(board.bootloader_image())
+    /// The flash regions of the image.
+    fn regions(&self, board: &Layout) -> Vec<Region> {
+        board.program(self.program).map_or_else(|| bootloader_flash(board), |program| vec![program])
     }
+}
+
+/// The flash regions of the bootloaders of a board: that of the resident part, and in the split map
+/// that of the RAM image.
+pub fn bootloader_flash(board: &Layout) -> Vec<Region> {
+    [Some(board.resident()), board.home].into_iter().flatten().collect()
 }
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let setup = Setup::from(&mut args);
-    let (every, unpacked) = (args.flag("--all"), args.flag("--unpacked"));
+    let every = args.flag("--all");
     let product = args.value("--product")?.map(|word| Product::chosen(&word)).transpose()?;
     let product = product.filter(|product| !product.is_default());
     let mut names = args.rest();
@@ -186,8 +191,7 @@ pub fn run(mut args: Args) -> Outcome {
             _ => (variant.name.to_owned(), variant.product()?),
         };
         let built = build(board, variant, &product)?;
-        let file = if unpacked { built } else { finished(variant, built)? };
-        put(board, &name, variant.region(board), &file)?;
+        put(board, variant, &name, &finished(variant, built)?)?;
     }
     if in_c {
         c_applications(board)?;
@@ -203,7 +207,7 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
         let built = build(board, variant, &variant.product()?)?;
-        put(board, variant.name, variant.region(board), &finished(variant, built)?)?;
+        put(board, variant, variant.name, &finished(variant, built)?)?;
     }
     Ok(workspace::firmware_dir(board))
 }
@@ -264,7 +268,7 @@ pub fn c_applications(board: &Layout) -> Outcome {
         for (name, more) in [(C_APPLICATION, None), ("app-c-probe", Some(PROBE))] {
             let name = if number == 1 { name.to_owned() } else { format!("{name}-program-{number}") };
             let elf = c_application(board, number, &name, more)?;
-            report(&elf, *region)?;
+            report(&elf, &[*region])?;
         }
     }
     Ok(())
@@ -345,7 +349,7 @@ fn rust_lld() -> Outcome<PathBuf> {
 pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
-    pack::pack(&built(board, "bootloader")?)
+    ram_image::seal(built(board, "bootloader")?)
 }
 
 /// The folders with the files of the boards.
@@ -402,17 +406,11 @@ fn target_dir(board: &Layout) -> PathBuf {
     workspace::target_dir().join("fw").join(board.chip.line.name())
 }
 
-include!("../../linker/packs_well.rs");
-
-/// The cargo command that builds an image. Its additional compiler arguments apply only to the last
-/// crate; with `lto` all code for the chip is generated there.
+/// The cargo command that builds an image.
 fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -> Command {
-    let is_packed = package == "bootloader";
-    let mut cargo = process::cargo(if is_packed { "rustc" } else { "build" });
+    let mut cargo = process::cargo("build");
     cargo.args(firmware_args(package, board, features)).args(product.args());
-    if is_packed {
-        cargo.args(["--bin", package, "--", PACKS_WELL]);
-    }
+    cargo.args(["--bin", package]);
     cargo
 }
 
@@ -429,17 +427,17 @@ fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
         .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
 }
 
-/// The step after the link: a bootloader is packed.
+/// The step after the link: a bootloader gets the CRC of its RAM image.
 fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
     if variant.is_bootloader() {
-        pack::pack(&built).map_err(|problem| format!("{} cannot be packed: {problem}", variant.name))
+        ram_image::seal(built).map_err(|problem| format!("{} gets no CRC: {problem}", variant.name))
     } else {
         Ok(built)
     }
 }
 
 /// Writes an image into the board's folder, under its name, and prints its size.
-fn put(board: &Layout, name: &str, region: Region, file: &[u8]) -> Outcome {
+fn put(board: &Layout, variant: &Variant, name: &str, file: &[u8]) -> Outcome {
     let dir = workspace::firmware_dir(board);
     fs::create_dir_all(&dir)
         .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
@@ -449,19 +447,20 @@ fn put(board: &Layout, name: &str, region: Region, file: &[u8]) -> Outcome {
         fs::write(&to, file)
             .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
     }
-    report(&to, region)
+    report(&to, &variant.regions(board))
 }
 
 /// Prints the size of an image.
 ///
 /// # Errors
 /// When it lies outside its flash.
-pub fn report(image: &Path, region: Region) -> Outcome {
-    let flash = Flash::of(&footprint::read(image)?, region)
+pub fn report(image: &Path, regions: &[Region]) -> Outcome {
+    let flash = Flash::of(&footprint::read(image)?, regions)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.
-    eprintln!("  {:<52} {:>6} of {} bytes", workspace::shown(image), flash.used, region.size);
+    let used: Vec<_> = flash.used.iter().map(|(region, bytes)| format!("{bytes} of {}", region.size)).collect();
+    eprintln!("  {:<52} {} bytes", workspace::shown(image), used.join(" + "));
     Ok(())
 }
 
@@ -494,10 +493,10 @@ mod tests {
         let sealed = Product { name: "sealed".to_owned(), ..lift };
         assert!(standard.name_of(&sealed).unwrap_err().contains("another image already"));
         let second = Variant::by_name(two, "app-program-2").ok().unwrap();
-        assert_eq!(second.region(two), two.programs[1]);
+        assert_eq!(second.regions(two), [two.programs[1]]);
         assert_eq!(
-            Variant::by_name(two, "bootloader-lift").ok().unwrap().region(two),
-            two.bootloader_image()
+            Variant::by_name(two, "bootloader-lift").ok().unwrap().regions(two),
+            [Some(two.resident()), two.home].map(Option::unwrap)
         );
     }
 }

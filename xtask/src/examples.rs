@@ -133,7 +133,7 @@ fn build(example: &Example) -> Outcome {
     fs::create_dir_all(&images)
         .and_then(|()| fs::copy(&built, &image))
         .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&image)))?;
-    report(&image, BOARD.programs[0])
+    report(&image, &BOARD.programs[..1])
 }
 
 /// Builds a folder with CMake; returns the program.

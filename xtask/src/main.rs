@@ -40,7 +40,6 @@ mod mutants;
 mod new_board;
 mod opinion;
 mod ordered;
-mod pack;
 mod package;
 mod pairs;
 mod parts;
@@ -50,6 +49,7 @@ mod portable;
 mod powercut;
 mod process;
 mod product;
+mod ram_image;
 mod reproduce;
 mod rooms;
 mod sbom;
@@ -58,7 +58,6 @@ mod size;
 mod test;
 mod toolchain;
 mod workspace;
-mod zx0;
 
 use args::Args;
 

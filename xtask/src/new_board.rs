@@ -100,15 +100,21 @@ fn constant(chip: &Geometry) -> String {
     chip.chip.to_uppercase()
 }
 
-/// A memory map for the chip, with its programs separate: the smallest sectors for bootloader and
-/// parameters, and the rest for one program.
+/// A memory map for the chip, with its programs separate: split from 512 KiB on, compact below, and
+/// the rest of the flash for one program.
 fn map(chip: &'static Geometry) -> (Layout, Region) {
     let (flash, ram_end) = (chip.flash.base, chip.sram.end());
-    let program = flash + 64 * 1024;
+    let is_split = chip.flash.size >= 512 * 1024;
+    // The first four sectors have 16 KiB and the fifth 64 KiB on every chip of the family.
+    let small = |number: u32| Region::new(flash + number * 0x4000, 0x4000);
+    let home = Region::new(flash + 0x1_0000, 0x1_0000);
+    let program = if is_split { home.end() } else { home.base };
     let layout = Layout {
         chip,
-        bootloader: Region::new(flash, 32 * 1024),
-        parameters: [Region::new(flash + 0x8000, 16 * 1024), Region::new(flash + 0xC000, 16 * 1024)],
+        bootloader: Region::new(flash, if is_split { 0x4000 } else { 0x8000 }),
+        home: is_split.then_some(home),
+        parameters: if is_split { [small(1), small(2)] } else { [small(2), small(3)] },
+        data: is_split.then(|| small(3)),
         ram: Region::new(chip.sram.base, chip.sram.size - 64),
         handoff: Region::new(ram_end - 64, 48),
         warm_start: Region::new(ram_end - 16, 16),
@@ -126,6 +132,9 @@ fn layout_file(name: &str, chip: &'static Geometry) -> String {
         };
         format!("Region::new(0x{:04X}_{:04X}, {kib})", region.base >> 16, region.base & 0xFFFF)
     };
+    let optional = |place: Option<Region>| {
+        place.map_or_else(|| "None".to_owned(), |place| format!("Some({})", region(place)))
+    };
     let constant = constant(chip);
     let (layout, program) = map(chip);
     format!(
@@ -138,13 +147,16 @@ use crate::layout::Layout;
 pub const LAYOUT: Layout = Layout {{
     board: \"{name}\",
     chip: &{constant},
-    // Step 1: the bootloader. 32 KiB are two sectors of 16 KiB on every chip of the family.
+    // Step 1: the bootloader's resident part, and the home of its RAM image (none in the compact map).
     bootloader: {},
     callgate_offset: 0x40,
-    // Step 2: the two sectors of the parameters.
+    home: {},
+    // Step 2: the two sectors of the parameters, and one for the application's own data.
     parameters: [{}, {}],
+    data: {},
     // Step 3: the programs, whole sectors each. Here one program has the rest of the flash.
     programs: &[{}],
+    staging: None,
     // Step 4: the RAM; the chip's last 64 bytes of it are for handoff and warm-start cell.
     ram: {},
     handoff: {},
@@ -155,8 +167,10 @@ pub const LAYOUT: Layout = Layout {{
         chip.flash.size / 1024,
         chip.sram.size / 1024,
         region(layout.bootloader),
+        optional(layout.home),
         region(layout.parameters[0]),
         region(layout.parameters[1]),
+        optional(layout.data),
         region(program),
         region(layout.ram),
         region(layout.handoff),

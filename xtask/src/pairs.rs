@@ -7,7 +7,7 @@ use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::elf::Elf;
-use crate::footprint::{kib, Flash};
+use crate::footprint::Flash;
 use crate::product::Product;
 use crate::setup::{Part, Setup};
 use crate::{build, workspace, Outcome};
@@ -115,15 +115,13 @@ pub const PRODUCT: Product = Product {
     file + "    ..Product::DEFAULT\n};\n"
 }
 
-/// The size in a board's flash of the bootloader of this product, in bytes.
+/// The size in a board's flash of the bootloader of this product, in bytes; an error if it does not
+/// fit.
 fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let told = |problem: String| format!("{}, {}: {problem}", board.board, words(row));
     let elf = build::to_look_at(board, "", product).map_err(told)?;
-    let used = Flash::of(&Elf::parse(&elf)?, board.bootloader).map_err(told)?.used;
-    if used > board.bootloader.size {
-        return Err(told(format!("{used} bytes, of {}", kib(board.bootloader.size))));
-    }
-    Ok(used)
+    let flash = Flash::of(&Elf::parse(&elf)?, &build::bootloader_flash(board)).map_err(told)?;
+    Ok(flash.used.iter().map(|(_, bytes)| bytes).sum())
 }
 
 /// The fields that differ from their default.

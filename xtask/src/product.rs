@@ -121,7 +121,7 @@ mod tests {
         }
         // It would have the name of the customer's, or one that a file of an image cannot have.
         let root = workspace::root();
-        for file in ["bootloader/products/default.rs", "bootloader/src/boot_report.rs"] {
+        for file in ["bootloader/products/default.rs", "bootloader/src/flash_controller.rs"] {
             assert!(Product::of_file(&root.join(file)).unwrap_err().contains("the name of a product"));
         }
     }

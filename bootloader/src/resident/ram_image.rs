@@ -1,52 +1,56 @@
-//! Loads the rest of the bootloader from flash to RAM, if it is undamaged.
+//! Loads the rest of the bootloader from flash to RAM, if it is undamaged and for this device.
 
 use core::slice;
 
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
-use shared_abi::ram_image::{Damage, Header, Method, LEAST_STACK};
+use shared_abi::ram_image::{Damage, Header};
+use shared_abi::vectors::VectorTable;
 
 use crate::flash::ResidentFlash;
-use crate::unpack::{restore_calls, unpack};
 
-/// Checks the image and unpacks it to the start of the RAM.
+include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
+
+extern "C" {
+    /// The image's header: the linker script of the resident part has its address.
+    #[link_name = "__ram_image"]
+    static HEADER: Header;
+}
+
+/// Checks the image, copies it to its RAM, and returns its vectors.
 ///
 /// # Errors
-/// The damaged part; the RAM may then hold a part of the image.
+/// The damaged part; the RAM may then hold the image.
 ///
 /// # Safety
-/// `header` must be the address of the image's header in the bootloader's flash, aligned. Nothing
-/// may use the RAM except its last [`LEAST_STACK`] bytes.
-pub unsafe fn load(header: *const Header, flash: &ResidentFlash) -> Result<(), Damage> {
-    let at = header as u32;
-    // SAFETY: the caller guarantees the address; any bits are a valid `Header`.
-    let header = unsafe { &*header };
+/// Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::ram_image::LEAST_STACK)
+/// bytes.
+pub unsafe fn load(flash: &ResidentFlash) -> Result<VectorTable, Damage> {
+    // SAFETY: the linker script places it in flash, aligned; any bits are a valid `Header`, and the
+    // flash behind it is part of its region, which `check` compares with the image's size.
+    let header = unsafe { &HEADER };
+    let at = core::ptr::from_ref(header) as u32;
     let data = at + Header::SIZE;
-    let method = header.check(LAYOUT.bootloader.end() - data, LAYOUT.ram.size - LEAST_STACK)?;
-    let front = Region::new(LAYOUT.bootloader.base, at - LAYOUT.bootloader.base);
-    if header.has_crc() {
-        let behind = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.stored);
-        if flash.crc32(flash.crc32(0, front), behind) != header.crc {
+    let home = LAYOUT.home.unwrap_or(LAYOUT.bootloader);
+    header.check(home.end() - data, LAYOUT.ram, BOARD_IDENTITY)?;
+    if header.crc != 0 {
+        let covered = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.size);
+        if flash.crc32(0, covered) != header.crc {
             return Err(Damage::Crc);
         }
     }
-    // SAFETY: the caller guarantees that the header lies in the bootloader's flash, and `check` has
-    // found that the stored bytes end within it. Nothing writes to it in this time.
-    let (front, stored) = unsafe {
-        (
-            slice::from_raw_parts(front.base as *const u8, front.size as usize),
-            slice::from_raw_parts(data as *const u8, header.stored as usize),
-        )
-    };
-    // SAFETY: `check` has found this to be RAM, and the caller guarantees that nothing else uses
-    // it.
-    let ram = unsafe { slice::from_raw_parts_mut(LAYOUT.ram.base as *mut u8, header.unpacked as usize) };
-    match method {
-        // SAFETY: the two slices are valid, and `check` has found them to be of one length.
-        Method::Raw => unsafe { stored.as_ptr().copy_to_nonoverlapping(ram.as_mut_ptr(), stored.len()) },
-        Method::Zx0 if !unpack(front, stored, ram) => return Err(Damage::Stream),
-        Method::Zx0 => restore_calls(ram),
+    let vectors = header.entry([flash.read_word(data), flash.read_word(data + 4)])?;
+    let words = header.size as usize / 4;
+    // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the
+    // stack its room, and has a multiple of four bytes; both addresses are aligned. The caller
+    // guarantees that nothing else uses the RAM.
+    unsafe {
+        let to = slice::from_raw_parts_mut(header.ram_base as *mut u32, words);
+        for (to, from) in to.iter_mut().zip((data..).step_by(4)) {
+            // Volatile: a call of memcpy would copy by bytes.
+            *to = (from as *const u32).read_volatile();
+        }
     }
-    Ok(())
+    Ok(vectors)
 }

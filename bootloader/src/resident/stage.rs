@@ -12,11 +12,10 @@ use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
+use shared_abi::boot_report::{BootReport, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
-use shared_abi::ram_image::Header;
 use shared_abi::warm_start::{BootRequest, Owed};
 
-use crate::boot_report::BootReport;
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
 use crate::product::{self, NO_NODE_ID, PRODUCT};
@@ -26,18 +25,16 @@ use crate::{ram_image, storing};
 /// the warm-start cell in this time.
 const RESET_PERIOD_MS: u32 = 100;
 
-/// Decides between a program and the bootloader. It returns if the bootloader stays; the rest of
-/// the bootloader is then in RAM, and `report` says what is left for it.
+/// Decides between a program and the bootloader, and starts it: a program in flash, or the RAM image
+/// with a report ([`BootReport`]) of what is left for it.
 ///
 /// A damaged RAM image does not run. The warm-start cell records the damage, and the program with
 /// autostart starts. If there is none, the chip resets again and again.
 ///
 /// # Safety
-/// `image` must be the address of the RAM image's header. `report` must be writable and outside the
-/// image's RAM. Nothing else may run yet.
-pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
-    // SAFETY: nothing else runs yet; the rest of the bootloader takes them after this function has
-    // returned.
+/// Nothing else may run yet.
+pub unsafe extern "C" fn stage() -> ! {
+    // SAFETY: nothing else runs yet.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
     let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
@@ -54,7 +51,7 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
     let request = cell.take();
     let strap = bsp::entry_strap();
 
-    // CRCs and unpacking need speed, but no exact clock. The crystal would take time to start.
+    // CRCs need speed, but no exact clock. The crystal would take time to start.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { ResidentFlash::steal(true) };
@@ -107,12 +104,18 @@ pub unsafe extern "C" fn stage(image: *const Header, report: *mut BootReport) {
                 program.vectors().jump()
             }
         }
-        // SAFETY: the caller guarantees the address; only the stack uses the RAM.
-        match unsafe { ram_image::load(image, &flash) } {
-            Ok(()) => {
-                // SAFETY: the caller guarantees the address.
-                unsafe { report.write(boot_report(&decision, request, node_id, node.bit_rate)) };
-                return;
+        // SAFETY: only the stack uses the RAM.
+        match unsafe { ram_image::load(&flash) } {
+            Ok(vectors) => {
+                let report = boot_report(&decision, request, node_id, node.bit_rate);
+                drop(caches);
+                // The image changes the clock. The CRC unit keeps its clock, for the services.
+                // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
+                // image. Since the reset no interrupt was enabled and no bus master started.
+                unsafe {
+                    (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
+                    vectors.jump()
+                }
             }
             Err(damage) => cell.put(BootRequest::Damaged(damage)),
         }

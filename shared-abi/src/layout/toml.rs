@@ -30,6 +30,11 @@ impl fmt::Display for List<'_> {
     }
 }
 
+/// A region that not every layout has.
+fn optional(f: &mut fmt::Formatter<'_>, name: &str, region: &Option<Region>) -> fmt::Result {
+    region.map_or(Ok(()), |region| writeln!(f, "{name} = {}", Table(region)))
+}
+
 impl fmt::Display for Toml<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Layout {
@@ -37,8 +42,11 @@ impl fmt::Display for Toml<'_> {
             chip,
             bootloader,
             callgate_offset,
+            home,
             parameters,
+            data,
             programs,
+            staging,
             ram,
             handoff,
             warm_start,
@@ -47,8 +55,11 @@ impl fmt::Display for Toml<'_> {
         writeln!(f, "board = \"{board}\"")?;
         writeln!(f, "bootloader = {}", Table(*bootloader))?;
         writeln!(f, "callgate-offset = {callgate_offset:#x}")?;
+        optional(f, "home", home)?;
         writeln!(f, "parameters = {}", List(parameters))?;
+        optional(f, "data", data)?;
         writeln!(f, "programs = {}", List(programs))?;
+        optional(f, "staging", staging)?;
         writeln!(f, "ram = {}", Table(*ram))?;
         writeln!(f, "handoff = {}", Table(*handoff))?;
         writeln!(f, "warm-start = {}", Table(*warm_start))?;

@@ -30,12 +30,12 @@ fn each_broken_rule_is_named() {
         (broken(|l| l.bootloader.base = 0x0800_4000), "must start at the base of the flash"),
         (broken(|l| l.bootloader.size = 33 * KIB), "the bootloader must end at a sector border"),
         (broken(|l| l.callgate_offset = 0x3C), "the callgate overlaps the bootloader's vector table"),
-        (broken(|l| l.callgate_offset = 32 * KIB), "the callgate lies outside the bootloader"),
+        (broken(|l| l.callgate_offset = 16 * KIB), "the callgate lies outside the bootloader"),
         (
             broken(|l| l.parameters[0].size = 8 * KIB),
             "a parameter region must start and end at sector borders",
         ),
-        (broken(|l| l.parameters[0].base = 0x0800_4000), "a parameter region overlaps the bootloader"),
+        (broken(|l| l.parameters[0].base = 0x0800_0000), "a parameter region overlaps the bootloader"),
         (broken(|l| l.parameters[1] = l.parameters[0]), "the two parameter regions overlap"),
         (broken(|l| l.programs = &[]), "there must be 1 to 254 programs"),
         (
@@ -46,14 +46,51 @@ fn each_broken_rule_is_named() {
             broken(|l| l.programs = programs(&[(0x0801_1000, 60 * KIB)])),
             "a program must start and end at sector borders",
         ),
-        (broken(|l| l.programs = programs(&[(0x0800_4000, 16 * KIB)])), "a program overlaps the bootloader"),
+        (broken(|l| l.programs = programs(&[(0x0800_0000, 16 * KIB)])), "a program overlaps the bootloader"),
+        (broken(|l| l.programs = programs(&[(0x0801_0000, 64 * KIB)])), "a program overlaps the bootloader"),
         (
-            broken(|l| l.programs = programs(&[(0x0800_C000, 80 * KIB)])),
+            broken(|l| l.programs = programs(&[(0x0800_8000, 16 * KIB)])),
             "a program overlaps a parameter region",
         ),
         (
-            broken(|l| l.programs = programs(&[(0x0801_0000, 192 * KIB), (0x0802_0000, 128 * KIB)])),
+            broken(|l| l.programs = programs(&[(0x0802_0000, 256 * KIB), (0x0804_0000, 128 * KIB)])),
             "two programs overlap",
+        ),
+        (
+            broken(|l| l.home = Some(Region::new(0x0801_0000, 32 * KIB))),
+            "the home of the RAM image must start and end at sector borders",
+        ),
+        (
+            broken(|l| l.home = Some(Region::new(0x0800_0000, 16 * KIB))),
+            "the home of the RAM image overlaps the bootloader",
+        ),
+        (
+            broken(|l| l.home = Some(Region::new(0x0800_4000, 16 * KIB))),
+            "the home of the RAM image overlaps a parameter region",
+        ),
+        (broken(|l| l.data = Some(Region::new(0x0800_C000, 17 * KIB))), "the data region must start and end"),
+        (broken(|l| l.data = l.home), "the data region overlaps the bootloader"),
+        (broken(|l| l.data = Some(l.bootloader)), "the data region overlaps the bootloader"),
+        (broken(|l| l.data = Some(l.parameters[1])), "the data region overlaps a parameter region"),
+        (
+            broken(|l| l.programs = programs(&[(0x0800_C000, 16 * KIB)])),
+            "a program overlaps the data region",
+        ),
+        (
+            broken(|l| {
+                l.home = None;
+                l.staging = Some(Region::new(0x080E_0000, 128 * KIB));
+            }),
+            "a staging region needs a home",
+        ),
+        (broken(|l| l.staging = Some(Region::new(0x080C_0000, 256 * KIB))), "must be the last sector"),
+        (broken(|l| l.staging = Some(Region::new(0x080C_0000, 128 * KIB))), "must be the last sector"),
+        (
+            broken(|l| {
+                l.programs = programs(&[(0x080E_0000, 128 * KIB)]);
+                l.staging = Some(Region::new(0x080E_0000, 128 * KIB));
+            }),
+            "and not its only one",
         ),
         (broken(|l| l.ram.size = 256 * KIB), "the RAM of the images lies outside the chip's SRAM"),
         (broken(|l| l.ram.size -= 4), "must be a multiple of 8"),
@@ -68,12 +105,12 @@ fn each_broken_rule_is_named() {
             }),
             "must be the last RAM cell",
         ),
-        (broken(|l| l.callgate_offset = 32 * KIB - 4), "the callgate lies outside the bootloader"),
+        (broken(|l| l.callgate_offset = 16 * KIB - 4), "the callgate lies outside the bootloader"),
         (
             broken(|l| l.programs = programs(&[(0x0801_0000, 64 * KIB); 255])),
             "there must be 1 to 254 programs",
         ),
-        (broken(|l| l.programs = programs(&[(0x0801_0000, 64 * KIB); 254])), "two programs overlap"),
+        (broken(|l| l.programs = programs(&[(0x0802_0000, 128 * KIB); 254])), "two programs overlap"),
         (
             broken(|l| {
                 l.ram.size -= 8;
@@ -90,13 +127,16 @@ fn each_broken_rule_is_named() {
 
 #[test]
 fn no_region_is_empty_or_reaches_over_the_end_of_the_address_space() {
-    let regions: [fn(&mut Layout) -> &mut Region; 6] = [
+    let regions: [fn(&mut Layout) -> &mut Region; 9] = [
         |l| &mut l.bootloader,
         |l| &mut l.parameters[0],
         |l| &mut l.parameters[1],
         |l| &mut l.ram,
         |l| &mut l.handoff,
         |l| &mut l.warm_start,
+        |l| l.home.as_mut().unwrap(),
+        |l| l.data.as_mut().unwrap(),
+        |l| l.staging.get_or_insert(Region::new(0x080E_0000, 128 * 1024)),
     ];
     for region in regions {
         for wrong in [Region::new(region(&mut { LAYOUT }).base, 0), Region::new(0xFFFF_FF00, 0x101)] {
@@ -104,7 +144,7 @@ fn no_region_is_empty_or_reaches_over_the_end_of_the_address_space() {
         }
     }
     for wrong in [(0x0802_0000, 0), (0xFFFF_FF00, 0x101)] {
-        let message = broken(|l| l.programs = programs(&[(0x0801_0000, 64 * 1024), wrong]));
+        let message = broken(|l| l.programs = programs(&[(0x0804_0000, 128 * 1024), wrong]));
         assert!(message.contains("a region is empty"), "{message}");
     }
 }

@@ -4,14 +4,16 @@
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::layout::toml::Toml;
-use shared_abi::layout::{by_name, chosen, Image};
+use shared_abi::layout::{by_name, chosen, nucleo_f446re, Image};
 
 #[test]
 fn regions_of_the_bootloader_and_its_programs() {
     assert_eq!(LAYOUT.callgate(), 0x0800_0040);
-    assert_eq!(LAYOUT.key_block(), Region::new(0x0800_7F00, 0x100));
-    assert_eq!(LAYOUT.bootloader_image(), Region::new(0x0800_0000, 0x7F00));
-    assert_eq!(LAYOUT.program(1), Some(Region::new(0x0801_0000, 0xF_0000)));
+    assert_eq!(LAYOUT.key_block(), Region::new(0x0800_3F00, 0x100));
+    assert_eq!(LAYOUT.resident(), Region::new(0x0800_0000, 0x3F00));
+    // The compact map has no key block.
+    assert_eq!(nucleo_f446re::LAYOUT.resident(), Region::new(0x0800_0000, 0x8000));
+    assert_eq!(LAYOUT.program(1), Some(Region::new(0x0802_0000, 0xE_0000)));
     assert_eq!((LAYOUT.program(0), LAYOUT.program(2)), (None, None));
 }
 
@@ -33,13 +35,13 @@ fn boards_have_names() {
 fn the_linker_script_of_a_program() {
     let text = LAYOUT.linker_script(Image::Program(1)).to_string();
     for line in [
-        "  FLASH : ORIGIN = 0x08010000, LENGTH = 0xf0000",
+        "  FLASH : ORIGIN = 0x08020000, LENGTH = 0xe0000",
         "  RAM   : ORIGIN = 0x20000000, LENGTH = 0x1ffc0",
         "__vector_table_alignment = 0x00000200;",
         "__vector_table_size = 0x00000188;",
         "__core_vectors_size = 0x00000040;",
-        "__label = 0x080101e0;",
-        "__label_end = 0x08010200;",
+        "__label = 0x080201e0;",
+        "__label_end = 0x08020200;",
         "__callgate_table = 0x08000040;",
         "__callgate_table_size = 0x00000010;",
         "__handoff = 0x2001ffc0;",
@@ -50,7 +52,11 @@ fn the_linker_script_of_a_program() {
         assert!(text.lines().any(|of| of == line), "{line}\n{text}");
     }
     let bootloader = LAYOUT.linker_script(Image::Bootloader).to_string();
-    assert!(bootloader.contains("FLASH : ORIGIN = 0x08000000, LENGTH = 0x7f00\n"), "{bootloader}");
+    assert!(bootloader.contains("FLASH : ORIGIN = 0x08000000, LENGTH = 0x3f00\n"), "{bootloader}");
+    assert!(bootloader.contains("HOME  : ORIGIN = 0x08010000, LENGTH = 0x10000\n"), "{bootloader}");
+    let compact = nucleo_f446re::LAYOUT.linker_script(Image::Bootloader).to_string();
+    assert!(compact.contains("FLASH : ORIGIN = 0x08000000, LENGTH = 0x8000\n"), "{compact}");
+    assert!(compact.contains("REGION_ALIAS(\"HOME\", FLASH)\n"), "{compact}");
 }
 
 /// Each row by its words: name, first and last address, size, sectors.
@@ -60,10 +66,12 @@ fn the_map_for_people() {
     let rows: Vec<Vec<&str>> = text.lines().map(|line| line.split_whitespace().collect()).collect();
     for row in [
         "stm32f407g-disc1 (stm32f407vg: flash 1024 KiB, SRAM 128 KiB)",
-        "bootloader 0800_0000 - 0800_7FFF 32 KiB sectors 0-1: vectors of the core, then the callgate",
-        "parameters A 0800_8000 - 0800_BFFF 16 KiB sector 2",
-        "parameters B 0800_C000 - 0800_FFFF 16 KiB sector 3",
-        "program 1 0801_0000 - 080F_FFFF 960 KiB sectors 4-11",
+        "resident part 0800_0000 - 0800_3FFF 16 KiB sector 0: vectors of the core, then the callgate",
+        "parameters A 0800_4000 - 0800_7FFF 16 KiB sector 1",
+        "parameters B 0800_8000 - 0800_BFFF 16 KiB sector 2",
+        "data 0800_C000 - 0800_FFFF 16 KiB sector 3: the application's own",
+        "RAM image 0801_0000 - 0801_FFFF 64 KiB sector 4: the rest of the bootloader",
+        "program 1 0802_0000 - 080F_FFFF 896 KiB sectors 5-11",
         "handoff 2001_FFC0 - 2001_FFEF 48 B bootloader -> application",
         "The callgate is at 0800_0040.",
     ] {
@@ -76,9 +84,11 @@ fn the_layout_as_toml() {
     let text = Toml(&LAYOUT).to_string();
     for line in [
         "board = \"stm32f407g-disc1\"",
-        "bootloader = { base = 0x08000000, size = 0x8000 }",
+        "bootloader = { base = 0x08000000, size = 0x4000 }",
         "callgate-offset = 0x40",
-        "programs = [\n  { base = 0x08010000, size = 0xf0000 },\n]",
+        "home = { base = 0x08010000, size = 0x10000 }",
+        "data = { base = 0x0800c000, size = 0x4000 }",
+        "programs = [\n  { base = 0x08020000, size = 0xe0000 },\n]",
         "warm-start = { base = 0x2001fff0, size = 0x10 }",
         "name = \"stm32f407vg\"",
         "  { count = 7, size = 0x20000 },\n]",

@@ -1,0 +1,134 @@
+//! The boot report: a record in which the resident part informs the RAM image why it runs, and what
+//! is left to do.
+//!
+//! It is in the [`handoff`](crate::handoff)'s place: the resident part starts a program or the RAM
+//! image, never both.
+
+use crate::check_word;
+use crate::warm_start::Owed;
+
+/// Identifies a boot report ("CBBR" read as little-endian bytes).
+pub const MAGIC: u32 = u32::from_le_bytes(*b"CBBR");
+
+/// The version of the record. Later versions only define words that were 0 before, so a reader
+/// accepts every version from 1 on.
+pub const VERSION: u16 = 1;
+
+/// The reason why the bootloader runs, and the work that is left for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BootReport {
+    /// The number of the reason (`boot_core::decision::StayReason`).
+    pub reason: u8,
+    /// The program that starts when the rescue window is over; 0 for none.
+    pub held_program: u8,
+    /// Length of the rescue window, in ms.
+    pub window_ms: u16,
+    /// The write of 1F51h that the application received and the bootloader answers; its node-ID is
+    /// 0 if there is none.
+    pub owed: Owed,
+    /// The program that returned control to the bootloader; 0 for none.
+    pub returned: u8,
+    /// Node-ID in force from this reset on; 255 for none.
+    pub node_id: u8,
+    /// Bit rate in force from this reset on, as the index of CiA 305 table 1.
+    pub bit_rate: u8,
+}
+
+/// The record in RAM: twelve words, little-endian.
+///
+/// | word | contents |
+/// |---|---|
+/// | 0 | [`MAGIC`] |
+/// | 1 | [`VERSION`] in the lower half, 48 (bytes) in the upper one |
+/// | 2 | reason, held program, length of the window (16 bits) |
+/// | 3 | owed: program, value, node-ID; then the program that returned |
+/// | 4 | node-ID, bit rate |
+/// | 5–10 | 0 |
+/// | 11 | [`check_word`] of the words before |
+pub type Words = [u32; 12];
+
+impl BootReport {
+    /// The record with this report.
+    #[must_use]
+    pub const fn words(&self) -> Words {
+        let Owed { program, value, node_id } = self.owed;
+        let [window, window_high] = self.window_ms.to_le_bytes();
+        let mut words = [0; 12];
+        words[0] = MAGIC;
+        words[1] = VERSION as u32 | (size_of::<Words>() as u32) << 16;
+        words[2] = u32::from_le_bytes([self.reason, self.held_program, window, window_high]);
+        words[3] = u32::from_le_bytes([program, value, node_id, self.returned]);
+        words[4] = u32::from_le_bytes([self.node_id, self.bit_rate, 0, 0]);
+        words[11] = check_of(&words);
+        words
+    }
+
+    /// The report in a record; `None` if the record is damaged.
+    #[must_use]
+    pub const fn parse(words: &Words) -> Option<Self> {
+        let [version, _, length, length_high] = words[1].to_le_bytes();
+        let length = u16::from_le_bytes([length, length_high]) as usize;
+        if words[0] != MAGIC || version == 0 || length != size_of::<Words>() || words[11] != check_of(words) {
+            return None;
+        }
+        let [reason, held_program, window, window_high] = words[2].to_le_bytes();
+        let [program, value, node, returned] = words[3].to_le_bytes();
+        let [node_id, bit_rate, ..] = words[4].to_le_bytes();
+        Some(Self {
+            reason,
+            held_program,
+            window_ms: u16::from_le_bytes([window, window_high]),
+            owed: Owed { program, value, node_id: node },
+            returned,
+            node_id,
+            bit_rate,
+        })
+    }
+}
+
+const fn check_of(words: &Words) -> u32 {
+    let (rest, _) = words.split_at(words.len() - 1);
+    check_word(rest)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const REPORT: BootReport = BootReport {
+        reason: 1,
+        held_program: 2,
+        window_ms: 0x0403,
+        owed: Owed { program: 5, value: 6, node_id: 7 },
+        returned: 8,
+        node_id: 9,
+        bit_rate: 10,
+    };
+
+    /// Written down by hand from the table above.
+    #[test]
+    fn the_words_are_frozen() {
+        let words = REPORT.words();
+        assert_eq!(words[..5], [0x5242_4243, 0x0030_0001, 0x0403_0201, 0x0807_0605, 0x0000_0A09]);
+        assert_eq!(words[5..11], [0; 6]);
+        assert_eq!(BootReport::parse(&words), Some(REPORT));
+    }
+
+    #[test]
+    fn any_damage_is_seen_and_a_newer_version_is_read() {
+        for word in 0..12 {
+            for bit in 0..32 {
+                let mut words = REPORT.words();
+                words[word] ^= 1 << bit;
+                assert_eq!(BootReport::parse(&words), None, "word {word}, bit {bit}");
+            }
+        }
+        let mut newer = REPORT.words();
+        newer[1] += 1;
+        newer[10] = 0xFFFF_FFFF;
+        newer[11] = check_of(&newer);
+        assert_eq!(BootReport::parse(&newer), Some(REPORT));
+        assert_eq!(BootReport::parse(&[0; 12]), None);
+        assert_eq!(BootReport::parse(&[u32::MAX; 12]), None);
+    }
+}
