@@ -38,10 +38,10 @@ fn memory_ranges(elf: &[u8]) -> Vec<(u32, u32)> {
     ranges
 }
 
-/// The first two words of an image in flash.
+/// The first two words of an image: of a program in flash, and of the bootloader's resident part.
 fn vectors(elf: &[u8]) -> (u32, u32) {
     let file = ElfFile32::<Endianness>::parse(elf).unwrap();
-    let table = file.section_by_name(".vector_table").unwrap();
+    let table = file.section_by_name(".vector_table").or_else(|| file.section_by_name(".resident")).unwrap();
     let data = table.data().unwrap();
     let word = |at: usize| u32::from_le_bytes(data[at..at + 4].try_into().unwrap());
     (word(0), word(4))
@@ -50,13 +50,15 @@ fn vectors(elf: &[u8]) -> (u32, u32) {
 #[test]
 fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
     let layout = firmware::board();
+    // The bootloader has two places in the split map.
+    let home = layout.home.unwrap_or(layout.bootloader);
     let images = [
-        (firmware::BOOTLOADER, layout.bootloader),
-        (firmware::BOOTLOADER, layout.bootloader),
-        (firmware::APP_V1, layout.programs[0]),
-        (firmware::APP_V2, layout.programs[0]),
+        (firmware::BOOTLOADER, [layout.bootloader, home]),
+        (firmware::APP_V1, [layout.programs[0]; 2]),
+        (firmware::APP_V2, [layout.programs[0]; 2]),
     ];
     for (image, flash) in images {
+        let is_in_flash = |address, size| flash.iter().any(|place| place.contains(address, size));
         let elf = firmware::elf(image);
         let header = FileHeader32::<Endianness>::parse(&*elf).unwrap();
         let mut loaded = 0;
@@ -68,11 +70,10 @@ fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
             let (paddr, vaddr) = (segment.p_paddr(endian), segment.p_vaddr(endian));
             let (filesz, memsz) = (segment.p_filesz(endian), segment.p_memsz(endian));
             if filesz > 0 {
-                assert!(flash.contains(paddr, filesz), "{image}: {paddr:#x} is not its flash");
+                assert!(is_in_flash(paddr, filesz), "{image}: {paddr:#x} is not its flash");
                 loaded += filesz;
             }
-            let runs_in_place = flash.contains(vaddr, memsz);
-            assert!(runs_in_place || layout.ram.contains(vaddr, memsz), "{image}: {vaddr:#x}+{memsz:#x}");
+            assert!(is_in_flash(vaddr, memsz) || layout.ram.contains(vaddr, memsz), "{image}: {vaddr:#x}+{memsz:#x}");
         }
         assert!(loaded > 1024, "{image} has only {loaded} bytes");
     }
@@ -81,8 +82,12 @@ fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
 #[test]
 fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
     let layout = firmware::board();
-    for (image, flash) in [(firmware::BOOTLOADER, layout.bootloader), (firmware::APP_V1, layout.programs[0])]
-    {
+    let home = layout.home.unwrap_or(layout.bootloader);
+    let images = [
+        (firmware::BOOTLOADER, [layout.bootloader, home]),
+        (firmware::APP_V1, [layout.programs[0]; 2]),
+    ];
+    for (image, flash) in images {
         let elf = firmware::elf(image);
         let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
         let mut count = 0;
@@ -99,7 +104,7 @@ fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
             let (address, size) = (symbol.address() as u32 & !1, symbol.size() as u32);
             // A border symbol may be the address directly after the last byte.
             let within = |region: &Region| address >= region.base && address + size <= region.end();
-            assert!(within(&flash) || within(&layout.ram), "{image}: {:?} at {address:#x}", symbol.name());
+            assert!(flash.iter().any(within) || within(&layout.ram), "{image}: {:?} at {address:#x}", symbol.name());
             count += 1;
         }
         assert!(count > 50, "{image}: only {count} symbols were looked at");
@@ -121,14 +126,13 @@ fn what_the_jump_demands_of_a_program_the_template_keeps() {
 fn the_callgate_is_where_the_layout_says() {
     let layout = firmware::board();
     let elf = firmware::elf(firmware::BOOTLOADER);
-    let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
-    let section = file.section_by_name(".callgate").unwrap();
-    assert_eq!(section.address() as u32, layout.callgate());
-    let data = section.data().unwrap();
+    let (base, resident) = firmware::section(&elf, ".resident");
+    assert_eq!(base, layout.bootloader.base);
+    let data = &resident[layout.callgate_offset as usize..];
     assert_eq!(data[..4], *b"CBCG");
     assert_eq!(data[4..8], [1, 0, 16, 0], "ABI version 1, 16 bytes");
     let entry = u32::from_le_bytes(data[12..16].try_into().unwrap());
-    let callgate = Region::new(layout.callgate(), section.size() as u32);
+    let callgate = Region::new(layout.callgate(), data.len() as u32);
     assert!(entry & 1 == 1 && callgate.contains(entry & !1, 2), "{entry:#x} leaves the callgate");
 }
 
@@ -146,22 +150,10 @@ fn the_bootloader_runs_from_ram() {
             continue;
         }
         let name = symbol.name().unwrap();
-        // The thunk comes from the linker: Reset jumps through it from flash to `main` in RAM.
-        let start_up = matches!(name, "Reset" | "__pre_init" | "boot_fault" | "__Thumbv7ABSLongThunk_main")
-            || name.contains("callgate");
         let address = symbol.address() as u32 & !1;
-        if start_up {
-            assert!(
-                layout.bootloader.contains(address, 2),
-                "{name} at {address:#x} runs before the RAM image is there"
-            );
-        } else {
-            assert!(
-                layout.ram.contains(address, 2),
-                "{name} at {address:#x} would stall while flash is busy"
-            );
-            in_ram += 1;
-        }
+        // The resident part, which runs from flash, is a program of its own: it has no symbols here.
+        assert!(layout.ram.contains(address, 2), "{name} at {address:#x} would stall while flash is busy");
+        in_ram += 1;
     }
     assert!(in_ram > 30, "only {in_ram} functions were looked at");
     for constants in [".rodata", ".text"] {

@@ -1,8 +1,7 @@
-//! The bootloader's image: the linker's image and the compressed one are equal, every loader writes
-//! it to the right place, and an image that is damaged in flash does not run.
+//! The bootloader's image: every loader writes it to the right place, and an image that is damaged in
+//! flash, or is for another device, does not run.
 
 mod gdb;
-mod zx0;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -11,15 +10,15 @@ use coboot_tests::firmware;
 use coflash::update::{flash, FlashOptions};
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::machine::{ResetCause, Stop};
-use emulator::time::Span;
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::geometry::Region;
+use shared_abi::layout::toml::Toml;
 use shared_abi::ram_image::SERVICES_VERSION;
 
 /// The size of the header in bytes (shared_abi::ram_image, typed again).
-const HEADER: usize = 24;
+const HEADER: usize = 64;
 
 fn words(bytes: &[u8]) -> Vec<u32> {
     bytes.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
@@ -29,116 +28,94 @@ fn crc32(bytes: &[u8]) -> u32 {
     Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes)
 }
 
-/// A bootloader in flash, with the places of its parts.
-struct Packed {
-    /// The bytes from the start of the flash.
-    flash: Vec<u8>,
-    /// Offset of the header of the RAM image.
-    header: usize,
-    /// The decompressed image.
-    ram: Vec<u8>,
+/// A bootloader in flash: the resident part, and the RAM image with its header.
+#[derive(Clone)]
+struct Parts {
+    resident: Vec<u8>,
+    /// The address of the header.
+    home: u32,
+    /// The header, and the image.
+    image: Vec<u8>,
 }
 
-impl Packed {
-    fn of(image: &str) -> Self {
-        let elf = firmware::elf(image);
-        let base = firmware::board().bootloader.base;
-        let mut flash = Vec::new();
-        for name in [".vector_table", ".callgate", ".boot", ".ram_image", ".ram_image.packed"] {
-            let (address, data) = firmware::section(&elf, name);
-            let at = (address - base) as usize;
-            assert!(at >= flash.len(), "{name} overlaps the section before");
-            flash.resize(at, 0xFF);
-            flash.extend(data);
-        }
-        let header = (firmware::section(&elf, ".ram_image").0 - base) as usize;
-        Self { flash, header, ram: firmware::section(&elf, ".data").1 }
+impl Parts {
+    fn of(name: &str) -> Self {
+        let elf = firmware::elf(name);
+        let (base, resident) = firmware::section(&elf, ".resident");
+        assert_eq!(base, firmware::board().bootloader.base);
+        let (home, header) = firmware::section(&elf, ".ram_image");
+        let (_, ram) = firmware::section(&elf, ".data");
+        assert_eq!(header.len(), HEADER);
+        Self { resident, home, image: [header, ram].concat() }
     }
 
-    /// The stored bytes.
-    fn stored(&mut self) -> &mut [u8] {
-        &mut self.flash[self.header + HEADER..]
+    /// The image without its header, as it is in RAM.
+    fn ram(&self) -> &[u8] {
+        &self.image[HEADER..]
     }
 
-    /// A word of the header.
+    /// A word of the header, or of the image after it.
     fn set(&mut self, word: usize, value: u32) {
-        let at = self.header + word * 4;
-        self.flash[at..at + 4].copy_from_slice(&value.to_le_bytes());
+        self.image[word * 4..][..4].copy_from_slice(&value.to_le_bytes());
     }
 
     fn get(&self, word: usize) -> u32 {
-        words(&self.flash[self.header..self.header + HEADER])[word]
+        words(&self.image[word * 4..][..4])[0]
     }
 
-    /// The bytes before the header.
-    fn front(&self) -> &[u8] {
-        &self.flash[..self.header]
-    }
-
-    /// The correct CRC: of the flash without the first two words of the header.
+    /// The correct CRC: of the header after it and of as much of the image as the header says.
     fn right_crc(&self) -> u32 {
-        crc32(&[self.front(), &self.flash[self.header + 8..]].concat())
+        crc32(&self.image[8..HEADER + self.get(SIZE) as usize])
     }
 
     /// Corrects the CRC.
     fn seal(&mut self) {
         self.set(CRC, self.right_crc());
     }
-}
 
-/// Removes the address from the target of each call (`shared_abi::ram_image::Method::Zx0`), with
-/// numbers of 44 bits; returns the number of calls.
-fn restore_calls(image: &mut [u8], base: u32) -> usize {
-    let (mut at, mut calls) = (0, 0);
-    while at + 4 <= image.len() {
-        let pair = u32::from_le_bytes(image[at..at + 4].try_into().unwrap());
-        if pair & 0xF800_F800 == 0xF800_F000 {
-            let target = u64::from(pair & 0x7FF) * 0x800 + u64::from(pair >> 16 & 0x7FF);
-            let here = (u64::from(base) + at as u64 + 2) / 2;
-            let distance = ((1 << 44) + target - here) % (1 << 22);
-            let pair = 0xF800_F000 | (distance % 0x800) << 16 | (distance / 0x800);
-            image[at..at + 4].copy_from_slice(&(pair as u32).to_le_bytes());
-            (at, calls) = (at + 2, calls + 1);
+    /// The chip's flash with both in it.
+    fn flash(&self) -> Vec<u8> {
+        let place = firmware::board().chip.flash;
+        let mut flash = vec![0xFF; place.size as usize];
+        for (address, bytes) in [(firmware::board().bootloader.base, &self.resident), (self.home, &self.image)] {
+            flash[(address - place.base) as usize..][..bytes.len()].copy_from_slice(bytes);
         }
-        at += 2;
+        flash
     }
-    calls
 }
 
-/// The words of the header by number.
+/// The words of the header by number, and the first two of the image.
 const MAGIC: usize = 0;
 const CRC: usize = 1;
-const SERVICES: usize = 2;
-const METHOD: usize = 3;
-const STORED: usize = 4;
-const UNPACKED: usize = 5;
-
-/// With offsets in bytes, our decoder of the format agrees with a foreign decompressor.
-#[test]
-fn the_format() {
-    // Four literals; 5 from two before; one literal; 2 from the last offset; the end.
-    let stream = [0x0E, b'a', b'b', b'c', b'd', 126 << 1, 0x28, b'X', 0xD5, 0x55, 0x60];
-    let unpacked = zx0decompress::decompress(&mut stream.as_slice()).unwrap();
-    assert_eq!(unpacked, b"abcdcdcdcXcX");
-    assert_eq!(zx0::unpack(&[], &stream, zx0::BYTES), Some(unpacked));
-    assert_eq!(zx0::unpack(&[], &stream[..10], zx0::BYTES), None, "without its end");
-}
+const LENGTH: usize = 2;
+const SIZE: usize = 3;
+const RAM_BASE: usize = 4;
+const RAM_END: usize = 5;
+const SERVICES: usize = 6;
+const FEATURES: usize = 7;
+const BOARD: usize = 8;
+const VERSION: usize = 12;
+const RESERVED: usize = 14;
+const STACK: usize = 16;
+const RESET: usize = 17;
 
 #[test]
-fn what_is_packed_is_what_was_linked() {
-    for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
-        let mut packed = Packed::of(image);
-        let (stored, ram) = (packed.stored().to_vec(), packed.ram.len());
-        assert_eq!(packed.get(MAGIC), u32::from_le_bytes(*b"CBI1"));
-        assert_eq!([packed.get(SERVICES), packed.get(METHOD)], [SERVICES_VERSION, 1]);
-        assert_eq!([packed.get(STORED), packed.get(UNPACKED)], [stored.len() as u32, ram as u32]);
-        assert_eq!(packed.get(CRC), packed.right_crc());
-        // By the description of the format, with our own offsets and the calls restored.
-        let mut unpacked = zx0::unpack(packed.front(), &stored, zx0::HALF_WORDS).unwrap();
-        let calls = restore_calls(&mut unpacked, firmware::board().ram.base);
-        assert!(unpacked == packed.ram, "{image}");
-        assert!(calls > 100, "{image}: {calls} calls");
-        assert!(stored.len() * 100 < ram * 85, "{image}: {} of {ram} bytes", stored.len());
+fn the_header_says_what_was_linked() {
+    let board = firmware::board();
+    for name in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST] {
+        let parts = Parts::of(name);
+        assert_eq!(parts.get(MAGIC), u32::from_le_bytes(*b"CBI2"));
+        assert_eq!(parts.get(CRC), parts.right_crc(), "{name}");
+        assert_eq!(parts.get(LENGTH), 64);
+        assert_eq!(parts.get(SIZE) as usize, parts.ram().len());
+        assert_eq!([parts.get(RAM_BASE), parts.get(RAM_END)], [board.ram.base, board.ram.end()]);
+        assert_eq!([parts.get(SERVICES), parts.get(FEATURES)], [SERVICES_VERSION, 0]);
+        assert_eq!(parts.get(BOARD), crc32(Toml(board).to_string().as_bytes()));
+        assert_eq!([parts.get(RESERVED), parts.get(RESERVED + 1)], [0, 0]);
+        match board.home {
+            Some(home) => assert_eq!(parts.home, home.base),
+            None => assert_eq!(parts.home, board.bootloader.base + parts.resident.len() as u32),
+        }
     }
 }
 
@@ -146,17 +123,17 @@ fn what_is_packed_is_what_was_linked() {
 #[test]
 fn vectors() {
     let board = firmware::board();
-    let packed = Packed::of(firmware::BOOTLOADER);
-    let in_flash = words(&packed.flash[..64]);
-    assert_eq!(packed.flash[64..68], *b"CBCG", "the callgate is behind them");
+    let parts = Parts::of(firmware::BOOTLOADER);
+    let in_flash = words(&parts.resident[..64]);
+    assert_eq!(parts.resident[64..68], *b"CBCG", "the callgate follows them");
     assert_eq!(in_flash[0], board.ram.end());
     for vector in &in_flash[1..] {
         assert!(vector & 1 == 1 && board.bootloader.contains(vector & !1, 2), "{vector:#x}");
     }
-    let in_ram = words(&packed.ram[..board.chip.vector_table_size() as usize]);
-    assert_eq!(in_ram[..2], in_flash[..2]);
+    let in_ram = words(&parts.ram()[..board.chip.vector_table_size() as usize]);
+    assert_eq!(in_ram[0], in_flash[0]);
     // No handler is in flash, because the flash may be busy. Some interrupts have no handler.
-    let handlers: Vec<_> = in_ram[2..].iter().filter(|vector| **vector != 0).collect();
+    let handlers: Vec<_> = in_ram[1..].iter().filter(|vector| **vector != 0).collect();
     assert!(handlers.iter().all(|vector| board.ram.contains(**vector & !1, 2)), "{in_ram:x?}");
     assert!(handlers.len() > 80);
     let (address, _) = firmware::section(&firmware::elf(firmware::BOOTLOADER), ".data");
@@ -171,8 +148,8 @@ fn probe_rs_loads_it() {
     let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
     let header = FileHeader32::<Endianness>::parse(&*elf).unwrap();
     let endian = Endianness::Little;
-    let base = firmware::board().bootloader.base;
-    let mut flash = vec![0xFF; firmware::board().bootloader.size as usize];
+    let place = firmware::board().chip.flash;
+    let mut flash = vec![0xFF; place.size as usize];
     for segment in header.program_headers(endian, &*elf).unwrap() {
         let range = u64::from(segment.p_offset(endian))..;
         let end = range.start + u64::from(segment.p_filesz(endian));
@@ -180,14 +157,15 @@ fn probe_rs_loads_it() {
             section.file_range().is_some_and(|(at, size)| at >= range.start && at + size <= end && size > 0)
         });
         if segment.p_type(endian) == PT_LOAD && segment.p_filesz(endian) > 0 && holds_a_section {
-            let at = (segment.p_paddr(endian) - base) as usize;
+            let at = (segment.p_paddr(endian) - place.base) as usize;
             let data = segment.data(endian, &*elf).unwrap();
             flash[at..at + data.len()].copy_from_slice(data);
         }
     }
-    let packed = Packed::of(firmware::BOOTLOADER).flash;
-    assert!(flash[..packed.len()] == packed);
-    assert!(flash[packed.len()..].iter().all(|byte| *byte == 0xFF));
+    assert!(flash == Parts::of(firmware::BOOTLOADER).flash());
+    // A debugger that starts the program at the file's entry starts where the chip does.
+    let reset = words(&Parts::of(firmware::BOOTLOADER).resident[4..8])[0];
+    assert_eq!(header.e_entry(endian), reset);
 }
 
 /// gdb itself, connected to a stub that has only memory.
@@ -203,13 +181,18 @@ fn gdb_loads_it_and_finds_symbols_in_ram() {
     ];
     let run = gdb::run(&firmware::dir().join(firmware::BOOTLOADER), &commands);
     let said = &run.said;
-    let packed = Packed::of(firmware::BOOTLOADER).flash;
-    let flash = run.memory(board.bootloader.base, packed.len());
-    assert!(flash == packed, "gdb wrote something else:\n{said}");
-    let beyond = Region::new(board.bootloader.base, packed.len() as u32);
+    let parts = Parts::of(firmware::BOOTLOADER);
+    for (address, bytes) in [(board.bootloader.base, &parts.resident), (parts.home, &parts.image)] {
+        assert!(run.memory(address, bytes.len()) == *bytes, "gdb wrote something else:\n{said}");
+    }
+    let places = [
+        Region::new(board.bootloader.base, parts.resident.len() as u32),
+        Region::new(parts.home, parts.image.len() as u32),
+    ];
     let flash = board.chip.flash;
-    assert!(run.written().all(|address| beyond.contains(address, 1) || !flash.contains(address, 1)));
-    assert!(said.contains(".ram_image.packed") && !said.contains("MIS-MATCHED"), "{said}");
+    let is_ours = |address| places.iter().any(|place| place.contains(address, 1));
+    assert!(run.written().all(|address| is_ours(address) || !flash.contains(address, 1)));
+    assert!(said.contains(".ram_image") && !said.contains("MIS-MATCHED"), "{said}");
     let main = said.split_once("Symbol \"main\" is at 0x").unwrap_or_else(|| panic!("{said}")).1;
     let main = u32::from_str_radix(&main[..8], 16).unwrap();
     assert!(board.ram.contains(main, 2), "{main:#x}");
@@ -236,8 +219,9 @@ fn board_with_a_program() -> Bench {
     bench
 }
 
-fn load(bench: &mut Bench, image: &[u8]) {
-    bench.machine().load_bin(firmware::board().bootloader.base, image).unwrap();
+fn load(bench: &mut Bench, parts: &Parts) {
+    bench.machine().load_bin(firmware::board().bootloader.base, &parts.resident).unwrap();
+    bench.machine().load_bin(parts.home, &parts.image).unwrap();
 }
 
 /// The warm-start cell as a debugger reads it: request and argument, if it is valid.
@@ -256,76 +240,65 @@ const DAMAGED: u32 = 8;
 const BY_HEADER: u32 = 1;
 const BY_SERVICES: u32 = 2;
 const BY_CRC: u32 = 3;
-const BY_STREAM: u32 = 4;
+const BY_BOARD: u32 = 4;
+const BY_VECTORS: u32 = 5;
 
 /// Ways to damage an image, and the boot stage's report.
-fn damages() -> Vec<(&'static str, Packed, u32)> {
-    let damaged = |change: &dyn Fn(&mut Packed)| {
-        let mut image = Packed::of(firmware::BOOTLOADER);
-        change(&mut image);
-        image
+fn damages() -> Vec<(&'static str, Parts, u32)> {
+    let board = firmware::board();
+    let good = Parts::of(firmware::BOOTLOADER);
+    let size = good.get(SIZE);
+    let damaged = |words: &[(usize, u32)]| {
+        let mut parts = good.clone();
+        words.iter().for_each(|(word, value)| parts.set(*word, *value));
+        parts
     };
-    let ram = firmware::board().ram.size;
+    // What a maker of images could have written: its CRC is right.
+    let sealed = |words: &[(usize, u32)]| {
+        let mut parts = damaged(words);
+        parts.seal();
+        parts
+    };
+    let bit = |at: usize| {
+        let mut parts = good.clone();
+        parts.image[at] ^= 1;
+        parts
+    };
+    let erased: Vec<(usize, u32)> = (0..16).map(|word| (word, !0)).collect();
+    let last = good.image.len() - 1;
     vec![
-        ("a bit of the magic", damaged(&|image| image.flash[image.header] ^= 1), BY_HEADER),
-        ("an erased header", damaged(&|image| (0..6).for_each(|word| image.set(word, !0))), BY_HEADER),
-        ("an unknown method", damaged(&|image| image.set(METHOD, 3)), BY_HEADER),
-        ("more bytes than flash", damaged(&|image| image.set(STORED, 0x8000)), BY_HEADER),
-        ("as many as there can be", damaged(&|image| image.set(STORED, !0)), BY_HEADER),
-        ("more bytes than RAM", damaged(&|image| image.set(UNPACKED, ram - 4092)), BY_HEADER),
-        ("packed told as raw", damaged(&|image| image.set(METHOD, 0)), BY_HEADER),
-        ("other services", damaged(&|image| image.set(SERVICES, SERVICES_VERSION + 1)), BY_SERVICES),
-        ("a bit of the CRC", damaged(&|image| image.flash[image.header + 5] ^= 0x10), BY_CRC),
-        ("no CRC", damaged(&|image| image.set(CRC, 0)), BY_CRC),
-        ("one byte less", damaged(&|image| image.set(STORED, image.get(STORED) - 1)), BY_CRC),
-        ("a word more in RAM", damaged(&|image| image.set(UNPACKED, image.get(UNPACKED) + 4)), BY_CRC),
-        ("the first bit", damaged(&|image| image.stored()[0] ^= 0x80), BY_CRC),
-        // A vector that is not used here.
-        ("a bit in front of it", damaged(&|image| image.flash[60] ^= 0x10), BY_CRC),
-        (
-            "the last bit",
-            damaged(&|image| {
-                let stored = image.stored();
-                stored[stored.len() - 1] ^= 1;
-            }),
-            BY_CRC,
-        ),
-        (
-            "a right CRC over a smaller size",
-            damaged(&|image| {
-                image.set(UNPACKED, image.get(UNPACKED) - 4);
-                image.seal();
-            }),
-            BY_STREAM,
-        ),
-        (
-            "a right CRC over a larger size",
-            damaged(&|image| {
-                image.set(UNPACKED, image.get(UNPACKED) + 4);
-                image.seal();
-            }),
-            BY_STREAM,
-        ),
-        (
-            "a right CRC over a byte behind the stream",
-            damaged(&|image| {
-                image.flash.push(0);
-                image.set(STORED, image.get(STORED) + 1);
-                image.seal();
-            }),
-            BY_STREAM,
-        ),
-        (
-            "a right CRC over a stream without its end",
-            damaged(&|image| {
-                let len = image.flash.len();
-                image.flash.truncate(len - 8);
-                image.set(STORED, image.get(STORED) - 8);
-                image.seal();
-                image.flash.resize(len, 0xFF);
-            }),
-            BY_STREAM,
-        ),
+        ("a bit of the magic", bit(0), BY_HEADER),
+        ("the magic of another format", damaged(&[(MAGIC, u32::from_le_bytes(*b"CBI1"))]), BY_HEADER),
+        ("an erased header", damaged(&erased), BY_HEADER),
+        ("another length of the header", sealed(&[(LENGTH, 24)]), BY_HEADER),
+        ("another format", sealed(&[(LENGTH, 64 | 1 << 16)]), BY_HEADER),
+        ("more bytes than flash", damaged(&[(SIZE, 0x1_0000)]), BY_HEADER),
+        ("as many as there can be", damaged(&[(SIZE, !3)]), BY_HEADER),
+        ("more bytes than RAM", damaged(&[(SIZE, board.ram.size - 4092)]), BY_HEADER),
+        ("no bytes", sealed(&[(SIZE, 0)]), BY_HEADER),
+        ("a half word", sealed(&[(SIZE, size - 2)]), BY_HEADER),
+        ("another place in RAM", sealed(&[(RAM_BASE, board.ram.base + 0x200)]), BY_HEADER),
+        ("a place in flash", sealed(&[(RAM_BASE, good.home)]), BY_HEADER),
+        ("RAM of the handoff", sealed(&[(RAM_END, board.ram.end() + 4)]), BY_HEADER),
+        ("RAM that ends before it begins", sealed(&[(RAM_END, 0)]), BY_HEADER),
+        ("RAM that is shorter than the image", sealed(&[(RAM_END, board.ram.base + size - 4)]), BY_HEADER),
+        ("a reserved word", sealed(&[(RESERVED, 1)]), BY_HEADER),
+        ("the other reserved word", sealed(&[(RESERVED + 1, 1 << 31)]), BY_HEADER),
+        ("newer services", sealed(&[(SERVICES, SERVICES_VERSION + 1)]), BY_SERVICES),
+        ("an unknown ability", sealed(&[(FEATURES, 1)]), BY_SERVICES),
+        ("another board", sealed(&[(BOARD, !good.get(BOARD))]), BY_BOARD),
+        ("a bit of the CRC", bit(5), BY_CRC),
+        ("a bit of the version", bit(VERSION * 4), BY_CRC),
+        ("a word less", damaged(&[(SIZE, size - 4)]), BY_CRC),
+        ("the first bit", bit(HEADER), BY_CRC),
+        ("the last bit", bit(last), BY_CRC),
+        ("a stack over the end of the RAM", sealed(&[(STACK, board.ram.end() + 8)]), BY_VECTORS),
+        ("an uneven stack", sealed(&[(STACK, board.ram.end() - 4)]), BY_VECTORS),
+        ("a stack in flash", sealed(&[(STACK, good.home + 8)]), BY_VECTORS),
+        ("a Reset in flash", sealed(&[(RESET, good.home + 0x201)]), BY_VECTORS),
+        ("a Reset in the vectors", sealed(&[(RESET, board.ram.base + 1)]), BY_VECTORS),
+        ("a Reset after the end", sealed(&[(RESET, board.ram.base + size + 1)]), BY_VECTORS),
+        ("a Reset without the Thumb bit", sealed(&[(RESET, good.get(RESET) & !1)]), BY_VECTORS),
     ]
 }
 
@@ -335,7 +308,7 @@ fn damages() -> Vec<(&'static str, Packed, u32)> {
 fn a_damaged_image_does_not_run_and_the_program_does() {
     let mut bench = board_with_a_program();
     for (what, image, damage) in damages() {
-        load(&mut bench, &image.flash);
+        load(&mut bench, &image);
         bench.power_on();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE), "{what}: the start of a program needs nothing of the image");
@@ -358,7 +331,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     }
     // The entry strap does not prevent the start of a program without a working bootloader.
     let (_, image, damage) = damages().swap_remove(0);
-    load(&mut bench, &image.flash);
+    load(&mut bench, &image);
     press(bench.machine(), true);
     bench.power_on();
     bench.await_boot_up(1000);
@@ -367,7 +340,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     press(bench.machine(), false);
     bench.power_off();
     // The image itself, for comparison.
-    load(&mut bench, &Packed::of(firmware::BOOTLOADER).flash);
+    load(&mut bench, &Parts::of(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(1000);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
@@ -382,7 +355,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
 fn beside_a_damaged_image_a_program_is_not_given_up() {
     let mut bench = board_with_a_program();
     let (_, image, _) = damages().swap_remove(0);
-    load(&mut bench, &image.flash);
+    load(&mut bench, &image);
     bench.power_on();
     bench.await_boot_up(1000);
     for reset in 1..=6 {
@@ -409,7 +382,7 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
 fn a_damaged_image_without_a_program_resets_again_and_again() {
     for (what, image, damage) in damages() {
         let mut bench = Bench::new();
-        load(&mut bench, &image.flash);
+        load(&mut bench, &image);
         bench.power_on();
         let mut seen = 0;
         for _ in 0..80 {
@@ -429,202 +402,28 @@ fn a_damaged_image_without_a_program_resets_again_and_again() {
     }
 }
 
-/// The boot stage's result after a power-on: the damage that it reports in the cell, or nothing if
-/// the image runs.
-fn outcome(bench: &mut Bench) -> Option<(u32, u32)> {
-    bench.events();
-    for _ in 0..200 {
-        bench.world.run_for(Span::from_micros(100));
-        if let Some(damage) = cell(bench).filter(|(request, _)| *request == DAMAGED) {
-            return Some(damage);
-        }
-        // The running code may be reset at once by its own fault.
-        if bench.machine().pc() >= firmware::board().ram.base || !bench.events().is_empty() {
-            return None;
-        }
-    }
-    panic!("the boot stage does not come to an end");
-}
-
-/// A stream by the description of the format: the literals "AB", a copy from this many half-words
-/// before, the end.
-fn one_copy(offset: usize, length: usize) -> Vec<u8> {
-    fn number(bits: &mut Vec<bool>, number: usize, inverted: bool) {
-        for digit in (0..number.ilog2()).rev() {
-            bits.extend([false, (number >> digit & 1 == 1) != inverted]);
-        }
-        bits.push(true);
-    }
-    let mut bits = Vec::new();
-    number(&mut bits, 2, false);
-    let literals = bits.len();
-    bits.push(true);
-    number(&mut bits, (offset - 1) / 256 + 1, true);
-    let lower = bits.len();
-    number(&mut bits, length - 1, false);
-    bits.push(true);
-    number(&mut bits, 256, true);
-    // A byte of bits is placed where its first bit is read.
-    let mut stream = Vec::new();
-    for (at, byte) in bits.chunks(8).enumerate() {
-        stream.push((0..8).fold(0, |out, i| out << 1 | u8::from(byte.get(i) == Some(&true))));
-        let asked_for_here = at * 8 + 1..at * 8 + 9;
-        if asked_for_here.contains(&literals) {
-            stream.extend(*b"AB");
-        }
-        if asked_for_here.contains(&lower) {
-            stream.push(255 - ((offset - 1) % 256) as u8);
-        }
-    }
-    stream
-}
-
-/// A copy may read from the flash before the header. A copy from before that is refused, and so is
-/// one that continues after it, even if the stream ends correctly.
+/// The image from the linker, without a CRC: the result of `cargo build` alone. It differs from the
+/// one of `cargo xtask build` in this word alone.
 #[test]
-fn a_copy_from_in_front_of_the_image() {
-    let front = Packed::of(firmware::BOOTLOADER).front().to_vec();
-    let end = front.len();
+fn an_image_without_a_crc_runs() {
+    let mut image = Parts::of(firmware::BOOTLOADER_LEAST);
+    image.set(CRC, 0);
     let mut bench = Bench::new();
-    let cases: [(usize, usize, Option<&[u8]>); 8] = [
-        (1, 2, Some(b"AB")),
-        (1, 5, Some(b"ABABA")),
-        (2, 2, Some(&front[end - 2..])),
-        (2, 3, None),
-        (end / 2 + 1, 2, Some(&front[..2])),
-        (end / 2 + 1, 14, Some(&front[..14])),
-        (end / 2 + 2, 2, None),
-        (255 * 256, 2, None),
-    ];
-    for (offset, length, copied) in cases {
-        let stream = one_copy(offset, length);
-        let unpacked = copied.map(|copied| [b"AB", copied].concat());
-        assert_eq!(zx0::unpack(&front, &stream, zx0::HALF_WORDS), unpacked, "{length} from {offset}");
-        let mut image = Packed::of(firmware::BOOTLOADER);
-        image.flash.truncate(image.header + HEADER);
-        image.flash.extend(&stream);
-        image.set(STORED, stream.len() as u32);
-        image.set(UNPACKED, 2 + length as u32);
-        image.seal();
-        load(&mut bench, &image.flash);
-        bench.power_on();
-        let damage = copied.is_none().then_some((DAMAGED, BY_STREAM));
-        assert_eq!(outcome(&mut bench), damage, "{length} from {offset}");
-        let mut found = vec![0; 2 + length];
-        bench.machine().read_memory(firmware::board().ram.base, &mut found).unwrap();
-        let is_there = unpacked.is_some_and(|unpacked| unpacked == found);
-        // A refused stream leaves the literals, and nothing of the copy.
-        assert_eq!(is_there, damage.is_none(), "{length} from {offset}");
-        bench.power_off();
-    }
-}
-
-/// Zeros are a number without an end, and more zeros may follow the image.
-#[test]
-fn a_number_without_an_end_is_damage() {
-    let chip = firmware::board().chip;
-    let mut image = Packed::of(firmware::BOOTLOADER);
-    image.stored().fill(0);
-    image.seal();
-    image.flash.resize(chip.flash.size as usize, 0);
-    let mut bench = Bench::new();
-    load(&mut bench, &image.flash);
-    bench.power_on();
-    assert_eq!(outcome(&mut bench), Some((DAMAGED, BY_STREAM)));
-}
-
-/// Hostile streams with a correct CRC: whatever they contain, the boot stage only writes to the RAM
-/// of the image, and always ends.
-#[test]
-fn no_stream_writes_outside_the_image() {
-    let board = firmware::board();
-    let good = Packed::of(firmware::BOOTLOADER);
-    let (len, image_end) = (good.get(STORED) as usize, board.ram.base + good.get(UNPACKED));
-    // Up to the stack that is left for the boot stage.
-    let size = board.ram.end() - 4096 - image_end;
-    let pattern: Vec<u8> = (0..size).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
-    let mut bench = Bench::new();
-    let mut refused = 0;
-    let mut random = 1_u32;
-    let mut next = move || {
-        random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        random >> 8
-    };
-    for round in 0..200 {
-        let mut image = Packed::of(firmware::BOOTLOADER);
-        let stored = image.stored();
-        match round {
-            // Zeros: numbers without an end. Ones: the shortest numbers.
-            0 => stored.fill(0),
-            1 => stored.fill(0xFF),
-            2 => stored.fill(0x55),
-            3 => stored.iter_mut().for_each(|byte| *byte = next() as u8),
-            _ => {
-                for _ in 0..1 + round % 4 {
-                    stored[next() as usize % len] ^= 1 << (next() % 8);
-                }
-            }
-        }
-        image.seal();
-        load(&mut bench, &image.flash);
-        bench.power_on();
-        bench.machine().write_ram(image_end, &pattern).unwrap();
-        let damage = outcome(&mut bench);
-        let mut found = vec![0; pattern.len()];
-        bench.machine().read_memory(image_end, &mut found).unwrap();
-        if damage.is_some() {
-            assert_eq!(damage, Some((DAMAGED, BY_STREAM)), "round {round}");
-            assert!(found == pattern, "round {round} has written behind the image");
-            refused += 1;
-        }
-        // Otherwise it was a bit of a literal: the stream is complete, and another image runs.
-        bench.power_off();
-    }
-    assert!(refused > 80, "{refused}");
-}
-
-/// The image from the linker, without a CRC: the result of `cargo build` alone and of `--unpacked`.
-#[test]
-fn an_image_that_is_not_packed_runs() {
-    let mut image = Packed::of(firmware::BOOTLOADER_LEAST);
-    let ram = image.ram.clone();
-    image.flash.truncate(image.header + HEADER);
-    image.flash.extend(&ram);
-    for (word, value) in [(CRC, 0), (METHOD, 0), (STORED, ram.len() as u32)] {
-        image.set(word, value);
-    }
-    assert!(image.flash.len() <= firmware::board().bootloader.size as usize);
-    let mut bench = Bench::new();
-    load(&mut bench, &image.flash);
+    load(&mut bench, &image);
     bench.power_on();
     bench.await_boot_up(100);
     assert!(bench.is_bootloader(NODE));
-
-    // An image with a CRC is checked.
-    image.seal();
-    load(&mut bench, &image.flash);
-    bench.power_off();
-    bench.power_on();
-    bench.await_boot_up(100);
-    image.set(CRC, image.get(CRC) ^ 1);
-    load(&mut bench, &image.flash);
-    bench.power_off();
-    bench.power_on();
-    bench.run_ms(50);
-    assert_eq!(cell(&bench), Some((DAMAGED, BY_CRC)));
 }
 
 /// A fault before the RAM image is ready has its handler in flash, by the vectors in flash: it
 /// requests the bootloader and resets.
 #[test]
-fn a_fault_in_the_boot_stage_is_told() {
+fn a_fault_in_the_boot_stage_is_reported() {
     let board = firmware::board();
-    let mut image = Packed::of(firmware::BOOTLOADER).flash;
-    // The word after the callgate's table is the address of the boot stage. ARMv7-M A7.7.194: udf
-    // #0.
-    let at = (board.callgate() - board.bootloader.base) as usize + 16;
-    let stage = (words(&image[at..at + 4])[0] & !1) - board.bootloader.base;
-    image[stage as usize..][..2].copy_from_slice(&[0x00, 0xDE]);
+    let mut image = Parts::of(firmware::BOOTLOADER);
+    // ARMv7-M A7.7.194: udf #0, in place of the first instruction.
+    let reset = (words(&image.resident[4..8])[0] & !1) - board.bootloader.base;
+    image.resident[reset as usize..][..2].copy_from_slice(&[0x00, 0xDE]);
     let mut bench = Bench::new();
     load(&mut bench, &image);
     bench.power_on();
@@ -634,47 +433,4 @@ fn a_fault_in_the_boot_stage_is_told() {
     assert!(resets.iter().all(|(_, stop)| *stop == Stop::Reset(ResetCause::Software)), "{resets:?}");
     // 4: a fault of the bootloader.
     assert_eq!(cell(&bench), Some((4, 0)));
-}
-
-/// This is a part of the time between "call back" and the boot-up message, during which masters
-/// wait for an answer: 5 ms at most. A chip with wait states takes 1.3 cycles for an instruction
-/// (see the emulator's cpu.rs).
-#[test]
-fn the_image_is_unpacked_within_5_ms() {
-    let board = firmware::board();
-    let packed = Packed::of(firmware::BOOTLOADER);
-    let mut bench = Bench::new();
-    bench.power_on();
-    let from = bench.time();
-    let (mut begun, mut done) = (None, None);
-    // Measured by the first and the last decompressed word.
-    let last = packed.ram.len() - 4;
-    loop {
-        bench.world.run_for(Span::from_micros(10));
-        for (at, seen) in [(0, &mut begun), (last, &mut done)] {
-            let mut word = [0; 4];
-            bench.machine().read_memory(board.ram.base + at as u32, &mut word).unwrap();
-            if seen.is_none() && word == packed.ram[at..at + 4] {
-                *seen = Some(bench.time());
-            }
-        }
-        let pc = bench.machine().pc();
-        if board.ram.contains(pc, 2) {
-            break;
-        }
-        assert!(bench.time() - from < Span::from_millis(100), "the bootloader does not start: {pc:#x}");
-    }
-    let took = done.expect("it is there before it runs") - begun.expect("and its beginning too");
-    let all = bench.time() - from;
-    println!(
-        "{}: {} bytes unpacked to {} in {} us; reset to the first instruction in RAM: {} us",
-        board.board,
-        packed.get(STORED),
-        packed.get(UNPACKED),
-        took.0 / 1_000_000,
-        all.0 / 1_000_000
-    );
-    assert!(took.0 / 10 * 13 <= Span::from_millis(5).0, "{} us", took.0 / 1_000_000);
-    // It was really decompressed, which takes more than microseconds.
-    assert!(took >= Span::from_micros(500));
 }

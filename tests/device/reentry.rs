@@ -9,7 +9,6 @@ use coflash::update::{flash, FlashOptions};
 use coflash::Error;
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
-use shared_abi::ram_image;
 
 const VERSION: Address = Address::new(0x100A, 0);
 /// Objects of the application template: the return, and its confirmation.
@@ -200,17 +199,6 @@ fn node_id_and_bit_rate_are_shared() {
     }
 }
 
-/// Writes the bootloader's RAM image to flash uncompressed, without a CRC: a compressed one copies
-/// from the flash before it, and is damaged when that is changed.
-fn store_unpacked(bench: &mut Bench) {
-    let elf = firmware::elf(firmware::BOOTLOADER);
-    let (header, _) = firmware::section(&elf, ".ram_image");
-    let (_, ram) = firmware::section(&elf, ".data");
-    let words = [0, ram_image::SERVICES_VERSION, ram_image::Method::Raw as u32, ram.len() as u32];
-    bench.machine().load_bin(header + 4, &words.map(u32::to_le_bytes).concat()).unwrap();
-    bench.machine().load_bin(header + size_of::<ram_image::Header>() as u32, &ram).unwrap();
-}
-
 /// With a bootloader with another version of the ABI, or without a callgate, the application works
 /// without it, and can be called back.
 #[test]
@@ -221,7 +209,6 @@ fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
         let mut bench = running_board();
         bench.power_off();
         bench.machine().load_bin(at, &value.to_le_bytes()).unwrap();
-        store_unpacked(&mut bench);
         bench.power_on();
         bench.await_boot_up(1000);
         assert!(!bench.is_bootloader(NODE));
