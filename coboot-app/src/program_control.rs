@@ -11,7 +11,7 @@
 //! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
 //! | NMT reset node | [`restart`](ProgramControl::restart) | |
 //!
-//! Behind each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
+//! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
 use shared_abi::callgate::PROGRAM_INSTALLED;
 use shared_abi::warm_start::{BootRequest, Owed};
@@ -238,7 +238,7 @@ impl ProgramControl {
 
     /// This program is good: it has heard its master, say, or a master has said so. Where the flash is
     /// locked (a sealed program) the device restarts to store it. Writes flash
-    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) tells how long that takes).
+    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) says how long that takes).
     ///
     /// # Errors
     /// [`Abort::HARDWARE`] where the bootloader did not store it, or there is none;

@@ -115,7 +115,7 @@ impl Application {
         Self { layout: chosen_board(), file: None, program: 1 }
     }
 
-    /// For a board whose memory map stands in this file, which `cargo xtask layout --toml` has written.
+    /// For a board whose memory map is in this file, which `cargo xtask layout --toml` has written.
     /// A relative path begins at the package.
     #[cfg(feature = "file")]
     pub fn of_file(path: impl AsRef<Path>) -> Self {
@@ -144,7 +144,7 @@ impl Application {
     /// As [`emit`](Self::emit).
     ///
     /// # Errors
-    /// [`Error`] tells what is wrong.
+    /// [`Error`] says what is wrong.
     pub fn try_emit(self) -> Result<(), Error> {
         let out = env::var_os("OUT_DIR").map(PathBuf::from).ok_or(Error::NoBuildScript)?;
         if let Some(file) = &self.file {
@@ -159,7 +159,7 @@ impl Application {
     /// Writes the files into a folder.
     ///
     /// # Errors
-    /// [`Error`] tells what is wrong.
+    /// [`Error`] says what is wrong.
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let layout = self.layout.clone()?;
         if layout.program(self.program).is_none() {

@@ -42,7 +42,7 @@ pub struct Extras {
     pub sealed: bool,
     /// Whether 1201h exists, the second SDO server.
     pub second_server: bool,
-    /// Whether 2006h exists, which tells where a download goes on.
+    /// Whether 2006h exists, which says where a download goes on.
     pub resume: bool,
 }
 

@@ -135,7 +135,7 @@ impl Bus {
     fn serve(&mut self, now: u32) {
         self.objects.now = now;
         loop {
-            // Asked behind every frame: it may have asked for the bootloader.
+            // Asked after every frame: it may have asked for the bootloader.
             let serves = match self.objects.proceed(self.can.is_transmitter_idle()) {
                 Next::Serve => true,
                 Next::Wait => false,

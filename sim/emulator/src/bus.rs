@@ -43,7 +43,7 @@ const FLAG_BITS: u32 = 6;
 const FLAG_ONE_LATE_BITS: u32 = 7;
 /// Bits of an error flag that the others answer with theirs.
 const FLAG_AND_ECHO_BITS: u32 = 12;
-/// Recessive bits behind an error flag.
+/// Recessive bits after an error flag.
 const DELIMITER_BITS: u32 = 8;
 /// Bits that an error passive transmitter leaves free behind the intermission.
 const SUSPEND_BITS: u32 = 8;

@@ -123,7 +123,7 @@ impl StandIn {
         self.now = now;
     }
 
-    /// To be called behind every frame: takes an answer back that the bootloader is to send. Where the
+    /// To be called after every frame: takes an answer back that the bootloader is to send. Where the
     /// client has written in segments that cannot be, so the command is judged once more.
     pub fn leave_owed(&mut self, slave: &mut Slave) {
         let Some(owed) = self.owed.take() else { return };

@@ -154,7 +154,7 @@ fn send_verified(
     }
 }
 
-/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing behind a begun
+/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing after a begun
 /// download; returns the number of repetitions and the duration.
 fn send(
     session: &mut Session<'_>,

@@ -53,7 +53,7 @@ fn a_damaged_text_or_block_file_never_means_something_else() {
                 let mut damaged = bytes.to_vec();
                 damaged[at] ^= 1 << bit;
                 // A flipped bit may turn a digit's case or a line end, and nothing else. (No
-                // checksum of an S-record covers its type, which tells how long the address is:
+                // checksum of an S-record covers its type, which says how long the address is:
                 // there the format itself is at an end.)
                 let srec_type = name.contains(".s") && at > 0 && bytes[at - 1] == b'S';
                 if let Ok(read) = meaning(&damaged, None) {

@@ -686,7 +686,7 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
         rig.settle();
         let size = if replaces { 700 } else { 600 };
         assert_eq!(rig.stored().records[0].map(|record| record.0), Some(size));
-        // Once more in the same session, also behind a download that broke off.
+        // Once more in the same session, also after a download that broke off.
         if replaces {
             rig.begin(1, None, &raw(setup, 1, 800)[..700]).unwrap();
             rig.settle();
@@ -765,7 +765,7 @@ const LENGTH: AbortCode = AbortCode(0x0607_0010);
 const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
 const LENGTH_TOO_LOW: AbortCode = AbortCode(0x0607_0013);
 
-/// A device behind CLEAR and a control block, with this buffer.
+/// A device after CLEAR and a control block, with this buffer.
 fn open(setup: &'static Setup, buffer: usize) -> Rig {
     let mut rig = Rig::new(setup, buffer);
     rig.command(1, CLEAR).unwrap();

@@ -292,7 +292,7 @@ fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
     assert_eq!(journal.get(&flash, Key::CrashCount), Some([8, 0, 0, 0]));
 }
 
-/// What stands in a region without a header is not a value: neither at once, nor when the region
+/// What is in a region without a header is not a value: neither at once, nor when the region
 /// gets a header.
 #[test]
 fn what_was_left_in_a_region_never_becomes_a_value() {

@@ -792,7 +792,7 @@ fn without_the_write_buffer_the_fault_names_its_store() {
     assert_eq!(stored.locks, [LOCKED[0], 0x0FFF_AAED]);
 }
 
-/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on behind the store. The status
+/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on after the store. The status
 /// registers show the fault.
 #[test]
 fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {

@@ -254,7 +254,7 @@ fn what_was_given_up_does_not_go_on() {
     assert!(ended.went_on().is_none(), "{:?}", ended.events);
     assert_eq!(data, file.len());
 
-    // CLEAR postpones the erase: a power cut behind one CLEAR has lost nothing, and the second in a
+    // CLEAR postpones the erase: a power cut after one CLEAR has lost nothing, and the second in a
     // row erases.
     let mut cleared = first;
     cleared.power_on();

@@ -113,7 +113,7 @@ struct Args {
     node_count: u8,
 
     /// Virtual seconds per second of the wall clock, or `max`: as fast as the host can, but 1:1 for
-    /// a moment behind every frame that a client gets, so that its answer is not late in virtual
+    /// a moment after every frame that a client gets, so that its answer is not late in virtual
     /// time
     #[arg(long, default_value = "1")]
     speed: Speed,
