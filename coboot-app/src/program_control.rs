@@ -429,8 +429,8 @@ mod tests {
         assert_eq!(control.proceed(true, 900), Next::Leave(BootRequest::Stay));
     }
 
-    /// In front of a sealed program the flash is locked: who was told that the program is confirmed is
-    /// not let down by another one.
+    /// In front of a sealed program the flash is locked: once the confirmation is acknowledged,
+    /// no other command takes it back.
     #[test]
     fn a_confirmation_at_the_reset_is_kept_against_other_commands() {
         let mut control = control(true);

@@ -42,7 +42,7 @@ impl Start {
         Self::new(told, defaults)
     }
 
-    /// From what the bootloader told, if it did.
+    /// From what the bootloader passed on, if it did.
     #[must_use]
     pub const fn new(told: Option<BootInfo>, defaults: Defaults) -> Self {
         match told {

@@ -6,7 +6,7 @@
 //! coboot_linker::Application::of_board("stm32f407g-disc1").emit();
 //! ```
 //!
-//! [`Application::emit`] writes three files into `OUT_DIR` and tells cargo to link with them:
+//! [`Application::emit`] writes three files into `OUT_DIR` and makes cargo link with them:
 //!
 //! | file | what it is |
 //! |---|---|
@@ -132,7 +132,7 @@ impl Application {
         self
     }
 
-    /// Writes the files into `OUT_DIR` and tells cargo to link with them. An error ends the build
+    /// Writes the files into `OUT_DIR` and makes cargo link with them. An error ends the build
     /// with a message that gives the reason.
     pub fn emit(self) {
         if let Err(error) = self.try_emit() {
@@ -200,7 +200,7 @@ pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), 
     write(&folder.join("memory.x"), &layout.linker_script(image).to_string())
 }
 
-/// Tells cargo to link the binaries of this package with `script`, which is in `folder` together
+/// Makes cargo link the binaries of this package with `script`, which is in `folder` together
 /// with the files that it includes.
 pub fn link(folder: &Path, script: &str) {
     // Not `rustc-link-search`: packages that depend on this one would find its files, too.

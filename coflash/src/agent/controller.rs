@@ -196,7 +196,7 @@ impl Task {
     }
 }
 
-/// Where the deployment stands.
+/// The state of the deployment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Work {
     None,
@@ -213,7 +213,7 @@ enum Work {
         at: Duration,
         /// Whether the deployment was read since the file is there.
         fresh: bool,
-        /// Whether the server was told why the deployment is held.
+        /// Whether the server has the report why the deployment is held.
         told: bool,
         /// How many times the bus or the device was in use or absent.
         tries: u32,
@@ -227,7 +227,7 @@ enum Work {
         tries: u32,
         progress: Progress,
     },
-    /// The end is in the record, and the server is to be told.
+    /// The end is in the record, and is to be reported to the server.
     Ended {
         action: String,
     },
@@ -492,7 +492,7 @@ impl Controller {
                     format!("the server answers with status {status}: check url, tenant and controller-id");
                 self.trouble(now, why, None);
             }
-            // The action is no longer the server's wish; the next poll tells.
+            // The action is no longer the server's wish; the next poll shows it.
             Ask::Cancel(_) | Ask::Deployment(_) | Ask::Confirm(_) | Ask::Tell { .. } => {}
             Ask::CancelReply { cancel, .. } => {
                 self.say(
@@ -786,7 +786,7 @@ impl Controller {
         }
     }
 
-    /// Writes the end of an action into the record; the server is told when it is there.
+    /// Writes the end of an action into the record; it is reported to the server when it is there.
     fn end(&mut self, action: &str, ok: bool, details: Vec<String>) {
         let words = details.join("; ");
         let kind = if ok { Kind::Updated } else { Kind::Failed };

@@ -83,7 +83,7 @@ impl Store {
     }
 
     /// The path of a device's file with this extension. The name is readable, and is no other
-    /// device's even if the system does not tell small letters from capitals.
+    /// device's even if the system does not distinguish small letters and capitals.
     pub(super) fn path(&self, controller: &str, extension: &str) -> PathBuf {
         let safe = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c } else { '_' };
         let name: String = controller.chars().take(40).map(safe).collect();

@@ -24,7 +24,7 @@ impl Begun {
     }
 }
 
-/// Reads the begun download of a program; `None` if there is none, or if the device does not tell.
+/// Reads the begun download of a program; `None` if there is none, or the device reports none.
 ///
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.

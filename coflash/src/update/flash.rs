@@ -87,7 +87,7 @@ fn flash_content(
         Err(error) => look(&mut inner, error, &course, original, options.program, file.program_crc()),
     };
     if let Some(taken) = course.mastership.take() {
-        // The result of the update stands, even if this fails.
+        // The result of the update remains, even if this fails.
         if let Ok(master) = flying_master::give_back(&mut inner, taken) {
             course.tell(match master {
                 Some(master) => Note::MasterBack { node: master.node }.into(),

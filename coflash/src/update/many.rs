@@ -39,7 +39,7 @@ impl Job {
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ManyOptions {
-    /// The time limits. Requests wait behind those for other devices: with several devices at the
+    /// The time limits. Requests wait for those to other devices: with several devices at the
     /// same time, the SDO time-out of a block is multiplied by their number, and that of other
     /// requests is doubled outside of a group.
     pub timing: Timing,

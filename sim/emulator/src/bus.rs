@@ -8,7 +8,7 @@
 //!   eight bits that an error passive transmitter leaves free. Received frames are valid one bit
 //!   before the end of frame is over (10.9), transmitted ones at its end.
 //! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very
-//!   same bits both succeed; the same identifier with other bits behind is a bit error.
+//!   same bits both succeed; the same identifier with other bits after it is a bit error.
 //! - A node whose bit rate differs by more than 1 % from the transmitter's reads the frame at its
 //!   own sample points, without resynchronisation. It sees a stuff error, and unless it is error
 //!   passive or silent it destroys the frame for everybody.
@@ -45,7 +45,7 @@ const FLAG_ONE_LATE_BITS: u32 = 7;
 const FLAG_AND_ECHO_BITS: u32 = 12;
 /// Recessive bits after an error flag.
 const DELIMITER_BITS: u32 = 8;
-/// Bits that an error passive transmitter leaves free behind the intermission.
+/// Bits that an error passive transmitter leaves free after the intermission.
 const SUSPEND_BITS: u32 = 8;
 /// Recessive bits of one sequence on the way onto the bus.
 const SEQUENCE_BITS: u64 = 11;
@@ -359,7 +359,7 @@ impl Bus {
         }
     }
 
-    /// Tells the nodes that wait for recessive bits how many have passed.
+    /// Reports to the nodes that wait for recessive bits how many have passed.
     fn count_recessive(&mut self, nodes: &mut [&mut dyn BusNode]) {
         for node in nodes {
             let Some(wait) = node.wait() else { continue };
@@ -533,7 +533,7 @@ impl Bus {
         }));
         let wire_len = u32::try_from(wire.len()).unwrap_or(u32::MAX);
         if fault == Some(FaultAction::Disturb) {
-            // A CRC error shows behind the ACK delimiter (10.11).
+            // A CRC error shows after the ACK delimiter (10.11).
             errors.push(Error {
                 at: now + bits(bit, ack_delimiter(wire_len) + 1),
                 flag_bits: FLAG_ONE_LATE_BITS,

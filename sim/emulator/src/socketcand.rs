@@ -36,7 +36,7 @@ pub const HOLD: Duration = Duration::from_millis(10);
 pub const MAX_CLIENTS: usize = 64;
 /// Texts that wait for a client to read them; one more, and it is disconnected.
 const QUEUE: usize = 8192;
-/// Frames of one client that wait for the bus; behind them its connection is not read on.
+/// Frames of one client that wait for the bus; after them its connection is not read on.
 const CREDIT: usize = 256;
 /// Events that wait for the world.
 const EVENTS: usize = 1024;

@@ -37,7 +37,7 @@ pub struct StandIn {
     underneath: Underneath,
     /// An answer that the SDO server has yet to withhold.
     owed: Option<Owed>,
-    /// The time that was told last.
+    /// The time that was set last.
     now: Instant,
 }
 
@@ -118,7 +118,7 @@ impl StandIn {
         self.device.lss_address()
     }
 
-    /// Tells the time, before each frame.
+    /// Sets the time, before each frame.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
     }

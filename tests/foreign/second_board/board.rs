@@ -73,7 +73,7 @@ const REACTION: Duration = Duration::from_millis(20);
 /// What the host may take for an access in a row.
 const ROW: Duration = Duration::from_millis(5);
 
-/// Behind the SRAM that the board has by its layout; QEMU's has 192 KiB.
+/// After the SRAM that the board has by its layout; QEMU's has 192 KiB.
 const SCRATCH: u32 = 0x2002_F000;
 /// A place there: the code, then the words that it loads.
 const PLACE: u32 = 0x30;

@@ -687,7 +687,7 @@ fn cancelling_aborts_the_transfer() {
             }
         });
         assert_eq!(result.unwrap_err().number(), 0x6000_0011);
-        // The requests behind it find out the state of the device.
+        // The requests after it find out the state of the device.
         let aborts = fake.log.iter().rposition(|entry| entry == "abort 08000000").unwrap();
         assert!(fake.log[aborts + 1..].iter().all(|entry| entry.starts_with("read ")), "{:?}", fake.log);
         // The next run works without any other step.

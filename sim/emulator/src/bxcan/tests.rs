@@ -1,5 +1,5 @@
-//! Register behaviour of the controller, driven register by register as RM0090 section 32 tells a
-//! driver to, with the bus played by hand. Offsets and bits are the manual's numbers.
+//! Register behaviour of the controller, driven register by register as RM0090 section 32 requires
+//! of a driver, with the bus played by hand. Offsets and bits are the manual's numbers.
 
 use super::*;
 

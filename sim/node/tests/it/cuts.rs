@@ -183,7 +183,7 @@ fn half(installed: &ModelFlash, file: &[u8]) -> ModelFlash {
 }
 
 /// Flashes a file into a device with this flash; it must end with this program. Returns what was
-/// told, and the data bytes that were sent.
+/// reported, and the data bytes that were sent.
 fn recover(flash: ModelFlash, image: &[u8], file: &[u8], options: &FlashOptions) -> (Ended, usize) {
     let mut bus = CutBus::new(flash, None);
     let ended = update(&mut bus, file, Transfers::Blocks, options);
