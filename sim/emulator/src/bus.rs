@@ -136,7 +136,7 @@ struct Flight {
     transmitters: Vec<Party>,
     receivers: Vec<Party>,
     /// The frame comes from the gateway that injected faults make.
-    gateway: Option<Held>,
+    gateway: Option<DelayedFrame>,
     fault: Option<FaultAction>,
     plan: Plan,
 }
@@ -156,7 +156,7 @@ impl Flight {
 
 /// A frame that an injected fault holds back or repeats.
 #[derive(Clone, Copy, Debug)]
-struct Held {
+struct DelayedFrame {
     due: Time,
     frame: Frame,
     origin: usize,
@@ -197,7 +197,7 @@ pub struct Bus {
     inner: Vec<Inner>,
     /// Until when each node must not start a frame.
     suspended: Vec<Time>,
-    held: VecDeque<Held>,
+    held: VecDeque<DelayedFrame>,
     faults: Faults,
     sinks: Vec<Sink>,
     frames: u64,
@@ -490,7 +490,7 @@ impl Bus {
     }
 
     /// Takes the frame that the gateway is sending; it comes back if that fails.
-    fn take_held(&mut self) -> Option<Held> {
+    fn take_held(&mut self) -> Option<DelayedFrame> {
         let n = self.held.iter().position(|held| held.due <= self.now)?;
         self.held.remove(n)
     }
@@ -616,10 +616,10 @@ impl Bus {
             let (frame, bit) = (flight.frame, flight.bit);
             match flight.fault {
                 Some(FaultAction::Delay(span)) => {
-                    self.held.push_back(Held { due: end + span, frame, origin, bit });
+                    self.held.push_back(DelayedFrame { due: end + span, frame, origin, bit });
                 }
                 Some(FaultAction::Duplicate) => {
-                    self.held.push_back(Held { due: end, frame, origin, bit });
+                    self.held.push_back(DelayedFrame { due: end, frame, origin, bit });
                 }
                 _ => {}
             }
@@ -664,7 +664,7 @@ impl Bus {
         }
         if let Some(held) = flight.gateway {
             // The gateway repeats it.
-            self.held.push_front(Held { due: end, ..held });
+            self.held.push_front(DelayedFrame { due: end, ..held });
         }
         self.recessive_since = error.at + bits(flight.error_bit, error.flag_bits);
         self.finish(&flight, flight.error_bit, end, Outcome::Bad(error.transmit), nodes);
