@@ -158,7 +158,7 @@ mod app {
         slave.observe(status, now, application);
         loop {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
-            // waiting behind it.
+            // that wait after it.
             carry_out(slave, &mut can, now, application);
             let Some(frame) = to_handle.dequeue() else { return };
             if slave.handle(&frame, now, application) {

@@ -22,7 +22,7 @@ use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services
 
 use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
 
-/// 1000h: no standardised profile. Anything but the bootloader's 10000000h tells a host that the
+/// 1000h: no standardised profile. Anything but the bootloader's 10000000h shows a host that the
 /// application runs.
 const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.

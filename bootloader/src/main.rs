@@ -310,7 +310,7 @@ mod app {
                 return;
             }
         }
-        // The stored values that a host was told of must not be lost by an early reset.
+        // The stored values that were reported to a host must not be lost by an early reset.
         if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
             pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);

@@ -76,7 +76,7 @@ pub unsafe trait Controller: Instance {
 pub struct Port<I: Controller> {
     can: Can<I>,
     waiting: Option<bxcan::Frame>,
-    /// If a frame waits, it is a heartbeat: it waits behind the one before, on a bus that is full
+    /// If a frame waits, it is a heartbeat: it waits for the one before, on a bus that is full
     /// with frames of higher priority. It must not hold up an answer, which takes its place.
     heartbeat_waits: bool,
     /// A boot-up is waiting; no frame may overtake it, whatever its priority.

@@ -72,7 +72,7 @@ pub struct Frame {
 /// The handler's addition to the frame: `DCRDR` points to this.
 #[repr(C)]
 pub struct Saved {
-    /// Address of the [`Frame`]; the program's SP points behind it.
+    /// Address of the [`Frame`]; the program's SP points right after it.
     pub frame: *mut Frame,
     /// R4 to R11.
     pub registers: [u32; 8],
@@ -258,7 +258,7 @@ unsafe extern "C" fn on_debug_event(saved: *mut Saved) {
     let next = unsafe { pc.read_volatile() };
     let instruction = Instruction::at(next);
     if next == stopped_at && instruction == Instruction::Breakpoint {
-        // The breakpoint is an instruction of the code itself: the program continues behind it.
+        // The breakpoint is an instruction of the code itself: the program continues after it.
         // SAFETY: see above.
         unsafe { pc.write_volatile(next + 2) };
     } else {

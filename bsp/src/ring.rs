@@ -66,7 +66,7 @@ pub const LOST: u8 = 0;
 /// The bytes of a line that may lose some, with a mark at each place where bytes are lost.
 pub struct Inbox<const N: usize> {
     ring: Ring<N>,
-    /// Bytes are lost behind the last one of the ring, and the mark is not there yet.
+    /// Bytes are lost after the last one of the ring, and the mark is not there yet.
     gap: AtomicBool,
     lost: AtomicBool,
 }

@@ -30,7 +30,7 @@ pub enum Departure<R> {
         /// The device leaves at this time, even if frames still wait to be sent.
         latest: u32,
     },
-    /// The answer is on the bus. The device serves requests during the pause behind it.
+    /// The answer is on the bus. The device serves requests during the pause after it.
     Pausing {
         /// As for [`Answering`](Self::Answering).
         request: R,
@@ -263,7 +263,7 @@ mod tests {
         assert_eq!(departure.proceed(false, 3), Next::Leave('o'));
     }
 
-    /// A promise is kept, whatever comes behind it; another promise takes its place, and a request
+    /// A promise is kept, whatever comes after it; another promise takes its place, and a request
     /// that promised nothing gives way.
     #[test]
     fn only_a_promise_takes_the_place_of_a_promise() {

@@ -3,7 +3,7 @@
 
 pub use shared_abi::label::{Label, OFFSET, SIZE};
 
-/// Puts the label of the program at its place in the image, behind the vector table: vendor-ID
+/// Puts the label of the program at its place in the image, after the vector table: vendor-ID
 /// (1018h/1), product code (1018h/2) and the version of the program, a number of the maker's own.
 /// Once in a program, outside of functions.
 ///

@@ -18,10 +18,10 @@
 //! In the order of use:
 //!
 //! 1. the build script calls `coboot_linker::Application::…::emit()`;
-//! 2. [`label!`](label!) tells whom the image is for;
-//! 3. [`Start::read`] tells node-ID and bit rate before CAN is set up;
+//! 2. [`label!`](label!) says whom the image is for;
+//! 3. [`Start::read`] gives node-ID and bit rate before CAN is set up;
 //! 4. [`ProgramControl`] answers 1F51h, 1F56h and 1F57h;
-//! 5. [`ProgramControl::proceed`] is asked regularly, and behind every frame, and says when to leave;
+//! 5. [`ProgramControl::proceed`] is asked regularly, and after every frame, and says when to leave;
 //! 6. `Bootloader::leave` leaves.
 #![no_std]
 

@@ -11,7 +11,7 @@
 //! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
 //! | NMT reset node | [`restart`](ProgramControl::restart) | |
 //!
-//! Behind each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
+//! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
 use shared_abi::callgate::PROGRAM_INSTALLED;
 use shared_abi::warm_start::{BootRequest, Owed};
@@ -238,7 +238,7 @@ impl ProgramControl {
 
     /// This program is good: it has heard its master, say, or a master has said so. Where the flash is
     /// locked (a sealed program) the device restarts to store it. Writes flash
-    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) tells how long that takes).
+    /// ([`Bootloader::store_node`](crate::Bootloader::store_node) says how long that takes).
     ///
     /// # Errors
     /// [`Abort::HARDWARE`] where the bootloader did not store it, or there is none;
@@ -429,8 +429,8 @@ mod tests {
         assert_eq!(control.proceed(true, 900), Next::Leave(BootRequest::Stay));
     }
 
-    /// In front of a sealed program the flash is locked: who was told that the program is confirmed is
-    /// not let down by another one.
+    /// In front of a sealed program the flash is locked: once the confirmation is acknowledged,
+    /// no other command takes it back.
     #[test]
     fn a_confirmation_at_the_reset_is_kept_against_other_commands() {
         let mut control = control(true);

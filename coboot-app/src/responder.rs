@@ -17,7 +17,7 @@
 //!
 //! - each data frame with one of [`identifiers`](Responder::identifiers) into
 //!   [`handle`](Responder::handle), and its answer onto the bus;
-//! - behind that, and every few milliseconds, [`poll`](Responder::poll) until it gives no frame;
+//! - after that, and every few milliseconds, [`poll`](Responder::poll) until it gives no frame;
 //! - then [`proceed`](Responder::proceed), which says when to leave.
 
 use shared_abi::warm_start::BootRequest;
@@ -481,7 +481,7 @@ mod tests {
         assert_eq!(responder.poll(60_000), None);
     }
 
-    /// The size may be told or not (CiA 301: the s bit).
+    /// The size may be announced or not (CiA 301: the s bit).
     #[test]
     fn a_call_back_is_acknowledged_and_the_device_leaves_behind_the_pause() {
         for command in [0x2F, 0x22] {

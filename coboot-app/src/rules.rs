@@ -1,4 +1,4 @@
-//! The rule that tells how an application reacts to a command of 1F51h. It has no state and does
+//! The rule that says how an application reacts to a command of 1F51h. It has no state and does
 //! not use the chip.
 
 use crate::abort::Abort;

@@ -25,7 +25,7 @@ pub struct Start {
     pub serial_number: u32,
     /// The program that this is, 1 to 254: the sub-index of 1F51h that is its own.
     pub program: u8,
-    /// It was started right behind its download in one go (raw image, Intel HEX or sealed image): the
+    /// It was started right after its download in one go (raw image, Intel HEX or sealed image): the
     /// first 1F51h = 80h confirms it.
     pub fresh: bool,
     /// All values of the bootloader; `None` if no bootloader started the program.
@@ -42,7 +42,7 @@ impl Start {
         Self::new(told, defaults)
     }
 
-    /// From what the bootloader told, if it did.
+    /// From what the bootloader passed on, if it did.
     #[must_use]
     pub const fn new(told: Option<BootInfo>, defaults: Defaults) -> Self {
         match told {

@@ -19,10 +19,10 @@ namespace {
 constexpr uint8_t DEFAULT_NODE_ID = 1;
 constexpr uint32_t DEFAULT_BIT_RATE = 125'000;
 
-// NMT states as a heartbeat tells them (CiA 301).
+// NMT states as a heartbeat reports them (CiA 301).
 enum class State : uint8_t { BootUp = 0, Stopped = 4, Operational = 5, PreOperational = 127 };
 
-// Tells every so many milliseconds that it is time. Its constructor runs before `main`.
+// Reports every so many milliseconds that it is time. Its constructor runs before `main`.
 class Timer {
 public:
     explicit Timer(uint32_t period_ms) : period_ms_(period_ms) {}

@@ -1,4 +1,4 @@
-//! Links the program for its place behind the bootloader of the board.
+//! Links the program for its place after the bootloader of the board.
 
 fn main() {
     // Written by `cargo xtask layout --toml --board stm32f407g-disc1 > board.toml`.

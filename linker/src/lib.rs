@@ -6,7 +6,7 @@
 //! coboot_linker::Application::of_board("stm32f407g-disc1").emit();
 //! ```
 //!
-//! [`Application::emit`] writes three files into `OUT_DIR` and tells cargo to link with them:
+//! [`Application::emit`] writes three files into `OUT_DIR` and makes cargo link with them:
 //!
 //! | file | what it is |
 //! |---|---|
@@ -115,7 +115,7 @@ impl Application {
         Self { layout: chosen_board(), file: None, program: 1 }
     }
 
-    /// For a board whose memory map stands in this file, which `cargo xtask layout --toml` has written.
+    /// For a board whose memory map is in this file, which `cargo xtask layout --toml` has written.
     /// A relative path begins at the package.
     #[cfg(feature = "file")]
     pub fn of_file(path: impl AsRef<Path>) -> Self {
@@ -132,7 +132,7 @@ impl Application {
         self
     }
 
-    /// Writes the files into `OUT_DIR` and tells cargo to link with them. An error ends the build
+    /// Writes the files into `OUT_DIR` and makes cargo link with them. An error ends the build
     /// with a message that gives the reason.
     pub fn emit(self) {
         if let Err(error) = self.try_emit() {
@@ -144,7 +144,7 @@ impl Application {
     /// As [`emit`](Self::emit).
     ///
     /// # Errors
-    /// [`Error`] tells what is wrong.
+    /// [`Error`] says what is wrong.
     pub fn try_emit(self) -> Result<(), Error> {
         let out = env::var_os("OUT_DIR").map(PathBuf::from).ok_or(Error::NoBuildScript)?;
         if let Some(file) = &self.file {
@@ -159,7 +159,7 @@ impl Application {
     /// Writes the files into a folder.
     ///
     /// # Errors
-    /// [`Error`] tells what is wrong.
+    /// [`Error`] says what is wrong.
     pub fn write(&self, folder: &Path) -> Result<(), Error> {
         let layout = self.layout.clone()?;
         if layout.program(self.program).is_none() {
@@ -200,7 +200,7 @@ pub fn write_memory(layout: &Layout, image: Image, folder: &Path) -> Result<(), 
     write(&folder.join("memory.x"), &layout.linker_script(image).to_string())
 }
 
-/// Tells cargo to link the binaries of this package with `script`, which is in `folder` together
+/// Makes cargo link the binaries of this package with `script`, which is in `folder` together
 /// with the files that it includes.
 pub fn link(folder: &Path, script: &str) {
     // Not `rustc-link-search`: packages that depend on this one would find its files, too.

@@ -24,7 +24,7 @@ impl BitTiming {
         let mut quanta = 25;
         while quanta >= 8 {
             if cycles.is_multiple_of(quanta) && cycles / quanta <= 1024 {
-                // 1 quantum of sync, then the segments; 1/8 of the bit, rounded, behind the sample
+                // 1 quantum of sync, then the segments; 1/8 of the bit, rounded, after the sample
                 // point.
                 let segment_2 = (quanta + 4) / 8;
                 let segment_1 = quanta - 1 - segment_2;

@@ -237,7 +237,7 @@ mod tests {
         }
     }
 
-    /// A date behind 2106-02-07 needs more than 32 bits; its low word comes first.
+    /// A date after 2106-02-07 needs more than 32 bits; its low word comes first.
     #[test]
     fn a_date_has_64_bits() {
         let mut control = [0; 24];

@@ -24,7 +24,7 @@ pub fn by_name(name: &str) -> Option<&'static Geometry> {
 mod tests {
     use super::*;
 
-    /// The order codes of the data sheet (DS8626, ordering information): package and range behind the
+    /// The order codes of the data sheet (DS8626, ordering information): package and range after the
     /// code, then options.
     #[test]
     fn a_chip_is_named_by_its_order_code() {

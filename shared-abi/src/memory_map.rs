@@ -1,5 +1,5 @@
 //! The addresses of a chip that a debugger may access without knowledge of the chip: there is
-//! memory or a register behind each of them. An access to any other address is a bus fault.
+//! memory or a register at each of them. An access to any other address is a bus fault.
 //!
 //! | what | read | written |
 //! |---|---|---|

@@ -11,7 +11,7 @@ use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
 
 const HEADER: &str = include_str!("../../examples/c/coboot/coboot.h");
 
-/// The numbers of the header by what they are: the name behind `COBOOT_`, or what an assertion is
+/// The numbers of the header by what they are: the name after `COBOOT_`, or what an assertion is
 /// about.
 fn of_header() -> BTreeMap<String, i64> {
     let number = |text: &str| match text.strip_prefix("0x") {

@@ -51,7 +51,7 @@ const REQUESTS: [u32; 6] = [1, 3, 5, 7, 10, 12];
 const OWED: u32 = 7;
 const CONFIRM: u32 = 10;
 
-/// What an application on `Departure` does: the rules that stand outside of it are those of
+/// What an application on `Departure` does: the rules that are outside of it are those of
 /// `app-template/src/objects.rs`.
 #[derive(Default)]
 struct Model {

@@ -42,14 +42,14 @@ static uint32_t values[LAST + 1] = {
     [ADDRESS] = (uint32_t)&values[WORD],
 };
 
-/* What stands in a free cell of RAM. */
+/* What is in a free cell of RAM. */
 static inline uint32_t pattern(const volatile uint32_t *cell, uint32_t seed)
 {
     return ((uint32_t)(uintptr_t)cell ^ seed) * COBOOT_CHECK_FACTOR;
 }
 
 /* All RAM that this program does not use lies between its variables and its stack pointer. It is filled before the call; the
- * lowest cell that the call has changed tells how deep its stack went, and that it wrote nowhere else.
+ * lowest cell that the call has changed shows how deep its stack went, and that it wrote nowhere else.
  *
  * Nothing may be pushed between filling and calling, and no interrupt may come: so it is one function of its own.
  */

@@ -59,7 +59,7 @@ mod probe {
     pub const SP: Address = Address::new(0x2100, 13);
 }
 
-/// What the emulator tells accesses by.
+/// The unit in which the emulator reports accesses.
 const PAGE: u32 = 4096;
 
 fn install(bench: &mut Bench, image: &str) -> Report {
@@ -189,7 +189,7 @@ fn it_is_a_node_like_any_other() {
         assert_eq!(bench.ask(0x601, request, ANSWERS), None);
     }
 
-    // A heartbeat every 100 ms from now on; it tells the NMT state. Who is stopped answers no SDO.
+    // A heartbeat every 100 ms from now on; it has the NMT state. Who is stopped answers no SDO.
     for (command, state) in [(0x01, 0x05), (0x02, 0x04), (0x80, 0x7F)] {
         bench.post(0x000, &[command, NODE]);
         bench.run_ms(20);
@@ -269,7 +269,7 @@ fn every_service_works_on_the_stack_alone() {
         let mut run = |bench: &mut Bench, selector, words| {
             bench.machine().take_touched();
             let called = call(bench, selector, words);
-            // Loads count as well: the pattern tells of stores alone.
+            // Loads count as well: the pattern shows stores alone.
             assert_stack_alone(bench, good, selector);
             let most = stacks.entry(selector).or_insert(0);
             *most = called.stack.max(*most);
@@ -286,7 +286,7 @@ fn every_service_works_on_the_stack_alone() {
             let (status, words) = run(&mut bench, CRC32, [address, len, !expected, 4, 5]);
             assert_eq!((status, words), (OK, [address, len, expected, 4, 5]), "{address:#x}, {len}");
         }
-        // What stands behind the structure is not touched.
+        // What is after the structure is not touched.
         let (status, words) = run(&mut bench, READ_NODE, [0, 0, 3, 4, 5]);
         assert_eq!((status, words), (OK, [1, 125_000, 3, 4, 5]));
         let installed_signed = 0b11;
@@ -371,7 +371,7 @@ fn every_hostile_call_has_its_status_and_does_nothing() {
         flash.base,
         layout.programs[0].base,
         ram.base - 4,
-        // Its end lies behind that of the RAM.
+        // Its end lies beyond that of the RAM.
         ram.end() - 4,
         ram.end(),
         0x4000_0000,
@@ -516,7 +516,7 @@ fn a_node_id_that_it_stores_is_in_force_from_the_next_reset_on() {
 }
 
 /// The flash takes nothing any more, as when somebody has protected the parameters' sectors by the
-/// option bytes: whoever stores is told so, everything else goes on, and so does storing once they
+/// option bytes: each store reports it, everything else goes on, and so does storing once they
 /// can be written again.
 #[test]
 fn a_flash_that_refuses_is_told_and_harms_nothing() {
@@ -529,7 +529,7 @@ fn a_flash_that_refuses_is_told_and_harms_nothing() {
     for sector in &sectors {
         bench.machine().protect_sector(*sector, true);
     }
-    // Twice: a refusal leaves the flash controller as it was, or the next call would be told that
+    // Twice: a refusal leaves the flash controller as it was, or the next call would report that
     // it is busy.
     for _ in 0..2 {
         for (selector, words) in [(STORE_NODE, [9, 250_000, 3, 4, 5]), (INVALIDATE, [1, 2, 3, 4, 5])] {
@@ -580,7 +580,7 @@ fn a_trial_confirms_itself_and_takes_it_back() {
     assert!(bench.is_bootloader(NODE), "it has taken that back");
 }
 
-/// Two programs: each knows of the other; one that is not there is told as such; one that was
+/// Two programs: each knows of the other; one that is not there is reported as such; one that was
 /// linked for the place of the other is refused in words.
 #[test]
 fn the_other_program_and_a_program_for_the_other_place() {
@@ -601,7 +601,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
-    // A host that does not know the board is told by the device, and sends nothing.
+    // A host that does not know the board asks the device, and sends nothing.
     let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &Options::default()).unwrap().file;
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");

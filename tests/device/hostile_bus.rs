@@ -1,5 +1,5 @@
 //! How long a request waits for its answer on a hostile bus, with the built firmware in virtual
-//! time: while a flood lasts, behind it, and behind bus-off. The limits are counted in bits of ISO
+//! time: while a flood lasts, after it, and after bus-off. The limits are counted in bits of ISO
 //! 11898-1 and in the waits of the device (`core/canopen/src/line.rs`).
 
 use coboot_tests::bench::{Bench, BIT_RATE, NODE, REQUEST, RESPONSE};
@@ -98,7 +98,7 @@ fn a_flood_of_lower_priority_holds_up_no_answer() {
     assert!(slowest <= limit, "{slowest} us of {limit} us");
 }
 
-/// Frames of the highest priority leave room for nothing. Behind the last one the request, which
+/// Frames of the highest priority leave room for nothing. After the last one the request, which
 /// waited as long as the heartbeats, is answered at once; and so is the next one.
 #[test]
 fn behind_a_flood_of_higher_priority_the_answer_comes_at_once() {
@@ -127,11 +127,11 @@ fn behind_a_flood_of_higher_priority_the_answer_comes_at_once() {
     assert!(after <= limit, "{after} us of {limit} us");
 }
 
-/// Somebody destroys the device's frames (a second node with its node-ID does that, too): behind 32
+/// Somebody destroys the device's frames (a second node with its node-ID does that, too): after 32
 /// errors it is bus-off. It returns after its wait of 200 ms, which doubles up to 5 s while it fails
 /// again within 10 s, and then after 128 sequences of 11 recessive bits (ISO 11898-1, 12.1.4.4; RM0090
 /// section 32.7.6). A master that repeats its request, because nobody acknowledges it, leaves one
-/// sequence behind each attempt. No answer can be slower.
+/// sequence after each attempt. No answer can be slower.
 #[test]
 fn behind_bus_off_an_answer_waits_for_the_patience_and_the_recovery_and_no_longer() {
     let mut bench = board();

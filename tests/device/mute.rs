@@ -11,7 +11,9 @@ use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options};
 use coflash::file::read::{read, Format};
-use coflash::update::{catch, flash, CatchOptions, Caught, DeviceState, FlashOptions, Left, Look};
+use coflash::update::{
+    catch, flash, CatchOptions, Caught, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions,
+};
 use coflash::Error;
 
 /// A jump to itself, in Thumb.
@@ -37,7 +39,7 @@ fn board() -> Bench {
     bench
 }
 
-fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, Left) {
+fn fails(bench: &mut Bench, options: &FlashOptions) -> (Error, DeviceAfterUpdate) {
     let mut left = None;
     let error = flash(&mut bench.session(), &mute(), options, &mut |event| {
         if let Some(state) = event.left() {
@@ -102,7 +104,7 @@ fn a_mute_program_is_not_released_and_the_device_comes_back() {
     let (error, left) = fails(&mut bench, &FlashOptions::default());
     assert!(matches!(error, Error::TrialFailed { how: TrialFailure::Silent, .. }), "{error}");
     assert!(error.to_string().contains("not released for autostart"), "{error}");
-    assert_eq!((left.state, left.look), (DeviceState::Unreleased, Look::Silent));
+    assert_eq!((left.state, left.answer), (DeviceState::Unreleased, DeviceAnswer::Silent));
     assert!(bench.session().device_type().unwrap().is_none(), "it runs, and says nothing");
     let caught = caught(&mut bench, CatchOptions::default());
     assert!(caught.running.is_some_and(|running| running.is_bootloader()), "{caught:?}");
@@ -119,7 +121,7 @@ fn a_mute_program_that_was_released_by_force_is_caught_in_its_rescue_window() {
         let mut bench = board();
         let (error, left) = fails(&mut bench, &FlashOptions::default().trial_run(false));
         assert!(matches!(error, Error::StartFailed { running: None, .. }), "{error}");
-        assert_eq!((left.state, left.look), (DeviceState::Released, Look::Silent));
+        assert_eq!((left.state, left.answer), (DeviceState::Released, DeviceAnswer::Silent));
         // It starts by itself: after a power-on nothing answers. The first start is delayed by the
         // frames that the host's controller still has to send, because no node has acknowledged
         // them.

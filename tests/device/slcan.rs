@@ -177,7 +177,7 @@ fn what_is_no_frame_is_refused_and_the_next_line_is_taken() {
     assert_eq!(say(&mut open(), b"\nt1000\r\nt1000\r\n").0, "z\rz\r");
 }
 
-/// A mark stands where bytes were lost: the halves of two lines must not form one line, and the
+/// A mark is where bytes were lost: the halves of two lines must not form one line, and the
 /// host gets an error when it asks.
 #[test]
 fn a_line_with_a_gap_is_refused() {

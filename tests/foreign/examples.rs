@@ -203,7 +203,7 @@ fn another_number_of_vectors_than_the_chips_does_not_link() {
     project.build(&["-DINTERRUPT_LINES=82"]).unwrap_or_else(|refused| panic!("{refused}"));
 }
 
-/// A label is optional: the device accepts the program, but coflash cannot tell its target.
+/// A label is optional: the device accepts the program, but coflash cannot determine its target.
 #[test]
 fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
     let project =

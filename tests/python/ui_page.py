@@ -457,7 +457,7 @@ def looks(bench):
              "filter", "trace", "frames", "fastscan", "lss-0", "lss-node", "assign", "run", "print"]
     places = [seen.index(name) for name in order]
     assert places == sorted(places), list(zip(order, places))
-    # The elements that tell the state to a screen reader.
+    # The elements that report the state to a screen reader.
     for name in ["task", "notice", "adapter-state"]:
         assert page.locator(f"#{name}").get_attribute("role") in ("status", "alert"), name
 
@@ -495,7 +495,7 @@ def emulated(bench):
     page.get_by_label("Choose all devices").check()
     page.locator("#update").click()
     line = page.locator(".update")
-    # The next line tells which one, with the page's message.
+    # The next line says which one, with the page's message.
     expect(line).to_have_attribute("data-phase", re.compile("done|failed"))
     expect(line).to_have_attribute("data-phase", "done")
     idle(page)

@@ -86,7 +86,7 @@ fn a_request_is_good_for_one_challenge() {
         assert_ne!(host.challenge()[12..44], before[12..44]);
         request
     });
-    // Behind a reset, the same device without a source of randomness has another challenge.
+    // After a reset, the same device without a source of randomness has another challenge.
     device.run(|host| {
         assert_eq!(host.ask(&request), Ok(()));
         host.settle();
@@ -209,7 +209,7 @@ fn an_opened_device_stays_open() {
     let device = Device::sealed(&STANDARD_1);
     device.run(|host| {
         assert!(host.grant(&keys().root, right::OPEN, 0));
-        // What is granted behind it takes nothing back.
+        // What is granted after it takes nothing back.
         assert!(host.grant(&keys().root, right::STORE, 0));
         assert_eq!(host.rights(), SEALED | right::OPEN | right::STORE);
         assert_ne!(host.update(1, &program(1), 7).1, status::OK);
@@ -283,7 +283,7 @@ fn the_log_tells_the_last_events_the_latest_first() {
         assert_eq!(logged(host, 5), [1, event::INSTALLED | 1, 5, 11]);
         assert_eq!(logged(host, 6), [0; 4]);
     });
-    // Whatever is installed is told, also the same again; and the log is there behind a reset.
+    // Whatever is installed is logged, also the same again; and the log is there after a reset.
     let before = device.run(|host| {
         let before = log(host);
         assert_eq!(before[0][..2], [5, event::UNLOCKED | right::ERASE | right::STORE]);

@@ -7,7 +7,7 @@
 //!
 //! ```sh
 //! COBOOT_ATTACKS=20000 cargo test --release -p coboot-tests --test sealed attacker::   # seeds per setup
-//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-tests --test sealed attacker::          # one, told
+//! COBOOT_ATTACK_SEED=4711 cargo test -p coboot-tests --test sealed attacker::          # printed
 //! ```
 
 use std::panic::{catch_unwind, AssertUnwindSafe};

@@ -176,7 +176,7 @@ fn a_signed_mistake_is_no_program() {
     }
 }
 
-/// CiA 301: the next segment tells why; a refused image, or flash that fails.
+/// CiA 301: the next segment says why; a refused image, or flash that fails.
 #[test]
 fn the_abort_tells_a_refusal_from_a_fault() {
     // In chunks of 512 bytes: the first one is written while the rest comes.

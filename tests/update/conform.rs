@@ -131,7 +131,7 @@ fn faults_of_updates_are_found() {
         (!busy).then_some(answer)
     });
     assert_eq!(ids(&failed), ["UPD-005", "UPD-006"]);
-    // An error is never told.
+    // An error is never reported.
     let (failed, ..) = with_a_program(|asked, mut answer| {
         if asked[..4] == [0x40, 0x57, 0x1F, 1] && answer[0] == 0x43 {
             answer[4] &= 1;

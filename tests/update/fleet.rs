@@ -66,7 +66,7 @@ fn together_takes_little_longer_than_one_and_one_by_one_much() {
 }
 
 /// The bus is full with requests for seconds: a heartbeat does not get through, and must not hold
-/// up the answers behind it.
+/// up the answers after it.
 #[test]
 fn eight_transfers_at_once_leave_every_device_its_answers() {
     let file = file(KIB);
@@ -136,7 +136,7 @@ fn a_device_that_falls_out_is_finished_afterwards() {
     assert_all_have(&mut fleet, 3, file.program_crc());
 }
 
-/// A device without power from the middle on: its outcome is told, and the others have theirs.
+/// A device without power from the middle on: its outcome is reported, and the others have theirs.
 #[test]
 fn a_device_that_stays_away_costs_the_others_nothing() {
     let file = file(KIB);

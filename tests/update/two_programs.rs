@@ -119,8 +119,8 @@ fn a_block_for_the_other_program_is_refused() {
     bench.await_boot_up(100);
     let second = blocks(firmware::PROGRAM_2, 2);
     let options = FlashOptions::default().program(1).start(false).repeats(0);
-    // The device tells the host its regions, and the host sends nothing. A host without this check
-    // gets the refusal from the device.
+    // The device reports its regions to the host, and the host sends nothing. A host without this
+    // check gets the refusal from the device.
     let refused = flash(&mut bench.session(), &second, &options, &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
     let refused = flash(&mut bench.session(), &second, &options.force(true), &mut |_| {}).unwrap_err();

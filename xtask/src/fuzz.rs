@@ -44,7 +44,7 @@ const TOO_LONG: u32 = 10;
 /// The longest input, in bytes.
 const LONGEST_INPUT: u32 = 4096;
 /// The targets whose bytes are commands or numbers, each with its longest input: many short lives find
-/// more than a few long ones. To tell the fuzzer what each comparison compares, which finds the words
+/// more than a few long ones. To show the fuzzer what each comparison compares, which finds the words
 /// of texts and files, would take three quarters of their time.
 const COMMANDS: [(&str, u32); 9] = [
     ("conform", 512),

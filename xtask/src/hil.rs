@@ -52,7 +52,7 @@ pub fn run(mut args: Args) -> Outcome {
     let json = args.value("--json")?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    // The build takes minutes; a program that is missing is told before.
+    // The build takes minutes; a program that is missing is reported before.
     probe.is_there()?;
     if let Some(power) = &power {
         power.is_there()?;
@@ -85,7 +85,7 @@ pub fn run(mut args: Args) -> Outcome {
     report.outcome()
 }
 
-/// Carries out all steps. Those behind a failed step that they rest on are left out.
+/// Carries out all steps. Those after a failed step that they rest on are left out.
 fn play(bench: &mut Bench, report: &mut Report) {
     let mut stopped_by = None;
     for step in steps::STEPS {

@@ -1,15 +1,15 @@
-//! `cargo xtask lint`: runs formatting, clippy and rustdoc, with warnings denied.
+//! `cargo xtask lint`: checks formatting and words, and runs clippy and rustdoc, with warnings denied.
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, product, workspace, Outcome};
+use crate::{build, process, product, words, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
 
-Checks the formatting of every crate, runs clippy over host crates (with their tests; the Python
-package, too) and over the firmware of a board, and makes the documentation of the host crates, all
-with warnings denied.
+Checks the formatting of every crate and the words of comments and pages, runs clippy over host
+crates (with their tests; the Python package, too) and over the firmware of a board, and makes the
+documentation of the host crates, all with warnings denied.
 
   --board BOARD   the board (default: stm32f407g-disc1)
   --yes           installs what is missing with sudo
@@ -26,6 +26,7 @@ pub fn run(mut args: Args) -> Outcome {
 
     // All checks run, so that one run shows all problems.
     let mut problems = formatting()?;
+    problems.extend(words::faults()?);
     problems.extend(clippy(HOST_CRATES));
     // The library without the command line; and the package for Python, which is not a default
     // member.

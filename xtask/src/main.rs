@@ -57,6 +57,7 @@ mod setup;
 mod size;
 mod test;
 mod toolchain;
+mod words;
 mod workspace;
 
 use args::Args;

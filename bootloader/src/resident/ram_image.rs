@@ -28,7 +28,7 @@ extern "C" {
 /// bytes.
 pub unsafe fn load(flash: &ResidentFlash) -> Result<VectorTable, Damage> {
     // SAFETY: the linker script places it in flash, aligned; any bits are a valid `Header`, and the
-    // flash behind it is part of its region, which `check` compares with the image's size.
+    // flash after it is part of its region, which `check` compares with the image's size.
     let header = unsafe { &HEADER };
     let at = core::ptr::from_ref(header) as u32;
     let data = at + Header::SIZE;

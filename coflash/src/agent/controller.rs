@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::backoff::Jitter;
 use super::config::Attempt;
 use super::ddi::{self, Artifact, Base, Cancel, Deployment, Execution, Finished, Handling};
-use super::record::{Begun, Finish, Record};
+use super::record::{Finish, Record, RunningAction};
 
 /// What is to be done next. Each step but `Wait` has exactly one answer.
 #[derive(Clone, Debug, PartialEq)]
@@ -196,7 +196,7 @@ impl Task {
     }
 }
 
-/// Where the deployment stands.
+/// The state of the deployment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Work {
     None,
@@ -213,7 +213,7 @@ enum Work {
         at: Duration,
         /// Whether the deployment was read since the file is there.
         fresh: bool,
-        /// Whether the server was told why the deployment is held.
+        /// Whether the server has the report why the deployment is held.
         told: bool,
         /// How many times the bus or the device was in use or absent.
         tries: u32,
@@ -227,7 +227,7 @@ enum Work {
         tries: u32,
         progress: Progress,
     },
-    /// The end is in the record, and the server is to be told.
+    /// The end is in the record, and is to be reported to the server.
     Ended {
         action: String,
     },
@@ -266,9 +266,9 @@ enum Ask {
     Closed(String),
 }
 
-/// The questions to the device.
+/// Whether the device is to be asked, or was asked, for its data.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Look {
+enum DeviceQuery {
     No,
     Wanted,
     Asked,
@@ -283,7 +283,7 @@ pub(super) struct Controller {
     record: Record,
     unsaved: bool,
     work: Work,
-    look: Look,
+    query: DeviceQuery,
     todo: VecDeque<Ask>,
     asked: Option<Ask>,
     /// No request before this time.
@@ -304,7 +304,7 @@ impl Controller {
             record,
             unsaved: false,
             work: Work::None,
-            look: Look::No,
+            query: DeviceQuery::No,
             todo: VecDeque::new(),
             asked: None,
             hold: Duration::ZERO,
@@ -335,7 +335,7 @@ impl Controller {
             Work::Ready { task, fresh, .. } => *fresh && !self.may_begin(task),
             _ => false,
         };
-        self.polled && held && self.todo.is_empty() && self.look == Look::No && self.poll_at > now
+        self.polled && held && self.todo.is_empty() && self.query == DeviceQuery::No && self.poll_at > now
     }
 
     /// The number of times in a row that the server did not answer as it should, or that the bus or
@@ -362,8 +362,8 @@ impl Controller {
         if self.unsaved && now >= self.hold {
             return Step::Save(self.record.clone());
         }
-        if self.look == Look::Wanted && !matches!(self.work, Work::Flashing { .. }) {
-            self.look = Look::Asked;
+        if self.query == DeviceQuery::Wanted && !matches!(self.work, Work::Flashing { .. }) {
+            self.query = DeviceQuery::Asked;
             return Step::Look;
         }
         if !self.unsaved {
@@ -492,7 +492,7 @@ impl Controller {
                     format!("the server answers with status {status}: check url, tenant and controller-id");
                 self.trouble(now, why, None);
             }
-            // The action is no longer the server's wish; the next poll tells.
+            // The action is no longer the server's wish; the next poll shows it.
             Ask::Cancel(_) | Ask::Deployment(_) | Ask::Confirm(_) | Ask::Tell { .. } => {}
             Ask::CancelReply { cancel, .. } => {
                 self.say(
@@ -545,8 +545,8 @@ impl Controller {
         {
             self.todo.push_back(Ask::Confirm(action));
         }
-        if base.config && self.look == Look::No {
-            self.look = Look::Wanted;
+        if base.config && self.query == DeviceQuery::No {
+            self.query = DeviceQuery::Wanted;
         }
         if nothing && matches!(self.work, Work::Fetching { .. } | Work::Ready { .. }) {
             self.say(Kind::Cancelled, "the server has withdrawn the deployment".to_string());
@@ -673,7 +673,7 @@ impl Controller {
         if let Work::Ready { task, tries, .. } = std::mem::replace(&mut self.work, Work::None) {
             let first = !self.record.has_begun(&task.action);
             if first {
-                self.record.begun = Some(Begun { action: task.action.clone(), kept: false });
+                self.record.begun = Some(RunningAction { action: task.action.clone(), kept: false });
                 self.unsaved = true;
             }
             self.say(Kind::Progress, format!("action {}: the device is flashed", task.action));
@@ -729,7 +729,7 @@ impl Controller {
 
     /// The attributes of the device, or why there are none.
     pub(super) fn looked(&mut self, told: Result<Vec<(String, String)>, String>) {
-        self.look = Look::No;
+        self.query = DeviceQuery::No;
         match told {
             Ok(attributes) => self.todo.push_back(Ask::Config(attributes)),
             Err(why) => self.say(Kind::Trouble, format!("the device does not tell about itself: {why}")),
@@ -786,7 +786,7 @@ impl Controller {
         }
     }
 
-    /// Writes the end of an action into the record; the server is told when it is there.
+    /// Writes the end of an action into the record; it is reported to the server when it is there.
     fn end(&mut self, action: &str, ok: bool, details: Vec<String>) {
         let words = details.join("; ");
         let kind = if ok { Kind::Updated } else { Kind::Failed };

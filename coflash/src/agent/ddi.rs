@@ -226,7 +226,7 @@ impl Cancel {
     }
 }
 
-/// Where an action stands.
+/// The state of an action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Execution {

@@ -23,7 +23,7 @@ pub(super) struct Pause<'p> {
 /// How many times that long a transfer may take that cannot pause.
 const LONGEST: u32 = 30;
 
-/// Fetches the next piece of a file into `path`, behind what is there.
+/// Fetches the next piece of a file into `path`, after what is there.
 pub(super) fn fetch(
     client: &Client,
     token: &Token,

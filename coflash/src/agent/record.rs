@@ -20,14 +20,14 @@ pub(super) struct Record {
     /// The root resource of the device on its server: actions of another server are others.
     pub(super) of: String,
     /// The action that changes the device, from just before the first request to the device.
-    pub(super) begun: Option<Begun>,
+    pub(super) begun: Option<RunningAction>,
     /// The actions that have ended, the last one last.
     pub(super) ended: Vec<Finish>,
 }
 
 /// An action that changes the device.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub(super) struct Begun {
+pub(super) struct RunningAction {
     pub(super) action: String,
     /// Whether the device is known to keep the program: it was released, or it was started last.
     pub(super) kept: bool,
@@ -83,7 +83,7 @@ impl Store {
     }
 
     /// The path of a device's file with this extension. The name is readable, and is no other
-    /// device's even if the system does not tell small letters from capitals.
+    /// device's even if the system does not distinguish small letters and capitals.
     pub(super) fn path(&self, controller: &str, extension: &str) -> PathBuf {
         let safe = |c: char| if c.is_ascii_alphanumeric() || c == '-' { c } else { '_' };
         let name: String = controller.chars().take(40).map(safe).collect();
@@ -139,7 +139,7 @@ mod tests {
         let store = Store::new(&folder).unwrap();
         assert_eq!(store.load("door", "here").unwrap(), Record::new("here"));
         let mut record = Record::new("here");
-        record.begun = Some(Begun { action: "20".to_string(), kept: false });
+        record.begun = Some(RunningAction { action: "20".to_string(), kept: false });
         (0..40).for_each(|action| record.end(finish(action)));
         assert_eq!(record.begun, None, "20 has ended");
         assert_eq!((record.ended.len(), record.ended[0].action.as_str()), (16, "24"));

@@ -27,7 +27,7 @@ pub trait Devices: Sync {
     /// In words, if the device does not answer.
     fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String>;
 
-    /// Flashes a device, and tells what happens.
+    /// Flashes a device, and says what happens.
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed;
 }
 

@@ -15,7 +15,7 @@ pub(super) struct Server {
 struct Parts<'u> {
     /// Scheme, host and port in one form: in small letters, with the port.
     origin: String,
-    /// From the first slash behind the host on.
+    /// From the first slash after the host on.
     rest: &'u str,
     host: String,
 }

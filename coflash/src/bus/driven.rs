@@ -65,9 +65,9 @@ const LOOK: Duration = Duration::from_millis(50);
 const OUTGOING: usize = 64;
 const INCOMING: usize = 4096;
 
-/// The results that the thread leaves.
+/// What the thread of the driver reports.
 #[derive(Default)]
-struct Left {
+struct DriverStatus {
     health: Health,
     fault: Option<Fault>,
 }
@@ -79,7 +79,7 @@ pub(super) struct Driven {
     /// `None` during drop.
     outgoing: Option<SyncSender<Frame>>,
     incoming: Receiver<Frame>,
-    left: Arc<Mutex<Left>>,
+    status: Arc<Mutex<DriverStatus>>,
 }
 
 impl fmt::Debug for Driven {
@@ -96,8 +96,8 @@ impl Driven {
     ) -> Result<Self, AdapterError> {
         let (outgoing, commands) = mpsc::sync_channel(OUTGOING);
         let (frames, incoming) = mpsc::sync_channel(INCOMING);
-        let left = Arc::<Mutex<Left>>::default();
-        let shared = left.clone();
+        let status = Arc::<Mutex<DriverStatus>>::default();
+        let shared = status.clone();
         let (told, opened) = mpsc::sync_channel(1);
         thread::spawn(move || {
             let mut driver = match open() {
@@ -116,7 +116,9 @@ impl Driven {
             driver.close();
         });
         match opened.recv_timeout(OPENING) {
-            Ok(Ok(())) => Ok(Self { name, opened: Instant::now(), outgoing: Some(outgoing), incoming, left }),
+            Ok(Ok(())) => {
+                Ok(Self { name, opened: Instant::now(), outgoing: Some(outgoing), incoming, status })
+            }
             Ok(Err(error)) => Err(error),
             Err(_) => Err(AdapterError::Open {
                 adapter: name,
@@ -131,7 +133,7 @@ impl Driven {
     /// The reason why the thread has ended.
     fn fault(&self) -> AdapterError {
         let adapter = self.name.clone();
-        match lock(&self.left).fault.clone() {
+        match lock(&self.status).fault.clone() {
             Some(Fault::Nonsense(said)) => AdapterError::Protocol { adapter, said },
             Some(Fault::Stuck(health)) => AdapterError::Stuck { adapter, health },
             Some(Fault::Lost(how)) => AdapterError::Lost { adapter, source: io::Error::other(how) },
@@ -140,9 +142,9 @@ impl Driven {
     }
 }
 
-/// Locks `left`. A thread that panics leaves nothing half done here.
-fn lock(left: &Mutex<Left>) -> std::sync::MutexGuard<'_, Left> {
-    left.lock().unwrap_or_else(PoisonError::into_inner)
+/// Locks `status`. A thread that panics leaves nothing half done here.
+fn lock(status: &Mutex<DriverStatus>) -> std::sync::MutexGuard<'_, DriverStatus> {
+    status.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Carries frames between the tool and the driver until the tool closes the channel.
@@ -150,7 +152,7 @@ fn work(
     driver: &mut impl Driver,
     commands: &Receiver<Frame>,
     frames: &SyncSender<Frame>,
-    left: &Mutex<Left>,
+    status: &Mutex<DriverStatus>,
 ) -> Result<(), Fault> {
     // A frame that found no room, and the time of the first attempt.
     let mut waiting: Option<(Frame, Instant)> = None;
@@ -180,7 +182,7 @@ fn work(
         }
         if looked.elapsed() >= LOOK {
             looked = Instant::now();
-            lock(left).health = driver.health();
+            lock(status).health = driver.health();
         }
     }
 }
@@ -231,6 +233,6 @@ impl Adapter for Driven {
     }
 
     fn health(&mut self) -> Option<Health> {
-        Some(lock(&self.left).health)
+        Some(lock(&self.status).health)
     }
 }

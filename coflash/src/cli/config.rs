@@ -163,7 +163,7 @@ mod tests {
             let argument = settings(&command).find(|argument| argument.get_long() == Some(key))?;
             Some(!argument.get_action().takes_values())
         };
-        // Options that exclude another one stand there as comments.
+        // Options that exclude another one are there as comments.
         let example: String =
             example.lines().map(|line| format!("{}\n", line.trim_start_matches("# "))).collect();
         let shown = parse(&example, &is_switch).unwrap();

@@ -85,7 +85,7 @@ impl Context {
             }
             None => adapter,
         };
-        // Passwords are recognised by the usual COB-IDs, so records are taken behind the
+        // Passwords are recognised by the usual COB-IDs, so records are taken after the
         // translation of COB-IDs.
         Ok(record::tapped(match (self.sdo_request, self.sdo_response) {
             (None, None) => traced,

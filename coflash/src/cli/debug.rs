@@ -320,7 +320,7 @@ fn refused(address: u32, why: NoBreakpoint) -> Failure {
     }
 }
 
-/// Sixteen bytes on each line after their address; a few bytes stand alone.
+/// Sixteen bytes on each line after their address; one word also as a number.
 fn dump(address: u32, bytes: &[u8]) -> String {
     let line = |(n, bytes): (usize, &[u8])| {
         let at = address.wrapping_add(16 * n as u32);

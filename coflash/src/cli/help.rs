@@ -1,6 +1,6 @@
 //! Arranges the help: options in groups, `-h` short and with examples, `--help` with all options.
 //!
-//! The help text of an option stands at the option; this file gives its place.
+//! The help text of an option is at the option; this file gives its place.
 
 use clap::{Arg, Command};
 

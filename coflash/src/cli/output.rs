@@ -15,7 +15,7 @@ use coflash::file::convert::ConvertError;
 use coflash::file::sealed::Refusal;
 use coflash::file::{judge, Cause, FileError};
 use coflash::update::job::Fault;
-use coflash::update::{refusal_number, Left, Look};
+use coflash::update::{refusal_number, DeviceAfterUpdate, DeviceAnswer};
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -276,7 +276,7 @@ pub(super) struct Failure {
     pub(super) legacy: u32,
     what: String,
     /// The state of the device after the failure, if it is known.
-    left: Option<Left>,
+    left: Option<DeviceAfterUpdate>,
     advice: Option<String>,
     /// Whether the document on standard output already contains the failure.
     told: bool,
@@ -364,7 +364,7 @@ impl Failure {
     }
 
     /// The same failure, with the state of the device.
-    pub(super) fn leaving(self, left: Option<Left>) -> Self {
+    pub(super) fn leaving(self, left: Option<DeviceAfterUpdate>) -> Self {
         Self { left, ..self }
     }
 
@@ -443,14 +443,14 @@ impl Failure {
                 "exit": self.exit as u8,
                 "what": self.what,
                 "device": self.left.map(|left| left.state.name()),
-                "seen": self.left.and_then(|left| match left.look {
-                    Look::Seen(seen) => Some(json!({
+                "seen": self.left.and_then(|left| match left.answer {
+                    DeviceAnswer::Seen(seen) => Some(json!({
                         "device_type": seen.running.0,
                         "bootloader": seen.running.is_bootloader(),
                         "control": seen.control,
                         "crc": seen.crc,
                     })),
-                    Look::Silent | Look::NotAsked => None,
+                    DeviceAnswer::Silent | DeviceAnswer::NotAsked => None,
                 }),
                 "advice": self.advice,
             }

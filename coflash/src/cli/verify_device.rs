@@ -2,7 +2,7 @@
 
 use clap::Args;
 use coflash::file::sealed::Device as Its;
-use coflash::update::{held, Held};
+use coflash::update::{compare_sealed, Comparison};
 use serde_json::json;
 
 use super::context::Context;
@@ -34,11 +34,12 @@ impl VerifyDevice {
         let (file, opened) = self.checked.check(&Its::default())?;
         let mut link = context.link()?;
         let mut session = self.device.session(&mut link)?;
-        let held = held(&mut session, &file).map_err(|error| Failure::diagnosed(error, &mut session))?;
+        let comparison =
+            compare_sealed(&mut session, &file).map_err(|error| Failure::diagnosed(error, &mut session))?;
         let (node, program) = (session.node(), file.head().program());
-        let Held { running, runs, differences, untold, .. } = &held;
+        let Comparison { running, runs, differences, untold, .. } = &comparison;
         let which = format!("program {program} of {}", path.display());
-        let verdict = match (held.is_same(), runs) {
+        let verdict = match (comparison.is_same(), runs) {
             (true, true) => format!("runs {which}, according to its own answers"),
             (true, false) => format!("holds {which} and does not run it, according to its own answers"),
             (false, _) => format!("is not the device of {which}, or has another program"),
@@ -57,7 +58,7 @@ impl VerifyDevice {
                 "command": "verify-device",
                 "node": node.get(),
                 "program": program,
-                "same": held.is_same(),
+                "same": comparison.is_same(),
                 "runs": runs,
                 "device_type": running.0,
                 "bootloader": running.is_bootloader(),
@@ -66,7 +67,7 @@ impl VerifyDevice {
                 "untold": untold.iter().map(ToString::to_string).collect::<Vec<_>>(),
             })
         });
-        match held.is_same() {
+        match comparison.is_same() {
             true => Ok(()),
             false => Err(Failure::differs(node, differences.len())),
         }

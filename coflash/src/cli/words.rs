@@ -1,11 +1,11 @@
-//! Reorders the words of the command line before parsing: an option of a command may also stand
+//! Reorders the words of the command line before parsing: an option of a command may also come
 //! before the command.
 
 use std::ffi::OsString;
 
 use clap::{Arg, Command};
 
-/// Moves options that stand before their command behind it: `coflash --node 5 info` becomes
+/// Moves options from before their command to after it: `coflash --node 5 info` becomes
 /// `coflash info --node 5`. Unknown options stay in place, and the parser reports them.
 pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
     let mut kept: Vec<OsString> = Vec::new();
@@ -52,7 +52,7 @@ pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
         kept.push(rest.remove(0));
         levels.push((next, kept.len()));
     }
-    // Insert behind the last command with this option, from the end on, so that earlier positions
+    // Insert after the last command with this option, from the end on, so that earlier positions
     // stay valid.
     let place = |text: &str| {
         let has = |(command, _): &&(&Command, usize)| {

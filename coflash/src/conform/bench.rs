@@ -147,7 +147,7 @@ impl<'a> Bench<'a> {
         Ok(())
     }
 
-    /// The NMT state that the next heartbeat tells, if one comes.
+    /// The NMT state that the next heartbeat reports, if one comes.
     pub(super) fn state(&mut self) -> Result<Option<NmtState>, Stop> {
         let frame = self.hear(CobId::heartbeat(self.node), HEARTBEAT)?;
         Ok(frame.and_then(|frame| frame.exactly::<1>().and_then(|[byte]| NmtState::from_byte(*byte))))

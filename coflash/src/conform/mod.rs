@@ -60,7 +60,7 @@ pub fn checks() -> Vec<Check> {
 
 /// Runs checks on a device and passes each verdict to `tell`. Before each check, the device is put
 /// into pre-operational state, and a transfer that is left over is aborted. At the end, also after
-/// an error, the device gets back the NMT state that its heartbeat told before the first check;
+/// an error, the device gets back the NMT state that its heartbeat reported before the first check;
 /// without a heartbeat it stays pre-operational.
 ///
 /// # Errors

@@ -1,5 +1,5 @@
 //! Checks of 1F50h to 1F57h in a bootloader. All requests here are refused, or change no program:
-//! the unknown command 55h stands where a download to 1F51h needs a value.
+//! the unknown command 55h is sent where a download to 1F51h needs a value.
 
 use std::time::Duration;
 

@@ -22,7 +22,7 @@ const RESUME: &str = "coboot, ADR 17";
 const NUMBER: u8 = 1;
 /// How long an erase may take: the largest F4 needs 32 s at most.
 const ERASE: Duration = Duration::from_secs(60);
-/// Requests that stand before a call.
+/// Requests that come before a call.
 const LOAD: usize = 20;
 /// How long the power is off.
 const OFF: Duration = Duration::from_millis(500);

@@ -359,7 +359,7 @@ mod tests {
         assert_eq!(chunks(u32::MAX, 5000).collect::<Vec<_>>(), [(u32::MAX, 4096)]);
     }
 
-    /// The frame begins after ten words; SP points behind it and behind its alignment word.
+    /// The frame begins after ten words; SP points after it and after its alignment word.
     #[test]
     fn registers_are_put_together_from_both_parts() {
         let handler = [0x2000_0128, 4, 5, 6, 7, 8, 9, 10, 11, 0xFFFF_FFF9];

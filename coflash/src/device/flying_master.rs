@@ -3,7 +3,7 @@
 //! clause 6.3).
 //! | CAN-ID | data | meaning |
 //! |---|---|---|
-//! | 071h | priority, node-ID | the active master tells that it is it |
+//! | 071h | priority, node-ID | the active master announces itself |
 //! | 072h | none | negotiation: each candidate waits for its time slot, the first to end it is master |
 //! | 073h | none | who is the active master? |
 //! | 076h | none | the active master is to let the others negotiate |

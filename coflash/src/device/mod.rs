@@ -2,7 +2,6 @@
 //! LSS, and errors.
 
 pub mod access;
-pub mod begun;
 pub mod debugger;
 mod device_type;
 pub mod diagnose;
@@ -16,6 +15,7 @@ pub mod legacy;
 mod listen;
 pub mod lock;
 pub mod lss;
+pub mod partial_download;
 pub(crate) mod recognise;
 pub mod region;
 pub mod scan;

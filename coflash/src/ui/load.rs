@@ -99,7 +99,7 @@ mod tests {
 
     /// Computed by hand (long division for the CRC, 7753h): identifier 14h, one byte 01h. The bits
     /// subject to stuffing are 0 00000010100 000 0001 00000001 111011101010011: five zeros in a row
-    /// stand at the start of the frame, before the length, and before the last bit of the data.
+    /// are at the start of the frame, before the length, and before the last bit of the data.
     #[test]
     fn stuff_bits_are_those_of_the_frame() {
         assert_eq!(standard(0x14, &[1]), 42 + 3 + 1 + 2 + 7 + 3);

@@ -6,8 +6,8 @@ use std::time::Duration;
 use canopen::program;
 use canopen::{Address, NodeId};
 
-use super::course::Course;
-use super::left::{DeviceState, Left, Look, Seen};
+use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen};
+use super::running::RunningUpdate;
 use crate::device::error::{optional, Error};
 use crate::device::{DeviceType, Session, Timing};
 
@@ -19,15 +19,15 @@ const ANSWER: Duration = Duration::from_millis(500);
 pub(super) fn look(
     session: &mut Session<'_>,
     error: &Error,
-    course: &Course<'_>,
+    update: &RunningUpdate<'_>,
     original: NodeId,
     number: u8,
     crc: u32,
-) -> Left {
-    let unseen = |look| Left { state: course.state, look };
-    let untouched = course.state == DeviceState::Untouched && !course.touched;
+) -> DeviceAfterUpdate {
+    let unseen = |answer| DeviceAfterUpdate { state: update.state, answer };
+    let untouched = update.state == DeviceState::Untouched && !update.touched;
     if untouched || matches!(error, Error::Adapter(_)) {
-        return unseen(Look::NotAsked);
+        return unseen(DeviceAnswer::NotAsked);
     }
     let current = session.node();
     let nodes = [current, original];
@@ -36,12 +36,17 @@ pub(super) fn look(
         let mut asked = session.with(*node, timing);
         asked.cancel_by_nobody();
         match ask(&mut asked, number) {
-            Ok(seen) => return Left { state: judge(course, &seen, crc), look: Look::Seen(seen) },
-            Err(Error::Adapter(_)) => return unseen(Look::NotAsked),
+            Ok(seen) => {
+                return DeviceAfterUpdate {
+                    state: judge(update, &seen, crc),
+                    answer: DeviceAnswer::Seen(seen),
+                }
+            }
+            Err(Error::Adapter(_)) => return unseen(DeviceAnswer::NotAsked),
             Err(_) => {}
         }
     }
-    unseen(Look::Silent)
+    unseen(DeviceAnswer::Silent)
 }
 
 fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
@@ -57,14 +62,14 @@ fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
 }
 
 /// The state of a device, from the course of the update and the device's answers.
-fn judge(course: &Course<'_>, seen: &Seen, crc: u32) -> DeviceState {
-    match course.state {
+fn judge(update: &RunningUpdate<'_>, seen: &Seen, crc: u32) -> DeviceState {
+    match update.state {
         // The application was called and has stayed, or is back.
         DeviceState::Called if !seen.running.is_bootloader() => DeviceState::Untouched,
         DeviceState::Erased if !seen.empty() => match seen.crc {
             // A device that erases with the first good block has received none.
-            told @ Some(_) if !course.wrote && told == course.before => course.resting,
-            Some(told) if course.wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
+            told @ Some(_) if !update.wrote && told == update.before => update.resting,
+            Some(told) if update.wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
             _ => DeviceState::Erased,
         },
         state => state,

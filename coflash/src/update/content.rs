@@ -56,7 +56,7 @@ pub enum Program {
 }
 
 impl Program {
-    /// The CRC that 1F56h of a device with this program tells.
+    /// The CRC that 1F56h of a device with this program reports.
     #[must_use]
     pub fn program_crc(&self) -> u32 {
         self.content().program_crc()

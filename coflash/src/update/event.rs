@@ -9,7 +9,7 @@ use std::fmt;
 use canopen::NodeId;
 use serde::{Serialize, Serializer};
 
-pub use super::left::{DeviceState, Left};
+pub use super::device_after::{DeviceAfterUpdate, DeviceState};
 pub use super::phase::{Note, Phase, Warning};
 pub use super::report::Report;
 pub use super::retry::{RepeatReason, Retry};
@@ -48,7 +48,7 @@ pub enum Event {
 pub struct Done {
     /// The state of the device.
     #[serde(flatten)]
-    pub left: Left,
+    pub left: DeviceAfterUpdate,
     /// The results of a successful update.
     pub report: Option<Report>,
     /// The error of a failed update.
@@ -57,7 +57,7 @@ pub struct Done {
 
 impl Done {
     /// The end of an update with this result, and this state of the device.
-    pub(super) fn new(left: Left, result: &Result<Report, Error>) -> Self {
+    pub(super) fn new(left: DeviceAfterUpdate, result: &Result<Report, Error>) -> Self {
         match result {
             Ok(report) => Self { left, report: Some(*report), error: None },
             Err(error) => Self { left, report: None, error: Some(Problem::of(error)) },
@@ -110,7 +110,7 @@ impl Event {
 
     /// The state of the device, if this event is the end of a failed update.
     #[must_use]
-    pub fn left(&self) -> Option<Left> {
+    pub fn left(&self) -> Option<DeviceAfterUpdate> {
         match self {
             Self::Done(done) if done.error.is_some() => Some(done.left),
             _ => None,

@@ -8,12 +8,12 @@ use std::cell::RefCell;
 
 use super::aftermath::look;
 use super::content::{Content, Program};
-use super::course::Course;
+use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
 use super::event::{Done, Event, Note, Phase, Report, Warning};
-use super::left::{Left, Look};
 use super::options::FlashOptions;
 use super::reach::reach;
+use super::running::RunningUpdate;
 use super::steps::compare_crc;
 use crate::device::session::Silence;
 use crate::device::{flying_master, Dialect, Error, Session};
@@ -80,22 +80,22 @@ fn flash_content(
     let mut tell = |event| (tell.borrow_mut())(event);
     let (original, timing) = (session.node(), *session.timing());
     let mut inner = session.with(original, timing).tell_silence(&silence);
-    let mut course = Course::new(&mut tell);
-    let result = procedure(&mut inner, file, options, &mut course);
+    let mut update = RunningUpdate::new(&mut tell);
+    let result = procedure(&mut inner, file, options, &mut update);
     let left = match &result {
-        Ok(_) => Left { state: course.state, look: Look::NotAsked },
-        Err(error) => look(&mut inner, error, &course, original, options.program, file.program_crc()),
+        Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
+        Err(error) => look(&mut inner, error, &update, original, options.program, file.program_crc()),
     };
-    if let Some(taken) = course.mastership.take() {
-        // The result of the update stands, even if this fails.
+    if let Some(taken) = update.mastership.take() {
+        // The result of the update remains, even if this fails.
         if let Ok(master) = flying_master::give_back(&mut inner, taken) {
-            course.tell(match master {
+            update.tell(match master {
                 Some(master) => Note::MasterBack { node: master.node }.into(),
                 None => Warning::MasterMissing.into(),
             });
         }
     }
-    course.tell(Event::Done(Box::new(Done::new(left, &result))));
+    update.tell(Event::Done(Box::new(Done::new(left, &result))));
     // The session may have followed the device to another node-ID.
     let (node, transfers) = (inner.node(), inner.transfers());
     session.talk_to(node);
@@ -108,11 +108,11 @@ fn procedure(
     session: &mut Session<'_>,
     file: Content<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Report, Error> {
     let began = session.now();
     let original = session.node();
-    let dialect = reach(session, file, options, course)?;
+    let dialect = reach(session, file, options, update)?;
     let its = dialect::of(dialect);
     if dialect != Dialect::Block {
         session.leave_group();
@@ -120,11 +120,11 @@ fn procedure(
     if options.alone {
         session.still_alone()?;
     }
-    let Downloaded { repeats, took: transfer, released } = its.download(session, file, options, course)?;
+    let Downloaded { repeats, took: transfer, released } = its.download(session, file, options, update)?;
     let running = if options.start {
-        course.tell(Phase::Starting.into());
+        update.tell(Phase::Starting.into());
         let running = its.start(session, original, options.program)?;
-        course.tell(Phase::Started(running).into());
+        update.tell(Phase::Started(running).into());
         Some(running)
     } else {
         None
@@ -132,7 +132,7 @@ fn procedure(
     if options.verify {
         let crc = file.program_crc();
         compare_crc(session, options.program, crc)?;
-        course.tell(Phase::VerifiedAgain { crc }.into());
+        update.tell(Phase::VerifiedAgain { crc }.into());
     }
     let took = session.now().saturating_sub(began);
     let (program_size, program_crc) = (file.program_size(), file.program_crc());

@@ -8,9 +8,9 @@ use canopen::frame::Channel;
 use canopen::{CobId, NodeId};
 
 use super::content::Program;
+use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Event, Note, Report, Warning};
 use super::flash::flash_program;
-use super::left::{DeviceState, Left, Look};
 use super::options::FlashOptions;
 use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
@@ -39,7 +39,7 @@ impl Job {
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct ManyOptions {
-    /// The time limits. Requests wait behind those for other devices: with several devices at the
+    /// The time limits. Requests wait for those to other devices: with several devices at the
     /// same time, the SDO time-out of a block is multiplied by their number, and that of other
     /// requests is doubled outside of a group.
     pub timing: Timing,
@@ -83,7 +83,7 @@ pub struct Failed {
     /// The error.
     pub error: Error,
     /// The state of the device.
-    pub left: Left,
+    pub left: DeviceAfterUpdate,
 }
 
 /// The COB-ID of requests to a group. The predefined connection set has no other use for it, and
@@ -223,7 +223,7 @@ fn update(
 ) -> Result<Report, Failed> {
     session.cancel_by(all.cancelled.clone());
     session.transfer_by(all.transfers);
-    let mut left = Left { state: DeviceState::Untouched, look: Look::NotAsked };
+    let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
     let result = flash_program(session, &job.file, one, &mut |event| {
         left = event.left().unwrap_or(left);
         tell(event);

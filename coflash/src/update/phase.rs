@@ -91,7 +91,7 @@ pub enum Note {
         #[serde(rename = "to", serialize_with = "json::node")]
         node: NodeId,
     },
-    /// The data go to so many devices at once. Told once.
+    /// The data go to so many devices at once. Reported once.
     Together {
         /// The number of devices.
         devices: usize,

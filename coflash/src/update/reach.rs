@@ -3,10 +3,10 @@
 use super::admission::{admit, admit_to_bootloader};
 use super::catch::knock;
 use super::content::Content;
-use super::course::Course;
 use super::dialect;
 use super::event::{Event, Note, Phase};
 use super::options::FlashOptions;
+use super::running::RunningUpdate;
 use super::steps::{check_target, CALL_BACK};
 use crate::device::{recognise, Dialect, Error, Session};
 
@@ -16,7 +16,7 @@ pub(super) fn reach(
     session: &mut Session<'_>,
     file: Content<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
     if options.alone && !options.wait {
         // Check before the first request, which would disturb another tool's running transfer.
@@ -25,19 +25,19 @@ pub(super) fn reach(
         session.ensure_alone()?;
     }
     if !options.wait {
-        return attempt(session, file, options, course);
+        return attempt(session, file, options, update);
     }
-    course.tell_once(true);
+    update.tell_once(true);
     loop {
-        knock(session, None, &mut |event| course.tell(event))?;
-        match attempt(session, file, options, course) {
+        knock(session, None, &mut |event| update.tell(event))?;
+        match attempt(session, file, options, update) {
             Err(error @ (Error::NoAnswer { .. } | Error::NoBootloader { .. })) => {
-                course.tell(Phase::Searching { reason: error.to_string() }.into());
+                update.tell(Phase::Searching { reason: error.to_string() }.into());
                 let pause = session.timing().poll_most;
                 session.wait(pause)?;
             }
             result => {
-                course.tell_once(false);
+                update.tell_once(false);
                 return result;
             }
         }
@@ -49,13 +49,13 @@ fn attempt(
     session: &mut Session<'_>,
     file: Content<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
     let running = session.find()?;
-    course.tell(Event::Found(running));
+    update.tell(Event::Found(running));
     if let Some(target) = options.check_target {
         check_target(session, target)?;
-        course.tell(Note::TargetRight(target).into());
+        update.tell(Note::TargetRight(target).into());
     }
     let found = match options.dialect {
         Some(dialect) => dialect,
@@ -68,7 +68,7 @@ fn attempt(
         (true, false) => session.still_alone()?,
         (true, true) => session.ensure_alone()?,
     }
-    let dialect = dialect::of(found).enter(session, running, options, course)?;
+    let dialect = dialect::of(found).enter(session, running, options, update)?;
     // The bootloader may have reported more than the application.
     check_way(file, dialect, options)?;
     if !admitted && !running.is_bootloader() {

@@ -1,8 +1,8 @@
 //! The trial run: a program is started once before it is released for autostart.
 
-use super::course::Course;
 use super::event::Phase;
 use super::options::FlashOptions;
+use super::running::RunningUpdate;
 use super::steps::{call_back, check_target, start};
 use crate::device::error::{Error, IdentityPart, TrialFailure};
 use crate::device::info::{identity, Identity};
@@ -12,10 +12,10 @@ use crate::device::Session;
 pub(super) fn run(
     session: &mut Session<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<(), Error> {
     let bootloader = identity(session)?;
-    course.tell(Phase::TrialStarting.into());
+    update.tell(Phase::TrialStarting.into());
     let running = start(session, options.program).map_err(failed)?;
     let right = same_identity(session, bootloader).and_then(|()| match options.check_target {
         Some(target) => check_target(session, target),
@@ -25,7 +25,7 @@ pub(super) fn run(
     let back = call_back(session).map_err(failed);
     right?;
     back?;
-    course.tell(Phase::TrialPassed(running).into());
+    update.tell(Phase::TrialPassed(running).into());
     Ok(())
 }
 

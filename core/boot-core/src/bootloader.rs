@@ -42,7 +42,7 @@ pub struct Extras {
     pub sealed: bool,
     /// Whether 1201h exists, the second SDO server.
     pub second_server: bool,
-    /// Whether 2006h exists, which tells where a download goes on.
+    /// Whether 2006h exists, which says where a download goes on.
     pub resume: bool,
 }
 
@@ -129,7 +129,7 @@ pub struct Config {
     pub layout: &'static Layout,
     /// Whether the CAN controller supports a bit rate.
     pub supports: fn(BitRate) -> bool,
-    /// Whether an emergency follows each boot-up message. It tells a master that this is the
+    /// Whether an emergency follows each boot-up message. It shows a master that this is the
     /// bootloader and not the application. Its code is FF00h (device specific, CiA 301 table 26);
     /// its data are "BOOT" and the reason why the device stayed
     /// ([`StayReason::code`](crate::decision::StayReason::code)).

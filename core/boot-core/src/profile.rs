@@ -1,7 +1,7 @@
 //! Dialects: what different tools expect of a bootloader where their expectations contradict each
 //! other (docs/dialects.md).
 //!
-//! Where they agree, or where the bootloader can tell them apart, one binary serves all of them:
+//! Where they agree, or where the bootloader can distinguish them, one binary serves all of them:
 //! [`STANDARD`](Profile::STANDARD).
 
 use canopen::program::{

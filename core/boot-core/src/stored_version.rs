@@ -151,7 +151,7 @@ mod tests {
         assert_eq!(version(&rom(4096, 0, &long), 4096).unwrap().len(), LONGEST);
         let at = 4096 - MARK.len() - 3;
         assert_eq!(version(&rom(4096, at, &[MARK, b"abc"].concat()), 4096).as_deref(), Some(&b"abc"[..]));
-        // What lies behind the image is none of its own.
+        // What lies after the image is none of its own.
         assert_eq!(
             version(&rom(4096, 1000, MARKED), 1000 + MARK.len() as u32 + 2).as_deref(),
             Some(&b"1."[..])

@@ -202,7 +202,7 @@ impl Lss {
     pub fn reset_communication(&mut self) -> Option<NodeId> {
         self.state = self.initial;
         self.active = self.pending;
-        // The owner starts the node now; a start that it was not told of yet is over.
+        // The owner starts the node now; a start that was not reported to it yet is over.
         self.assigned = None;
         self.active
     }

@@ -149,7 +149,7 @@ pub const SEALED_ENTRIES: [Entry; 12] = [
 /// number.
 pub const ENABLE_FLASH: u16 = 0x7F50;
 
-/// 1000h of the bootloader. An application has another value, so a host can tell them apart.
+/// 1000h of the bootloader. An application has another value, so a host can distinguish them.
 pub const BOOTLOADER_DEVICE_TYPE: u32 = 0x1000_0000;
 
 /// 1000h of a boot loader as ESAcademy describes it ("BOOT"), and of older lift bootloaders.

@@ -21,7 +21,7 @@ extern "C" {
 #define COBOOT_NORETURN _Noreturn
 #endif
 
-/* The check word that guards a record in RAM. It tells a record from the noise of an unpowered RAM. */
+/* The check word that guards a record in RAM: it distinguishes a record and the noise of unpowered RAM. */
 
 #define COBOOT_CHECK_SEED UINT32_C(0xC0B007A5)
 #define COBOOT_CHECK_ROTATION UINT32_C(0x5)
@@ -68,7 +68,7 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, reserved) == 16, "coboot_labe
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, check) == 28, "coboot_label: check");
 
 /* The label of this image, once in a program: COBOOT_LABEL(vendor-ID, product code, version). The first two are those of
- * 1018h; 0 is any. The linker script puts the section `.label` at the symbol __label, behind the vectors.
+ * 1018h; 0 is any. The linker script puts the section `.label` at the symbol __label, after the vectors.
  */
 #define COBOOT_LABEL(vendor_id, product_code, version) \
     __attribute__((section(".label"), used)) const struct coboot_label coboot_label_of_image = { \
@@ -109,7 +109,7 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, argument) == 8, "coboot_
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_warm_start, check) == 12, "coboot_warm_start: check");
 
 /* The argument of COBOOT_REQUEST_OWED: node `node_id` was written `value` (0 STOP or 3 CLEAR) to 1F51h, sub-index `program`,
- * and has not answered. The bootloader serves the request behind its boot-up, if it comes up with this node-ID.
+ * and has not answered. The bootloader serves the request after its boot-up, if it comes up with this node-ID.
  */
 static inline uint32_t coboot_owed(uint8_t program, uint8_t value, uint8_t node_id)
 {
@@ -136,7 +136,7 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 #define COBOOT_HANDOFF_VERSION UINT32_C(0x2)
 #define COBOOT_HANDOFF_OLDEST UINT32_C(0x1)
 
-/* In `flags`, since version 2: the program was started right behind its download in one go. */
+/* In `flags`, since version 2: the program was started right after its download in one go. */
 #define COBOOT_HANDOFF_FRESH UINT32_C(0x1)
 
 /* Reset causes. */
@@ -188,7 +188,7 @@ static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
         && handoff->check == coboot_check_word(handoff, guarded);
 }
 
-/* Whether the program was started right behind its download as raw image, Intel HEX or sealed image: the first 1F51h = 80h
+/* Whether the program was started right after its download as raw image, Intel HEX or sealed image: the first 1F51h = 80h
  * confirms it then, and does not call the bootloader.
  */
 static inline bool coboot_is_fresh(const struct coboot_handoff *handoff)

@@ -19,7 +19,7 @@ enum coboot_next {
 enum coboot_phase {
     COBOOT_STAYS,   /* nobody asked it to leave: as it begins */
     COBOOT_ANSWERS, /* the answer to a command is not on the bus yet */
-    COBOOT_PAUSES,  /* everything is answered, and the pause behind it runs */
+    COBOOT_PAUSES,  /* everything is answered, and the pause after it runs */
 };
 
 /* The state of the return to the bootloader. All zeros at the start. */

@@ -47,7 +47,7 @@ bind_interrupts!(struct Interrupts {
 async fn main(spawner: Spawner) {
     let chip = embassy_stm32::init(clocks());
 
-    // The bootloader tells node-ID and bit rate, so that whoever talked to it goes on talking to
+    // The bootloader gives node-ID and bit rate, so that whoever talked to it goes on talking to
     // this program. The defaults hold where a debugger has started the program.
     let defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
     let start = Start::read(&LAYOUT, defaults);
@@ -95,7 +95,7 @@ async fn serve(mut can: Can<'static>, mut responder: Responder, mut bootloader: 
                 // It may have asked for the bootloader: nothing is sent then but the answer.
                 responder.proceed(can.is_transmitter_idle(), now());
             }
-            // An error on the bus is told again and again while it lasts; others are to run too.
+            // An error on the bus is reported repeatedly while it lasts; others are to run too.
             Ok(Err(_)) => Timer::after(TICK).await,
             Err(_) => {}
         }

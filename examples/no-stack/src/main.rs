@@ -48,7 +48,7 @@ fn main() -> ! {
     systick.enable_counter();
     systick.enable_interrupt();
 
-    // The bootloader tells node-ID and bit rate, so that whoever talked to it goes on talking to
+    // The bootloader gives node-ID and bit rate, so that whoever talked to it goes on talking to
     // this program. The defaults hold where a debugger has started the program.
     let defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
     let start = Start::read(&LAYOUT, defaults);

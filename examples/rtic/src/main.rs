@@ -66,7 +66,7 @@ mod app {
         let mut rcc = cx.device.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
         Mono::start(cx.core.SYST, rcc.clocks.sysclk().raw());
 
-        // The bootloader tells node-ID and bit rate, so that whoever talked to it goes on talking to
+        // The bootloader gives node-ID and bit rate, so that whoever talked to it goes on talking to
         // this program. The defaults hold where a debugger has started the program.
         let defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
         let start = Start::read(&LAYOUT, defaults);
@@ -135,7 +135,7 @@ impl Bus {
     fn serve(&mut self, now: u32) {
         self.objects.now = now;
         loop {
-            // Asked behind every frame: it may have asked for the bootloader.
+            // Asked after every frame: it may have asked for the bootloader.
             let serves = match self.objects.proceed(self.can.is_transmitter_idle()) {
                 Next::Serve => true,
                 Next::Wait => false,

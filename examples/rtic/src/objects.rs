@@ -13,7 +13,7 @@ use crate::{LAYOUT, PRODUCT_CODE, REVISION, VENDOR_ID};
 /// 2000h, an object of the application: half the period of the LED, in ms.
 pub static BLINK_MS: AtomicU16 = AtomicU16::new(500);
 
-/// The values behind the dictionary.
+/// The values of the dictionary.
 pub struct Objects {
     control: ProgramControl,
     bootloader: Bootloader,

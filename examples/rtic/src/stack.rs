@@ -145,7 +145,7 @@ fn download(
     if command & EXPEDITED == 0 {
         return Err(AbortCode::COMMAND);
     }
-    // A client that does not tell the size means that of the object.
+    // A client that does not announce the size means that of the object.
     let size = match command & SIZE_TOLD {
         0 => objects.read(index, sub)?.len(),
         _ => 4 - usize::from(command >> 2 & 3),

@@ -8,7 +8,7 @@
 //!   eight bits that an error passive transmitter leaves free. Received frames are valid one bit
 //!   before the end of frame is over (10.9), transmitted ones at its end.
 //! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very
-//!   same bits both succeed; the same identifier with other bits behind is a bit error.
+//!   same bits both succeed; the same identifier with other bits after it is a bit error.
 //! - A node whose bit rate differs by more than 1 % from the transmitter's reads the frame at its
 //!   own sample points, without resynchronisation. It sees a stuff error, and unless it is error
 //!   passive or silent it destroys the frame for everybody.
@@ -43,9 +43,9 @@ const FLAG_BITS: u32 = 6;
 const FLAG_ONE_LATE_BITS: u32 = 7;
 /// Bits of an error flag that the others answer with theirs.
 const FLAG_AND_ECHO_BITS: u32 = 12;
-/// Recessive bits behind an error flag.
+/// Recessive bits after an error flag.
 const DELIMITER_BITS: u32 = 8;
-/// Bits that an error passive transmitter leaves free behind the intermission.
+/// Bits that an error passive transmitter leaves free after the intermission.
 const SUSPEND_BITS: u32 = 8;
 /// Recessive bits of one sequence on the way onto the bus.
 const SEQUENCE_BITS: u64 = 11;
@@ -136,7 +136,7 @@ struct Flight {
     transmitters: Vec<Party>,
     receivers: Vec<Party>,
     /// The frame comes from the gateway that injected faults make.
-    gateway: Option<Held>,
+    gateway: Option<DelayedFrame>,
     fault: Option<FaultAction>,
     plan: Plan,
 }
@@ -156,7 +156,7 @@ impl Flight {
 
 /// A frame that an injected fault holds back or repeats.
 #[derive(Clone, Copy, Debug)]
-struct Held {
+struct DelayedFrame {
     due: Time,
     frame: Frame,
     origin: usize,
@@ -197,7 +197,7 @@ pub struct Bus {
     inner: Vec<Inner>,
     /// Until when each node must not start a frame.
     suspended: Vec<Time>,
-    held: VecDeque<Held>,
+    held: VecDeque<DelayedFrame>,
     faults: Faults,
     sinks: Vec<Sink>,
     frames: u64,
@@ -359,7 +359,7 @@ impl Bus {
         }
     }
 
-    /// Tells the nodes that wait for recessive bits how many have passed.
+    /// Reports to the nodes that wait for recessive bits how many have passed.
     fn count_recessive(&mut self, nodes: &mut [&mut dyn BusNode]) {
         for node in nodes {
             let Some(wait) = node.wait() else { continue };
@@ -490,7 +490,7 @@ impl Bus {
     }
 
     /// Takes the frame that the gateway is sending; it comes back if that fails.
-    fn take_held(&mut self) -> Option<Held> {
+    fn take_held(&mut self) -> Option<DelayedFrame> {
         let n = self.held.iter().position(|held| held.due <= self.now)?;
         self.held.remove(n)
     }
@@ -533,7 +533,7 @@ impl Bus {
         }));
         let wire_len = u32::try_from(wire.len()).unwrap_or(u32::MAX);
         if fault == Some(FaultAction::Disturb) {
-            // A CRC error shows behind the ACK delimiter (10.11).
+            // A CRC error shows after the ACK delimiter (10.11).
             errors.push(Error {
                 at: now + bits(bit, ack_delimiter(wire_len) + 1),
                 flag_bits: FLAG_ONE_LATE_BITS,
@@ -616,10 +616,10 @@ impl Bus {
             let (frame, bit) = (flight.frame, flight.bit);
             match flight.fault {
                 Some(FaultAction::Delay(span)) => {
-                    self.held.push_back(Held { due: end + span, frame, origin, bit });
+                    self.held.push_back(DelayedFrame { due: end + span, frame, origin, bit });
                 }
                 Some(FaultAction::Duplicate) => {
-                    self.held.push_back(Held { due: end, frame, origin, bit });
+                    self.held.push_back(DelayedFrame { due: end, frame, origin, bit });
                 }
                 _ => {}
             }
@@ -664,7 +664,7 @@ impl Bus {
         }
         if let Some(held) = flight.gateway {
             // The gateway repeats it.
-            self.held.push_front(Held { due: end, ..held });
+            self.held.push_front(DelayedFrame { due: end, ..held });
         }
         self.recessive_since = error.at + bits(flight.error_bit, error.flag_bits);
         self.finish(&flight, flight.error_bit, end, Outcome::Bad(error.transmit), nodes);

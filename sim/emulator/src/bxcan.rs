@@ -359,7 +359,7 @@ impl Default for BxCan {
 }
 
 impl BxCan {
-    /// CAN1 behind a reset, without a clock.
+    /// CAN1 after a reset, without a clock.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -386,7 +386,7 @@ impl BxCan {
         }
     }
 
-    /// CAN2 behind a reset, without a clock, and with a master that has none.
+    /// CAN2 after a reset, without a clock, and with a master that has none.
     #[must_use]
     pub fn slave() -> Self {
         Self { share: Share::Can2, master_clocked: false, ..Self::new() }

@@ -29,7 +29,7 @@ impl fmt::Display for Line<'_> {
     }
 }
 
-/// Seconds with ten places before and six behind the point.
+/// Seconds with ten places before and six after the point.
 struct Stamp(Time);
 
 impl fmt::Display for Stamp {
@@ -104,7 +104,7 @@ impl<W: Write + 'static> Handle<W> {
     }
 
     /// Brings everything to where it belongs. Gives the first failure since the last call; writing
-    /// goes on behind it.
+    /// goes on after it.
     ///
     /// # Errors
     /// What the writer said.

@@ -174,9 +174,9 @@ pub struct Counters {
     pub units_programmed: u64,
     /// Flash operations refused with an error flag.
     pub flash_refused: u64,
-    /// How often the CPU stood still because it wanted the flash while that was busy.
+    /// How often the CPU was stalled because it wanted the flash while that was busy.
     pub flash_stalls: u64,
-    /// How long it stood still for that, altogether.
+    /// How long it was stalled for that, altogether.
     pub flash_stall_time: crate::time::Span,
 }
 

@@ -39,7 +39,7 @@ pub struct CycleClock {
 }
 
 impl CycleClock {
-    /// A clock of `hz` that stands at `now` with no cycle counted.
+    /// A clock of `hz` that is at `now` with no cycle counted.
     #[must_use]
     pub fn new(now: Time, hz: u32) -> Self {
         Self { hz: u64::from(hz.max(1)), anchor: now, anchor_cycles: 0, cycles: 0 }

@@ -231,7 +231,7 @@ impl Cpu {
             // (`HostMemory::new`).
             unsafe { self.uc.mem_map_ptr(base.into(), len, perms, memory.cast()) }
                 .map_err(failed("mapping memory"))?;
-            // Mapping alone would let stores through to read-only memory behind the hook's back.
+            // Mapping alone would let stores through to read-only memory without the hook.
             self.uc.mem_protect(base.into(), len, perms).map_err(failed("protecting memory"))?;
         }
         for region in [PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE] {
@@ -508,7 +508,7 @@ impl Cpu {
     // --- memory
     // ------------------------------------------------------------------------------------------------------
 
-    /// The memory block behind `address` with the offset in it. Only plain memory, no peripherals.
+    /// The memory block of `address`, with the offset in it. Only plain memory, no peripherals.
     fn memory(chip: &Chip, address: u32) -> Option<(&HostMemory, usize)> {
         let geometry = chip.geometry;
         let flash_alias = shared_abi::geometry::Region::new(BOOT_ALIAS, geometry.flash.size);
@@ -680,7 +680,7 @@ impl Cpu {
         }
     }
 
-    /// Runs from where the CPU stands; so many instructions, or with 0 any number.
+    /// Runs from where the CPU is; so many instructions, or with 0 any number.
     fn start(&mut self, count: usize) -> Result<(), uc_error> {
         let thumb = self.register(RegisterARM::XPSR) & XPSR_T != 0;
         let begin = self.pc() | u32::from(thumb);
@@ -746,7 +746,7 @@ impl Cpu {
         chip.clock.cycles = cycles + 1;
         chip.counters.instructions = instructions + 1;
         match exit {
-            // The engine stops behind the instruction as it does behind WFI.
+            // The engine stops after the instruction as it does after WFI.
             Exit::WaitForInterrupt if self.last_hint(self.pc()) != Some(Hint::Wfi) => Exit::Slice,
             exit => exit,
         }
@@ -837,7 +837,7 @@ impl Cpu {
         }
     }
 
-    /// The hint instruction that ended the last block, if the PC is right behind it.
+    /// The hint instruction that ended the last block, if the PC is right after it.
     fn last_hint(&self, pc: u32) -> Option<Hint> {
         let (start, size) = self.chip().slice.block;
         if size == 0 || pc != start.wrapping_add(size) {

@@ -5,7 +5,7 @@ use std::fmt;
 
 pub use embedded_can::{ExtendedId, Id, StandardId};
 
-/// Bits behind the CRC sequence that carry no stuff bits: CRC delimiter, ACK slot, ACK delimiter,
+/// Bits after the CRC sequence that carry no stuff bits: CRC delimiter, ACK slot, ACK delimiter,
 /// end of frame.
 const TAIL_BITS: u32 = 1 + 1 + 1 + END_OF_FRAME_BITS;
 /// End of frame: seven recessive bits.
@@ -187,7 +187,7 @@ impl Frame {
     }
 
     /// The bits that the frame occupies on the bus: [`wire_len`](Self::wire_len) and the
-    /// intermission behind it.
+    /// intermission after it.
     #[must_use]
     pub fn bus_bits(&self) -> u32 {
         self.wire_len() + INTERMISSION_BITS
@@ -208,7 +208,7 @@ fn crc15(bits: &[bool]) -> u16 {
     })
 }
 
-/// Where the tail of a frame of `wire_len` bits begins to matter: the first bit behind the ACK
+/// Where the tail of a frame of `wire_len` bits begins to matter: the first bit after the ACK
 /// slot.
 #[must_use]
 pub fn ack_delimiter(wire_len: u32) -> u32 {
@@ -319,7 +319,7 @@ mod tests {
 
     #[test]
     fn no_stuff_bits_in_an_alternating_head() {
-        // 555h: SOF 0, 101 0101 0101, RTR 0, IDE 0, r0 0, DLC 0000. The run 0000000 behind the last
+        // 555h: SOF 0, 101 0101 0101, RTR 0, IDE 0, r0 0, DLC 0000. The run 0000000 after the last
         // identifier bit takes one stuff bit after five.
         let frame = Frame::standard(0x555, &[]).unwrap();
         assert!(wire(&frame).starts_with("0101010101010000010"), "{}", wire(&frame));
@@ -329,7 +329,7 @@ mod tests {
     fn lengths_stay_in_the_standards_bounds() {
         // n data bytes: 44 + 8n bits without the intermission and without stuff bits (64 + 8n with
         // 29 bits); of those 34 + 8n (54 + 8n) can be stuffed, at worst one stuff bit for the first
-        // five and one for every four behind them.
+        // five and one for every four after them.
         let mut seed = 0x1234_5678_u32;
         let mut next = || {
             seed ^= seed << 13;

@@ -342,7 +342,7 @@ impl Door {
         self.go_on(machine, next.map_err(|error| error.to_string()), stream);
     }
 
-    /// Tells the debugger that the machine, which it let run, is halted.
+    /// Reports to the debugger that the machine, which it let run, is halted.
     fn report_halt(&mut self, machine: &mut Machine) {
         let Some((session, stream)) = self.session.take() else { return };
         let next = match (session, machine.halted()) {

@@ -494,7 +494,7 @@ impl Machine {
     }
 
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
-    /// anything else level 1. The model tells it in its registers and does nothing about it.
+    /// anything else level 1. The model shows it in its registers and does nothing about it.
     pub fn set_read_protection(&mut self, rdp: u8) {
         self.cpu.chip_mut().flash.preset_read_protection(rdp);
     }

@@ -49,7 +49,7 @@ impl HostMemory {
         unsafe { std::slice::from_raw_parts(self.start.as_ptr(), self.size()) }
     }
 
-    /// The content, for changes. A caller that changes code must tell the translator.
+    /// The content, for changes. A caller that changes code must notify the translator.
     #[must_use]
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         // SAFETY: as in `bytes`, and `&mut self` makes the slice the only way in.

@@ -10,10 +10,10 @@ pub enum Speed {
     /// So many virtual seconds in a second of the wall clock. Idle or not, the clock goes on, so
     /// the time-outs of both sides come when they should.
     Times(f64),
-    /// As fast as the host can, but for a moment behind every frame that a client got: then it goes
+    /// As fast as the host can, but for a moment after every frame that a client got: then it goes
     /// 1:1, so that the client's answer does not come late in the device's eyes. Waits in which
-    /// nobody has to answer (an erase, a heartbeat's period) are skipped through. Time never stands
-    /// still. Beware: a client that waits for wall-clock time between two requests lets much
+    /// nobody has to answer (an erase, a heartbeat's period) are skipped through. Time never
+    /// stops. Beware: a client that waits for wall-clock time between two requests lets much
     /// virtual time pass, and time-outs of the device may strike.
     Max,
 }

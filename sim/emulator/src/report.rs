@@ -32,7 +32,7 @@ pub struct Report {
     /// The address accessed.
     pub address: u32,
     /// The instruction that did it, or the first one of its straight run of code where the
-    /// instruction itself cannot be told.
+    /// instruction itself cannot be determined.
     pub pc: u32,
     /// Bytes accessed.
     pub size: u8,

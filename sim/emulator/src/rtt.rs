@@ -8,7 +8,7 @@ use crate::machine::Machine;
 
 /// The first bytes of a control block.
 const ID: &[u8; 16] = b"SEGGER RTT\0\0\0\0\0\0";
-/// Number of buffers up behind it.
+/// The number of up buffers is after it.
 const UP_BUFFERS: u32 = 16;
 /// The first buffer's description: name, memory, size, the program's offset, the probe's offset.
 const NAME: u32 = 24;

@@ -144,7 +144,7 @@ impl Line {
         }
         match self {
             #[cfg(unix)]
-            // A write waits until all bytes find room, and the check before it only tells that
+            // A write waits until all bytes find room, and the check before it only says that
             // there is some room. So write a byte at a time.
             Self::Terminal(terminal) => {
                 bytes.iter().take_while(|byte| matches!(terminal.ours.write(&[**byte]), Ok(1))).count()

@@ -36,7 +36,7 @@ pub struct Slice {
     pub attention: bool,
     /// A system reset was asked for.
     pub reset_request: Option<ResetCause>,
-    /// The CPU stands still until this time, because the bus to the flash is held.
+    /// The CPU is stalled until this time, because the bus to the flash is held.
     pub hold_until: Option<Time>,
     /// A bus error came back for the last store, to this address.
     pub bus_error: Option<u32>,

@@ -7,7 +7,7 @@
 //! `< rtr … >`.
 //!
 //! What clients taught us: python-can expects each answer of the opening alone in one read, so no
-//! frame goes out for [`HOLD`] behind the answer to `rawmode`; and without TCP_NODELAY every
+//! frame goes out for [`HOLD`] after the answer to `rawmode`; and without TCP_NODELAY every
 //! exchange waits for delayed acknowledges.
 //!
 //! No client can hold up the world: a client that does not read is disconnected, and a client that
@@ -30,13 +30,13 @@ use crate::frame::Frame;
 use crate::world::{Computer, PortId, World};
 use protocol::{frame_element, Effect, Session, Splitter, HELLO};
 
-/// How long frames are held back behind the answer to `rawmode`.
+/// How long frames are held back after the answer to `rawmode`.
 pub const HOLD: Duration = Duration::from_millis(10);
 /// Clients at a time.
 pub const MAX_CLIENTS: usize = 64;
 /// Texts that wait for a client to read them; one more, and it is disconnected.
 const QUEUE: usize = 8192;
-/// Frames of one client that wait for the bus; behind them its connection is not read on.
+/// Frames of one client that wait for the bus; after them its connection is not read on.
 const CREDIT: usize = 256;
 /// Events that wait for the world.
 const EVENTS: usize = 1024;

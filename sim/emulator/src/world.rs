@@ -286,7 +286,7 @@ impl<M: Computer> World<M> {
         self.news.pop_front()
     }
 
-    /// Whether a debugger has halted a machine. Time stands still then, for all.
+    /// Whether a debugger has halted a machine. Time is stopped then, for all.
     #[must_use]
     pub fn is_halted(&self) -> bool {
         self.slots.iter().any(|slot| matches!(&slot.plug, Plug::Machine(machine) if machine.is_halted()))

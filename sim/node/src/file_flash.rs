@@ -1,8 +1,8 @@
 //! The flash of a chip in a file: its raw contents, byte by byte, from the first address on.
 //!
 //! The file is replaced as a whole, by renaming, so that whoever reads it finds a state that the
-//! flash has had; ending the program is cutting the power. What the bus is told to be stored is in
-//! the file before ([`FileFlash::is_urgent`]). A crash of the computer itself may cost more.
+//! flash has had; ending the program is cutting the power. What is reported on the bus as stored is
+//! in the file before ([`FileFlash::is_urgent`]). A crash of the computer itself may cost more.
 
 use std::fs;
 use std::io;

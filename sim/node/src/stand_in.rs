@@ -37,7 +37,7 @@ pub struct StandIn {
     underneath: Underneath,
     /// An answer that the SDO server has yet to withhold.
     owed: Option<Owed>,
-    /// The time that was told last.
+    /// The time that was set last.
     now: Instant,
 }
 
@@ -118,12 +118,12 @@ impl StandIn {
         self.device.lss_address()
     }
 
-    /// Tells the time, before each frame.
+    /// Sets the time, before each frame.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
     }
 
-    /// To be called behind every frame: takes an answer back that the bootloader is to send. Where the
+    /// To be called after every frame: takes an answer back that the bootloader is to send. Where the
     /// client has written in segments that cannot be, so the command is judged once more.
     pub fn leave_owed(&mut self, slave: &mut Slave) {
         let Some(owed) = self.owed.take() else { return };

@@ -68,12 +68,12 @@ const STORED: [u32; 10] =
 /// Registers whose stores do something in QEMU as well.
 const SHARED: [u32; 2] = [USART2_CR1, AIRCR];
 
-/// How long the host keeps silent behind a frame of the device.
+/// How long the host keeps silent after a frame of the device.
 const REACTION: Duration = Duration::from_millis(20);
 /// What the host may take for an access in a row.
 const ROW: Duration = Duration::from_millis(5);
 
-/// Behind the SRAM that the board has by its layout; QEMU's has 192 KiB.
+/// After the SRAM that the board has by its layout; QEMU's has 192 KiB.
 const SCRATCH: u32 = 0x2002_F000;
 /// A place there: the code, then the words that it loads.
 const PLACE: u32 = 0x30;
@@ -456,7 +456,7 @@ impl Board {
         }
     }
 
-    /// Goes on behind an access that was made here.
+    /// Goes on after an access that was made here.
     fn skip(&mut self, registers: &[u32; 17], access: &Access) {
         self.set.extend(access.write_back);
         let xpsr = registers[XPSR_AT];

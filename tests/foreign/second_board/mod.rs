@@ -70,7 +70,7 @@ impl Line for QemuLine<'_> {
     }
 }
 
-/// The application with this many bytes behind it, which make another version of it.
+/// The application with this many bytes after it, which make another version of it.
 fn version(more: usize) -> BlockFile {
     let mut bytes = firmware::raw(firmware::APP_VIRTUAL_CAN);
     bytes.extend((0..more).map(|n| (n * 31 / 8) as u8));

@@ -1,5 +1,5 @@
 //! The readers of firmware files (Intel HEX, S-record, ELF, block file, raw) and the conversion
-//! behind them.
+//! after them.
 //!
 //! Must hold: any bytes give an image or an error that can be shown; an image that can be converted
 //! gives a block file that reads back equal, with every byte of the image in it; a block file is

@@ -1,7 +1,7 @@
 //! Downloads of block files by both SDO servers, in any order: blocks that come twice or are left in
 //! the middle, another file, CLEAR, any value in 1201h, and power cuts at any operation of the flash.
 //!
-//! Must hold: a program that verifies is one of the files, byte for byte; 2006h never tells an
+//! Must hold: a program that verifies is one of the files, byte for byte; 2006h never reports an
 //! address up to which the flash does not have the data of the file that it names; and afterwards
 //! CLEAR and a whole file install a program (tried after each eighth input, because it takes longer
 //! than most of them).
@@ -257,7 +257,7 @@ fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool 
                     host.next += 1;
                 }
             }
-            // The last block again, or any block of any file: the device has to tell them apart.
+            // The last block again, or any block of any file: the device has to distinguish them.
             140..=149 => {
                 let Some(file) = host.file.map(|which| &files()[which]) else { continue };
                 let _ = world.write(second, DATA, &file.blocks[host.next - 1], blocks, u32::MAX);
@@ -311,7 +311,7 @@ fn judge(flash: &ModelFlash) {
     }
 }
 
-/// The flash behind 2006h, as a probe sees it after a reset.
+/// The flash that 2006h reports, as a probe sees it after a reset.
 fn is_in_flash(flash: &mut ModelFlash) {
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();

@@ -187,7 +187,7 @@ fn status(device: &mut Sealed<'_, '_>) -> u32 {
     u32::from_le_bytes(bytes)
 }
 
-/// Sends a file in these pieces, seven bytes each behind them; returns whether the device has
+/// Sends a file in these pieces, seven bytes each after them; returns whether the device has
 /// installed it. `until`: the download is cancelled there.
 fn send(device: &mut Sealed<'_, '_>, file: &[u8], pieces: &mut Input<'_>, until: Option<usize>) -> bool {
     device.write(CONTROL, &[CLEAR]).expect("CLEAR");

@@ -114,7 +114,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     request.extend(content);
     CONNECTION.with_borrow_mut(|kept| {
         let mut answer = None;
-        // A kept connection may have been closed behind a refusal.
+        // A kept connection may have been closed after a refusal.
         for _ in 0..2 {
             let connection = kept.get_or_insert_with(|| {
                 let connection = TcpStream::connect(host).expect("the server listens");

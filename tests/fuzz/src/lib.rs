@@ -22,7 +22,7 @@ macro_rules! target {
 }
 
 /// Runs a target with each file that the arguments name, in the order of their names, and prints
-/// how many there were. The name of a file stands on standard error before a panic ends the run.
+/// how many there were. The name of a file is on standard error before a panic ends the run.
 pub fn replay(target: impl Fn(&[u8])) -> std::process::ExitCode {
     let mut count = 0;
     for argument in std::env::args_os().skip(1) {
@@ -49,7 +49,7 @@ fn files(path: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// Tells its file when a panic drops it.
+/// Prints its file when a panic drops it.
 struct Told<'p>(&'p Path);
 
 impl Drop for Told<'_> {

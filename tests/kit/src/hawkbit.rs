@@ -73,7 +73,7 @@ pub struct Action {
     pub result: Option<String>,
     /// All feedback on it: execution and details.
     pub told: Vec<(String, Vec<String>)>,
-    /// The progress that was told.
+    /// The progress that was reported.
     pub progress: Vec<u64>,
     /// The reasons why a cancellation was rejected.
     pub rejected: Vec<String>,

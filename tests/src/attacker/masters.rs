@@ -221,7 +221,7 @@ impl Attack {
         self.write(Address::new(index, program), wrong, WHOLE).map(drop)
     }
 
-    /// A value of 1F51h behind which the device may leave.
+    /// A value of 1F51h after which the device may leave.
     fn leave(&mut self, program: u8, value: u8) -> Result<(), Broken> {
         self.write(Address::new(0x1F51, program), vec![value], WHOLE)?;
         self.await_reset()

@@ -2,7 +2,7 @@
 //! frames that are nearly right, bus errors and power cuts; in virtual time, by seeds. It goes on
 //! where it has brought the device, and checks after each burst:
 //!
-//! - the device answers: a read of 1000h behind an SDO abort, within [`Target::answer_us`];
+//! - the device answers: a read of 1000h after an SDO abort, within [`Target::answer_us`];
 //! - the programs and the node parameters are as they were, unless a master asked for a change;
 //! - no reset that nobody asked for;
 //! - the record of a program is true: its CRC is that of the flash and of an image that was sent;
@@ -78,9 +78,9 @@ pub struct Summary {
     pub running: u64,
     /// Stores of node parameters.
     pub stores: u64,
-    /// The slowest answer of a check, without those behind bus-off and resets, in us.
+    /// The slowest answer of a check, without those after bus-off and resets, in us.
     pub slowest_us: u64,
-    /// The slowest one behind bus-off, in us.
+    /// The slowest one after bus-off, in us.
     pub slowest_off_us: u64,
 }
 
@@ -449,7 +449,7 @@ impl Attack {
 
     fn reset_was_asked(&self) -> Result<(), Broken> {
         let programs = 1..=self.setup.layout.programs.len() as u8;
-        // Behind a restart, the end of a rescue window is a reset.
+        // After a restart, the end of a rescue window is a reset.
         let window = self.was_reset && programs.into_iter().any(|program| self.may_have(program));
         if self.may_leave() || window || self.target.now_us() < self.leaves_until {
             return Ok(());
@@ -465,7 +465,7 @@ impl Attack {
         Some((id as u8, rate as u8))
     }
 
-    /// The checks behind a burst.
+    /// The checks after a burst.
     fn check(&mut self) -> Result<(), Broken> {
         self.target.disturb(0);
         self.clear_doubt()?;
@@ -501,7 +501,7 @@ impl Attack {
         let begun = self.target.now_us();
         loop {
             self.lss([0x04, 0, 0, 0, 0, 0, 0, 0], 0)?;
-            // Behind bus-off, answers of before come first.
+            // After bus-off, answers of before come first.
             let patience = match (self.was_disturbed, self.may_leave() || self.was_reset) {
                 (true, _) => BUS_OFF_US,
                 (false, true) => 3 * START_US,

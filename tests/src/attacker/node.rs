@@ -196,7 +196,7 @@ impl Target for Node {
     fn cut_power(&mut self, cut: PowerCut) {
         // Its operations take no time, so that nothing can be in the middle of one.
         if matches!(cut, PowerCut::Now) {
-            // Flash does not forget. The file is behind by a time of the host's clock, which would make
+            // Flash does not forget. The file lags by a time of the host's clock, which would make
             // another attack of the same seed on a faster host.
             if let Some(flash) = self.device.as_mut().and_then(device::Device::flash) {
                 flash.save().expect("its file can be written");

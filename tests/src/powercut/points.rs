@@ -59,13 +59,13 @@ pub struct Report<P = Point> {
     pub operations: u64,
     /// Cuts, single and double.
     pub points: u64,
-    /// The different states of the flash behind these cuts. Level 1 does not count them.
+    /// The different states of the flash after these cuts. Level 1 does not count them.
     pub states: u64,
     /// How many times the host did everything again. Level 1 does so after each cut.
     pub recoveries: u64,
     /// The states of the device after the power returned, with their counts.
     pub outcomes: BTreeMap<String, u64>,
-    /// For each way, a letter for each operation: what was found behind a cut there. `B` bootloader,
+    /// For each way, a letter for each operation: what was found after a cut there. `B` bootloader,
     /// `O` old program, `N` new program, `!` a violation, `=` a flash that was looked at already, `.`
     /// not cut. Level 1 has none.
     pub map: BTreeMap<&'static str, Vec<u8>>,

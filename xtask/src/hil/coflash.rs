@@ -127,7 +127,7 @@ impl Coflash {
     }
 }
 
-/// Whether an event tells that more than a third is in the device, and not all of it.
+/// Whether an event reports that more than a third is in the device, and not all of it.
 fn is_middle(event: &Value) -> bool {
     let number = |key: &str| event[key].as_u64();
     let is_progress = event["event"].as_str() == Some("progress");

@@ -40,7 +40,7 @@ pub fn words(line: &str) -> Outcome<Vec<String>> {
     }
 }
 
-/// Whether a program can be found: a path as it stands, a name in the folders of `PATH`.
+/// Whether a program can be found: a path as it is, a name in the folders of `PATH`.
 pub fn is_there(program: &str) -> bool {
     if Path::new(program).components().count() > 1 {
         return Path::new(program).is_file();

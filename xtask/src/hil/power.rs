@@ -1,4 +1,4 @@
-//! The power of the board: a relay behind a command.
+//! The power of the board: a relay that a command switches.
 
 use std::process::Command;
 use std::time::Duration;

@@ -35,7 +35,7 @@ impl Probe {
     /// Checks that the program exists.
     ///
     /// # Errors
-    /// When it does not; the message tells how to get it.
+    /// When it does not; the message says how to get it.
     pub fn is_there(&self) -> Outcome {
         let program = &self.words[0];
         if command::is_there(program) {

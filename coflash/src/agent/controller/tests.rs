@@ -298,7 +298,7 @@ fn a_held_deployment_is_fetched_and_waits() {
         drive.deploy(&held);
         assert_eq!(drive.feedback(), told("deploymentBase/8", "downloaded", "none"), "{held}");
         assert!(drive.controller.is_settled(drive.now));
-        // The server is told once.
+        // The server gets one report.
         drive.deploy(&held);
         drive.deploy(&deployment("8", "forced"));
         assert!(matches!(drive.next(), Step::Flash(_)), "{held}");
@@ -571,7 +571,7 @@ fn a_state_that_cannot_be_written_keeps_the_device_untouched() {
     assert!(matches!(drive.next(), Step::Flash(_)));
 }
 
-/// Whatever order things come in: it never stands still without a time, never flashes what is not
+/// Whatever order things come in: it never waits without a time, never flashes what is not
 /// in the record, and never more than one thing at once.
 #[test]
 fn no_course_of_answers_brings_it_out_of_step() {

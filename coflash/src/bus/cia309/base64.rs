@@ -18,7 +18,7 @@ pub(super) fn encode(bytes: &[u8]) -> String {
 }
 
 /// Decodes base64. `None` if the text has an invalid digit, if its length is not a multiple of
-/// four, or if padding stands anywhere but at the end.
+/// four, or if padding is anywhere but at the end.
 pub(super) fn decode(text: &[u8]) -> Option<Vec<u8>> {
     if !text.len().is_multiple_of(4) {
         return None;

@@ -229,7 +229,7 @@ impl Cia309 {
         }
     }
 
-    /// The next line that is complete, and whether CR stood before its LF.
+    /// The next line that is complete, and whether CR was before its LF.
     fn line(&mut self) -> Result<Option<(String, bool)>, AdapterError> {
         loop {
             let end = self.inbox[self.searched..].iter().position(|byte| *byte == b'\n');
@@ -283,7 +283,7 @@ impl Cia309 {
         format!("{what} (error {code} of CiA 309-3)")
     }
 
-    /// Tells the gateway how long a node may take. A gateway without this command keeps its own
+    /// Sets in the gateway how long a node may take. A gateway without this command keeps its own
     /// time-out.
     fn set_timeout(&mut self, ask: &Ask<'_>) -> Result<(), GatewayError> {
         if self.timeout == Some(ask.sdo) {

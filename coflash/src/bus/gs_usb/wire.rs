@@ -20,7 +20,7 @@ pub mod request {
     pub const DEVICE_CONFIG: u8 = 5;
 }
 
-/// `struct gs_host_config`: a number with known bytes, which tells the device the byte order.
+/// `struct gs_host_config`: a number with known bytes, which shows the device the byte order.
 pub const LITTLE_ENDIAN: [u8; 4] = 0x0000_BEEF_u32.to_le_bytes();
 /// `struct gs_device_mode` with `GS_CAN_MODE_RESET`.
 pub const RESET: [u8; 8] = [0; 8];

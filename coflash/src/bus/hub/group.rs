@@ -136,8 +136,8 @@ impl Meetings {
         self.running = Some(Running { download, lines: with, refused: Vec::new(), until: now });
     }
 
-    /// Tells the conversations what became of their data. After a download that was broken off,
-    /// they wait for the next one, except for a device that breaks off each.
+    /// Reports to the conversations what became of their data. After a download that was broken
+    /// off, they wait for the next one, except for a device that breaks off each.
     fn end(&mut self, result: GroupResult, lines: &mut [Option<Line>], now: Duration) {
         let Some(running) = self.running.take() else { return };
         let devices = running.lines.len();

@@ -525,7 +525,7 @@ impl<'a> Sealed<'a> {
         Ok((root, recipient, needs.epoch))
     }
 
-    /// The rule behind a fault.
+    /// The rule that a fault breaks.
     fn why(&self, fault: Fault, device: &seal::judge::Device<'_>) -> Refusal {
         let head = self.head;
         match fault {

@@ -2,7 +2,7 @@
 
 import { $, notice, text } from "./dom.js";
 
-/** Asks the server for something. Tells the user where it refuses; true if it did not. */
+/** Asks the server for something. Shows a refusal to the user; true if there was none. */
 export async function ask(what, value) {
   return send(what, { headers: { "content-type": "application/json" }, body: JSON.stringify(value ?? {}) });
 }
@@ -34,7 +34,7 @@ async function send(what, options) {
   return false;
 }
 
-/** The server tells something each second; after so many milliseconds of silence it is taken for lost. */
+/** The server sends something each second; after so many milliseconds of silence it is taken for lost. */
 const SILENCE = 6000;
 
 /** Has `take` called with each event, and `renew` when they begin anew. */

@@ -44,7 +44,7 @@ export function date(seconds) {
 
 let shown = 0;
 
-/** Tells the user how something went. */
+/** Shows the user how something went. */
 export function notice(ok, words, advice) {
   const box = $("notice");
   shown += 1;

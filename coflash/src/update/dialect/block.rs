@@ -9,18 +9,18 @@ use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::bus::adapter::Met;
-use crate::device::begun::{begun, Begun};
+use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
 use crate::file::convert::blocks_of_sealed;
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::event::{Event, Note, Phase, RepeatReason, Retry, Warning};
 use crate::update::judge::{judge, Judgement};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 use crate::update::{steps, trial};
 
 /// See the [module](self).
@@ -38,9 +38,9 @@ impl Procedure for Block {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, running, Dialect::Block, options, course)
+        enter_by_call(session, running, Dialect::Block, options, update)
     }
 
     /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
@@ -52,19 +52,19 @@ impl Procedure for Block {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let file = match (file, options.blocks) {
             (Content::Blocks(file), _) => file,
             (Content::Sealed(sealed), None) => {
-                return cia302::download(session, sealed.bytes(), file.program_crc(), options, course);
+                return cia302::download(session, sealed.bytes(), file.program_crc(), options, update);
             }
             (Content::Sealed(sealed), Some(block_size)) => {
                 let blocks = cut(session, sealed, block_size, options.program)?;
-                let (repeats, took) = send(session, &blocks, None, &mut false, options, course)?;
-                course.state = DeviceState::Written;
+                let (repeats, took) = send(session, &blocks, None, &mut false, options, update)?;
+                update.state = DeviceState::Written;
                 let crc = file.program_crc();
-                steps::verify(session, options.program, crc, &mut |event| course.tell(event))?;
+                steps::verify(session, options.program, crc, &mut |event| update.tell(event))?;
                 return Ok(Downloaded { repeats, took, released: None });
             }
         };
@@ -75,21 +75,21 @@ impl Procedure for Block {
         }
         let larger = options.group_blocks.filter(|_| in_group).map(|size| file.joined(size));
         let file = larger.as_ref().unwrap_or(file);
-        let sent = send_verified(session, file, &mut in_group, options, course);
+        let sent = send_verified(session, file, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
         }
         let (repeats, took) = sent?;
-        course.state = DeviceState::Unreleased;
+        update.state = DeviceState::Unreleased;
         if !options.start {
-            course.tell(Phase::NotReleased.into());
+            update.tell(Phase::NotReleased.into());
             return Ok(Downloaded { repeats, took, released: Some(false) });
         }
         if options.trial_run {
-            trial::run(session, options, course)?;
+            trial::run(session, options, update)?;
         }
-        steps::release(session, number, &mut |event| course.tell(event))?;
-        course.state = DeviceState::Released;
+        steps::release(session, number, &mut |event| update.tell(event))?;
+        update.state = DeviceState::Released;
         Ok(Downloaded { repeats, took, released: Some(true) })
     }
 }
@@ -111,7 +111,7 @@ fn cut(
     blocks_of_sealed(sealed, region.base, block_size).map_err(|error| not_cut(&error.to_string()))
 }
 
-impl Begun {
+impl PartialDownload {
     /// Whether it is the download of this file.
     fn is_of(self, file: &BlockFile) -> bool {
         let control = &file.blocks()[0];
@@ -133,52 +133,52 @@ fn send_verified(
     file: &BlockFile,
     in_group: &mut bool,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
-    let begun = if options.from_start { None } else { begun(session, number)? };
-    let begun = begun.filter(|begun| begun.is_of(file));
-    let mut all = |from, course: &mut Course<'_>| {
-        let sent = send(session, file, from, in_group, options, course)?;
-        steps::verify(session, number, file.program_crc(), &mut |event| course.tell(event))?;
+    let partial = if options.from_start { None } else { partial_download(session, number)? };
+    let partial = partial.filter(|partial| partial.is_of(file));
+    let mut all = |from, update: &mut RunningUpdate<'_>| {
+        let sent = send(session, file, from, in_group, options, update)?;
+        steps::verify(session, number, file.program_crc(), &mut |event| update.tell(event))?;
         Ok(sent)
     };
-    match all(begun, course) {
+    match all(partial, update) {
         Err(error @ (Error::Failed { .. } | Error::WrongCrc { .. } | Error::Refused { .. }))
-            if begun.is_some() =>
+            if partial.is_some() =>
         {
-            course.tell(Warning::BeginsAgain { why: error.to_string() }.into());
-            all(None, course)
+            update.tell(Warning::BeginsAgain { why: error.to_string() }.into());
+            all(None, update)
         }
         result => result,
     }
 }
 
-/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing behind a begun
+/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing after a partial
 /// download; returns the number of repetitions and the duration.
 fn send(
     session: &mut Session<'_>,
     file: &BlockFile,
-    begun: Option<Begun>,
+    partial: Option<PartialDownload>,
     in_group: &mut bool,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
     let before = steps::told_before(session, number)?;
-    course.erases(before);
-    if let Some(begun) = begun {
+    update.erases(before);
+    if let Some(partial) = partial {
         let total = file.program_size() as usize;
-        let done = begun.end.saturating_sub(file.program_start()) as usize;
-        course.tell(Phase::GoingOn { done: done.min(total), total }.into());
-    } else if let Err(error) = steps::erase(session, number, &mut |event| course.tell(event)) {
+        let done = partial.end.saturating_sub(file.program_start()) as usize;
+        update.tell(Phase::GoingOn { done: done.min(total), total }.into());
+    } else if let Err(error) = steps::erase(session, number, &mut |event| update.tell(event)) {
         if error.is_refusal() {
-            course.erases_not();
+            update.erases_not();
         }
         return Err(error);
     }
     let began = session.now();
-    let repeats = send_blocks(session, file, begun, in_group, options, course)?;
+    let repeats = send_blocks(session, file, partial, in_group, options, update)?;
     Ok((repeats, session.now().saturating_sub(began)))
 }
 
@@ -187,10 +187,10 @@ fn send(
 fn send_blocks(
     session: &mut Session<'_>,
     file: &BlockFile,
-    begun: Option<Begun>,
+    partial: Option<PartialDownload>,
     in_group: &mut bool,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
     let blocks: Vec<(&FileBlock, Vec<u8>)> =
         file.blocks().iter().map(|block| (block, block.emit_with(file.checksum()))).collect();
@@ -198,9 +198,9 @@ fn send_blocks(
     let mut done = 0;
     let mut repeats = 0;
     let (mut together, mut disturbed) = (0, false);
-    course.tell(Event::Progress { done, total });
+    update.tell(Event::Progress { done, total });
     for (block, bytes) in &blocks {
-        if begun.is_some_and(|begun| begun.has(block)) {
+        if partial.is_some_and(|partial| partial.has(block)) {
             done += bytes.len();
             continue;
         }
@@ -212,7 +212,7 @@ fn send_blocks(
         let sent =
             send_block(session, block.number, bytes, together_now, options, &mut |event| match event {
                 Event::Progress { done: part, .. } => {
-                    course.tell(Event::Progress { done: done + part, total })
+                    update.tell(Event::Progress { done: done + part, total })
                 }
                 Event::Note(Note::Together { devices }) if devices == together => {}
                 Event::Warning(Warning::GroupDisturbed) if disturbed => {}
@@ -222,15 +222,15 @@ fn send_blocks(
                         Event::Warning(Warning::GroupDisturbed) => disturbed = true,
                         _ => {}
                     }
-                    course.tell(event);
+                    update.tell(event);
                 }
             });
         // A device that postpones the erase starts it with the first good data: block 0 alone loses
         // nothing.
-        course.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
+        update.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
         repeats += sent?;
         done += bytes.len();
-        course.tell(Event::Progress { done, total });
+        update.tell(Event::Progress { done, total });
     }
     Ok(repeats)
 }

@@ -7,10 +7,10 @@ use super::procedure::Downloaded;
 use super::whole::{self, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Error, Session};
-use crate::update::course::Course;
 use crate::update::event::{Note, Phase};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
 
 /// Makes the bootloader run.
@@ -19,13 +19,13 @@ pub(super) fn enter(
     running: DeviceType,
     dialect: Dialect,
     number: u8,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
     if !running.is_bootloader() {
-        course.state = DeviceState::Called;
-        stop_program(session, number, course)?;
+        update.state = DeviceState::Called;
+        stop_program(session, number, update)?;
     }
-    course.tell(Note::Dialect { dialect }.into());
+    update.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
 }
 
@@ -35,14 +35,14 @@ pub(super) fn download(
     content: &[u8],
     crc: u32,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
     let number = options.program;
-    let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| {
-        clear_and_wait(session, number, &mut |event| course.tell(event))
+    let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
+        clear_and_wait(session, number, &mut |event| update.tell(event))
     };
     let whole = Whole { content, crc, prepare: &prepare, status: whole::status };
-    whole::download(session, &whole, options, course)
+    whole::download(session, &whole, options, update)
 }
 
 /// Calls the bootloader of a device that only supports CiA 302-3 with STOP: the bootloader then
@@ -50,7 +50,7 @@ pub(super) fn download(
 ///
 /// # Errors
 /// [`Error::NoBootloader`].
-fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) -> Result<(), Error> {
+fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdate<'_>) -> Result<(), Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
     let control = |number| Address::new(program::PROGRAM_CONTROL, number);
     // The running program may have another number than the program to be written.
@@ -66,12 +66,12 @@ fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) 
         return Ok(());
     };
     let at = control(running);
-    course.tell(Phase::CallingBack.into());
+    update.tell(Phase::CallingBack.into());
     match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
             call_back(session)?;
-            course.tell(Phase::InBootloader.into());
+            update.tell(Phase::InBootloader.into());
             return Ok(());
         }
         Err(error) => return Err(error),
@@ -91,6 +91,6 @@ fn stop_program(session: &mut Session<'_>, number: u8, course: &mut Course<'_>) 
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;
     }
-    course.tell(Phase::InBootloader.into());
+    update.tell(Phase::InBootloader.into());
     Ok(())
 }

@@ -12,9 +12,9 @@ use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
 use crate::file::ihex;
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::event::Note;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 use crate::update::steps::await_application;
 
 /// ESAcademy's password for 7F50h: "INIT".
@@ -33,9 +33,9 @@ impl Procedure for EsAcademy {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        enter_by_call(session, running, Dialect::EsAcademy, options, course)
+        enter_by_call(session, running, Dialect::EsAcademy, options, update)
     }
 
     fn download(
@@ -43,13 +43,14 @@ impl Procedure for EsAcademy {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
-        let prepare = |session: &mut Session<'_>, course: &mut Course<'_>| unlock(session, options, course);
+        let prepare =
+            |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| unlock(session, options, update);
         let crc = file.program_crc();
         let whole = Whole { content: &content, crc, prepare: &prepare, status };
-        whole::download(session, &whole, options, course)
+        whole::download(session, &whole, options, update)
     }
 
     fn start(&self, session: &mut Session<'_>, _: NodeId, number: u8) -> Result<DeviceType, Error> {
@@ -64,7 +65,11 @@ impl Procedure for EsAcademy {
 
 /// Writes the password, which erases the program. It is optional; without it, the download alone
 /// must be sufficient.
-fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course<'_>) -> Result<(), Error> {
+fn unlock(
+    session: &mut Session<'_>,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(), Error> {
     let node = session.node();
     let password = match options.unlock {
         None => PASSWORD,
@@ -78,7 +83,7 @@ fn unlock(session: &mut Session<'_>, options: &FlashOptions, course: &mut Course
     let patient = session.timing().erasing();
     let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
     match written {
-        Ok(()) => course.tell(Note::Unlocked.into()),
+        Ok(()) => update.tell(Note::Unlocked.into()),
         Err(Error::Refused { code: AbortCode::NO_OBJECT, .. }) => {}
         Err(error) => return Err(error),
     }

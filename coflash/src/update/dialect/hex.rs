@@ -5,8 +5,8 @@ use super::procedure::{Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::ihex;
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 
 /// See the [module](self).
 pub(super) struct Hex;
@@ -17,9 +17,9 @@ impl Procedure for Hex {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        cia302::enter(session, running, Dialect::Hex, options.program, course)
+        cia302::enter(session, running, Dialect::Hex, options.program, update)
     }
 
     fn download(
@@ -27,9 +27,9 @@ impl Procedure for Hex {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
-        cia302::download(session, &content, file.program_crc(), options, course)
+        cia302::download(session, &content, file.program_crc(), options, update)
     }
 }

@@ -15,11 +15,11 @@ use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
 use crate::file::BlockFile;
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::event::{Event, Note, Phase, Warning};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::password::Password;
+use crate::update::running::RunningUpdate;
 
 /// The program of a lift device; the other sub-indices of 1F50h hold data, which are not started
 /// (CiA 814-1 clause 6.4).
@@ -41,26 +41,26 @@ impl Procedure for Lift {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
         if !options.follow {
             let what = "the bootloaders share a node-ID: update the devices one after the other";
             return Err(Error::NotInDialect { dialect: Dialect::Lift, what });
         }
-        course.tell(Note::Dialect { dialect: Dialect::Lift }.into());
-        course.tell(Note::Nameplate(Box::new(nameplate(session)?)).into());
+        update.tell(Note::Dialect { dialect: Dialect::Lift }.into());
+        update.tell(Note::Nameplate(Box::new(nameplate(session)?)).into());
         check(session, running, options.unlock)?;
         if options.mastership {
             match flying_master::ask(session)? {
                 Asked::Nobody => {}
-                Asked::Kept(master) => course.tell(Warning::MasterKept { node: master.node }.into()),
+                Asked::Kept(master) => update.tell(Warning::MasterKept { node: master.node }.into()),
                 Asked::Taken(taken) => {
-                    course.tell(Note::MasterTaken { node: taken.from.node }.into());
-                    course.mastership = Some(taken);
+                    update.tell(Note::MasterTaken { node: taken.from.node }.into());
+                    update.mastership = Some(taken);
                 }
             }
         }
-        unlock_bootloader(session, options.unlock, course)?;
+        unlock_bootloader(session, options.unlock, update)?;
         Ok(Dialect::Lift)
     }
 
@@ -69,13 +69,13 @@ impl Procedure for Lift {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let (content, crc) = (file.stream(BlockFile::flash_image), file.program_crc());
         // The device is already unlocked; the download overwrites the old program.
-        let prepare = |_: &mut Session<'_>, _: &mut Course<'_>| Ok(());
+        let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
         let whole = Whole { content: &content, crc, prepare: &prepare, status: whole::status };
-        whole::download(session, &whole, options, course)
+        whole::download(session, &whole, options, update)
     }
 
     fn start(&self, session: &mut Session<'_>, original: NodeId, number: u8) -> Result<DeviceType, Error> {
@@ -100,24 +100,24 @@ impl Procedure for Lift {
 fn unlock_bootloader(
     session: &mut Session<'_>,
     password: Option<Password>,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<(), Error> {
     let node = session.node();
     let password = password.ok_or(Error::NoPassword { node })?;
     let lift = lift_node();
     if node != lift {
         unlock(session, password)?;
-        course.tell(Note::Unlocked.into());
-        course.state = DeviceState::Called;
-        course.tell(Phase::CallingBack.into());
+        update.tell(Note::Unlocked.into());
+        update.state = DeviceState::Called;
+        update.tell(Phase::CallingBack.into());
         reset_program(session, LIFT_PROGRAM)?;
         session.talk_to(lift);
         await_lift(session)?;
-        course.tell(Note::Moved { node: lift }.into());
-        course.tell(Phase::InBootloader.into());
+        update.tell(Note::Moved { node: lift }.into());
+        update.tell(Phase::InBootloader.into());
     }
     unlock(session, password)?;
-    course.tell(Note::Unlocked.into());
+    update.tell(Note::Unlocked.into());
     Ok(())
 }
 
@@ -217,7 +217,7 @@ pub fn read_locked(
     }
     let original = session.node();
     check(session, running, password)?;
-    unlock_bootloader(session, password, &mut Course::new(tell))?;
+    unlock_bootloader(session, password, &mut RunningUpdate::new(tell))?;
     let bytes = session.upload(at, &mut |_| {});
     if original != session.node() && !matches!(bytes, Err(Error::Adapter(_))) {
         let restarted = reset_program(session, LIFT_PROGRAM);

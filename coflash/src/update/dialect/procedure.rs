@@ -6,10 +6,10 @@ use canopen::NodeId;
 
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::event::{Note, Phase};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
 /// The parts of an update that each dialect implements, in their order.
@@ -24,7 +24,7 @@ pub(in crate::update) trait Procedure {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error>;
 
     /// Steps 4 to 14: afterwards the program is in the device and starts at the next reset.
@@ -36,7 +36,7 @@ pub(in crate::update) trait Procedure {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error>;
 
     /// Step 15: starts the program; afterwards the session talks to the program's node. `original`
@@ -67,18 +67,18 @@ pub(super) fn enter_by_call(
     running: DeviceType,
     found: Dialect,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Dialect, Error> {
     let mut dialect = found;
     if !running.is_bootloader() {
-        course.state = DeviceState::Called;
-        course.tell(Phase::CallingBack.into());
+        update.state = DeviceState::Called;
+        update.tell(Phase::CallingBack.into());
         let running = steps::call_back(session)?;
-        course.tell(Phase::InBootloader.into());
+        update.tell(Phase::InBootloader.into());
         if options.dialect.is_none() {
             dialect = Dialect::of_bootloader(running, session.node()).unwrap_or(found);
         }
     }
-    course.tell(Note::Dialect { dialect }.into());
+    update.tell(Note::Dialect { dialect }.into());
     Ok(dialect)
 }

@@ -5,8 +5,8 @@ use super::procedure::{Downloaded, Procedure};
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::file::BlockFile;
 use crate::update::content::Content;
-use crate::update::course::Course;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 
 /// See the [module](self).
 pub(super) struct Raw;
@@ -17,9 +17,9 @@ impl Procedure for Raw {
         session: &mut Session<'_>,
         running: DeviceType,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Dialect, Error> {
-        cia302::enter(session, running, Dialect::Raw, options.program, course)
+        cia302::enter(session, running, Dialect::Raw, options.program, update)
     }
 
     fn download(
@@ -27,9 +27,9 @@ impl Procedure for Raw {
         session: &mut Session<'_>,
         file: Content<'_>,
         options: &FlashOptions,
-        course: &mut Course<'_>,
+        update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(BlockFile::flash_image);
-        cia302::download(session, &content, file.program_crc(), options, course)
+        cia302::download(session, &content, file.program_crc(), options, update)
     }
 }

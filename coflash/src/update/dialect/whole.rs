@@ -8,11 +8,11 @@ use canopen::Address;
 use super::procedure::Downloaded;
 use crate::device::error::absent;
 use crate::device::{Doing, Error, Session, Timing, Transfers};
-use crate::update::course::Course;
 use crate::update::event::{Event, RepeatReason, Retry};
 use crate::update::judge::{judge, Judgement};
 use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
 use crate::update::steps;
 
 /// A device that takes the whole program in one transfer may erase after any segment: at most 2 s,
@@ -29,7 +29,7 @@ pub(super) struct Whole<'w> {
     /// CRC of the program.
     pub(super) crc: u32,
     /// The action at the start of each attempt.
-    pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut Course<'_>) -> Result<(), Error>,
+    pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut RunningUpdate<'_>) -> Result<(), Error>,
     /// Reads the device's result of the download.
     pub(super) status: fn(&mut Session<'_>, u8) -> Result<Said, Error>,
 }
@@ -42,16 +42,16 @@ pub(super) fn download(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
     let began = session.now();
-    let repeats = send(session, whole, options, course)?;
+    let repeats = send(session, whole, options, update)?;
     let took = session.now().saturating_sub(began);
-    course.state = DeviceState::Written;
+    update.state = DeviceState::Written;
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
-        steps::verify(session, options.program, whole.crc, &mut |event| course.tell(event))?;
+        steps::verify(session, options.program, whole.crc, &mut |event| update.tell(event))?;
     }
     Ok(Downloaded { repeats, took, released: None })
 }
@@ -61,7 +61,7 @@ fn send(
     session: &mut Session<'_>,
     whole: &Whole<'_>,
     options: &FlashOptions,
-    course: &mut Course<'_>,
+    update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
     let at = Address::new(program::PROGRAM_DATA, options.program);
     let content = whole.content;
@@ -69,27 +69,27 @@ fn send(
     let mut repeat = 0;
     loop {
         let before = if repeat == 0 { steps::told_before(session, options.program)? } else { None };
-        course.erases(before);
-        if let Err(error) = (whole.prepare)(session, course) {
+        update.erases(before);
+        if let Err(error) = (whole.prepare)(session, update) {
             // A refused password erases nothing, and neither does a refused command.
             if error.is_refusal() || matches!(error, Error::NotInDialect { .. }) {
-                course.erases_not();
+                update.erases_not();
             }
             return Err(error);
         }
-        course.tell(Event::Progress { done: 0, total });
+        update.tell(Event::Progress { done: 0, total });
         let slow = Timing { sdo: SLOW_SEGMENT.max(session.timing().sdo), ..*session.timing() };
         let node = session.node();
         let mut long = session.with(node, slow);
         let mut progress = |part: u32| {
-            course.wrote |= part > 0;
-            course.tell(Event::Progress { done: part as usize, total });
+            update.wrote |= part > 0;
+            update.tell(Event::Progress { done: part as usize, total });
         };
         let sent = long.write(at, content, Doing::Program, &mut progress);
         let transfers = long.transfers();
         session.transfer_by(transfers);
         // Data without an answer may have arrived.
-        course.wrote |= !matches!(sent, Err(Error::Refused { .. }));
+        update.wrote |= !matches!(sent, Err(Error::Refused { .. }));
         if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
             return Err(error);
         }
@@ -104,7 +104,7 @@ fn send(
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }
-                course.tell(Event::Retry(Retry::program(repeat, options.repeats, why)));
+                update.tell(Event::Retry(Retry::program(repeat, options.repeats, why)));
             }
             _ => return Err(error),
         }

@@ -220,7 +220,7 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
     assert!(done.exit != 3 && done.err.contains("127.0.0.1:1"), "{}", done.err);
 }
 
-/// The label of an image (`docs/dialects.md`) is told by `inspect`, and goes into block 0.
+/// The label of an image (`docs/dialects.md`) is shown by `inspect`, and goes into block 0.
 #[test]
 fn the_label_is_shown_and_goes_into_block_0() {
     let folder = folder("label");
@@ -265,7 +265,7 @@ fn the_label_is_shown_and_goes_into_block_0() {
         assert_eq!(bytes[12..12 + block.len()], block, "{options:?}");
         assert_eq!(done.out.contains("as its label says"), data.len() == 6, "{}", done.out);
     }
-    // The block file has the label, too, and tells both.
+    // The block file has the label, too, and `inspect` shows it.
     let done = coflash(&["inspect", &out]);
     assert!(done.out.contains("  label        vendor-ID 00000319h"), "{}", done.out);
 }
@@ -521,7 +521,7 @@ fn the_target_is_checked_before_anything_is_erased() {
     assert_eq!((&json["size"], &json["running"]), (&4001.into(), &serde_json::Value::Null));
     assert_eq!((&json["transfer"], &json["blocks_repeated"]), (&"segments".into(), &0.into()));
     let fake = server.join().unwrap();
-    // Block 0: vendor-ID and product code behind the size.
+    // Block 0: vendor-ID and product code after the size.
     assert_eq!(fake.blocks[0][16..24], [0x3F, 0, 0, 0, 0xD2, 4, 0, 0]);
     assert_eq!(fake.count("command 01"), 0);
 }

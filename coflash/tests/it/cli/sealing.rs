@@ -243,7 +243,7 @@ fn word(bytes: &[u8], at: usize) -> u32 {
     u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
 }
 
-/// Parses blocks by the manual's figure: each has its number, its CRC, and the address behind the
+/// Parses blocks by the manual's figure: each has its number, its CRC, and the address after the
 /// previous block. Returns the data of block 0 and the data of the others.
 fn unwrapped(blocks: &[Vec<u8>]) -> (Vec<u8>, Vec<u8>) {
     let data = |block: &[u8]| {

@@ -245,7 +245,7 @@ impl Fake {
         self.restart = Some((self.now + self.leave_time + self.restart_time, next));
     }
 
-    /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; tells whether
+    /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; says whether
     /// it was one.
     fn block_frame(&mut self, bytes: [u8; 8]) -> bool {
         let Blocks::Known(blksize) = self.knows_blocks else { return false };

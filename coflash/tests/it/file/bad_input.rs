@@ -53,7 +53,7 @@ fn a_damaged_text_or_block_file_never_means_something_else() {
                 let mut damaged = bytes.to_vec();
                 damaged[at] ^= 1 << bit;
                 // A flipped bit may turn a digit's case or a line end, and nothing else. (No
-                // checksum of an S-record covers its type, which tells how long the address is:
+                // checksum of an S-record covers its type, which says how long the address is:
                 // there the format itself is at an end.)
                 let srec_type = name.contains(".s") && at > 0 && bytes[at - 1] == b'S';
                 if let Ok(read) = meaning(&damaged, None) {
@@ -81,7 +81,7 @@ fn a_damaged_block_file_is_named_with_its_offset() {
         meaning(&bytes, Some(Format::BlockFile)).unwrap_err()
     };
     let crc_of = |block: &[u8]| coflash::file::block_file::CRC.checksum(block).to_le_bytes();
-    // Data of block 1, which starts behind the 24 bytes of block 0.
+    // Data of block 1, which starts after the 24 bytes of block 0.
     assert!(with(0x30, 0).starts_with("offset 0x18: CRC of block 1 is 0x39a6fa3b"), "{}", with(0x30, 0));
     assert!(
         with(0x21, 0xFF).starts_with("offset 0x18: block 1 has 65478 data bytes"),

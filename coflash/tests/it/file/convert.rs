@@ -124,7 +124,7 @@ fn the_flash_image_is_that_of_objcopy() {
     }
 }
 
-/// The example of CiA 814-1, section 6.5: the text begins 24 bytes behind the mark.
+/// The example of CiA 814-1, section 6.5: the text begins 24 bytes after the mark.
 #[test]
 fn the_software_version_is_found_in_every_format() {
     let text = b"junk$CANopenSoftwareVersion\x001.2.0 (\xE9)\x1B\0more";

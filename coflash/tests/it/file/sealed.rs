@@ -345,7 +345,7 @@ fn blocks_that_carry_no_whole_image_are_refused() {
         block(number as u32, address, image.chunks(600).nth(at).unwrap())
     };
 
-    // Cut off, at each byte behind what tells that it is one.
+    // Cut off, at each byte after those that show that it is one.
     let whole = good.concat();
     for end in FRONT..whole.len() {
         assert!(carried(whole[..end].to_vec()).is_err(), "{end}");
@@ -385,7 +385,7 @@ fn blocks_that_carry_no_whole_image_are_refused() {
     };
     let words = fault(&good.iter().cloned().map(with_crc_16).collect::<Vec<_>>());
     assert!(words.contains("accepts only blocks with CRC-32"), "{words}");
-    // Erased flash in front of it or behind it is no part of it.
+    // Erased flash before it or after it is no part of it.
     let behind = [&good[..count - 1], &[last(&[&image[..], &[0xFF; 4]].concat())]].concat();
     assert!(fault(&behind).contains("does not match the blocks before it"));
     let front = [&good[..count - 1], &[last(&[&[0xFF; 4], &image[..]].concat())]].concat();

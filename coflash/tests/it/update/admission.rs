@@ -181,7 +181,7 @@ impl Maker for Told2004 {
     }
 }
 
-/// A device whose program lies at `base`, as this tells it.
+/// A device whose program lies at `base`, as 2004h reports it.
 fn at(base: u32, size: u32, running: u32, while_running: &[u32]) -> Fake {
     let mut fake = Fake::new(running);
     let value = [base.to_le_bytes(), size.to_le_bytes()].concat();

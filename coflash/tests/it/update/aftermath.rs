@@ -8,7 +8,7 @@ use coflash::bus::AdapterError;
 use coflash::device::error::Intruder;
 use coflash::device::{Dialect, Session, Timing};
 use coflash::file::block_file::BlockFile;
-use coflash::update::{flash, DeviceState, Event, FlashOptions, Left, Look, Report};
+use coflash::update::{flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash::{Adapter, Error};
 
 use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
@@ -24,7 +24,7 @@ fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Err
     (result, events)
 }
 
-fn left(running: u32, change: &dyn Fn(&mut Fake), options: FlashOptions) -> Left {
+fn left(running: u32, change: &dyn Fn(&mut Fake), options: FlashOptions) -> DeviceAfterUpdate {
     let mut fake = Fake::new(running);
     change(&mut fake);
     let (result, events) = run(&mut fake, &options);
@@ -50,7 +50,7 @@ const STANDARD: [Dialect; 3] = [Dialect::Block, Dialect::Raw, Dialect::Hex];
 #[test]
 fn nobody_there_and_nothing_done() {
     let nobody = left(BOOTLOADER, &|fake| fake.running = None, FlashOptions::default());
-    assert_eq!((nobody.state, nobody.look), (DeviceState::Untouched, Look::NotAsked));
+    assert_eq!((nobody.state, nobody.answer), (DeviceState::Untouched, DeviceAnswer::NotAsked));
     assert_eq!(nobody.to_string(), "it was not changed");
     // A successful update reports no state.
     let (_, events) = run(&mut Fake::new(BOOTLOADER), &FlashOptions::default());
@@ -134,14 +134,14 @@ fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
             fake.deaf_while_busy = true;
         };
         let gone = left(BOOTLOADER, &dies, dialect(its));
-        assert_eq!((gone.state, gone.look), (DeviceState::Erased, Look::Silent), "{its}");
+        assert_eq!((gone.state, gone.answer), (DeviceState::Erased, DeviceAnswer::Silent), "{its}");
         assert_eq!(gone.to_string(), "it does not answer; last known: it contains no complete program");
     }
     let mut fake = Fake::new(BOOTLOADER);
     run(&mut fake, &FlashOptions::default()).0.unwrap();
     let frames = fake.sent.len() / 2;
     let lost = left(BOOTLOADER, &|fake| fake.frames_left = frames, FlashOptions::default());
-    assert_eq!(lost.look, Look::NotAsked);
+    assert_eq!(lost.answer, DeviceAnswer::NotAsked);
     assert_eq!(lost.to_string(), "it cannot be asked any more; last known: it contains no complete program");
 }
 
@@ -149,21 +149,21 @@ fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
 fn a_program_that_does_not_answer_is_told_with_its_release() {
     let silent = |fake: &mut Fake| fake.starts = None;
     let tried = left(BOOTLOADER, &silent, FlashOptions::default());
-    assert_eq!((tried.state, tried.look), (DeviceState::Unreleased, Look::Silent));
+    assert_eq!((tried.state, tried.answer), (DeviceState::Unreleased, DeviceAnswer::Silent));
     assert_eq!(
         tried.to_string(),
         "it does not answer; last known: it contains the new program, not released for autostart: after a reset the \
          bootloader waits for the next attempt"
     );
     let released = left(BOOTLOADER, &silent, FlashOptions::default().trial_run(false));
-    assert_eq!((released.state, released.look), (DeviceState::Released, Look::Silent));
+    assert_eq!((released.state, released.answer), (DeviceState::Released, DeviceAnswer::Silent));
     let written = |fake: &mut Fake| {
         fake.starts = None;
         fake.on_block = Box::new(|_| Outcome::Ignore);
         fake.crc = Some(BlockFile::parse(data!("identity-110.blk")).unwrap().program_crc());
     };
     let raw = left(BOOTLOADER, &written, dialect(Dialect::Raw));
-    assert_eq!((raw.state, raw.look), (DeviceState::Written, Look::Silent));
+    assert_eq!((raw.state, raw.answer), (DeviceState::Written, DeviceAnswer::Silent));
 }
 
 /// A request of another client to a node: reads 1F57h.

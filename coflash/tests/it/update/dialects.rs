@@ -228,7 +228,7 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     assert!(matches!(result, Err(Error::Refused { doing: Doing::Program, .. })), "{result:?}");
     assert!(kept.lock().unwrap().is_empty());
 
-    // One that was told by 1018h is refused before anything.
+    // One that was recognised by 1018h is refused before anything.
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});
     let target = Some(Target { vendor_id: 1, product_code: 2 });
     let options = locked(PHRASE).check_target(target);
@@ -469,7 +469,7 @@ fn a_standard_device_is_stopped_cleared_written_and_started() {
     }
 }
 
-// --- telling them apart
+// --- recognition
 // ----------------------------------------------------------------------------------------------
 
 #[test]

@@ -241,7 +241,7 @@ fn verify_looks_once_more_at_the_running_program() {
     let mut fake = Fake::new(BOOTLOADER);
     let (report, events) = run(&mut fake, options);
     report.unwrap();
-    // Before the erasure, behind the download, and at the end.
+    // Before the erasure, after the download, and at the end.
     assert_eq!(fake.count("read 1F56/1"), 3);
     assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
     let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
@@ -409,7 +409,7 @@ fn every_status_of_the_manual_has_its_number_and_words() {
     }
 }
 
-/// Behind the boot-up that ends a trial, the bootloader stores that the program came back. CLEAR is not
+/// After the boot-up that ends a trial, the bootloader stores that the program came back. CLEAR is not
 /// repeated: what keeps the device busy may be the download of somebody else.
 #[test]
 fn a_command_is_repeated_while_the_device_is_still_storing() {
@@ -687,7 +687,7 @@ fn cancelling_aborts_the_transfer() {
             }
         });
         assert_eq!(result.unwrap_err().number(), 0x6000_0011);
-        // The requests behind it find out the state of the device.
+        // The requests after it find out the state of the device.
         let aborts = fake.log.iter().rposition(|entry| entry == "abort 08000000").unwrap();
         assert!(fake.log[aborts + 1..].iter().all(|entry| entry.starts_with("read ")), "{:?}", fake.log);
         // The next run works without any other step.

@@ -174,7 +174,7 @@ impl<'b> Programmer<'b> {
     /// Prepares for pieces of this program, and of no other. The first piece removes its record.
     /// With `erase`, its sectors are erased, those of the first `size` bytes before data arrive;
     /// otherwise each piece must find its place erased.
-    /// `partial` is the progress to begin with: a download that goes on begins behind its region's
+    /// `partial` is the progress to begin with: a download that goes on begins after its region's
     /// start.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
@@ -198,7 +198,7 @@ impl<'b> Programmer<'b> {
         });
     }
 
-    /// The pieces of the [opened](Self::open) program are of another file from here on: behind a
+    /// The pieces of the [opened](Self::open) program are of another file from here on: after a
     /// cut, neither of them can go on.
     pub(crate) fn disown(&mut self) {
         let Some(target) = &mut self.target else { return };

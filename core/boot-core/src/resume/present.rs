@@ -14,7 +14,7 @@ pub struct Partial {
     id: u32,
     /// The address up to which its data are in flash.
     end: u32,
-    /// It went on behind a cut: its data may already be in flash.
+    /// It went on after a cut: its data may already be in flash.
     resumed: bool,
 }
 
@@ -47,12 +47,12 @@ impl Partial {
         self.id != 0 && self.id == other.id
     }
 
-    /// It does not go on behind a cut any more. Returns whether it could.
+    /// It does not go on after a cut any more. Returns whether it could.
     pub(crate) const fn disown(&mut self) -> bool {
         core::mem::replace(&mut self.id, 0) != 0
     }
 
-    /// Whether it goes on behind a cut.
+    /// Whether it goes on after a cut.
     pub(crate) const fn is_resumed(self) -> bool {
         self.resumed
     }

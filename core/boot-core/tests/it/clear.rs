@@ -75,7 +75,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     // A debugger has written something to the last sector.
     rig.chip.model().poke(0x0800_43FC, &[0x7F]);
     assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
-    // An aborted download may have left more than the contents show, also behind a program that was
+    // An aborted download may have left more than the contents show, also after a program that was
     // installed since.
     let image = raw(&STANDARD_1, 1, 3000);
     for installed_since in [false, true] {

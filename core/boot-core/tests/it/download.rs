@@ -47,7 +47,7 @@ fn a_program_may_fill_its_region_and_not_a_byte_more() {
     assert_eq!(bench.stream(&image, Some(PROGRAM.size), 7), (Ok(()), 0));
     assert_eq!(bench.word(IDENTIFICATION), block_crc(&image));
 
-    // The last block is behind the end by a byte, or by all of it; and so is a program size.
+    // The last block is beyond the end by a byte, or by all of it; and so is a program size.
     for behind in [1, 16] {
         assert_eq!(bench.command(CLEAR), 0);
         let file = block_file(&image, 96);
@@ -678,7 +678,7 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
 /// A store outside the flash replaces the journal.
 #[test]
 fn parameters_may_be_kept_in_an_eeprom() {
-    /// Stores a value after a delay, like a memory that is written byte by byte; fails if told to.
+    /// Stores a value after a delay, like a memory that is written byte by byte; fails on demand.
     #[derive(Default)]
     struct Eeprom {
         values: Vec<(Key, Value)>,

@@ -130,7 +130,7 @@ fn each_program_has_its_own_values_and_no_other_exists() {
     }
 }
 
-/// The label must lie inside the program: bytes behind it are none of its own.
+/// The label must lie inside the program: bytes after it are none of its own.
 #[test]
 fn a_label_counts_from_the_first_size_that_holds_it() {
     let whole = (label::OFFSET as usize) + label::SIZE;
@@ -291,7 +291,7 @@ fn node_id_and_bit_rate_are_stored_one_after_the_other_and_kept() {
     assert_eq!(rig.stored().node, NodeParameters { id: NodeId::new(11), bit_rate: BitRate::K500 });
 }
 
-/// The flash does one thing at a time. What is refused is told, and changes nothing.
+/// The flash does one thing at a time. What is refused is reported, and changes nothing.
 #[test]
 fn a_store_while_the_flash_works_is_refused() {
     let image = raw(&STANDARD_1, 1, 900);
@@ -686,7 +686,7 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
         rig.settle();
         let size = if replaces { 700 } else { 600 };
         assert_eq!(rig.stored().records[0].map(|record| record.0), Some(size));
-        // Once more in the same session, also behind a download that broke off.
+        // Once more in the same session, also after a download that broke off.
         if replaces {
             rig.begin(1, None, &raw(setup, 1, 800)[..700]).unwrap();
             rig.settle();
@@ -765,7 +765,7 @@ const LENGTH: AbortCode = AbortCode(0x0607_0010);
 const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
 const LENGTH_TOO_LOW: AbortCode = AbortCode(0x0607_0013);
 
-/// A device behind CLEAR and a control block, with this buffer.
+/// A device after CLEAR and a control block, with this buffer.
 fn open(setup: &'static Setup, buffer: usize) -> Rig {
     let mut rig = Rig::new(setup, buffer);
     rig.command(1, CLEAR).unwrap();
@@ -775,7 +775,7 @@ fn open(setup: &'static Setup, buffer: usize) -> Rig {
     rig
 }
 
-/// A block is 12 bytes in front of its data and 4 behind them (SYS TEC manual, figure 5).
+/// A block is 12 bytes in front of its data and 4 after them (SYS TEC manual, figure 5).
 #[test]
 fn a_block_that_is_no_block_is_told_how() {
     let base = STANDARD_1.region(1).base;
@@ -818,7 +818,7 @@ fn a_block_is_as_large_as_the_buffer_and_no_larger() {
             assert_eq!(first, if announced { Err(LENGTH_TOO_HIGH) } else { Ok(()) }, "{buffer}");
             rig.cancel(1);
             assert_eq!(rig.begin(1, size(&large), &large[..12]), Err(LENGTH_TOO_HIGH), "{buffer}");
-            // What the header does not tell.
+            // What the header does not announce.
             let mut hidden = block(largest + 2);
             hidden[8..12].copy_from_slice(&4_u32.to_le_bytes());
             rig.begin(1, None, &hidden[..largest + 16]).unwrap();
@@ -959,7 +959,7 @@ fn a_block_goes_on_beside_a_command_that_fails() {
     assert_eq!((rig.state(1), rig.identification(1)), (0, crc32(&one)));
 }
 
-/// An emergency tells of work that has ended: a block that is refused has its answer.
+/// An emergency reports work that has ended: a block that is refused has its answer.
 #[test]
 fn a_refused_block_is_no_emergency() {
     let mut rig = open(&STANDARD_1, 1024);
@@ -1002,7 +1002,7 @@ fn a_stream_that_is_refused_as_it_begins_leaves_nothing() {
     rig.settle();
     let at = Address::new(0x1F50, 1);
     rig.node.download_start(at, None).unwrap();
-    // More than a piece of 128 bytes, and behind it no record.
+    // More than a piece of 128 bytes, and after it no record.
     let bad = format!("{}\n:X", text.lines().take(12).collect::<Vec<_>>().join("\n"));
     assert!(rig.node.download_data(at, bad.as_bytes()).is_err());
     rig.cancel(1);

@@ -214,7 +214,7 @@ fn record(key: Key, [a, b, c, d]: Value) -> Vec<u8> {
     slot([key.tag(), a, b, c, d])
 }
 
-/// The used slots of a region, one after another; everything behind them is blank.
+/// The used slots of a region, one after another; everything after them is blank.
 fn used(flash: &ModelFlash, region: Region, slots: usize) -> &[u8] {
     let (used, rest) = flash.cells(region).split_at(slots * SLOT as usize);
     assert!(rest.iter().all(|byte| *byte == 0xFF), "there is more than {slots} slots");
@@ -276,7 +276,7 @@ fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
         record(Key::Node, [6, 2, 0, 0]),
     ];
     assert_eq!(used(&flash, REGIONS[1], 6), expected.concat());
-    // The header comes behind the copies, and the new record behind the header.
+    // The header comes after the copies, and the new record after the header.
     let sectors: Vec<u32> = flash.touched.iter().filter(|at| at.size > 4).map(|at| at.base).collect();
     assert_eq!(sectors, [REGIONS[1].base]);
     let slots: Vec<u32> =
@@ -292,7 +292,7 @@ fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
     assert_eq!(journal.get(&flash, Key::CrashCount), Some([8, 0, 0, 0]));
 }
 
-/// What stands in a region without a header is not a value: neither at once, nor when the region
+/// What is in a region without a header is not a value: neither at once, nor when the region
 /// gets a header.
 #[test]
 fn what_was_left_in_a_region_never_becomes_a_value() {
@@ -497,7 +497,7 @@ fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
     let mut journal = Journal::open(&flash, REGIONS);
     store(&mut flash, &mut journal, Key::Node, [1; 4]).unwrap();
     let before = flash.operations;
-    // Behind the header and the first record, and all of the other region.
+    // After the header and the first record, and all of the other region.
     let rest = Region::new(REGIONS[0].base + 2 * SLOT, 256 - 2 * SLOT);
     let mut worn = Worn { flash, places: vec![rest, REGIONS[1]] };
     for attempt in 1..4 {
@@ -511,7 +511,7 @@ fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
     }
 }
 
-/// The first region is worn out from the start: what is refused is told, and nothing is believed.
+/// The first region is worn out from the start: a refusal is reported, and nothing is believed.
 #[test]
 fn a_device_whose_regions_are_worn_out_stores_nothing_and_says_so() {
     for places in [vec![REGIONS[0]], REGIONS.to_vec()] {

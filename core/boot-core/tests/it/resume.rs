@@ -25,7 +25,7 @@ fn named(image: &[u8]) -> Vec<Vec<u8>> {
     file
 }
 
-/// What the device tells of a begun download: the CRC of block 0, and the address.
+/// What the device reports of a begun download: the CRC of block 0, and the address.
 fn partial(bench: &mut Bench<'_>) -> (u32, u32) {
     let mut bytes = [0; 8];
     assert_eq!(bench.node.read(PARTIAL, &mut bytes), Ok(8));
@@ -217,7 +217,7 @@ fn a_download_of_two_files_does_not_go_on() {
         assert_eq!(partial(&mut bench).0, crc_of(&file[0]));
         bench.good(&control_of_other);
         assert_eq!(partial(&mut bench).0, 0, "{sent} blocks");
-        // The flash takes nothing where there are data, and everything behind them.
+        // The flash takes nothing where there are data, and everything after them.
         for (number, data) in (1..).zip(other.chunks(CHUNK).skip(sent)) {
             let address = PROGRAM.base + (sent * CHUNK) as u32 + (number - 1) * CHUNK as u32;
             bench.good(&block(number, address, data));
@@ -270,7 +270,7 @@ fn progress_is_stored_each_kib_and_ends_with_the_program() {
     }
 }
 
-/// Flash and program of the model, with larger sectors behind the first five.
+/// Flash and program of the model, with larger sectors after the first five.
 static LARGE_CHIP: Geometry = Geometry {
     chip: "large-model",
     flash: Region::new(0x0800_0000, 0x1_0C00),
@@ -295,7 +295,7 @@ fn the_progress_of_a_large_program_is_stored_sixteen_times() {
     }
     let in_journal = |at: &&Region| LAYOUT.parameters.iter().any(|own| own.contains(at.base, at.size));
     let words = flash.touched.iter().filter(in_journal).filter(|at| at.size == 4).count();
-    // Six words each: the journal's header, and a record with the first data and behind each sixteenth
+    // Six words each: the journal's header, and a record with the first data and after each sixteenth
     // part but the last, which the program fills only in part.
     assert_eq!(words, (1 + 16) * 6);
 }

@@ -287,7 +287,7 @@ mod tests {
             assert_eq!(receiver.take(&other, false).map(|received| received.is_data), Ok(false));
             assert_eq!(receiver.is_within(), is_of_the_next, "{seqno}");
         }
-        // Behind segment 3 of the rest, another 3 is the next sub-block's.
+        // After segment 3 of the rest, another 3 is the next sub-block's.
         let mut receiver = behind_two_of(6);
         for (content, is_of_the_next) in [(0xEE, false), (0xDD, true)] {
             let segment = BlockSegment { last: false, seqno: 3, data: [content; 7] }.emit();
@@ -296,7 +296,7 @@ mod tests {
         }
     }
 
-    /// Behind a lost segment 30, number 32 reads as an initiate (20h), and follows 31.
+    /// After a lost segment 30, number 32 reads as an initiate (20h), and follows 31.
     #[test]
     fn the_successor_of_the_last_segment_is_one_also_behind_a_gap() {
         let mut receiver = Receiver::new(false);

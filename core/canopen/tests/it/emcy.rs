@@ -191,7 +191,7 @@ fn a_stopped_node_keeps_its_emergencies() {
     assert_eq!(bench.sent(), first_four);
 }
 
-/// CiA 301 table 51: bit 0 is set with each of the others, and stays when it is told by itself.
+/// CiA 301 table 51: bit 0 is set with each of the others, and stays when it is reported by itself.
 #[test]
 fn the_generic_bit_is_set_with_each_error() {
     for bits in [0, register::GENERIC, register::COMMUNICATION, register::GENERIC | register::MANUFACTURER] {
@@ -201,7 +201,8 @@ fn the_generic_bit_is_set_with_each_error() {
     }
 }
 
-/// Events of the line: lost frames and bus-off have ended when they are told, error passive has not.
+/// Events of the line: lost frames and bus-off have ended when they are reported, error passive has
+/// not.
 #[test]
 fn events_of_the_line_are_errors_that_end() {
     use canopen::line::LineEvent;
@@ -218,7 +219,7 @@ fn events_of_the_line_are_errors_that_end() {
         emcy.line_event(LineEvent::Active);
         let ended = emcy.next_message().map(|bytes| Emergency::parse(&bytes)).unwrap();
         assert_eq!((ended.code, ended.register, emcy.next_message()), (0, 0, None), "{event:?}");
-        // 1003h keeps it; the places behind it are empty.
+        // 1003h keeps it; the places after it are empty.
         let mut bytes = [0; 4];
         assert_eq!(emcy.read(node(), Address::new(0x1003, 1), &mut bytes), Some(Ok(4)));
         assert_eq!(bytes[..2], code.to_le_bytes());

@@ -51,7 +51,7 @@ impl Group {
         has
     }
 
-    /// One attempt; `hears` tells whether a request gets to the bus (`None`), which device hears
+    /// One attempt; `hears` says whether a request gets to the bus (`None`), which device hears
     /// it, and which answer is heard.
     fn download(
         &mut self,

@@ -164,7 +164,7 @@ fn a_device_without_node_id_takes_one_and_starts() {
 }
 
 /// A reset that comes before the start was reported: the node must not start with the earlier node-ID
-/// behind it.
+/// after it.
 #[test]
 fn a_reset_communication_takes_the_place_of_a_start_that_was_not_reported() {
     let mut bench = Bench::in_configuration(0xFF);

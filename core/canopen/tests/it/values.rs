@@ -87,7 +87,7 @@ fn addresses_and_codes_are_printed_as_the_documents_write_them() {
     assert_eq!(format!("{}", CobId::new(0x85).unwrap()), "085h");
 }
 
-/// The counter starts again behind 2^32 ms; half of that lies ahead, and half behind.
+/// The counter starts again after 2^32 ms; half of that is the future, and half the past.
 #[test]
 fn a_deadline_lies_ahead_for_half_the_range_of_the_counter() {
     for (now, deadline, has_passed) in [

@@ -355,7 +355,7 @@ fn a_test_key_needs_a_device_for_tests() {
 }
 
 /// Is it possible, is it for this device, is it recent enough, are the keys there: with all faults from
-/// one on, that one is told.
+/// one on, that one is reported.
 #[test]
 fn the_first_fault_is_told() {
     let faults: [(Fault, Change); 8] = [

@@ -200,7 +200,7 @@ fn a_record_that_exceeds_the_manifest_has_no_bytes_and_no_known_tag() {
     let list =
         |file: &[u8]| Head(file).records().map(|(tag, bytes)| (tag, bytes.to_vec())).collect::<Vec<_>>();
     let expected = vec![(0x8001, vec![1, 2, 3, 4]), (2, vec![]), (3, vec![5; 8])];
-    // Behind the manifest there is none.
+    // After the manifest there is none.
     assert_eq!(list(&[&whole[..], &record(4, &[6; 4])].concat()), expected);
     assert_eq!(list(&manifest(&[], 1)), []);
     for (length, known) in [(9, 2), (u16::MAX, 2)] {

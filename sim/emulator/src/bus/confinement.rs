@@ -6,7 +6,7 @@
 pub enum ErrorState {
     /// Takes part, and answers errors with six dominant bits that destroy the frame for everyone.
     Active,
-    /// Takes part, but its error flags are recessive and it leaves eight more bits free behind its
+    /// Takes part, but its error flags are recessive and it leaves eight more bits free after its
     /// own frames.
     Passive,
     /// Takes no part until 128 × 11 recessive bits have gone by.

@@ -21,7 +21,7 @@ pub enum FaultAction {
     /// The frame is acknowledged, held back, and sent again after this time as a frame of its own,
     /// as a store-and-forward gateway does.
     Delay(Span),
-    /// The frame gets through, and is sent once more right behind.
+    /// The frame gets through, and is sent once more right after it.
     Duplicate,
 }
 
@@ -60,7 +60,7 @@ pub enum When {
     Nth(u64),
     /// Every n-th; 0 hits none.
     EveryNth(u64),
-    /// The n-th and all behind it, from 1.
+    /// The n-th and all after it, from 1.
     FromNth(u64),
     /// One in so many on average, in an order that the seed fixes; 0 hits none.
     OneIn {

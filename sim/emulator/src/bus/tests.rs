@@ -392,7 +392,7 @@ fn bus_off_ends_after_128_times_11_recessive_bits() {
     bench.run(3_000);
     assert_eq!(bench.read(0, 0x18) & 7, 7);
     assert_eq!(bench.log().len(), 32, "256 / 8");
-    // The receivers see a CRC error: the flag begins behind the ACK delimiter, 7 + 8 bits.
+    // The receivers see a CRC error: the flag begins after the ACK delimiter, 7 + 8 bits.
     assert_eq!(bench.log()[0], (20, 20 + 41 + 15, 0x080, Outcome::Bad(ErrorKind::BitRecessive)));
     let recessive = bench.bus.recessive_since.0 / US;
     assert_eq!(recessive, bench.log()[31].1 - 8);
@@ -419,7 +419,7 @@ fn bus_off_recovery_counts_between_frames() {
     for _ in 0..32 {
         bench.can(0).event(BusEvent::TransmitFailed { kind: ErrorKind::BitDominant, exempt: false }, now);
     }
-    // 200 frames back to back: each leaves one sequence of 11 recessive bits behind it.
+    // 200 frames back to back: each leaves one sequence of 11 recessive bits after it.
     (0..200).for_each(|_| bench.send(1, 20, sync()));
     bench.run(20 + 127 * 51);
     assert_eq!(bench.read(0, 0x18) & 4, 4);
@@ -460,7 +460,7 @@ fn injected_faults() {
     assert_eq!(bench.log.borrow()[2].from, None);
 
     let mut bench = faulty(FaultAction::Disturb);
-    // 56 bits: the ACK delimiter is bit 48, the flag begins behind it; 7 + 8 + 3 bits later it is
+    // 56 bits: the ACK delimiter is bit 48, the flag begins after it; 7 + 8 + 3 bits later it is
     // repeated.
     assert_eq!(bench.log()[1], (100, 100 + 49 + 15, 0x701, Outcome::Bad(ErrorKind::BitRecessive)));
     assert_eq!(bench.log()[2].0, 100 + 49 + 18);

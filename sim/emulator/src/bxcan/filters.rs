@@ -7,7 +7,7 @@ use crate::peripheral::Unmodelled;
 /// Banks of the dual bxCAN.
 pub const BANKS: usize = 28;
 const ALL_BANKS: u32 = (1 << BANKS) - 1;
-/// FMR behind a reset: 14 banks for CAN1, initialisation mode, and reserved bits that read as they
+/// FMR after a reset: 14 banks for CAN1, initialisation mode, and reserved bits that read as they
 /// are.
 const FMR_RESET: u32 = 0x2A1C_0E01;
 const FINIT: u32 = 1;

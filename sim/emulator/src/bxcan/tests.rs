@@ -1,5 +1,5 @@
-//! Register behaviour of the controller, driven register by register as RM0090 section 32 tells a
-//! driver to, with the bus played by hand. Offsets and bits are the manual's numbers.
+//! Register behaviour of the controller, driven register by register as RM0090 section 32 requires
+//! of a driver, with the bus played by hand. Offsets and bits are the manual's numbers.
 
 use super::*;
 
@@ -520,7 +520,7 @@ fn running_slave(filters: &[(u32, u32)]) -> (Bench, BxCan) {
     (bench, master.can)
 }
 
-/// Bank 14, CAN2's first behind a reset: lets everything through, into FIFO 0.
+/// Bank 14, CAN2's first after a reset: lets everything through, into FIFO 0.
 const EVERYTHING_FOR_CAN2: [(u32, u32); 3] = [(FS1R, 1 << 14), (FA1R, 1 << 14), (FMR, 0x0E00)];
 
 #[test]

@@ -80,7 +80,7 @@ impl Debug {
         self.dfsr &= !(value & DFSR_MASK);
     }
 
-    /// `DEMCR`; whether the exception is pending is told elsewhere.
+    /// `DEMCR`; whether the exception is pending is reported elsewhere.
     #[must_use]
     pub fn read_demcr(&self, pending: bool) -> u32 {
         self.demcr | if pending { DEMCR_MON_PEND } else { 0 }

@@ -204,7 +204,7 @@ impl Scs {
     /// the code that runs lets it in, as BusFault if that is enabled and as HardFault if not. It
     /// does not lock the core up, and BFHFNMIGN does not stop it: that bit is about precise faults
     /// (DDI 0403E B3.2.8; PM0214 section 4.4.7 is silent about which). With ACTLR.DISDEFWBUF the
-    /// fault is precise, and code at priority -1 (FAULTMASK) or -2 goes on behind the store if
+    /// fault is precise, and code at priority -1 (FAULTMASK) or -2 goes on after the store if
     /// BFHFNMIGN is set.
     pub fn refuse_store(&mut self, address: u32, masks: Masks) -> RefusedStore {
         if self.actlr & ACTLR_UNBUFFERED == 0 {

@@ -1,8 +1,8 @@
 //! Which instruction of a block makes a given access.
 //!
-//! Unicorn tells a peripheral's callback the address, but not the instruction. The registers are up
-//! to date then, so the instruction is the one whose base and offset give that address (encodings:
-//! DDI 0403E A5.2.4 and A5.3.5 to A5.3.10).
+//! Unicorn passes the address to a peripheral's callback, but not the instruction. The registers
+//! are up to date then, so the instruction is the one whose base and offset give that address
+//! (encodings: DDI 0403E A5.2.4 and A5.3.5 to A5.3.10).
 
 use crate::report::Access;
 

@@ -45,7 +45,7 @@ impl Instruction {
         }
     }
 
-    /// The IT state behind this instruction if it is an IT (A7.7.38).
+    /// The IT state after this instruction if it is an IT (A7.7.38).
     pub fn it_state(self) -> Option<u8> {
         (self.first & 0xFF00 == 0xBF00 && self.first & 0xF != 0).then_some((self.first & 0xFF) as u8)
     }
@@ -103,7 +103,7 @@ pub fn holds(condition: u8, xpsr: u32) -> bool {
     met != (condition & 1 != 0)
 }
 
-/// The IT state behind one more instruction (A7.3.2, ITAdvance).
+/// The IT state after one more instruction (A7.3.2, ITAdvance).
 pub fn advance(it: u8) -> u8 {
     if it & 7 == 0 {
         0

@@ -121,7 +121,7 @@ pub struct Tim {
     psc: Preloaded,
     arr: Preloaded,
     ccr: [Preloaded; 4],
-    /// The counter, and ticks of CK_INT since it changed, as of `seen` ticks behind the anchor.
+    /// The counter, and ticks of CK_INT since it changed, as of `seen` ticks after the anchor.
     count: u32,
     prescaled: u64,
     anchor: Time,
@@ -426,7 +426,7 @@ impl Peripheral for Tim {
 
     fn advance(&mut self, now: Time) {
         if !self.counts() {
-            // It stands still; when it goes on, it counts from there.
+            // It is stopped; when it goes on, it counts from there.
             self.anchor_at(now);
             return;
         }

@@ -127,7 +127,7 @@ pub struct Character {
     pub bit_rate: u32,
 }
 
-/// The content of the transmitter's shift register; without a word it is the idle frame behind TE.
+/// The content of the transmitter's shift register; without a word it is the idle frame after TE.
 #[derive(Clone, Copy, Debug)]
 struct Shift {
     word: Option<u8>,
@@ -233,7 +233,7 @@ impl Usart {
         self.outside.bit_rate = bit_rate;
     }
 
-    /// The outside sends bytes, one behind the other, from `now` on. Returns how many it takes; the
+    /// The outside sends bytes, one after the other, from `now` on. Returns how many it takes; the
     /// caller has to pass the rest again.
     pub fn receive(&mut self, bytes: &[u8], now: Time) -> usize {
         let room = MOST_WAITING - self.outside.waiting.len();
@@ -520,7 +520,7 @@ mod tests {
         usart.set_wired(true, true);
         usart.write(BRR, 22 << 4 | 13, Time(0)).unwrap();
         usart.write(CR1, 1 << 13 | 1 << 3 | 1 << 2 | enable, Time(0)).unwrap();
-        // The idle frame behind TE.
+        // The idle frame after TE.
         usart.advance(Time(100 * MICRO));
         usart
     }

@@ -236,7 +236,7 @@ fn parse_remote_frame(words: &[&str]) -> Result<Frame, String> {
     Frame::remote_frame(parse_id(id)?, parse_dlc(dlc)?).ok_or_else(|| "more than eight data bytes".into())
 }
 
-/// A frame as a client in raw mode gets it. Data bytes stand together, as the daemon writes them
+/// A frame as a client in raw mode gets it. Data bytes are adjacent, as the daemon writes them
 /// (its description puts blanks between them), and a frame without data has two blanks before its
 /// closing bracket: clients split there.
 #[must_use]

@@ -319,7 +319,7 @@ fn gdb(address: &str, commands: &[&str]) -> String {
 const COUNTS: &[u16] =
     &[0x2000, 0x4904, 0x3001, 0x6008, 0xF000, 0xF801, 0xE7FA, 0x3203, 0x4770, 0xBF00, 0x0000, 0x2000];
 
-/// gdb with breakpoints, steps, memory, registers, and a reset; the virtual time stands still while
+/// gdb with breakpoints, steps, memory, registers, and a reset; the virtual time is stopped while
 /// the machine is halted.
 #[test]
 #[cfg(all(unix, feature = "gdb"))]

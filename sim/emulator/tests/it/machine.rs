@@ -266,7 +266,7 @@ fn can_is_not_late_because_the_program_writes_registers() {
     assert_no_delay(&[(0x4002_3840, 1 << 25), (CAN1_MCR, 0)], not_asleep, 88);
 }
 
-/// RM0090 section 30.3.2: TE sends an idle frame first, as long as the character behind it: 10 bits
+/// RM0090 section 30.3.2: TE sends an idle frame first, as long as the character after it: 10 bits
 /// each, at 1 Mbit/s.
 #[test]
 fn a_usart_is_not_late_because_the_program_writes_registers() {
@@ -396,7 +396,7 @@ fn an_interrupt_within_a_conditional_block_leaves_it_whole() {
 }
 
 /// The first load from a page calls a hook in the middle of a block. If the load is within an IT
-/// block, the code behind the IT block stays unconditional.
+/// block, the code after the IT block stays unconditional.
 #[test]
 fn a_load_within_a_conditional_block_leaves_the_code_behind_it_alone() {
     let mut machine = machine(&programs::CONDITIONAL_LOADS);
@@ -565,7 +565,7 @@ fn the_watchdog_resets_unless_it_is_fed() {
 const SECTOR_1: usize = 0x4000;
 
 /// Datasheet: 250 ms for 16 KiB at x32. Polling from flash sees BSY set never more than once: the
-/// CPU stands still.
+/// CPU is stalled.
 #[test]
 fn code_in_flash_stands_still_while_the_flash_is_busy() {
     let mut machine = with_options(&programs::FLASH_FROM_FLASH, Options::default());
@@ -792,7 +792,7 @@ fn without_the_write_buffer_the_fault_names_its_store() {
     assert_eq!(stored.locks, [LOCKED[0], 0x0FFF_AAED]);
 }
 
-/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on behind the store. The status
+/// PM0214 section 4.4.7, BFHFNMIGN: code at priority -1 goes on after the store. The status
 /// registers show the fault.
 #[test]
 fn a_precise_fault_is_ignored_under_faultmask_if_the_program_says_so() {
@@ -1001,7 +1001,7 @@ fn noise_as_a_program_does_no_harm() {
         (state >> 32) as u32
     };
     for seed in 0..60 {
-        // adr r7, table; ldmia r7, {r0-r7}; b behind the table; nop
+        // adr r7, table; ldmia r7, {r0-r7}; b past the table; nop
         let mut code = bytes(&[0xA701, 0xCFFF, 0xE010, 0xBF00]);
         for _ in 0..8 {
             code.extend_from_slice(&PLACES[random() as usize % 16].to_le_bytes());

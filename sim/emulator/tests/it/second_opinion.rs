@@ -21,7 +21,7 @@ const RESULTS: u32 = 0x2000_0000;
 const END: u32 = 0x2000_3000;
 /// Where they are.
 const CODE: u32 = 0x2000_4000;
-/// Words that are compared; those behind the last one of a program are 0.
+/// Words that are compared; those after the last one of a program are 0.
 const WORDS: usize = 64;
 /// The last word of every program.
 const LAST: u32 = 0x0E0E_0E0E;

@@ -121,7 +121,7 @@ const FAULTS: &[Fault] = &[
     answers(&["BOOT-001", "BOOT-002", "BOOT-003", "BOOT-004", "LSS-026"], |_, f| {
         (!f.has_cob_id(CobId::heartbeat(NODE)) || f.data() != [0]).then_some(f)
     }),
-    // The heartbeat tells operational.
+    // The heartbeat reports operational.
     answers(&["HB-001", "NMT-005"], |_, f| {
         let beat = f.has_cob_id(CobId::heartbeat(NODE)) && f.data() == [0x7F];
         Some(if beat { Frame::of(CobId::heartbeat(NODE), &[5]) } else { f })

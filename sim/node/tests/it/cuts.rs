@@ -183,7 +183,7 @@ fn half(installed: &ModelFlash, file: &[u8]) -> ModelFlash {
 }
 
 /// Flashes a file into a device with this flash; it must end with this program. Returns what was
-/// told, and the data bytes that were sent.
+/// reported, and the data bytes that were sent.
 fn recover(flash: ModelFlash, image: &[u8], file: &[u8], options: &FlashOptions) -> (Ended, usize) {
     let mut bus = CutBus::new(flash, None);
     let ended = update(&mut bus, file, Transfers::Blocks, options);
@@ -254,7 +254,7 @@ fn what_was_given_up_does_not_go_on() {
     assert!(ended.went_on().is_none(), "{:?}", ended.events);
     assert_eq!(data, file.len());
 
-    // CLEAR postpones the erase: a power cut behind one CLEAR has lost nothing, and the second in a
+    // CLEAR postpones the erase: a power cut after one CLEAR has lost nothing, and the second in a
     // row erases.
     let mut cleared = first;
     cleared.power_on();

@@ -39,7 +39,7 @@ fn objects_are_read_in_lists_and_by_their_names() {
     assert_eq!(said.len(), 5, "{said:?}");
     assert_eq!(said[1], "node 5, 1018h/1: 63 (0000003Fh)");
     assert_eq!(said[4], "node 5, 1018h/4: 77 (0000004Dh)");
-    // The option may stand before the command, and the object may be named.
+    // The option may come before the command, and the object may be named.
     let named = coflash.done(&["-N", "5", "read", "Identity object/4", "--eds", &eds()]);
     assert!(
         named.starts_with("node 5, 1018h/4 (Identity object/") && named.ends_with("): 77 (0000004Dh)\n"),

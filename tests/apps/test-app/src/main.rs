@@ -169,7 +169,7 @@ mod app {
         debugger.with(device, |device| slave.observe(status, now, device));
         loop {
             // A frame that finds no room (a heartbeat on a busy bus) must not keep the requests
-            // waiting behind it.
+            // that wait after it.
             debugger.with(device, |device| carry_out(slave, &mut can, now, device));
             let Some(frame) = to_handle.dequeue() else { return };
             if debugger.with(device, |device| slave.handle(&frame, now, device)) {

@@ -1,7 +1,7 @@
 //! Level 2: the built firmware on the emulated chip, with the power cut at its flash operations.
 //!
 //! A power cut leaves nothing but the flash. So a scenario runs once, and the emulator keeps the
-//! list of its flash operations: from it follows the flash behind each cut. Cuts that leave the
+//! list of its flash operations: from it follows the flash after each cut. Cuts that leave the
 //! same flash are one state. With each state the board is switched on and looked at, and with some
 //! of them the host does everything again; this recovery has operations of its own, which are cut
 //! in the same way.
@@ -121,7 +121,7 @@ fn record(story: &Story, bench: &mut Bench, cells: &Cells) -> Result<Vec<Operati
     acted.map(|()| operations)
 }
 
-/// The flash behind a cut, from the flash before and the operations up to this one.
+/// The flash after a cut, from the flash before and the operations up to this one.
 fn behind(before: &Cells, operations: &[Operation], at: At) -> Option<Cells> {
     let chip = firmware::board().chip;
     let mut cells = before.clone();

@@ -28,8 +28,8 @@ const LATE_MS: u32 = 120;
 /// match. So each server takes the whole data or none, and the caller sends them again to those
 /// that have none. They must be such that a server which has taken them takes them again.
 ///
-/// No server ever gets more bytes than it was told: that would end its transfer, and it would take
-/// the segments behind that for requests.
+/// No server ever gets more bytes than were announced: that would end its transfer, and it would
+/// take the segments after that for requests.
 #[derive(Debug)]
 pub struct GroupDownload<D> {
     request: CobId,
@@ -212,7 +212,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         }
     }
 
-    /// Goes on behind the last segment that a server has acknowledged. Who has not got so far stays
+    /// Goes on after the last segment that a server has acknowledged. Who has not got so far stays
     /// behind.
     fn next_sub_block(&mut self, mut sent: Sent) {
         let data = self.data.as_ref();

@@ -4,7 +4,7 @@
 //!
 //! Byte 0 of a segment is its number, 1 to 127, with bit 7 set in the last segment of the transfer.
 //! The command specifiers of the initiates (20h, 40h, A0h, C0h with their flags) are also such
-//! numbers, and CiA 301 has no rule to tell the two apart. A client that is switched off in the
+//! numbers, and CiA 301 has no rule to distinguish the two. A client that is switched off in the
 //! middle of a download must however not block other clients until the time-out. A frame is
 //! therefore taken for a request if
 //!

@@ -4,7 +4,7 @@
 //!   than 8 bytes are not SDO requests (CiA 301 section 7.2.4.3: all have 8 bytes) and are ignored.
 //! - Every request is answered or aborted, except for an abort.
 //! - An initiate ends the previous transfer. Within a sub-block of a block download it must first
-//!   be told apart from a segment, see `block_download.rs`.
+//!   be distinguished from a segment, see `block_download.rs`.
 //! - If the client is silent for the time-out, the transfer is aborted with 05040000h. In a block
 //!   download the time-out counts from the last accepted segment, whatever else arrives.
 //! - If a sub-block of a block download stops early, the received segments are acknowledged, and

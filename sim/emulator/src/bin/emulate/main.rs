@@ -113,7 +113,7 @@ struct Args {
     node_count: u8,
 
     /// Virtual seconds per second of the wall clock, or `max`: as fast as the host can, but 1:1 for
-    /// a moment behind every frame that a client gets, so that its answer is not late in virtual
+    /// a moment after every frame that a client gets, so that its answer is not late in virtual
     /// time
     #[arg(long, default_value = "1")]
     speed: Speed,
@@ -184,7 +184,7 @@ fn main() -> ExitCode {
         // The reader of the output has closed it.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            // If that cannot be written either, only the exit code tells it.
+            // If that cannot be written either, only the exit code reports it.
             let _ = writeln!(io::stderr(), "emulate: {error:#}");
             ExitCode::FAILURE
         }
@@ -346,7 +346,7 @@ const STEPS: usize = 100;
 #[cfg(feature = "gdb")]
 const STEP: Span = Span::from_micros(10);
 
-/// How often a board's RAM is looked at for what it tells a debug probe.
+/// How often a board's RAM is looked at for what it reports to a debug probe.
 const LOOK: Span = Span::from_millis(5);
 
 impl Bench {
@@ -492,7 +492,7 @@ impl Bench {
             let (wall, now) = (Instant::now(), self.world.now());
             let halted = self.world.is_halted();
             if halted {
-                // Time stands still, and nothing of it is caught up on.
+                // Time is stopped, and nothing of it is caught up on.
                 pacer = Pacer::new(args.speed, wall, now);
                 lag = Lag::new(args.speed);
             }

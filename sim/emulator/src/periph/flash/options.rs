@@ -21,9 +21,9 @@ const KEPT: u32 = 0x0FFF_FFEC;
 /// From the factory: no protection, BOR off, software watchdog (section 3.9.9).
 const FACTORY: u32 = 0x0FFF_AAEC;
 /// What is left when the power fails while they are programmed: an erased cell reads as 1. That is
-/// read-out protection level 1 with no sector protected. Of an STM32F429 it was told in ST's forum
-/// ("STM32F429ZIT6 reset values for flash option bytes when power down", 2018); there the same ones
-/// are SPRMOD, too, so that no sector can be read and the part never starts again.
+/// read-out protection level 1 with no sector protected. Of an STM32F429 it was reported in ST's
+/// forum ("STM32F429ZIT6 reset values for flash option bytes when power down", 2018); there the
+/// same ones are SPRMOD, too, so that no sector can be read and the part never starts again.
 const ERASED: u32 = KEPT;
 
 /// RDP of level 0.

@@ -809,7 +809,7 @@ after_second:
     movs r4, #0
     store SCR, 2
     store 0xE000E010, 7
-    wfi                         // goes on behind the third interrupt
+    wfi                         // goes on after the third interrupt
     log r4
     log_word SCR
     store 0xE000E010, 0

@@ -1,4 +1,4 @@
-// In 64 rounds the first load from a page of flash, within an IT block; behind the block four
+// In 64 rounds the first load from a page of flash, within an IT block; after the block four
 // additions of 1. Their sum at 2000_0000h.
 .include "program.inc"
 

@@ -1,7 +1,7 @@
 // Follows a script at 2000_0100h, of pairs of words: address and value of a store; 1 or 2 and a
 // value for FAULTMASK; 0 for the end. Logs then from 2000_0004h on: FLASH_CR, FLASH_OPTCR, CFSR,
 // HFSR, BFAR. The handler of BusFault and HardFault counts at 2000_0000h, logs IPSR and the
-// stacked PC at 2000_0018h, and goes on behind the store if that is what the PC points to.
+// stacked PC at 2000_0018h, and goes on after the store if that is what the PC points to.
 .include "program.inc"
 vector 3, fault
 vector 5, fault

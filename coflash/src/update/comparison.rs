@@ -22,7 +22,7 @@ use crate::file::sealed::SealedFile;
 /// The result of comparing a device with a sealed image.
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Held {
+pub struct Comparison {
     /// The device type of what runs: the bootloader or an application.
     pub running: DeviceType,
     /// Whether the program runs.
@@ -93,7 +93,7 @@ impl fmt::Display for Difference {
     }
 }
 
-impl Held {
+impl Comparison {
     /// Whether no reported value differs.
     #[must_use]
     pub fn is_same(&self) -> bool {
@@ -116,16 +116,16 @@ impl Held {
 ///
 /// # Errors
 /// [`Error::NoAnswer`] and the like; an object that the device does not have is no error.
-pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error> {
+pub fn compare_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<Comparison, Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
     let head = file.head();
     let program = head.program();
     let running = session.find()?;
-    let mut held = Held { running, runs: false, differences: Vec::new(), untold: Vec::new() };
-    let mut number = |held: &mut Held, at: Address| -> Result<Option<u32>, Error> {
+    let mut comparison = Comparison { running, runs: false, differences: Vec::new(), untold: Vec::new() };
+    let mut number = |comparison: &mut Comparison, at: Address| -> Result<Option<u32>, Error> {
         let told = optional(session.read_number(at))?;
         if told.is_none() {
-            held.untold.push(at);
+            comparison.untold.push(at);
         }
         Ok(told)
     };
@@ -133,14 +133,14 @@ pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error>
     for (sub, what, said) in
         [(1, Part::VendorId, head.vendor_id()), (2, Part::ProductCode, head.product_code())]
     {
-        if let Some(device) = number(&mut held, Address::new(IDENTITY, sub))? {
-            held.compare(what, said, device, hexadecimal);
+        if let Some(device) = number(&mut comparison, Address::new(IDENTITY, sub))? {
+            comparison.compare(what, said, device, hexadecimal);
         }
     }
     if head.hardware() != 0 {
-        if let Some(device) = number(&mut held, Address::new(IDENTITY, 3))? {
+        if let Some(device) = number(&mut comparison, Address::new(IDENTITY, 3))? {
             if head.hardware() >> (device & 31) & 1 == 0 {
-                held.differs(
+                comparison.differs(
                     Part::Hardware,
                     format!("the mask {:08X}h", head.hardware()),
                     hexadecimal(device),
@@ -148,45 +148,53 @@ pub fn held(session: &mut Session<'_>, file: &SealedFile) -> Result<Held, Error>
             }
         }
     }
-    held.runs = number(&mut held, Address::new(PROGRAM_CONTROL, program))? == Some(RUNNING);
-    match number(&mut held, Address::new(PROGRAM_ID, program))? {
-        Some(0) if head.crc() != 0 => held.differs(Part::Crc, hexadecimal(head.crc()), "no program"),
-        Some(device) => held.compare(Part::Crc, head.crc(), device, hexadecimal),
+    comparison.runs = number(&mut comparison, Address::new(PROGRAM_CONTROL, program))? == Some(RUNNING);
+    match number(&mut comparison, Address::new(PROGRAM_ID, program))? {
+        Some(0) if head.crc() != 0 => comparison.differs(Part::Crc, hexadecimal(head.crc()), "no program"),
+        Some(device) => comparison.compare(Part::Crc, head.crc(), device, hexadecimal),
         // No other object identifies the program.
-        None => held.differs(Part::Crc, hexadecimal(head.crc()), "reports none"),
+        None => comparison.differs(Part::Crc, hexadecimal(head.crc()), "reports none"),
     }
-    if let Some(device) = number(&mut held, Address::new(PROGRAM_VERSION, program))? {
-        held.compare(Part::Version, head.version(), device, release);
+    if let Some(device) = number(&mut comparison, Address::new(PROGRAM_VERSION, program))? {
+        comparison.compare(Part::Version, head.version(), device, release);
     }
-    compare_access(session, file, &mut held)?;
-    compare_events(session, file, &mut held)?;
-    Ok(held)
+    compare_access(session, file, &mut comparison)?;
+    compare_events(session, file, &mut comparison)?;
+    Ok(comparison)
 }
 
 /// 2002h: compares the unique ID, and checks whether the device is sealed.
-fn compare_access(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
+fn compare_access(
+    session: &mut Session<'_>,
+    file: &SealedFile,
+    comparison: &mut Comparison,
+) -> Result<(), Error> {
     match told_challenge(session)? {
         Some(challenge) => {
             let only_for = file.head().unique_id();
             if only_for != [0; 12] {
-                held.compare(Part::UniqueId, only_for, challenge.unique_id(), |id| digits(&id));
+                comparison.compare(Part::UniqueId, only_for, challenge.unique_id(), |id| digits(&id));
             }
             if !challenge.is_sealed() {
-                held.differs(Part::Keys, "a signature to be checked", "is not sealed and has no keys");
+                comparison.differs(Part::Keys, "a signature to be checked", "is not sealed and has no keys");
             }
         }
-        None if held.running.is_bootloader() => {
+        None if comparison.running.is_bootloader() => {
             let device = "has a bootloader without support for sealed images";
-            held.differs(Part::Keys, "a signature to be checked", device);
+            comparison.differs(Part::Keys, "a signature to be checked", device);
         }
-        None => held.untold.push(Address::new(ACCESS, 1)),
+        None => comparison.untold.push(Address::new(ACCESS, 1)),
     }
     Ok(())
 }
 
 /// 2003h: compares the last installation of this program. An installation that is not among the
 /// last eight events counts as not reported.
-fn compare_events(session: &mut Session<'_>, file: &SealedFile, held: &mut Held) -> Result<(), Error> {
+fn compare_events(
+    session: &mut Session<'_>,
+    file: &SealedFile,
+    comparison: &mut Comparison,
+) -> Result<(), Error> {
     let head = file.head();
     let installed = event::INSTALLED | u32::from(head.program());
     let last = match events(session) {
@@ -196,10 +204,11 @@ fn compare_events(session: &mut Session<'_>, file: &SealedFile, held: &mut Held)
     };
     match last {
         Some(last) => {
-            held.compare(Part::InstalledCounter, head.counter(), last.counter, |number| number.to_string());
-            held.compare(Part::InstalledVersion, head.version(), last.version, release);
+            comparison
+                .compare(Part::InstalledCounter, head.counter(), last.counter, |number| number.to_string());
+            comparison.compare(Part::InstalledVersion, head.version(), last.version, release);
         }
-        None => held.untold.push(Address::new(EVENTS, 1)),
+        None => comparison.untold.push(Address::new(EVENTS, 1)),
     }
     Ok(())
 }

@@ -64,16 +64,16 @@ impl fmt::Display for DeviceState {
 /// The state of a device after a failed update. `Display` has the text for people.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
-pub struct Left {
+pub struct DeviceAfterUpdate {
     /// The device's contents: from its own answers if it answered, otherwise the last known state.
     pub state: DeviceState,
-    /// The device's answers after the failure.
-    pub look: Look,
+    /// The device's answer after the failure.
+    pub answer: DeviceAnswer,
 }
 
 /// The result of asking the device for its state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Look {
+pub enum DeviceAnswer {
     /// It was not asked: it was not changed, or the connection is lost.
     NotAsked,
     /// It does not answer.
@@ -102,13 +102,13 @@ impl Seen {
 }
 
 /// `state`, and the device's answers as `seen`, if there are any.
-impl Serialize for Left {
+impl Serialize for DeviceAfterUpdate {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let seen = match &self.look {
-            Look::Seen(seen) => Some(seen),
-            Look::NotAsked | Look::Silent => None,
+        let seen = match &self.answer {
+            DeviceAnswer::Seen(seen) => Some(seen),
+            DeviceAnswer::NotAsked | DeviceAnswer::Silent => None,
         };
-        let mut fields = serializer.serialize_struct("Left", 2)?;
+        let mut fields = serializer.serialize_struct("DeviceAfterUpdate", 2)?;
         fields.serialize_field("state", &self.state)?;
         fields.serialize_field("seen", &seen)?;
         fields.end()
@@ -126,13 +126,15 @@ impl Serialize for Seen {
     }
 }
 
-impl fmt::Display for Left {
+impl fmt::Display for DeviceAfterUpdate {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self.look {
-            Look::NotAsked | Look::Silent if self.state == DeviceState::Untouched => self.state.fmt(f),
-            Look::NotAsked => write!(f, "it cannot be asked any more; last known: {}", self.state),
-            Look::Silent => write!(f, "it does not answer; last known: {}", self.state),
-            Look::Seen(seen) => {
+        match self.answer {
+            DeviceAnswer::NotAsked | DeviceAnswer::Silent if self.state == DeviceState::Untouched => {
+                self.state.fmt(f)
+            }
+            DeviceAnswer::NotAsked => write!(f, "it cannot be asked any more; last known: {}", self.state),
+            DeviceAnswer::Silent => write!(f, "it does not answer; last known: {}", self.state),
+            DeviceAnswer::Seen(seen) => {
                 let what = if seen.running.is_bootloader() { "bootloader" } else { "application" };
                 write!(f, "its {what} is running; {}", self.state)?;
                 match seen.crc {

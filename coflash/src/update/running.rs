@@ -5,7 +5,7 @@ use super::left::DeviceState;
 use crate::device::flying_master::Mastership;
 
 /// A running update.
-pub(super) struct Course<'t> {
+pub(super) struct RunningUpdate<'t> {
     /// The state of the device so far.
     pub(super) state: DeviceState,
     /// Whether any action may have changed the device.
@@ -23,7 +23,7 @@ pub(super) struct Course<'t> {
     told: Option<Vec<Event>>,
 }
 
-impl<'t> Course<'t> {
+impl<'t> RunningUpdate<'t> {
     /// An update that has not done anything yet.
     pub(super) fn new(tell: &'t mut dyn FnMut(Event)) -> Self {
         Self {
