@@ -69,7 +69,6 @@ impl FlashController {
     }
 
     /// The word at a word-aligned address, FFFFFFFFh for other addresses.
-    #[inline(never)]
     pub fn read_word(&self, address: u32) -> u32 {
         if FLASH.contains(address, 4) && address.is_multiple_of(4) {
             // SAFETY: as above, and aligned.

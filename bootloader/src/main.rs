@@ -10,7 +10,6 @@
 //! | `services.rs`, `storage.rs` | the services of the resident part, and their use | its ABI |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
-//! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
 //! The behaviour of the bootloader is in `boot-core` and `canopen`.
 #![no_std]
@@ -18,7 +17,6 @@
 
 mod flash_controller;
 mod log;
-mod memory;
 mod product;
 mod services;
 mod start;

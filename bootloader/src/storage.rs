@@ -48,8 +48,6 @@ impl Flash for BootFlash {
         self.0.read(address, buffer);
     }
 
-    // Not inlined: many functions call it, and each call has checks.
-    #[inline(never)]
     fn read_word(&self, address: u32) -> u32 {
         self.0.read_word(address)
     }
@@ -92,8 +90,6 @@ impl Store {
 }
 
 impl Parameters for Store {
-    // Not inlined: many functions call it, and a call is shorter.
-    #[inline(never)]
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.

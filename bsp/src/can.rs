@@ -136,7 +136,6 @@ impl<I: Controller> Port<I> {
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
     /// FIFO 0. The other controller's filters stay as they are.
-    #[inline(never)]
     pub fn accept(&mut self, [a, b, c, d]: [u16; 4]) {
         let change = |offset: usize, clear: u32, set: u32| {
             // SAFETY: the offset is one of a register above, in the registers of the master. Only
@@ -196,7 +195,6 @@ impl<I: Controller> Port<I> {
     ///
     /// Frames of one identifier leave in order: the mailboxes take the second only when the first
     /// is on its way.
-    #[inline(never)]
     pub fn send<F: Frame>(&mut self, frame: &F) {
         let (embedded_can::Id::Standard(id), Some(data)) = (frame.id(), Data::new(frame.data())) else {
             return;

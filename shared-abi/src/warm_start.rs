@@ -194,7 +194,6 @@ impl Cell {
     }
 
     /// Reads the request and empties the cell, so that no later reset reads it again.
-    #[inline(never)]
     pub fn take(&mut self) -> Option<BootRequest> {
         // SAFETY: the caller of `at` guarantees the address; volatile, because another image wrote
         // the cell.

@@ -102,10 +102,13 @@ fn callgate_byte_for_byte() {
 #[test]
 fn the_layout_of_the_stm32f407_is_the_documented_one() {
     let layout = &shared_abi::layout::stm32f407g_disc1::LAYOUT;
-    assert_eq!(layout.bootloader, Region::new(0x0800_0000, 0x8000));
+    assert_eq!(layout.bootloader, Region::new(0x0800_0000, 0x4000));
+    assert_eq!(layout.home, Some(Region::new(0x0801_0000, 0x1_0000)));
+    assert_eq!(layout.data, Some(Region::new(0x0800_C000, 0x4000)));
+    assert_eq!(layout.staging, None);
     assert_eq!(layout.callgate(), 0x0800_0040);
-    assert_eq!(layout.parameters, [Region::new(0x0800_8000, 0x4000), Region::new(0x0800_C000, 0x4000)]);
-    assert_eq!(layout.programs, [Region::new(0x0801_0000, 960 * 1024)]);
+    assert_eq!(layout.parameters, [Region::new(0x0800_4000, 0x4000), Region::new(0x0800_8000, 0x4000)]);
+    assert_eq!(layout.programs, [Region::new(0x0802_0000, 896 * 1024)]);
     assert_eq!(layout.ram, Region::new(0x2000_0000, 128 * 1024 - 64));
     assert_eq!(layout.handoff, Region::new(0x2001_FFC0, 48));
     assert_eq!(layout.warm_start, Region::new(0x2001_FFF0, 16));

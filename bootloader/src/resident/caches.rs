@@ -58,7 +58,6 @@ impl Caches {
 }
 
 impl Drop for Caches {
-    #[inline(never)]
     fn drop(&mut self) {
         let off = self.disabled();
         self.write(off);

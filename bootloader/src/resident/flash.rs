@@ -73,7 +73,6 @@ impl Flash for ResidentFlash {
     /// The CRC unit computes whole words, software the rest. The unit has the right polynomial, but
     /// it takes words with the most significant bit first and always starts from its initial value.
     /// One additional word first brings it to the state of the previous CRC.
-    #[inline(never)]
     fn crc32(&self, mut crc: u32, region: Region) -> u32 {
         let (mut address, end) = (region.base, region.end());
         if self.has_crc_unit && address.is_multiple_of(4) && FLASH.contains(address, region.size) {

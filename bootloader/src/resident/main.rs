@@ -26,8 +26,6 @@ mod flash;
 mod flash_controller;
 #[cfg(feature = "sealed")]
 mod flash_lock;
-#[path = "../memory.rs"]
-mod memory;
 #[path = "../product.rs"]
 mod product;
 mod ram_image;

@@ -8,7 +8,6 @@ use crate::flash::ResidentFlash;
 use crate::product::Parameters;
 
 /// Stores a value and waits for it.
-#[inline(never)]
 pub fn store(
     parameters: &mut Parameters,
     flash: &mut ResidentFlash,

@@ -53,7 +53,6 @@ impl<'b> Queue<'b> {
     }
 
     /// Data bytes of the open piece.
-    #[inline(never)]
     pub(crate) fn open_size(&self) -> usize {
         self.open.saturating_sub(PIECE_HEADER)
     }
@@ -191,7 +190,6 @@ impl<'b> Queue<'b> {
     }
 
     /// Offsets are less than twice the size of the ring.
-    #[inline(never)]
     fn place(&self, offset: usize) -> usize {
         let at = self.front + offset;
         if at >= self.buffer.len() {

@@ -14,7 +14,6 @@ impl Refusal {
     }
 
     /// The data or the command are not possible in the present state of the device (08000022h).
-    #[inline(never)]
     pub(crate) const fn untimely(error: FlashError) -> Self {
         Self(error, AbortCode::DEVICE_STATE)
     }

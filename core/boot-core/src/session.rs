@@ -6,8 +6,6 @@ use crate::policy::Policy;
 use crate::refusal::Refusal;
 
 /// The state of a program's download. It continues from one SDO transfer to the next.
-// No comparison of the whole value, which costs 140 bytes of flash: `matches!` only looks at the
-// necessary part.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Session {
     /// No block was accepted yet.

@@ -99,8 +99,6 @@ pub enum DataType {
 impl DataType {
     /// The size of a value in bytes; `None` for types of variable length.
     #[must_use]
-    // Not inlined: there would be a table for each caller.
-    #[inline(never)]
     pub const fn size(self) -> Option<u32> {
         match self {
             Self::Boolean | Self::Integer8 | Self::Unsigned8 => Some(1),

@@ -245,8 +245,6 @@ impl Slave {
     }
 
     /// The identifiers of the frames that it accepts.
-    // Not inlined: this is shorter.
-    #[inline(never)]
     fn identifiers(&self) -> [CobId; 4] {
         let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
         let [nmt, request] = match &self.node {

@@ -104,10 +104,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// The program has returned the device to the bootloader: it no longer needs a rescue window.
     pub fn confirm(&mut self, program: u8) {
-        // Does not use `program()`: this function runs before the bootloader is at its final
-        // address, and functions that are only called from there are shorter without it.
-        let state = self.programs.get(usize::from(program).wrapping_sub(1));
-        let Some(record) = state.and_then(|state| state.record) else { return };
+        let Some(record) = self.program(program).and_then(|state| state.record) else { return };
         if !record.confirmed && !self.busy() {
             let record = ProgramRecord { confirmed: true, ..record };
             self.programmer.record(&mut self.parameters, program, record, true);

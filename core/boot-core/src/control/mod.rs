@@ -209,7 +209,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// Whether a complete program or an acknowledged command is not yet carried out: a reset now
     /// would undo it.
     #[must_use]
-    #[inline(never)]
     pub fn is_finishing(&self) -> bool {
         self.programmer.finishing().is_some() || self.programmer.is_storing()
     }
@@ -368,8 +367,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             #[cfg(feature = "sealed")]
             sealed_only: false,
         };
-        // The version of a control block takes precedence. (As one expression this is 190 bytes
-        // shorter.)
+        // The version of a control block takes precedence.
         let told = state.version;
         let checked = judge.check_label(&label).map(|version| if told == 0 { version } else { told });
         checked.map_err(|Refusal(error, _)| error)
@@ -403,11 +401,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// The program with this number, if it exists.
     fn program(&self, program: u8) -> Option<&Program> {
-        if PROGRAMS == 1 {
-            self.programs.first().filter(|_| program == 1)
-        } else {
-            one_of_many(&self.programs, program)
-        }
+        self.programs.get(usize::from(program).wrapping_sub(1))
     }
 }
 
@@ -423,23 +417,7 @@ fn load<F: Flash>(
 }
 
 /// The program with this number, if it exists.
-fn find<const PROGRAMS: usize>(programs: &mut [Program; PROGRAMS], number: u8) -> Option<&mut Program> {
-    // For one program the comparison is shorter than a call; for several, the computation of its
-    // place is not.
-    if PROGRAMS == 1 {
-        programs.first_mut().filter(|_| number == 1)
-    } else {
-        find_of_many(programs, number)
-    }
-}
-
-#[inline(never)]
-fn one_of_many(programs: &[Program], number: u8) -> Option<&Program> {
-    programs.get(usize::from(number).wrapping_sub(1))
-}
-
-#[inline(never)]
-fn find_of_many(programs: &mut [Program], number: u8) -> Option<&mut Program> {
+fn find(programs: &mut [Program], number: u8) -> Option<&mut Program> {
     programs.get_mut(usize::from(number).wrapping_sub(1))
 }
 

@@ -54,7 +54,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// The number of bytes that [`download_data`](Self::download_data) accepts at present. With
     /// `held`, the answer to the client is already delayed, and the client may use a reserve.
     #[must_use]
-    #[inline(never)]
     pub fn space(&self, held: bool) -> usize {
         let room = |transfer: &Transfer| transfer.intake.room(self.programmer.queue(), held);
         self.transfer.as_ref().map_or(usize::MAX, room)

@@ -33,7 +33,6 @@ pub(crate) struct Judge<'a> {
 
 impl Judge<'_> {
     /// Whether the program number is for data of the application.
-    #[inline(never)]
     pub(crate) fn is_data(&self) -> bool {
         self.policy.data == Some(self.program)
     }

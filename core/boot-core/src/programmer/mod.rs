@@ -166,7 +166,6 @@ impl<'b> Programmer<'b> {
     }
 
     /// See [`queue`](Self::queue).
-    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn queue_mut(&mut self) -> &mut Queue<'b> {
         &mut self.queue
     }
@@ -238,7 +237,6 @@ impl<'b> Programmer<'b> {
 
     /// Removes the record of a program. The record of the target marks it as half erased until the
     /// work on it has ended.
-    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn void(&mut self, program: u8) {
         self.voids |= bit(program);
     }
@@ -354,13 +352,11 @@ impl<'b> Programmer<'b> {
 
     /// Whether the queue has room for a block of the largest size. (A smaller queue takes one block
     /// at a time.)
-    #[inline(never)]
     pub(crate) fn has_room(&self) -> bool {
         self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
     }
 
     /// Continues the work with one step.
-    #[cfg_attr(feature = "sealed", inline(never))]
     pub(crate) fn step<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -401,7 +397,6 @@ impl<'b> Programmer<'b> {
     }
 
     /// The next action of the job.
-    #[cfg_attr(feature = "sealed", inline(never))]
     fn next<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
@@ -508,8 +503,6 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    // A separate function because a call is shorter: there are three callers.
-    #[inline(never)]
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
         #[cfg(feature = "sealed")]
         self.unsealer.end(Err(error));
@@ -522,7 +515,6 @@ impl<'b> Programmer<'b> {
     }
 
     /// Chooses the next work for an idle flash.
-    #[cfg_attr(feature = "sealed", inline(never))]
     fn choose<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,

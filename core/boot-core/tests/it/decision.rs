@@ -37,8 +37,8 @@ fn check_record(
     let mut flash = ModelFlash::new(LAYOUT.chip);
     let mut bytes = vec![0xA5; 64];
     bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
-    bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
-    flash.poke(0x0801_0000, &bytes);
+    bytes[4..8].copy_from_slice(&0x0802_0189_u32.to_le_bytes());
+    flash.poke(0x0802_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
     let record = ProgramRecord {
         #[cfg(feature = "sealed")]
@@ -163,14 +163,14 @@ fn a_request_for_a_program_that_is_not_there_stays() {
 fn any_damage_to_a_program_keeps_it_from_starting() {
     for offset in 8..64 {
         for bit in 0..8 {
-            let damaged = check(true, |flash| flash.poke(0x0801_0000 + offset, &[0xA5 ^ 1 << bit]));
+            let damaged = check(true, |flash| flash.poke(0x0802_0000 + offset, &[0xA5 ^ 1 << bit]));
             assert_eq!(damaged, Err(Invalid::Crc));
         }
     }
-    let erased = check(true, |flash| flash.poke(0x0801_0000, &[0xFF; 64]));
+    let erased = check(true, |flash| flash.poke(0x0802_0000, &[0xFF; 64]));
     assert_eq!(erased, Err(Invalid::Vectors(VectorFault::StackPointer)));
     assert!(
-        check(true, |flash| flash.poke(0x0801_0040, &[0])).is_ok(),
+        check(true, |flash| flash.poke(0x0802_0040, &[0])).is_ok(),
         "what lies behind its size is not its own"
     );
 }

@@ -87,7 +87,7 @@ fn two_devices_are_updated_and_the_third_ones_silence_is_told() {
     // What is in the flash is the file, byte for byte.
     for serial in ["1.flash", "2.flash"] {
         let flash = folder.read(serial);
-        assert!(flash[0x1_0000..0x1_0000 + 40 * 1024] == program(0xA5), "{serial}");
+        assert!(flash[0x2_0000..0x2_0000 + 40 * 1024] == program(0xA5), "{serial}");
     }
 }
 
@@ -142,7 +142,7 @@ fn an_agent_that_was_ended_goes_on() {
     let action = server.action(IDS[0]);
     assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
     assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
-    assert!(folder.read("1.flash")[0x1_0000..0x1_0000 + 40 * 1024] == program(0xA5));
+    assert!(folder.read("1.flash")[0x2_0000..0x2_0000 + 40 * 1024] == program(0xA5));
 }
 
 /// The agent died between the end of the update and the report: its state is that of a moment

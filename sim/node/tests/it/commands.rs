@@ -28,7 +28,7 @@ fn folder(test: &str) -> Folder {
 
 /// Bytes of the program's region that are not erased.
 fn rest(folder: &Folder) -> usize {
-    folder.read("1.flash")[0x1_0000..].iter().filter(|byte| **byte != 0xFF).count()
+    folder.read("1.flash")[0x2_0000..].iter().filter(|byte| **byte != 0xFF).count()
 }
 
 #[test]
@@ -102,7 +102,7 @@ fn an_update_in_all_its_ways() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     let board = ["--board", "stm32f407g-disc1"];
-    let region = ["--start-address", "0x08010000", "--end-address", "0x0801FFFF"];
+    let region = ["--start-address", "0x08020000", "--end-address", "0x0802FFFF"];
     let ways: [(&[&str], &[&str]); 6] = [
         (&board, &["--segmented", "--no-start"]),
         (&board, &["--no-trial", "--verify", "--check-target"]),
@@ -120,7 +120,7 @@ fn an_update_in_all_its_ways() {
         let update = ["flash", "program.bin", "-I", "binary", "--vid", "0", "--pid", "0", "-N", "5"];
         coflash.done(&[&update[..], place, way].concat());
         let file = folder.read("1.flash");
-        assert_eq!(file[0x1_0000..0x1_1000], program(number)[..0x1000], "{way:?}");
+        assert_eq!(file[0x2_0000..0x2_1000], program(number)[..0x1000], "{way:?}");
     }
     // The last one was cut off at the given address.
     assert!(folder.read("1.flash")[0x2_0000..].iter().all(|byte| *byte != 6));
@@ -151,7 +151,7 @@ fn a_job_file_serves_its_devices_and_reports() {
     }
     assert!(!of(99)["error"].is_null(), "{report}");
     for serial in [1, 2, 3] {
-        assert_eq!(folder.read(&format!("{serial}.flash"))[0x1_0000..0x1_1000], program(0xA5)[..0x1000]);
+        assert_eq!(folder.read(&format!("{serial}.flash"))[0x2_0000..0x2_1000], program(0xA5)[..0x1000]);
     }
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "5"])["number"], 1);
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "6"])["number"], 0);
@@ -198,7 +198,7 @@ fn an_interrupted_update_is_started_again_at_once() {
         assert_eq!(done.exit, 130, "{until}: {}{}", done.out, done.err);
         assert!(done.err.contains("run the same command again"), "{}", done.err);
         coflash.done(&update);
-        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(version), "{until}");
+        assert_eq!(folder.read("1.flash")[0x2_0000..0x5_2000], program(version), "{until}");
     }
 }
 
@@ -264,7 +264,7 @@ fn a_second_host_on_the_same_node_leaves_it_alone() {
         assert!(!done.out.contains("erase"), "{}", done.out);
         let done = first.wait();
         assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
-        assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(round));
+        assert_eq!(folder.read("1.flash")[0x2_0000..0x5_2000], program(round));
     }
     // A process that has ended holds no lock.
     coflash.done(&update);
@@ -328,7 +328,7 @@ fn frames_of_others_are_passed_over() {
     coflash.done(&[FLASH, &["-N", "5", "--verify"]].concat());
     drop(stop);
     assert!(noise.join().unwrap() > 10);
-    assert_eq!(folder.read("1.flash")[0x1_0000..0x4_2000], program(0xA5));
+    assert_eq!(folder.read("1.flash")[0x2_0000..0x5_2000], program(0xA5));
 }
 
 /// Images and Intel HEX, and the dialects in which nodes contradict the standard one; coflash names
@@ -346,7 +346,7 @@ fn dialects_are_found_out_or_named() {
             assert_eq!(done["dialect"], dialect);
             assert_eq!(done["running"], 0, "{done}");
         }
-        assert_eq!(folder.read("1.flash")[0x1_0000..][..200 * 1024], program(0xA5));
+        assert_eq!(folder.read("1.flash")[0x2_0000..][..200 * 1024], program(0xA5));
     }
     let nodes =
         Nodes::start(&folder, &[&stand_in[..], &["--serial", "2", "--profile", "esacademy"]].concat());

@@ -17,10 +17,10 @@ fn program() -> Vec<u8> {
 /// zlib's crc32 over [`program`].
 const CRC: &str = "A6FB8F81h";
 
-/// The flash after the parameters of a device with the program at 0801_0000h.
+/// The flash after the parameters of a device with the program at 0802_0000h.
 fn flashed() -> Vec<u8> {
     let mut bytes = program();
-    bytes.resize(0xF_0000, 0xFF);
+    bytes.resize(0xE_0000, 0xFF);
     bytes
 }
 
@@ -42,9 +42,9 @@ fn the_file_holds_the_program_and_nothing_else() {
     assert!(said.contains("not released for autostart"), "{said}");
     coflash.done(&["release", "-N", "5"]);
     let flash = folder.read("1.flash");
-    assert!(flash[..0x8000].iter().all(|byte| *byte == 0xFF), "where the chip has its bootloader");
-    assert!(flash[0x8000..0xC000].iter().any(|byte| *byte != 0xFF), "the parameters");
-    assert!(flash[0x1_0000..] == flashed());
+    assert!(flash[..0x4000].iter().all(|byte| *byte == 0xFF), "where the chip has its bootloader");
+    assert!(flash[0x4000..0x8000].iter().any(|byte| *byte != 0xFF), "the parameters");
+    assert!(flash[0x2_0000..] == flashed());
     assert!(coflash.done(&["info", "-N", "5"]).contains(&format!("CRC             {CRC}")));
 
     // The state survives: after a kill without notice, the device starts like a chip.
@@ -58,7 +58,7 @@ fn the_file_holds_the_program_and_nothing_else() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--stay"]);
     nodes.await_line("serial 1, node 5: bootloader (Strap)");
     assert!(Coflash::new(&folder, &nodes).done(&["info", "-N", "5"]).contains(CRC));
-    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    assert!(folder.read("1.flash")[0x2_0000..] == flashed());
 }
 
 #[test]
@@ -122,7 +122,7 @@ fn many_nodes_take_their_programs_at_the_same_time() {
     let coflash = Coflash::new(&folder, &nodes);
     coflash.done(&[FLASH, &["-N", "10-14", "--at-once", "5"]].concat());
     for serial in 0x100..0x105 {
-        assert!(folder.read(&format!("{serial}.flash"))[0x1_0000..] == flashed(), "{serial}");
+        assert!(folder.read(&format!("{serial}.flash"))[0x2_0000..] == flashed(), "{serial}");
     }
     let scan = coflash.json(&["scan", "-N", "9-15", "--sdo-timeout", "500"]);
     let found: Vec<_> = scan["nodes"].as_array().unwrap().iter().map(|found| &found["node"]).collect();
@@ -139,7 +139,7 @@ fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
     // Replaces the old program, which is lost with the first block.
     let flashing = coflash.spawn(&[FLASH, &["-N", "5"]].concat());
     let beginning = program()[..0x400].to_vec();
-    while folder.read("1.flash")[0x1_0000..0x1_0400] == beginning {
+    while folder.read("1.flash")[0x2_0000..0x2_0400] == beginning {
         std::thread::sleep(Duration::from_millis(5));
     }
     drop(nodes);
@@ -147,7 +147,7 @@ fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
     nodes.await_line("serial 1, node 5: bootloader (Program(Absent))");
     Coflash::new(&folder, &nodes).done(&[FLASH, &["-N", "5"]].concat());
-    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    assert!(folder.read("1.flash")[0x2_0000..] == flashed());
 }
 
 /// The same file goes on where the device's power was cut; with `--from-start` it does not; another
@@ -162,7 +162,7 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let cut = || {
         let nodes = Nodes::start(&folder, &options);
         let flashing = Coflash::new(&folder, &nodes).spawn(&flash);
-        while folder.read("1.flash")[0x1_0000 + 200 * 1024..][..64] == [0xFF; 64] {
+        while folder.read("1.flash")[0x2_0000 + 200 * 1024..][..64] == [0xFF; 64] {
             std::thread::sleep(Duration::from_millis(5));
         }
         drop(nodes);
@@ -179,7 +179,7 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let has: usize = has.split(' ').next().unwrap().parse().unwrap();
     assert!((180 * 1024..240 * 1024).contains(&has), "{has}");
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
-    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    assert!(folder.read("1.flash")[0x2_0000..] == flashed());
     drop(nodes);
 
     // A file that does not fit into the flash's data any more.
@@ -260,7 +260,7 @@ fn a_program_for_another_product_is_refused() {
     assert_eq!(said.exit, 6, "{}", said.err);
     assert!(said.err.contains("60000182"), "{}", said.err);
     assert!(said.err.contains("it was not changed"), "{}", said.err);
-    assert!(folder.read("1.flash")[0x1_0000..] == before[0x1_0000..]);
+    assert!(folder.read("1.flash")[0x2_0000..] == before[0x2_0000..]);
 }
 
 /// One of three devices that are updated together is another product: it refuses alone.
@@ -280,9 +280,9 @@ fn another_product_among_the_devices_of_a_group_refuses_alone() {
     assert!(said.out.contains(refusal) && said.out.contains("2 of 3 devices are done"), "{}", said.out);
     assert!(said.out.contains("together"), "{}", said.out);
     for serial in 1..=2 {
-        assert!(folder.read(&format!("{serial}.flash"))[0x1_0000..] == flashed(), "{serial}");
+        assert!(folder.read(&format!("{serial}.flash"))[0x2_0000..] == flashed(), "{serial}");
     }
-    assert!(folder.read("3.flash")[0x1_0000..].iter().all(|byte| *byte == 0xFF));
+    assert!(folder.read("3.flash")[0x2_0000..].iter().all(|byte| *byte == 0xFF));
 }
 
 #[test]
@@ -300,7 +300,7 @@ fn two_programs_have_their_places() {
     coflash.done(&[&["flash", "second.bin", "-N", "1", "-P", "2", "--no-start"][..], &flash].concat());
     let file = folder.read("1.flash");
     assert_eq!(file[0x8_0000..0x8_03E8], second);
-    assert!(file[0x1_0000..0x8_0000].iter().chain(&file[0x8_03E8..]).all(|byte| *byte == 0xFF));
+    assert!(file[0x2_0000..0x8_0000].iter().chain(&file[0x8_03E8..]).all(|byte| *byte == 0xFF));
     let said = coflash.done(&["start", "-N", "1", "-P", "2"]);
     assert!(said.contains("an application"), "{said}");
     nodes.await_line("serial 1, node 1: would start program 2");
@@ -348,7 +348,7 @@ fn nodes_join_a_bus() {
     guests.await_line("serial 2, node 2: bootloader (Program(Absent))");
     let coflash = Coflash::new(&folder, &hosts);
     coflash.done(&[FLASH, &["-N", "2", "--no-start"]].concat());
-    assert!(folder.read("2.flash")[0x1_0000..] == flashed());
+    assert!(folder.read("2.flash")[0x2_0000..] == flashed());
     assert_eq!(folder.read("1.flash"), vec![0xFF; 1 << 20]);
     // The bus is gone: the nodes end with a reason.
     drop(hosts);
@@ -394,7 +394,7 @@ fn clients_that_misbehave_harm_nobody() {
     let silent = [stream, connect(), connect()];
     let coflash = Coflash::new(&folder, &nodes);
     coflash.done(&[FLASH, &["-N", "5", "--no-start"]].concat());
-    assert!(folder.read("1.flash")[0x1_0000..] == flashed());
+    assert!(folder.read("1.flash")[0x2_0000..] == flashed());
     drop(silent);
 }
 

@@ -282,7 +282,7 @@ fn a_layout_comes_from_a_file() {
     let board = shared_abi::layout::toml::Toml(&shared_abi::layout::stm32f407g_disc1::LAYOUT).to_string();
     let board = board.replace("stm32f407g-disc1", "my-board");
     folder.write("board.toml", board.as_bytes());
-    folder.write("bad.toml", board.replace("base = 0x08010000", "base = 0x0800c000").as_bytes());
+    folder.write("bad.toml", board.replace("base = 0x08020000", "base = 0x0801c000").as_bytes());
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     let flash =
