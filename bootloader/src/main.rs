@@ -7,9 +7,10 @@
 //! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | the resident part's bytes, the header of the RAM image, the boot report | handoff |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
-//! | `services.rs`, `storage.rs` | the services of the resident part, and their use | its ABI |
+//! | `storage.rs` | flash and stored values, by the services of the resident part | its ABI |
 //! | `watchdog.rs` | feeds the watchdog when all tasks are alive | no |
 //! | `log.rs`, `log/` | log lines for a port to a new board (features `log-…`) | interrupts |
+//! | `memory.rs` | small versions of `memcpy` and similar functions | assembly |
 //!
 //! The behaviour of the bootloader is in `boot-core` and `canopen`.
 #![no_std]
@@ -17,8 +18,8 @@
 
 mod flash_controller;
 mod log;
+mod memory;
 mod product;
-mod services;
 mod start;
 mod storage;
 mod watchdog;
@@ -60,12 +61,12 @@ mod app {
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
+    use shared_abi::services::{StoreState, STORE_STATE_WORDS};
     use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
     use super::{product, start, Mono};
     use crate::log::{self, log};
     use crate::product::PRODUCT;
-    use crate::services::{StoreState, STORE_STATE_WORDS};
     use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;

@@ -1,16 +1,15 @@
 //! The flash and the store for the RAM part: flash operations are started and polled here, and the
-//! resident part does everything else ([`services`](crate::services)).
+//! resident part does everything else ([`shared_abi::services`]).
 
-use core::mem::MaybeUninit;
 use core::task::Poll;
 
 use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters, StoreError, Value};
 use bsp::LAYOUT;
 use shared_abi::geometry::{Region, Sector};
+use shared_abi::services::{Services, Step, StoreState, ERASE, OFFSET};
 
 use crate::flash_controller::FlashController;
-use crate::services::{outcome_code, Services, StoreState, StoreStep, OFFSET};
 
 /// The resident part's services.
 fn services() -> &'static Services {
@@ -18,8 +17,13 @@ fn services() -> &'static Services {
     // has the table at this offset.
     let services = unsafe { &*((LAYOUT.callgate() + OFFSET) as *const Services) };
     // The boot stage has compared the versions; this check finds a table at a wrong address.
-    debug_assert_eq!(services.size as usize, size_of::<Services>());
+    debug_assert!(services.size as usize >= size_of::<Services>());
     services
+}
+
+/// A sector in the words of the services.
+fn sector([number, base, size]: [u32; 3]) -> Sector {
+    Sector { number: number as u8, region: Region::new(base, size) }
 }
 
 /// The flash, for the RAM part.
@@ -61,11 +65,10 @@ impl Flash for BootFlash {
     }
 
     fn sector_at(&self, address: u32) -> Option<Sector> {
-        let mut sector = MaybeUninit::uninit();
-        // SAFETY: the service has written the sector if it returns true.
-        unsafe {
-            (self.idle_services().sector_at)(address, sector.as_mut_ptr()).then(|| sector.assume_init())
-        }
+        let mut words = [0; 3];
+        // SAFETY: the words are writable.
+        let found = unsafe { (self.idle_services().sector_at)(address, &mut words) };
+        (found != 0).then(|| sector(words))
     }
 
     fn crc32(&self, crc: u32, region: Region) -> u32 {
@@ -73,7 +76,7 @@ impl Flash for BootFlash {
     }
 
     fn is_blank(&self, region: Region) -> bool {
-        (self.idle_services().is_blank)(region.base, region.size)
+        (self.idle_services().is_blank)(region.base, region.size) != 0
     }
 }
 
@@ -93,25 +96,30 @@ impl Parameters for Store {
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.
-        unsafe { (services().get)(&*self.0, key, &mut value).then_some(value) }
+        unsafe { ((services().get)(&*self.0, key.0, &mut value) != 0).then_some(value) }
     }
 
     fn store(&mut self, key: Key, value: Value) {
         // SAFETY: the state comes from `open`.
-        unsafe { (services().store)(&mut *self.0, key, &value) };
+        unsafe { (services().store)(&mut *self.0, key.0, &value) };
     }
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
-        let mut operation = MaybeUninit::uninit();
-        // SAFETY: the state comes from `open`; the service has written the operation if it returns
-        // `Start`.
-        unsafe {
-            match (services().next)(&mut *self.0, outcome_code(outcome), operation.as_mut_ptr()) {
-                StoreStep::Start => Next::Start(operation.assume_init()),
-                StoreStep::Again => Next::Again,
-                StoreStep::Done => Next::Done(Ok(())),
-                StoreStep::Failed => Next::Done(Err(StoreError::Device)),
-            }
+        let outcome = match outcome {
+            Ok(()) => 0,
+            Err(FlashFault::Protected) => 1,
+            Err(FlashFault::Failed) => 2,
+            Err(FlashFault::Verify) => 3,
+        };
+        let mut operation = [0; 4];
+        // SAFETY: the state comes from `open`, and the words are writable.
+        let step = unsafe { (services().next)(&mut *self.0, outcome, &mut operation) };
+        match (Step::from_number(step), operation) {
+            (Step::Start, [ERASE, place @ ..]) => Next::Start(Operation::Erase(sector(place))),
+            (Step::Start, [_, address, word, _]) => Next::Start(Operation::Program { address, word }),
+            (Step::Again, _) => Next::Again,
+            (Step::Done, _) => Next::Done(Ok(())),
+            (Step::Failed, _) => Next::Done(Err(StoreError::Device)),
         }
     }
 }

@@ -25,7 +25,8 @@ impl<E> Callgate<E> {
         if table.magic != MAGIC || u32::from(table.length) < TABLE_SIZE {
             return Err(CallgateError::Absent);
         }
-        if table.abi_version != ABI_VERSION {
+        // Newer versions only add services.
+        if table.abi_version < ABI_VERSION {
             return Err(CallgateError::Version(table.abi_version));
         }
         Ok(Self { table })

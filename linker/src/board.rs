@@ -184,8 +184,16 @@ mod tests {
             ("sram = { base = 0x20000000", "sram = { base = 0x20000004", "whole pages of 4 KiB"),
             ("board = \"stm32f429i-disc1\"", "board = \"a\\u001bb\"", "printable ASCII"),
             ("callgate-offset = 0x40", "callgate-offset = -1", "line 4: "),
-            ("home = { base = 0x08010000", "home = { base = 0x0800c000", "the home of the RAM image must start"),
-            ("data = { base = 0x0800c000", "data = { base = 0x08008000", "the data region overlaps a parameter"),
+            (
+                "home = { base = 0x08010000",
+                "home = { base = 0x0800c000",
+                "the home of the RAM image must start",
+            ),
+            (
+                "data = { base = 0x0800c000",
+                "data = { base = 0x08008000",
+                "the data region overlaps a parameter",
+            ),
             (
                 "data = {",
                 "staging = { base = 0x08020000, size = 0x1e0000 }\ndata = {",

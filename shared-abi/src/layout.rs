@@ -239,7 +239,9 @@ impl Layout {
                 || staging.base <= last.base
                 || !is_one_sector(chip, staging)
             {
-                return Err("the staging region must be the last sector of the last program, and not its only one");
+                return Err(
+                    "the staging region must be the last sector of the last program, and not its only one",
+                );
             }
         }
         if !chip.sram.contains(self.ram.base, self.ram.size) {

@@ -13,6 +13,7 @@
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
 //! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
 //! | [`boot_report`] | information from the resident part of the bootloader to its RAM image |
+//! | [`services`] | the services of the resident part for the RAM image |
 //! | `reentry` | the return from an application to its bootloader (on the target) |
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
 //! | [`block_file`] | the format of the data for object 1F50h |
@@ -38,6 +39,7 @@ pub mod reentry;
 mod registers;
 #[cfg(any(target_arch = "arm", test))]
 pub mod reset;
+pub mod services;
 pub mod vectors;
 pub mod warm_start;
 

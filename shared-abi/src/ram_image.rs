@@ -11,8 +11,8 @@ use crate::vectors::VectorTable;
 /// Identifies a RAM image, format 2 ("CBI2" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
 
-/// Version of the services that the resident part has. It grows with each entry that is added to
-/// their table; entries are never changed or removed.
+/// Version of the services that the resident part has ([`crate::services`]). It grows with each entry
+/// that is added to their table.
 pub const SERVICES_VERSION: u32 = 1;
 
 /// Optional abilities of the resident part, a bit each. None is defined yet.
@@ -199,7 +199,8 @@ mod tests {
 
     #[test]
     fn the_entry_is_inside_its_ram() {
-        let entry = |sp, reset| SOUND.entry([sp, reset]).map(|vectors| (vectors.initial_sp(), vectors.reset()));
+        let entry =
+            |sp, reset| SOUND.entry([sp, reset]).map(|vectors| (vectors.initial_sp(), vectors.reset()));
         assert_eq!(entry(0x2001_FFC0, 0x2000_0041), Ok((0x2001_FFC0, 0x2000_0041)));
         assert_eq!(entry(0x2000_0008, 0x2000_3FFF), Ok((0x2000_0008, 0x2000_3FFF)));
         for (sp, reset) in [

@@ -70,6 +70,8 @@ int main(void)
     printf("%d%d%d", coboot_callgate_state(&gate), gate.entry == 0x08000211, gate.bootloader_version == 1);
     gate.abi_version = 2;
     printf("%d", coboot_callgate_state(&gate));
+    gate.abi_version = 0;
+    printf("%d", coboot_callgate_state(&gate));
     gate.length = 12;
     printf("%d", coboot_callgate_state(&gate));
     memset(&gate, 0xFF, sizeof gate);
@@ -115,7 +117,7 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
         10 1 1 5 125000 1 1\n\
         0\n\
         00\n\
-        011211\n";
+        0110211\n";
     for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
         let folder = kit::folder!("header");
         let source = folder.write(format!("header.{extension}"), PROGRAM);

@@ -73,7 +73,10 @@ fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
                 assert!(is_in_flash(paddr, filesz), "{image}: {paddr:#x} is not its flash");
                 loaded += filesz;
             }
-            assert!(is_in_flash(vaddr, memsz) || layout.ram.contains(vaddr, memsz), "{image}: {vaddr:#x}+{memsz:#x}");
+            assert!(
+                is_in_flash(vaddr, memsz) || layout.ram.contains(vaddr, memsz),
+                "{image}: {vaddr:#x}+{memsz:#x}"
+            );
         }
         assert!(loaded > 1024, "{image} has only {loaded} bytes");
     }
@@ -83,10 +86,8 @@ fn every_segment_lies_in_its_own_flash_and_in_the_images_ram() {
 fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
     let layout = firmware::board();
     let home = layout.home.unwrap_or(layout.bootloader);
-    let images = [
-        (firmware::BOOTLOADER, [layout.bootloader, home]),
-        (firmware::APP_V1, [layout.programs[0]; 2]),
-    ];
+    let images =
+        [(firmware::BOOTLOADER, [layout.bootloader, home]), (firmware::APP_V1, [layout.programs[0]; 2])];
     for (image, flash) in images {
         let elf = firmware::elf(image);
         let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
@@ -104,7 +105,11 @@ fn every_symbol_lies_in_its_own_flash_or_in_the_images_ram() {
             let (address, size) = (symbol.address() as u32 & !1, symbol.size() as u32);
             // A border symbol may be the address directly after the last byte.
             let within = |region: &Region| address >= region.base && address + size <= region.end();
-            assert!(flash.iter().any(within) || within(&layout.ram), "{image}: {:?} at {address:#x}", symbol.name());
+            assert!(
+                flash.iter().any(within) || within(&layout.ram),
+                "{image}: {:?} at {address:#x}",
+                symbol.name()
+            );
             count += 1;
         }
         assert!(count > 50, "{image}: only {count} symbols were looked at");

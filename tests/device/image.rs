@@ -77,7 +77,9 @@ impl Parts {
     fn flash(&self) -> Vec<u8> {
         let place = firmware::board().chip.flash;
         let mut flash = vec![0xFF; place.size as usize];
-        for (address, bytes) in [(firmware::board().bootloader.base, &self.resident), (self.home, &self.image)] {
+        for (address, bytes) in
+            [(firmware::board().bootloader.base, &self.resident), (self.home, &self.image)]
+        {
             flash[(address - place.base) as usize..][..bytes.len()].copy_from_slice(bytes);
         }
         flash

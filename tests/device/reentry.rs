@@ -205,7 +205,7 @@ fn node_id_and_bit_rate_are_shared() {
 fn an_application_on_a_bootloader_with_another_abi_does_without_it() {
     let table = firmware::board().callgate();
     // The version of the ABI (a half-word after the magic), and the magic itself.
-    for (at, value) in [(table + 4, 9_u16), (table, 0)] {
+    for (at, value) in [(table + 4, 0_u16), (table, 0)] {
         let mut bench = running_board();
         bench.power_off();
         bench.machine().load_bin(at, &value.to_le_bytes()).unwrap();

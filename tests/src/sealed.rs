@@ -497,7 +497,7 @@ impl Device {
     /// The lowest counter stored for a program.
     #[must_use]
     pub fn counter(&self, program: u8) -> u32 {
-        self.parameters().get(&self.chip, Key::Counter(program)).map_or(0, |[counter, ..]| counter)
+        self.parameters().get(&self.chip, Key::counter(program)).map_or(0, |[counter, ..]| counter)
     }
 
     /// The program that the boot stage starts.

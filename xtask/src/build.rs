@@ -459,7 +459,8 @@ pub fn report(image: &Path, regions: &[Region]) -> Outcome {
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.
-    let used: Vec<_> = flash.used.iter().map(|(region, bytes)| format!("{bytes} of {}", region.size)).collect();
+    let used: Vec<_> =
+        flash.used.iter().map(|(region, bytes)| format!("{bytes} of {}", region.size)).collect();
     eprintln!("  {:<52} {} bytes", workspace::shown(image), used.join(" + "));
     Ok(())
 }

@@ -43,8 +43,11 @@ impl Flash {
                 return Err(format!(
                     "{size} bytes are loaded at {at:#010x}, outside the image's flash ({}); the linker \
                      script and the layout do not agree.",
-                    regions.iter().map(|region| format!("{:#010x}, {}", region.base, kib(region.size)))
-                        .collect::<Vec<_>>().join("; ")
+                    regions
+                        .iter()
+                        .map(|region| format!("{:#010x}, {}", region.base, kib(region.size)))
+                        .collect::<Vec<_>>()
+                        .join("; ")
                 ));
             };
             let end = at.saturating_add(size);

@@ -56,7 +56,9 @@ pub fn run(mut args: Args) -> Outcome {
             for ((region, bytes), budget) in flash.used.iter().zip(budgets(board)) {
                 println!("{:<23}  {name:<25}  {:#010x}  {bytes:>5}  {budget:>5}", board.board, region.base);
                 images.push(json!({"image": name, "board": board.board, "bytes": bytes, "budget": budget}));
-                problems.extend(within(*bytes, budget).err().map(|problem| format!("{}: {problem}", board.board)));
+                problems.extend(
+                    within(*bytes, budget).err().map(|problem| format!("{}: {problem}", board.board)),
+                );
             }
         }
     }
@@ -140,8 +142,10 @@ impl Share {
 /// listed by its section.
 fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> Vec<Share> {
     let others = elf.sections.iter().filter(|section| section.loaded && section.name != ram_image::IMAGE);
-    let others = others.map(|section| Share { part: format!("{} (in flash)", section.name), bytes: section.size });
-    let mut rows: Vec<_> = image.into_iter().map(|(part, bytes)| Share { part, bytes }).chain(others).collect();
+    let others =
+        others.map(|section| Share { part: format!("{} (in flash)", section.name), bytes: section.size });
+    let mut rows: Vec<_> =
+        image.into_iter().map(|(part, bytes)| Share { part, bytes }).chain(others).collect();
     let bytes = rows.iter().map(|row| row.bytes).sum();
     rows.push(Share { part: "(all)".to_owned(), bytes });
     rows.sort_by_key(|row| cmp::Reverse(row.bytes));

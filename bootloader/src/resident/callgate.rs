@@ -154,7 +154,7 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     };
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };
-    keep(&mut parameters, flash, Key::Node, node.value())
+    keep(&mut parameters, flash, Key::NODE, node.value())
 }
 
 /// Reports about a program, confirms it (which also signs it, so that it may start by itself), or
@@ -178,10 +178,10 @@ fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs
     let confirmed = selector == Selector::Confirm;
     if record.signed != confirmed || record.confirmed != confirmed {
         let told = ProgramRecord { signed: confirmed, confirmed, ..record };
-        keep(&mut parameters, flash, Key::Program(number), told.value())?;
+        keep(&mut parameters, flash, Key::program(number), told.value())?;
     }
     if confirmed && crash_count(&parameters, flash) > 0 {
-        keep(&mut parameters, flash, Key::CrashCount, [0; 4])?;
+        keep(&mut parameters, flash, Key::CRASH_COUNT, [0; 4])?;
     }
     Ok(())
 }

@@ -26,12 +26,12 @@ mod flash;
 mod flash_controller;
 #[cfg(feature = "sealed")]
 mod flash_lock;
+#[path = "../memory.rs"]
+mod memory;
 #[path = "../product.rs"]
 mod product;
 mod ram_image;
 mod service_table;
-#[path = "../services.rs"]
-mod services;
 mod stage;
 mod storing;
 
@@ -40,6 +40,7 @@ use core::arch::global_asm;
 use shared_abi::callgate::{Entry, Table, ABI_VERSION, MAGIC, TABLE_SIZE};
 use shared_abi::geometry::CORE_VECTORS;
 use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
+use shared_abi::services::{self, Services};
 use shared_abi::warm_start::BootRequest;
 
 // The vectors of the core. Before the RAM image or a program runs, the only possible exceptions are
@@ -93,7 +94,7 @@ global_asm!(
 #[repr(C)]
 struct Header {
     callgate: Table<Entry>,
-    services: services::Services,
+    services: Services,
 }
 const _: () = assert!(core::mem::offset_of!(Header, services) == services::OFFSET as usize);
 

@@ -1,13 +1,13 @@
 //! The services for the RAM part of the bootloader: all access to non-volatile data.
 
-use boot_core::flash::{Flash, Next, Operation};
+use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters as _, Value};
-use shared_abi::geometry::{Region, Sector};
+use shared_abi::geometry::Region;
 use shared_abi::ram_image::SERVICES_VERSION;
+use shared_abi::services::{FlashOperation, Services, Step, StoreState, ERASE, PROGRAM};
 
 use crate::flash::ResidentFlash;
 use crate::product::{self, Parameters};
-use crate::services::{outcome_of, Services, StoreState, StoreStep};
 
 pub const SERVICES: Services = Services {
     version: SERVICES_VERSION,
@@ -24,7 +24,7 @@ pub const SERVICES: Services = Services {
 const _: () = assert!(
     size_of::<Parameters>() <= size_of::<StoreState>()
         && align_of::<Parameters>() <= align_of::<StoreState>(),
-    "product: the parameters need more than services.rs has room for: raise STORE_STATE_WORDS"
+    "product: the parameters need more than the services have room for"
 );
 
 /// The flash, for one call. The boot stage has left the clock of the CRC unit on.
@@ -43,52 +43,64 @@ unsafe extern "C" fn open(state: *mut StoreState) {
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be writable.
-unsafe extern "C" fn get(state: *const StoreState, key: Key, value: *mut Value) -> bool {
+unsafe extern "C" fn get(state: *const StoreState, key: u32, value: *mut Value) -> u32 {
     // SAFETY: the caller guarantees both.
     unsafe {
-        let Some(found) = (*state.cast::<Parameters>()).get(&flash(), key) else { return false };
+        let Some(found) = (*state.cast::<Parameters>()).get(&flash(), Key(key)) else { return 0 };
         value.write(found);
     }
-    true
+    1
 }
 
 /// # Safety
 /// `state` must come from [`open`]; `value` must be readable.
-unsafe extern "C" fn store(state: *mut StoreState, key: Key, value: *const Value) {
+unsafe extern "C" fn store(state: *mut StoreState, key: u32, value: *const Value) {
     // SAFETY: the caller guarantees both.
-    unsafe { (*state.cast::<Parameters>()).store(key, *value) };
+    unsafe { (*state.cast::<Parameters>()).store(Key(key), *value) };
 }
 
 /// # Safety
 /// `state` must come from [`open`]; `operation` must be writable.
-unsafe extern "C" fn next(state: *mut StoreState, outcome: u32, operation: *mut Operation) -> StoreStep {
+unsafe extern "C" fn next(state: *mut StoreState, outcome: u32, operation: *mut FlashOperation) -> u32 {
+    let outcome = match outcome {
+        0 => Ok(()),
+        1 => Err(FlashFault::Protected),
+        3 => Err(FlashFault::Verify),
+        _ => Err(FlashFault::Failed),
+    };
     // SAFETY: the caller guarantees both.
-    unsafe {
-        match (*state.cast::<Parameters>()).next(&flash(), outcome_of(outcome)) {
+    let step = unsafe {
+        match (*state.cast::<Parameters>()).next(&flash(), outcome) {
             Next::Start(start) => {
-                operation.write(start);
-                StoreStep::Start
+                operation.write(match start {
+                    Operation::Erase(sector) => {
+                        [ERASE, sector.number.into(), sector.region.base, sector.region.size]
+                    }
+                    Operation::Program { address, word } => [PROGRAM, address, word, 0],
+                });
+                Step::Start
             }
-            Next::Again => StoreStep::Again,
-            Next::Done(Ok(())) => StoreStep::Done,
-            Next::Done(Err(_)) => StoreStep::Failed,
+            Next::Again => Step::Again,
+            Next::Done(Ok(())) => Step::Done,
+            Next::Done(Err(_)) => Step::Failed,
         }
-    }
+    };
+    step as u32
 }
 
 extern "C" fn crc32(crc: u32, base: u32, size: u32) -> u32 {
     flash().crc32(crc, Region::new(base, size))
 }
 
-extern "C" fn is_blank(base: u32, size: u32) -> bool {
-    flash().is_blank(Region::new(base, size))
+extern "C" fn is_blank(base: u32, size: u32) -> u32 {
+    flash().is_blank(Region::new(base, size)).into()
 }
 
 /// # Safety
 /// `sector` must be writable.
-unsafe extern "C" fn sector_at(address: u32, sector: *mut Sector) -> bool {
-    let Some(found) = flash().sector_at(address) else { return false };
+unsafe extern "C" fn sector_at(address: u32, sector: *mut [u32; 3]) -> u32 {
+    let Some(found) = flash().sector_at(address) else { return 0 };
     // SAFETY: the caller guarantees it.
-    unsafe { sector.write(found) };
-    true
+    unsafe { sector.write([found.number.into(), found.region.base, found.region.size]) };
+    1
 }

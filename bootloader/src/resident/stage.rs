@@ -173,7 +173,7 @@ fn count_crash_resets(
     let now = DECISION.crash_resets(before, reset_cause, request);
     if now != before {
         // If the store fails, the count is lost, but the start continues.
-        let _ = storing::store(parameters, flash, Key::CrashCount, [now, 0, 0, 0]);
+        let _ = storing::store(parameters, flash, Key::CRASH_COUNT, [now, 0, 0, 0]);
     }
     now
 }

@@ -23,5 +23,5 @@ pub fn store(
 
 /// Resets in a row by which an application ended without a request.
 pub fn crash_count(parameters: &Parameters, flash: &ResidentFlash) -> u32 {
-    parameters.get(flash, Key::CrashCount).map_or(0, |[count, ..]| count)
+    parameters.get(flash, Key::CRASH_COUNT).map_or(0, |[count, ..]| count)
 }

@@ -1,7 +1,7 @@
 //! A running update: what it has done to the device, and the function that gets its events.
 
+use super::device_after::DeviceState;
 use super::event::Event;
-use super::left::DeviceState;
 use crate::device::flying_master::Mastership;
 
 /// A running update.

@@ -12,7 +12,7 @@ use crate::store::Parameters;
 /// passes the checks then.
 #[cfg(feature = "sealed")]
 pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Layout) -> bool {
-    let [_, opened, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
+    let [_, opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);
     opened == 0 && !flash.is_blank(layout.key_block())
 }
 

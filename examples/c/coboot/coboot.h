@@ -295,7 +295,7 @@ static inline enum coboot_callgate_state coboot_callgate_state(const struct cobo
     if (gate->magic != COBOOT_CALLGATE_MAGIC || gate->length < COBOOT_CALLGATE_TABLE_SIZE) {
         return COBOOT_CALLGATE_ABSENT;
     }
-    return gate->abi_version == COBOOT_CALLGATE_ABI_VERSION ? COBOOT_CALLGATE_GOOD : COBOOT_CALLGATE_OTHER_VERSION;
+    return gate->abi_version >= COBOOT_CALLGATE_ABI_VERSION ? COBOOT_CALLGATE_GOOD : COBOOT_CALLGATE_OTHER_VERSION;
 }
 
 #if defined(__arm__)

@@ -72,10 +72,7 @@ fn each_broken_rule_is_named() {
         (broken(|l| l.data = l.home), "the data region overlaps the bootloader"),
         (broken(|l| l.data = Some(l.bootloader)), "the data region overlaps the bootloader"),
         (broken(|l| l.data = Some(l.parameters[1])), "the data region overlaps a parameter region"),
-        (
-            broken(|l| l.programs = programs(&[(0x0800_C000, 16 * KIB)])),
-            "a program overlaps the data region",
-        ),
+        (broken(|l| l.programs = programs(&[(0x0800_C000, 16 * KIB)])), "a program overlaps the data region"),
         (
             broken(|l| {
                 l.home = None;

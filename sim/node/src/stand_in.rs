@@ -73,7 +73,7 @@ impl Services for Underneath {
         let record = self.record(number).ok_or(CallgateError::Refused(Status::NoProgram as i32))?;
         let mut journal = Journal::open(&self.flash, self.layout.parameters);
         let confirmed = ProgramRecord { signed: true, confirmed: true, ..record };
-        journal.store(Key::Program(number), confirmed.value());
+        journal.store(Key::program(number), confirmed.value());
         run(&mut self.flash, |flash, outcome| journal.next(flash, outcome))
             .map(|()| Confirmed::Now)
             .map_err(|_| CallgateError::Refused(Status::Failed as i32))

@@ -17,7 +17,7 @@ static CHIP: Geometry = Geometry {
     ..STM32F407VG
 };
 const REGIONS: [Region; 2] = [Region::new(0x0800_0000, 0x200), Region::new(0x0800_0200, 0x200)];
-const KEYS: [Key; 3] = [Key::Program(1), Key::Program(2), Key::CrashCount];
+const KEYS: [Key; 3] = [Key::program(1), Key::program(2), Key::CRASH_COUNT];
 
 coboot_fuzz::target!(|bytes: &[u8]| {
     let mut input = Input::new(bytes);

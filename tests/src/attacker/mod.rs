@@ -461,7 +461,7 @@ impl Attack {
     fn stored(&mut self) -> Option<Node> {
         let layout = self.setup.layout;
         let view = View { bytes: self.target.flash(), layout };
-        let [id, rate, ..] = Journal::open(&view, layout.parameters).get(&view, Key::Node)?;
+        let [id, rate, ..] = Journal::open(&view, layout.parameters).get(&view, Key::NODE)?;
         Some((id as u8, rate as u8))
     }
 
@@ -580,7 +580,7 @@ impl Attack {
         };
         let view = View { bytes: &now, layout };
         let journal = Journal::open(&view, layout.parameters);
-        let stored = journal.get(&view, Key::Node).map(|[id, rate, ..]| (id as u8, rate as u8));
+        let stored = journal.get(&view, Key::NODE).map(|[id, rate, ..]| (id as u8, rate as u8));
         self.model.stored_is(stored)?;
         if now[place(layout.bootloader)] != self.flash[place(layout.bootloader)] {
             return Err(Broken::Program("the bootloader itself has changed".into()));

@@ -234,8 +234,8 @@ impl Device {
     /// The boot stage, including its writes.
     pub fn boot(&mut self) {
         let mut parameters = self.parameters();
-        if parameters.get(&self.flash, Key::CrashCount).is_some_and(|[count, ..]| count > 0) {
-            parameters.store(Key::CrashCount, [0; 4]);
+        if parameters.get(&self.flash, Key::CRASH_COUNT).is_some_and(|[count, ..]| count > 0) {
+            parameters.store(Key::CRASH_COUNT, [0; 4]);
             let _ = run(&mut self.flash, |flash, outcome| parameters.next(flash, outcome));
         }
     }
@@ -480,15 +480,9 @@ impl Store {
 /// The words of a naive record: its key, four words of value, its CRC.
 const NAIVE: usize = 6;
 
-fn naive_key(key: Key) -> u32 {
-    match key {
-        Key::Program(number) => 0x100 + u32::from(number),
-        Key::CrashCount => 0x200,
-        Key::Node => 0x300,
-        Key::Counter(number) => 0x400 + u32::from(number),
-        Key::Event(place) => 0x500 + u32::from(place),
-        Key::Grants => 0x600,
-    }
+/// Another number for the key, in the lower half of the word.
+fn naive_key(Key(key): Key) -> u32 {
+    (key >> 16) << 8 | key & 0xFF
 }
 
 fn naive_crc(words: &[u32]) -> u32 {
@@ -519,7 +513,12 @@ impl Parameters for Store {
                 let [first, rest @ ..] = journal.get(flash, key)?;
                 let [a, b, c] = rest;
                 // Above the size.
-                Some([if let Key::Program(_) = key { first & 0x00FF_FFFF } else { first }, a, b, c])
+                Some([
+                    if key.0 >> 16 == Key::program(0).0 >> 16 { first & 0x00FF_FFFF } else { first },
+                    a,
+                    b,
+                    c,
+                ])
             }
             Self::Naive { checked, .. } => {
                 let (records, _) = naive_records(flash, *checked);
@@ -532,7 +531,7 @@ impl Parameters for Store {
     fn store(&mut self, key: Key, value: Value) {
         match self {
             Self::Instead(journal, instead)
-                if key == Key::Program(1) && ProgramRecord::from_value(value).is_none() =>
+                if key == Key::program(1) && ProgramRecord::from_value(value).is_none() =>
             {
                 if let Some(instead) = instead {
                     journal.store(key, *instead);

@@ -386,7 +386,7 @@ pub const SCENARIOS: &[Scenario] = &[
         about: "the count of crashes, cleared by a power-on",
         prepare: |device| {
             install(device, 1, OLD, true);
-            device.store(Key::CrashCount, [2, 0, 0, 0]);
+            device.store(Key::CRASH_COUNT, [2, 0, 0, 0]);
         },
         act: |_, tell| {
             tell(allowed(&[START_OLD]));

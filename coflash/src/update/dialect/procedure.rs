@@ -6,8 +6,8 @@ use canopen::NodeId;
 
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::content::Content;
+use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
-use crate::update::left::DeviceState;
 use crate::update::options::FlashOptions;
 use crate::update::running::RunningUpdate;
 use crate::update::steps;

@@ -266,7 +266,7 @@ impl<'b> Programmer<'b> {
 
     /// Stores node-ID and bit rate.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
-        parameters.store(Key::Node, node.value());
+        parameters.store(Key::NODE, node.value());
         self.job = Some(Job::Store(Change::Node, 0));
     }
 
@@ -556,7 +556,7 @@ impl<'b> Programmer<'b> {
             #[cfg(feature = "sealed")]
             if !core::mem::replace(&mut self.kept, true) {
                 if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
-                    parameters.store(Key::Counter(program), counter);
+                    parameters.store(Key::counter(program), counter);
                     return Ok(Some(Job::Store(Change::Counter, program)));
                 }
             }
@@ -604,7 +604,7 @@ impl<'b> Programmer<'b> {
             let program = target.program;
             // Also for the same image: its certificate may have a higher epoch.
             if let Some(counter) = self.unsealer.take_counter() {
-                parameters.store(Key::Counter(program), counter);
+                parameters.store(Key::counter(program), counter);
                 return Ok(Some(Job::Store(Change::Counter, program)));
             }
             if self.unsealer.is_same() {
@@ -627,6 +627,6 @@ fn bit(program: u8) -> u32 {
 
 /// Starts to store a value of a program.
 fn store(parameters: &mut impl Parameters, change: Change, program: u8, value: Value) -> Job {
-    parameters.store(Key::Program(program), value);
+    parameters.store(Key::program(program), value);
     Job::Store(change, program)
 }

@@ -141,12 +141,12 @@ impl Journal {
 
 impl Parameters for Journal {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        let [_, a, b, c, d, _] = self.latest(flash, key.tag())?;
+        let [_, a, b, c, d, _] = self.latest(flash, key.0)?;
         Some([a, b, c, d])
     }
 
     fn store(&mut self, key: Key, value: Value) {
-        self.storing.record = slot(key.tag(), value);
+        self.storing.record = slot(key.0, value);
         self.storing.attempts = 0;
         self.storing.step = Step::Begin;
     }

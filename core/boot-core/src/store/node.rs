@@ -28,7 +28,7 @@ impl NodeParameters {
         supports: impl FnOnce(BitRate) -> bool,
     ) -> Self {
         parameters
-            .get(flash, Key::Node)
+            .get(flash, Key::NODE)
             .and_then(Self::from_value)
             .filter(|stored| supports(stored.bit_rate))
             .unwrap_or(board)

@@ -2,43 +2,37 @@
 
 use crate::flash::{Flash, FlashFault, Next};
 
-/// The key of a stored value.
+/// The key of a stored value: a word, in flash and between the parts of the bootloader. A part that
+/// does not know a key keeps its value. FFFFFFFFh (erased flash) is no key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Key {
-    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord).
-    Program(u8),
-    /// The number of consecutive times that the application ended without a request.
-    CrashCount,
-    /// Node-ID and bit rate, see [`NodeParameters`](super::NodeParameters).
-    Node,
-    /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
-    /// accepts, and the counter of the installed program. This value survives the program's record.
-    #[cfg(feature = "sealed")]
-    Counter(u8),
-    /// An event (0 to 7), see `seal::access`.
-    #[cfg(feature = "sealed")]
-    Event(u8),
-    /// The number of grants of rights, and whether one of them has opened the device permanently.
-    #[cfg(feature = "sealed")]
-    Grants,
-}
+#[repr(transparent)]
+pub struct Key(pub u32);
 
 impl Key {
-    /// The word for the key. FFFFFFFFh (erased flash) means no key.
+    /// The number of consecutive times that the application ended without a request.
+    pub const CRASH_COUNT: Self = Self(0x0002_0000);
+    /// Node-ID and bit rate, see [`NodeParameters`](super::NodeParameters).
+    pub const NODE: Self = Self(0x0003_0000);
+    /// The number of grants of rights, and whether one of them has opened the device permanently.
+    pub const GRANTS: Self = Self(0x0006_0000);
+
+    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord).
     #[must_use]
-    pub const fn tag(self) -> u32 {
-        match self {
-            Self::Program(number) => 0x0001_0000 | number as u32,
-            Self::CrashCount => 0x0002_0000,
-            Self::Node => 0x0003_0000,
-            #[cfg(feature = "sealed")]
-            Self::Counter(number) => 0x0004_0000 | number as u32,
-            #[cfg(feature = "sealed")]
-            Self::Event(place) => 0x0005_0000 | place as u32,
-            #[cfg(feature = "sealed")]
-            Self::Grants => 0x0006_0000,
-        }
+    pub const fn program(number: u8) -> Self {
+        Self(0x0001_0000 | number as u32)
+    }
+
+    /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
+    /// accepts, and the counter of the installed program. This value survives the program's record.
+    #[must_use]
+    pub const fn counter(number: u8) -> Self {
+        Self(0x0004_0000 | number as u32)
+    }
+
+    /// An event (0 to 7), see `seal::access`.
+    #[must_use]
+    pub const fn event(place: u8) -> Self {
+        Self(0x0005_0000 | place as u32)
     }
 }
 

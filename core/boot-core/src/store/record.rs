@@ -66,7 +66,7 @@ impl ProgramRecord {
 
     /// The download of a program that was cut off.
     pub fn load_partial<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Partial {
-        match parameters.get(flash, Key::Program(number)) {
+        match parameters.get(flash, Key::program(number)) {
             Some([first, id, end, _]) if first & SIZE == 0 => Partial::of_words([id, end]),
             _ => Partial::NONE,
         }
@@ -74,7 +74,7 @@ impl ProgramRecord {
 
     /// [`half_erased`](Self::half_erased), also if there is no program.
     pub fn load_half_erased<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> bool {
-        parameters.get(flash, Key::Program(number)).is_some_and(|[first, ..]| first & HALF_ERASED != 0)
+        parameters.get(flash, Key::program(number)).is_some_and(|[first, ..]| first & HALF_ERASED != 0)
     }
 
     /// Whether it was installed as a sealed image.
@@ -88,7 +88,7 @@ impl ProgramRecord {
 
     /// Loads the record from the store; `None` if there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
-        Self::from_value(parameters.get(flash, Key::Program(number))?)
+        Self::from_value(parameters.get(flash, Key::program(number))?)
     }
 
     /// Decodes the stored form; `None` for [`none`](Self::none).

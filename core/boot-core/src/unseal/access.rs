@@ -77,10 +77,10 @@ impl Unsealer<'_> {
     pub(crate) fn take_store(&mut self) -> Option<(Key, Value)> {
         let room = &mut *self.0;
         if core::mem::take(&mut room.stores.1) {
-            return Some((Key::Grants, [room.grants, room.opened, 0, 0]));
+            return Some((Key::GRANTS, [room.grants, room.opened, 0, 0]));
         }
         let place = room.event as usize % LAST;
-        core::mem::take(&mut room.stores.0).then(|| (Key::Event(place as u8), room.events[place]))
+        core::mem::take(&mut room.stores.0).then(|| (Key::event(place as u8), room.events[place]))
     }
 
     /// Whether the signature of a request for rights is being checked.

@@ -206,10 +206,10 @@ impl Unsealer<'_> {
     ) {
         let room = &mut self.0;
         for (place, event) in (0..).zip(&mut room.events) {
-            *event = parameters.get(flash, Key::Event(place)).unwrap_or([0; 4]);
+            *event = parameters.get(flash, Key::event(place)).unwrap_or([0; 4]);
             room.event = room.event.max(event[0]);
         }
-        [room.grants, room.opened, ..] = parameters.get(flash, Key::Grants).unwrap_or([0; 4]);
+        [room.grants, room.opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);
         self.0.layout = Some(layout);
         self.0.key_block = layout.key_block().base;
         self.0.policy = Some(&policy.seal);
@@ -395,7 +395,7 @@ impl Room {
         let word = |at| seal::wire::word(&keys, at);
         let record = ProgramRecord::load(parameters, flash, self.program);
         let [mut counter, mut epoch, installed, _] =
-            parameters.get(flash, Key::Counter(self.program)).unwrap_or([0; 4]);
+            parameters.get(flash, Key::counter(self.program)).unwrap_or([0; 4]);
         // A program that has proved itself has raised the counter, if the policy raises it at
         // confirmation.
         if record.is_some_and(|record| record.confirmed) {
@@ -595,7 +595,7 @@ impl Room {
 /// this way now and differently later.
 pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
     let record = ProgramRecord::load(parameters, flash, program)?;
-    let [counter, epoch, installed, _] = parameters.get(flash, Key::Counter(program))?;
+    let [counter, epoch, installed, _] = parameters.get(flash, Key::counter(program))?;
     (record.confirmed && installed >= counter).then_some([installed, epoch, installed, 0])
 }
 

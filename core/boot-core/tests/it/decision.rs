@@ -50,7 +50,7 @@ fn check_record(
         version: 0,
         half_erased: false,
     };
-    journal.store(Key::Program(1), record.value());
+    journal.store(Key::program(1), record.value());
     run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
     damage(&mut flash);
     verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1)
@@ -136,7 +136,7 @@ fn a_program_ends_inside_its_region() {
             half_erased: false,
         };
         let mut journal = Journal::open(&flash, LAYOUT.parameters);
-        journal.store(Key::Program(1), record.value());
+        journal.store(Key::program(1), record.value());
         run(&mut flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
         verify(&flash, &Journal::open(&flash, LAYOUT.parameters), &LAYOUT, CrcKind::Crc32, 1).map(|_| ())
     };

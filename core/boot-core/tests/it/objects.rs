@@ -504,7 +504,7 @@ fn an_idle_device_stays_idle() {
     assert_eq!(bench.status() & BUSY, BUSY);
     bench.settle();
     let journal = Journal::open(bench.node.flash(), kit::bench::LAYOUT.parameters);
-    assert!(journal.get(bench.node.flash(), Key::Program(1)).is_some());
+    assert!(journal.get(bench.node.flash(), Key::program(1)).is_some());
 }
 
 // --- confirmation, the queue's room, and where a block may lie
@@ -555,7 +555,7 @@ fn a_busy_device_confirms_nothing() {
     assert_eq!(bench.node.stored(), Poll::Ready(Ok(())));
     let flash = bench.node.flash();
     let journal = Journal::open(flash, kit::bench::LAYOUT.parameters);
-    assert_eq!(journal.get(flash, Key::Node).map(|[id, ..]| id), Some(9));
+    assert_eq!(journal.get(flash, Key::NODE).map(|[id, ..]| id), Some(9));
     assert!(!ProgramRecord::load(&journal, flash, 1).unwrap().confirmed);
 }
 

@@ -25,14 +25,14 @@ fn store(flash: &mut ModelFlash, journal: &mut Journal, key: Key, value: Value) 
 fn values_survive_a_restart_and_any_number_of_compactions() {
     let mut flash = ModelFlash::new(&SMALL);
     let mut journal = Journal::open(&flash, REGIONS);
-    assert_eq!(journal.get(&flash, Key::CrashCount), None);
+    assert_eq!(journal.get(&flash, Key::CRASH_COUNT), None);
     for i in 0..200 {
-        store(&mut flash, &mut journal, Key::Program(1 + (i % 3) as u8), [i, !i, i * 7, 0]).unwrap();
+        store(&mut flash, &mut journal, Key::program(1 + (i % 3) as u8), [i, !i, i * 7, 0]).unwrap();
         let reopened = Journal::open(&flash, REGIONS);
         for age in 0..3.min(i + 1) {
             let j = i - age;
             for journal in [&journal, &reopened] {
-                let value = journal.get(&flash, Key::Program(1 + (j % 3) as u8));
+                let value = journal.get(&flash, Key::program(1 + (j % 3) as u8));
                 assert_eq!(value, Some([j, !j, j * 7, 0]));
             }
         }
@@ -48,9 +48,9 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
     const STORES: u32 = 25;
     let history = |flash: &mut ModelFlash, done: &mut u32| {
         let mut journal = Journal::open(flash, REGIONS);
-        store(flash, &mut journal, Key::CrashCount, [0xC0FFEE, 0, 0, 0]).unwrap();
+        store(flash, &mut journal, Key::CRASH_COUNT, [0xC0FFEE, 0, 0, 0]).unwrap();
         for i in 1..=STORES {
-            store(flash, &mut journal, Key::Program(1), [i, i, i, i]).unwrap();
+            store(flash, &mut journal, Key::program(1), [i, i, i, i]).unwrap();
             *done = i;
         }
     };
@@ -72,11 +72,11 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
 
             let check = |flash: &ModelFlash, newest: u32| {
                 let journal = Journal::open(flash, REGIONS);
-                let value = journal.get(flash, Key::Program(1));
+                let value = journal.get(flash, Key::program(1));
                 let expected = [done, newest].map(|i| (i > 0).then_some([i; 4]));
                 assert!(expected.contains(&value), "{at}: {value:?}");
                 if done > 0 {
-                    assert_eq!(journal.get(flash, Key::CrashCount), Some([0xC0FFEE, 0, 0, 0]), "{at}");
+                    assert_eq!(journal.get(flash, Key::CRASH_COUNT), Some([0xC0FFEE, 0, 0, 0]), "{at}");
                 }
             };
             check(&flash, done + 1);
@@ -86,7 +86,7 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
                 flash.cut = Some((second, cut));
                 let recovered = until_power_cut(|| {
                     let mut journal = Journal::open(&flash, REGIONS);
-                    store(&mut flash, &mut journal, Key::Program(1), [done + 1; 4]).unwrap();
+                    store(&mut flash, &mut journal, Key::program(1), [done + 1; 4]).unwrap();
                 });
                 flash.power_on();
                 check(&flash, done + 1);
@@ -96,9 +96,9 @@ fn after_any_cut_the_old_or_the_new_value_is_read_and_the_neighbour_is_untouched
                 }
             }
             let mut journal = Journal::open(&flash, REGIONS);
-            store(&mut flash, &mut journal, Key::Program(1), [777; 4]).unwrap();
+            store(&mut flash, &mut journal, Key::program(1), [777; 4]).unwrap();
             let journal = Journal::open(&flash, REGIONS);
-            assert_eq!(journal.get(&flash, Key::Program(1)), Some([777; 4]), "{at}");
+            assert_eq!(journal.get(&flash, Key::program(1)), Some([777; 4]), "{at}");
         }
     }
     assert!(points > 1000, "{points}");
@@ -111,9 +111,9 @@ fn noise_in_both_regions_is_an_empty_journal() {
         flash.poke(region.base, &[byte; 256]);
     }
     let mut journal = Journal::open(&flash, REGIONS);
-    assert_eq!(journal.get(&flash, Key::Program(1)), None);
-    store(&mut flash, &mut journal, Key::Program(1), [5; 4]).unwrap();
-    assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([5; 4]));
+    assert_eq!(journal.get(&flash, Key::program(1)), None);
+    store(&mut flash, &mut journal, Key::program(1), [5; 4]).unwrap();
+    assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::program(1)), Some([5; 4]));
 }
 
 #[test]
@@ -121,11 +121,11 @@ fn errors_of_the_flash_are_told_and_the_old_value_stays() {
     for operation in 1..=6 {
         let mut flash = ModelFlash::new(&SMALL);
         let mut journal = Journal::open(&flash, REGIONS);
-        store(&mut flash, &mut journal, Key::Program(1), [1; 4]).unwrap();
+        store(&mut flash, &mut journal, Key::program(1), [1; 4]).unwrap();
         flash.fail = Some((flash.operations + operation, FlashFault::Protected));
-        let outcome = store(&mut flash, &mut journal, Key::Program(1), [2; 4]);
+        let outcome = store(&mut flash, &mut journal, Key::program(1), [2; 4]);
         assert_eq!(outcome, Err(StoreError::Flash(FlashFault::Protected)));
-        assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::Program(1)), Some([1; 4]));
+        assert_eq!(Journal::open(&flash, REGIONS).get(&flash, Key::program(1)), Some([1; 4]));
     }
 }
 
@@ -150,12 +150,12 @@ fn a_journal_of_an_older_version_is_read_and_moves_to_this_one_and_a_newer_one_i
         flash.poke(REGIONS[0].base, &slot([magic, 7, !7, version, u32::MAX]));
         flash.poke(REGIONS[0].base + 24, &slot([0x0001_0002, 1, 2, 3, 4]));
         let mut journal = Journal::open(&flash, REGIONS);
-        assert_eq!(journal.get(&flash, Key::Program(2)), known.then_some([1, 2, 3, 4]), "version {version}");
+        assert_eq!(journal.get(&flash, Key::program(2)), known.then_some([1, 2, 3, 4]), "version {version}");
         if version == 0 {
-            store(&mut flash, &mut journal, Key::CrashCount, [9, 0, 0, 0]).unwrap();
+            store(&mut flash, &mut journal, Key::CRASH_COUNT, [9, 0, 0, 0]).unwrap();
             let reopened = Journal::open(&flash, REGIONS);
-            assert_eq!(reopened.get(&flash, Key::Program(2)), Some([1, 2, 3, 4]));
-            assert_eq!(reopened.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
+            assert_eq!(reopened.get(&flash, Key::program(2)), Some([1, 2, 3, 4]));
+            assert_eq!(reopened.get(&flash, Key::CRASH_COUNT), Some([9, 0, 0, 0]));
             // The other region, the next sequence number, today's version.
             assert_eq!(flash.cells(REGIONS[1])[..24], slot([magic, 8, !8, 1, u32::MAX]));
         }
@@ -179,7 +179,7 @@ fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
             flash.poke(REGIONS[1 - newer].base, other);
         }
         let before = flash.cells(SMALL.flash).to_vec();
-        for key in [Key::CrashCount, Key::Node, Key::Program(1)] {
+        for key in [Key::CRASH_COUNT, Key::NODE, Key::program(1)] {
             let mut journal = Journal::open(&flash, REGIONS);
             let outcome = store(&mut flash, &mut journal, key, [9, 0, 0, 0]);
             let what = format!("{key:?}, newer in region {newer}, {other:?} in the other one");
@@ -196,9 +196,9 @@ fn a_journal_of_a_newer_version_refuses_every_store_and_stays_as_it_is() {
 fn a_store_that_is_asked_while_the_flash_works_is_caught() {
     let mut flash = ModelFlash::new(&SMALL);
     let mut journal = Journal::open(&flash, REGIONS);
-    store(&mut flash, &mut journal, Key::CrashCount, [1; 4]).unwrap();
+    store(&mut flash, &mut journal, Key::CRASH_COUNT, [1; 4]).unwrap();
     flash.start(Operation::Program { address: 0x0800_0300, word: 0 }).unwrap();
-    let _ = journal.get(&flash, Key::CrashCount);
+    let _ = journal.get(&flash, Key::CRASH_COUNT);
 }
 
 // --- the bytes
@@ -211,7 +211,7 @@ fn header(sequence: u32) -> Vec<u8> {
 }
 
 fn record(key: Key, [a, b, c, d]: Value) -> Vec<u8> {
-    slot([key.tag(), a, b, c, d])
+    slot([key.0, a, b, c, d])
 }
 
 /// The used slots of a region, one after another; everything after them is blank.
@@ -226,9 +226,9 @@ fn used(flash: &ModelFlash, region: Region, slots: usize) -> &[u8] {
 fn the_first_values_stand_behind_a_header_in_the_first_region() {
     let mut flash = ModelFlash::new(&SMALL);
     let mut journal = Journal::open(&flash, REGIONS);
-    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
-    store(&mut flash, &mut journal, Key::CrashCount, [2, 0, 0, 0]).unwrap();
-    let expected = [header(1), record(Key::Node, [5, 1, 0, 0]), record(Key::CrashCount, [2, 0, 0, 0])];
+    store(&mut flash, &mut journal, Key::NODE, [5, 1, 0, 0]).unwrap();
+    store(&mut flash, &mut journal, Key::CRASH_COUNT, [2, 0, 0, 0]).unwrap();
+    let expected = [header(1), record(Key::NODE, [5, 1, 0, 0]), record(Key::CRASH_COUNT, [2, 0, 0, 0])];
     assert_eq!(used(&flash, REGIONS[0], 3), expected.concat());
     used(&flash, REGIONS[1], 0);
     assert!(flash.touched.iter().all(|touched| touched.size == 4), "a new device needs no erase");
@@ -236,11 +236,11 @@ fn the_first_values_stand_behind_a_header_in_the_first_region() {
 
 #[test]
 fn the_tags_are_those_of_devices_in_the_field() {
-    let tags = [Key::Program(1), Key::Program(254), Key::CrashCount, Key::Node].map(Key::tag);
+    let tags = [Key::program(1), Key::program(254), Key::CRASH_COUNT, Key::NODE].map(|key| key.0);
     assert_eq!(tags, [0x0001_0001, 0x0001_00FE, 0x0002_0000, 0x0003_0000]);
     #[cfg(feature = "sealed")]
     {
-        let tags = [Key::Counter(1), Key::Counter(254), Key::Event(7), Key::Grants].map(Key::tag);
+        let tags = [Key::counter(1), Key::counter(254), Key::event(7), Key::GRANTS].map(|key| key.0);
         assert_eq!(tags, [0x0004_0001, 0x0004_00FE, 0x0005_0007, 0x0006_0000]);
     }
 }
@@ -251,29 +251,29 @@ fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
     let mut flash = ModelFlash::new(&SMALL);
     let mut journal = Journal::open(&flash, REGIONS);
     let stores = [
-        (Key::Node, [5, 1, 0, 0]),
-        (Key::Program(1), [1; 4]),
-        (Key::CrashCount, [1, 0, 0, 0]),
-        (Key::Program(1), [2; 4]),
-        (Key::Program(2), [3; 4]),
-        (Key::CrashCount, [2, 0, 0, 0]),
-        (Key::Program(1), [4; 4]),
-        (Key::CrashCount, [3, 0, 0, 0]),
-        (Key::Program(2), [5; 4]),
+        (Key::NODE, [5, 1, 0, 0]),
+        (Key::program(1), [1; 4]),
+        (Key::CRASH_COUNT, [1, 0, 0, 0]),
+        (Key::program(1), [2; 4]),
+        (Key::program(2), [3; 4]),
+        (Key::CRASH_COUNT, [2, 0, 0, 0]),
+        (Key::program(1), [4; 4]),
+        (Key::CRASH_COUNT, [3, 0, 0, 0]),
+        (Key::program(2), [5; 4]),
     ];
     for (key, value) in stores {
         store(&mut flash, &mut journal, key, value).unwrap();
     }
     used(&flash, REGIONS[1], 0);
     flash.touched.clear();
-    store(&mut flash, &mut journal, Key::Node, [6, 2, 0, 0]).unwrap();
+    store(&mut flash, &mut journal, Key::NODE, [6, 2, 0, 0]).unwrap();
     let expected = [
         header(2),
-        record(Key::Node, [5, 1, 0, 0]),
-        record(Key::Program(1), [4; 4]),
-        record(Key::CrashCount, [3, 0, 0, 0]),
-        record(Key::Program(2), [5; 4]),
-        record(Key::Node, [6, 2, 0, 0]),
+        record(Key::NODE, [5, 1, 0, 0]),
+        record(Key::program(1), [4; 4]),
+        record(Key::CRASH_COUNT, [3, 0, 0, 0]),
+        record(Key::program(2), [5; 4]),
+        record(Key::NODE, [6, 2, 0, 0]),
     ];
     assert_eq!(used(&flash, REGIONS[1], 6), expected.concat());
     // The header comes after the copies, and the new record after the header.
@@ -284,43 +284,43 @@ fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
     assert_eq!(slots, [1, 2, 3, 4, 0, 5]);
     // The next ones follow, and the next compaction goes back to the first region.
     for count in 4..9 {
-        store(&mut flash, &mut journal, Key::CrashCount, [count, 0, 0, 0]).unwrap();
+        store(&mut flash, &mut journal, Key::CRASH_COUNT, [count, 0, 0, 0]).unwrap();
     }
     assert_eq!(flash.cells(REGIONS[0])[..24], header(3));
     let journal = Journal::open(&flash, REGIONS);
-    assert_eq!(journal.get(&flash, Key::Node), Some([6, 2, 0, 0]));
-    assert_eq!(journal.get(&flash, Key::CrashCount), Some([8, 0, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::NODE), Some([6, 2, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::CRASH_COUNT), Some([8, 0, 0, 0]));
 }
 
 /// What is in a region without a header is not a value: neither at once, nor when the region
 /// gets a header.
 #[test]
 fn what_was_left_in_a_region_never_becomes_a_value() {
-    let leftover = record(Key::Program(1), [9; 4]);
+    let leftover = record(Key::program(1), [9; 4]);
     for slots_before in 1..10 {
         let mut flash = ModelFlash::new(&SMALL);
         flash.poke(REGIONS[0].base + slots_before * SLOT, &leftover);
         let mut journal = Journal::open(&flash, REGIONS);
-        assert_eq!(journal.get(&flash, Key::Program(1)), None);
-        store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+        assert_eq!(journal.get(&flash, Key::program(1)), None);
+        store(&mut flash, &mut journal, Key::NODE, [5, 1, 0, 0]).unwrap();
         for journal in [journal, Journal::open(&flash, REGIONS)] {
-            assert_eq!(journal.get(&flash, Key::Program(1)), None, "slot {slots_before}");
-            assert_eq!(journal.get(&flash, Key::Node), Some([5, 1, 0, 0]), "slot {slots_before}");
+            assert_eq!(journal.get(&flash, Key::program(1)), None, "slot {slots_before}");
+            assert_eq!(journal.get(&flash, Key::NODE), Some([5, 1, 0, 0]), "slot {slots_before}");
         }
     }
     // The same in the region that a compaction goes to: power failed before its header was written.
     let mut flash = ModelFlash::new(&SMALL);
     flash.poke(REGIONS[0].base, &header(7));
     for n in 1..10 {
-        flash.poke(REGIONS[0].base + n * SLOT, &record(Key::CrashCount, [n, 0, 0, 0]));
+        flash.poke(REGIONS[0].base + n * SLOT, &record(Key::CRASH_COUNT, [n, 0, 0, 0]));
     }
     flash.poke(REGIONS[1].base + 4 * SLOT, &leftover);
     let mut journal = Journal::open(&flash, REGIONS);
-    store(&mut flash, &mut journal, Key::Node, [5, 1, 0, 0]).unwrap();
+    store(&mut flash, &mut journal, Key::NODE, [5, 1, 0, 0]).unwrap();
     let journal = Journal::open(&flash, REGIONS);
-    assert_eq!(journal.get(&flash, Key::Program(1)), None);
-    assert_eq!(journal.get(&flash, Key::CrashCount), Some([9, 0, 0, 0]));
-    assert_eq!(journal.get(&flash, Key::Node), Some([5, 1, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::program(1)), None);
+    assert_eq!(journal.get(&flash, Key::CRASH_COUNT), Some([9, 0, 0, 0]));
+    assert_eq!(journal.get(&flash, Key::NODE), Some([5, 1, 0, 0]));
 }
 
 #[test]
@@ -337,15 +337,15 @@ fn the_region_with_the_later_sequence_number_counts_also_across_its_wrap() {
         let mut flash = ModelFlash::new(&SMALL);
         for (n, (region, sequence)) in (0..).zip(REGIONS.into_iter().zip([first, second])) {
             flash.poke(region.base, &header(sequence));
-            flash.poke(region.base + SLOT, &record(Key::Node, [10 + n, 0, 0, 0]));
+            flash.poke(region.base + SLOT, &record(Key::NODE, [10 + n, 0, 0, 0]));
         }
         let journal = Journal::open(&flash, REGIONS);
         let what = format!("{first:#x}, {second:#x}");
-        assert_eq!(journal.get(&flash, Key::Node), Some([10 + latest, 0, 0, 0]), "{what}");
+        assert_eq!(journal.get(&flash, Key::NODE), Some([10 + latest, 0, 0, 0]), "{what}");
         // The next region to be valid gets the next number.
         let mut journal = journal;
         for n in 0..10 {
-            store(&mut flash, &mut journal, Key::CrashCount, [n, 0, 0, 0]).unwrap();
+            store(&mut flash, &mut journal, Key::CRASH_COUNT, [n, 0, 0, 0]).unwrap();
         }
         let next = if latest == 0 { first } else { second }.wrapping_add(1);
         assert_eq!(flash.cells(REGIONS[1 - latest as usize])[..24], header(next), "{what}");
@@ -356,11 +356,11 @@ fn the_region_with_the_later_sequence_number_counts_also_across_its_wrap() {
 #[test]
 fn a_header_or_a_record_with_any_wrong_bit_does_not_count() {
     let mut good = header(7);
-    good.extend(record(Key::Node, [5, 1, 0, 0]));
+    good.extend(record(Key::NODE, [5, 1, 0, 0]));
     let read = |bytes: &[u8]| {
         let mut flash = ModelFlash::new(&SMALL);
         flash.poke(REGIONS[1].base, bytes);
-        Journal::open(&flash, REGIONS).get(&flash, Key::Node)
+        Journal::open(&flash, REGIONS).get(&flash, Key::NODE)
     };
     assert_eq!(read(&good), Some([5, 1, 0, 0]));
     for bit in 0..good.len() * 8 {
@@ -381,7 +381,7 @@ fn the_first_store_after_a_start_writes_the_header_again() {
         let mut flash = ModelFlash::new(&SMALL);
         let mut journal = Journal::open(&flash, REGIONS);
         for n in 0..full {
-            store(&mut flash, &mut journal, Key::Node, [n, 1, 0, 0]).unwrap();
+            store(&mut flash, &mut journal, Key::NODE, [n, 1, 0, 0]).unwrap();
         }
         let mut journal = Journal::open(&flash, REGIONS);
         let mut written = |key| {
@@ -390,9 +390,9 @@ fn the_first_store_after_a_start_writes_the_header_again() {
             let slots = flash.touched.chunks(6).map(|words| (words[0].base - REGIONS[0].base) / SLOT);
             slots.collect::<Vec<_>>()
         };
-        assert_eq!(written(Key::CrashCount), [0, full + 1]);
+        assert_eq!(written(Key::CRASH_COUNT), [0, full + 1]);
         if full < 8 {
-            assert_eq!(written(Key::CrashCount), [full + 2]);
+            assert_eq!(written(Key::CRASH_COUNT), [full + 2]);
         }
     }
 }
@@ -406,14 +406,14 @@ fn to_open_a_journal_takes_a_look_at_each_byte_and_no_more() {
         let mut flash = ModelFlash::new(LAYOUT.chip);
         flash.poke(region.base, &header(1));
         for n in 1..=full {
-            flash.poke(region.base + n * SLOT, &record(Key::Node, [n, 0, 0, 0]));
+            flash.poke(region.base + n * SLOT, &record(Key::NODE, [n, 0, 0, 0]));
         }
         flash.bytes_read.set(0);
         let journal = Journal::open(&flash, LAYOUT.parameters);
         let read = flash.bytes_read.get();
         assert!(read <= region.size as usize + 1024, "{full} records: {read} bytes");
         let latest = (full > 0).then_some([full, 0, 0, 0]);
-        assert_eq!(journal.get(&flash, Key::Node), latest);
+        assert_eq!(journal.get(&flash, Key::NODE), latest);
     }
 }
 
@@ -450,7 +450,7 @@ impl Flash for Worn {
 }
 
 fn store_worn(flash: &mut Worn, journal: &mut Journal, value: Value) -> Result<(), StoreError> {
-    journal.store(Key::Node, value);
+    journal.store(Key::NODE, value);
     run(flash, |flash, outcome| journal.next(flash, outcome))
 }
 
@@ -473,7 +473,7 @@ fn a_worn_out_slot_costs_a_slot_and_no_value() {
                 Err(error) => assert_eq!(error, StoreError::WornOut),
             }
             for journal in [&journal, &Journal::open(&worn, REGIONS)] {
-                assert_eq!(journal.get(&worn, Key::Node), stored, "slot {slot}, value {n}");
+                assert_eq!(journal.get(&worn, Key::NODE), stored, "slot {slot}, value {n}");
             }
         }
     }
@@ -495,7 +495,7 @@ fn a_store_tries_nine_places() {
 fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
     let mut flash = ModelFlash::new(&SMALL);
     let mut journal = Journal::open(&flash, REGIONS);
-    store(&mut flash, &mut journal, Key::Node, [1; 4]).unwrap();
+    store(&mut flash, &mut journal, Key::NODE, [1; 4]).unwrap();
     let before = flash.operations;
     // After the header and the first record, and all of the other region.
     let rest = Region::new(REGIONS[0].base + 2 * SLOT, 256 - 2 * SLOT);
@@ -503,7 +503,7 @@ fn a_store_in_worn_out_flash_ends_and_the_old_value_stays() {
     for attempt in 1..4 {
         assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut), "{attempt}");
         for journal in [&journal, &Journal::open(&worn, REGIONS)] {
-            assert_eq!(journal.get(&worn, Key::Node), Some([1; 4]), "{attempt}");
+            assert_eq!(journal.get(&worn, Key::NODE), Some([1; 4]), "{attempt}");
         }
         // Eight attempts, each with a word that does not read back, and an erase for those that
         // change the region; the ninth gives up.
@@ -519,7 +519,7 @@ fn a_device_whose_regions_are_worn_out_stores_nothing_and_says_so() {
         let mut journal = Journal::open(&flash, REGIONS);
         let mut worn = Worn { flash, places };
         assert_eq!(store_worn(&mut worn, &mut journal, [7; 4]), Err(StoreError::WornOut));
-        assert_eq!(Journal::open(&worn, REGIONS).get(&worn, Key::Node), None);
+        assert_eq!(Journal::open(&worn, REGIONS).get(&worn, Key::NODE), None);
     }
 }
 
@@ -532,7 +532,7 @@ fn node_id_and_bit_rate_are_read_if_the_firmware_knows_them() {
         let mut flash = ModelFlash::new(&SMALL);
         let mut journal = Journal::open(&flash, REGIONS);
         if let Some(value) = value {
-            store(&mut flash, &mut journal, Key::Node, value).unwrap();
+            store(&mut flash, &mut journal, Key::NODE, value).unwrap();
         }
         NodeParameters::load(&journal, &flash, board, supports)
     };

@@ -1,0 +1,116 @@
+//! The services of the resident part for the RAM image: only the resident part has the code for
+//! non-volatile data.
+//!
+//! The table follows the callgate's at its fixed address. Everything in it is an integer, or a
+//! pointer to integers, so no side can give the other a value that its types do not know. The table
+//! only grows: an entry is never changed or removed, and the version counts the additions. A RAM
+//! image needs at least a version ([`Header::services`](crate::ram_image::Header::services)); the
+//! resident part does not start an image that needs more.
+//!
+//! The services run from flash. They may be called only **while no flash operation runs**. Each
+//! call returns an answer, or the operation that the RAM image must start and poll. The store keeps
+//! its state between two calls in RAM, in a [`StoreState`] of the caller.
+
+use crate::callgate::TABLE_SIZE;
+
+/// Offset of the table from the callgate's.
+pub const OFFSET: u32 = TABLE_SIZE;
+
+/// The services.
+#[repr(C)]
+pub struct Services {
+    /// [`SERVICES_VERSION`](crate::ram_image::SERVICES_VERSION) of the resident part.
+    pub version: u32,
+    /// Bytes of this table.
+    pub size: u32,
+    /// Finds the stored values.
+    pub open: unsafe extern "C" fn(*mut StoreState),
+    /// Reads the value of a key; returns 1 if there is one, otherwise 0.
+    pub get: unsafe extern "C" fn(*const StoreState, u32, *mut [u32; 4]) -> u32,
+    /// Begins to store a value under a key. A key that the resident part does not know is as good as
+    /// any other.
+    pub store: unsafe extern "C" fn(*mut StoreState, u32, *const [u32; 4]),
+    /// Continues to store the value. The second argument is the result of the previous operation: 0
+    /// for success, 1 protected, 2 failed, 3 not verified. Returns a number of a [`Step`].
+    pub next: unsafe extern "C" fn(*mut StoreState, u32, *mut FlashOperation) -> u32,
+    /// CRC-32 of a region of the flash (address, size); it continues the CRC in the first argument.
+    pub crc32: extern "C" fn(u32, u32, u32) -> u32,
+    /// Returns 1 if a region of the flash (address, size) is erased, otherwise 0.
+    pub is_blank: extern "C" fn(u32, u32) -> u32,
+    /// Finds the sector that contains an address: its number, its address, its size. Returns 1 if
+    /// there is one, otherwise 0.
+    pub sector_at: unsafe extern "C" fn(u32, *mut [u32; 3]) -> u32,
+}
+
+/// An operation of the flash in four words: [`ERASE`], and number, address and size of a sector; or
+/// [`PROGRAM`], an address, the word, 0.
+pub type FlashOperation = [u32; 4];
+
+/// The first word of a [`FlashOperation`] that erases a sector.
+pub const ERASE: u32 = 1;
+/// The first word of a [`FlashOperation`] that programs a word.
+pub const PROGRAM: u32 = 2;
+
+/// The next step of the store.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum Step {
+    /// The operation must be started.
+    Start = 0,
+    /// There is more to compute: call again.
+    Again = 1,
+    /// The value is stored.
+    Done = 2,
+    /// The value could not be stored; the old one is still stored.
+    Failed = 3,
+}
+
+impl Step {
+    /// The step with this number; any other number is [`Failed`](Self::Failed).
+    #[must_use]
+    pub const fn from_number(number: u32) -> Self {
+        match number {
+            0 => Self::Start,
+            1 => Self::Again,
+            2 => Self::Done,
+            _ => Self::Failed,
+        }
+    }
+}
+
+/// Memory for the state of the store. Only the resident part knows its contents.
+#[repr(C, align(8))]
+pub struct StoreState(pub [u32; STORE_STATE_WORDS]);
+
+/// Words of [`StoreState`]: enough for the journal. It never changes: a store of a product's own that
+/// needs more keeps it elsewhere.
+pub const STORE_STATE_WORDS: usize = 32;
+
+// The table as the resident parts in the field have it: eight more bytes for each entry where a
+// pointer has eight.
+const _: () = {
+    use core::mem::offset_of;
+    const POINTER: usize = size_of::<usize>();
+    assert!(offset_of!(Services, version) == 0 && offset_of!(Services, size) == 4);
+    assert!(offset_of!(Services, open) == 8);
+    assert!(offset_of!(Services, get) == 8 + POINTER);
+    assert!(offset_of!(Services, store) == 8 + 2 * POINTER);
+    assert!(offset_of!(Services, next) == 8 + 3 * POINTER);
+    assert!(offset_of!(Services, crc32) == 8 + 4 * POINTER);
+    assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
+    assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
+    assert!(size_of::<StoreState>() == 128);
+};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_step_that_nobody_knows_is_a_failure() {
+        for step in [Step::Start, Step::Again, Step::Done, Step::Failed] {
+            assert_eq!(Step::from_number(step as u32), step);
+        }
+        assert_eq!([4, u32::MAX].map(Step::from_number), [Step::Failed; 2]);
+    }
+}
