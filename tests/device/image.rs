@@ -417,6 +417,45 @@ fn an_image_without_a_crc_runs() {
     assert!(bench.is_bootloader(NODE));
 }
 
+/// The resident part stays in the field while RAM images come and go: an image of another product,
+/// in which every address differs, runs on it, and calls its services.
+#[test]
+fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
+    if firmware::board().home.is_none() {
+        // In the compact map the two are one, written together.
+        return;
+    }
+    let names = [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST, firmware::BOOTLOADER_LOG_RTT];
+    let entries = names.map(|name| Parts::of(name).get(RESET));
+    let addresses = |name| {
+        let elf = firmware::elf(name);
+        let file = ElfFile32::<Endianness>::parse(&*elf).unwrap();
+        let all = file.symbols().filter(|symbol| symbol.size() > 0);
+        all.filter_map(|symbol| Some((symbol.name().ok()?.to_owned(), symbol.address()))).collect::<Vec<_>>()
+    };
+    let (here, there) = (addresses(names[0]), addresses(names[1]));
+    let same = here.iter().filter(|of_one| there.contains(of_one)).count();
+    assert!(same * 10 < here.len(), "{same} of {} are where they were; {entries:x?}", here.len());
+    for resident in names {
+        for image in names.into_iter().filter(|image| *image != resident) {
+            let parts = Parts { resident: Parts::of(resident).resident, ..Parts::of(image) };
+            let mut bench = Bench::new();
+            load(&mut bench, &parts);
+            bench.power_on();
+            bench.await_boot_up(100);
+            assert!(bench.is_bootloader(NODE), "{image} on {resident}");
+            // The image erases, programs and stores by the services of the other resident part.
+            let options = FlashOptions::default().trial_run(false);
+            flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+            bench.confirm_program();
+            assert!(!bench.is_bootloader(NODE), "{image} on {resident}");
+            bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+            bench.await_boot_up(1000);
+            assert!(bench.is_bootloader(NODE), "{image} on {resident}");
+        }
+    }
+}
+
 /// A fault before the RAM image is ready has its handler in flash, by the vectors in flash: it
 /// requests the bootloader and resets.
 #[test]

@@ -245,6 +245,26 @@ fn the_tags_are_those_of_devices_in_the_field() {
     }
 }
 
+/// A newer RAM image stores under keys that this resident part does not know: they survive each
+/// change of the region.
+#[test]
+fn an_unknown_key_is_as_good_as_any_other() {
+    let mut flash = ModelFlash::new(&SMALL);
+    let mut journal = Journal::open(&flash, REGIONS);
+    let unknown = [Key(0x0077_0001), Key(0xFFFF_FFFE), Key(0)];
+    for (number, key) in (1..).zip(unknown) {
+        store(&mut flash, &mut journal, key, [number; 4]).unwrap();
+    }
+    for count in 0..50 {
+        store(&mut flash, &mut journal, Key::CRASH_COUNT, [count, 0, 0, 0]).unwrap();
+        let again = Journal::open(&flash, REGIONS);
+        for (number, key) in (1..).zip(unknown) {
+            assert_eq!(again.get(&flash, key), Some([number; 4]), "{key:?} after {count}");
+        }
+    }
+    assert!(flash.touched.iter().any(|touched| touched.size > 4), "a region was erased");
+}
+
 /// 256 bytes are ten slots: a header and nine records. The tenth record needs the other region.
 #[test]
 fn a_compaction_copies_the_latest_value_of_each_key_once_and_nothing_else() {
