@@ -40,9 +40,6 @@ impl Args {
     }
 
     /// Takes `NAME VALUE` or `NAME=VALUE`.
-    ///
-    /// # Errors
-    /// When the value is missing, or the option is there twice.
     pub fn value(&mut self, name: &str) -> Outcome<Option<String>> {
         let mut found = None;
         while let Some(at) = self.own.iter().position(|word| {
@@ -69,9 +66,6 @@ impl Args {
     }
 
     /// Checks that all words were taken, for a job that passes none on.
-    ///
-    /// # Errors
-    /// When a word is left.
     pub fn none_left(self) -> Outcome {
         match self.rest().first() {
             None => Ok(()),

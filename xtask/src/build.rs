@@ -114,9 +114,6 @@ const fn application(name: &'static str, package: &'static str, features: &'stat
 
 impl Variant {
     /// The image with this name, if the board has it.
-    ///
-    /// # Errors
-    /// When there is none; the message lists the existing ones.
     pub fn by_name(board: &Layout, name: &str) -> Outcome<&'static Self> {
         Self::of(board).find(|variant| variant.name == name).ok_or_else(|| {
             let known: Vec<_> = Self::of(board).map(|variant| variant.name).collect();
@@ -130,9 +127,6 @@ impl Variant {
     }
 
     /// The product of the image.
-    ///
-    /// # Errors
-    /// When its file is missing.
     pub fn product(&self) -> Outcome<Product> {
         self.product.map_or_else(|| Ok(Product::default()), Product::named)
     }
@@ -196,9 +190,6 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// Builds images of a board by their names, and prints their sizes; returns their folder.
-///
-/// # Errors
-/// When an image does not build, or is not an image of this board.
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
@@ -209,9 +200,6 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
 }
 
 /// Builds all images of a board except those in C, and prints their sizes; returns their folder.
-///
-/// # Errors
-/// As for [`images`].
 pub fn all(board: &Layout) -> Outcome<PathBuf> {
     images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
 }
@@ -219,9 +207,6 @@ pub fn all(board: &Layout) -> Outcome<PathBuf> {
 /// Builds the images with these names for several boards, or everything ([`all`] and
 /// [`c_applications`]) where there are no names; several chips at once, since the last step of each
 /// image uses only one core.
-///
-/// # Errors
-/// As for [`images`]; the first error.
 pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
     let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     chips.sort_unstable();
@@ -251,9 +236,6 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
 
 /// Builds the application in C for each program of a board, and the same with the tests' object
 /// 2100h. A board without a header in examples/c/boards has none.
-///
-/// # Errors
-/// When it does not build, or is not an image of this board.
 pub fn c_applications(board: &Layout) -> Outcome {
     let sources = workspace::root().join("examples/c");
     if !sources.join("boards").join(board.board).with_extension("h").exists() {
@@ -339,9 +321,6 @@ fn rust_lld() -> Outcome<PathBuf> {
 }
 
 /// Builds a bootloader for examination; returns its ELF file.
-///
-/// # Errors
-/// When it does not build.
 pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
@@ -352,9 +331,6 @@ pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<
 pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
 
 /// The files in such a folder.
-///
-/// # Errors
-/// When it cannot be read.
 pub fn board_files(folder: &str) -> Outcome<Vec<PathBuf>> {
     let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
     let entries = fs::read_dir(workspace::root().join(folder)).map_err(unreadable)?;
@@ -453,9 +429,6 @@ fn put(board: &Layout, name: &str, region: Region, file: &[u8]) -> Outcome {
 }
 
 /// Prints the size of an image.
-///
-/// # Errors
-/// When it lies outside its flash.
 pub fn report(image: &Path, region: Region) -> Outcome {
     let flash = Flash::of(&footprint::read(image)?, region)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;

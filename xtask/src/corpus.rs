@@ -22,9 +22,6 @@ fn failed(path: &Path) -> impl Fn(Error) -> String + '_ {
 }
 
 /// The inputs of a file; none if there is no file.
-///
-/// # Errors
-/// When it cannot be read, or its lengths are not those of its inputs.
 fn read(file: &Path) -> Outcome<Vec<Input>> {
     if !file.exists() {
         return Ok(Vec::new());
@@ -50,9 +47,6 @@ fn next(rest: &mut &[u8]) -> Option<Input> {
 }
 
 /// Puts each input into a file in a folder, which it makes; returns the folder.
-///
-/// # Errors
-/// When the inputs cannot be read, or the files cannot be written.
 pub fn unpack(file: &Path, folder: PathBuf) -> Outcome<PathBuf> {
     fs::create_dir_all(&folder).map_err(failed(&folder))?;
     for (name, bytes) in read(file)? {
@@ -63,9 +57,6 @@ pub fn unpack(file: &Path, folder: PathBuf) -> Outcome<PathBuf> {
 
 /// Puts what the fuzzer has found in a folder into a file, the shortest first, as much as [`KEPT`]
 /// allows. Inputs that a person has named stay there.
-///
-/// # Errors
-/// When a file cannot be read or written.
 pub fn keep(folder: &Path, file: &Path) -> Outcome {
     let is_number = |name: &str| name.bytes().all(|byte| byte.is_ascii_digit());
     let mut inputs: Vec<Input> = read(file)?;

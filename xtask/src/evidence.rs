@@ -111,10 +111,6 @@ fn folder() -> PathBuf {
 }
 
 /// Records the facts of a job, a JSON object.
-///
-/// # Errors
-/// When `facts` is no object or has one of the members of the origin, or when the file cannot be
-/// written.
 pub fn record(name: &str, facts: Value) -> Outcome {
     let (commit, clean) = sources();
     let date = process::output(Command::new("date").args(["-u", "+%Y-%m-%dT%H:%M:%SZ"]))?;
@@ -124,9 +120,6 @@ pub fn record(name: &str, facts: Value) -> Outcome {
 }
 
 /// Records facts that another program has written as text.
-///
-/// # Errors
-/// As [`record`], and when the text is no JSON.
 pub fn record_text(name: &str, facts: &str) -> Outcome {
     let facts =
         serde_json::from_str(facts).map_err(|error| format!("what is recorded is no JSON: {error}."))?;
@@ -134,9 +127,6 @@ pub fn record_text(name: &str, facts: &str) -> Outcome {
 }
 
 /// Records that this job has begun: if it breaks off, the page says so.
-///
-/// # Errors
-/// When the file cannot be written.
 pub fn begin(name: &str) -> Outcome {
     record(name, json!({"unfinished": true}))
 }

@@ -106,9 +106,6 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// Builds all examples but the template, and prints their sizes. The tools must be installed.
-///
-/// # Errors
-/// When an example does not build, or is not an image of its board.
 pub fn all() -> Outcome {
     EXAMPLES.iter().filter(|example| example.tools != Tools::Template).try_for_each(build)
 }

@@ -29,9 +29,6 @@ pub struct Link {
 
 /// Every page, as a path from the root of the repository: all in `docs/`, the README of each
 /// example, and those of [`ELSEWHERE`].
-///
-/// # Errors
-/// When a folder cannot be read.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
     let mut pages: Vec<PathBuf> = ELSEWHERE.iter().map(PathBuf::from).collect();
     for example in within(Path::new("examples"))? {
@@ -62,18 +59,12 @@ fn within(folder: &Path) -> Outcome<Vec<PathBuf>> {
 }
 
 /// The text of a page.
-///
-/// # Errors
-/// When it cannot be read.
 pub fn text(page: &Path) -> Outcome<String> {
     fs::read_to_string(workspace::root().join(page))
         .map_err(|error| format!("{} cannot be read: {error}.", page.display()))
 }
 
 /// All links of all pages that stay within the repository.
-///
-/// # Errors
-/// When a page cannot be read.
 pub fn all() -> Outcome<Vec<Link>> {
     let mut links = Vec::new();
     for page in pages()? {
@@ -83,9 +74,6 @@ pub fn all() -> Outcome<Vec<Link>> {
 }
 
 /// The faults of the pages' links, one a line.
-///
-/// # Errors
-/// When a page cannot be read.
 pub fn faults() -> Outcome<Vec<String>> {
     let mut known: BTreeMap<PathBuf, BTreeSet<String>> = BTreeMap::new();
     for page in pages()? {

@@ -47,9 +47,6 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// Checks the formatting of all files; returns the problems.
-///
-/// # Errors
-/// When the folders of the boards cannot be read.
 pub fn formatting() -> Outcome<Vec<String>> {
     let mut problems = Vec::new();
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
@@ -74,9 +71,6 @@ pub fn clippy(args: &[impl AsRef<std::ffi::OsStr>]) -> Option<String> {
 }
 
 /// The outcome of several checks.
-///
-/// # Errors
-/// When there is a problem; the message has all.
 pub fn all_good(problems: &[String]) -> Outcome {
     if problems.is_empty() {
         Ok(())

@@ -44,9 +44,6 @@ struct House {
 }
 
 /// The orders that are not kept, as messages.
-///
-/// # Errors
-/// When the repository cannot be read.
 pub fn broken(metadata: &Value) -> Outcome<Vec<String>> {
     let root = workspace::root();
     let mut house = House::default();

@@ -32,9 +32,6 @@ pub fn clang() -> Command {
 }
 
 /// Runs a program to its end; its output is shown.
-///
-/// # Errors
-/// When it cannot be started, or fails.
 pub fn run(command: &mut Command) -> Outcome {
     let status = command.status().map_err(|error| not_started(command, &error))?;
     if status.success() {
@@ -45,9 +42,6 @@ pub fn run(command: &mut Command) -> Outcome {
 }
 
 /// Runs a program to its end and returns its standard output.
-///
-/// # Errors
-/// When it cannot be started, fails, or its output is not UTF-8.
 pub fn output(command: &mut Command) -> Outcome<String> {
     let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
     if !output.status.success() {
@@ -58,17 +52,11 @@ pub fn output(command: &mut Command) -> Outcome<String> {
 }
 
 /// Reads JSON that a program has printed.
-///
-/// # Errors
-/// When it is none.
 pub fn json(text: &str) -> Outcome<Value> {
     serde_json::from_str(text).map_err(|error| format!("a program printed what is no JSON: {error}."))
 }
 
 /// Runs a program to its end and returns its standard error.
-///
-/// # Errors
-/// When it cannot be started, or fails.
 pub fn messages(command: &mut Command) -> Outcome<String> {
     let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
     let said = String::from_utf8_lossy(&output.stderr).into_owned();

@@ -85,11 +85,8 @@ impl Setup {
         Self { yes: args.flag("--yes") }
     }
 
-    /// Installs what these parts need and is missing.
-    ///
-    /// # Errors
-    /// When something is missing and cannot be installed or may not be; the message has the command
-    /// to run.
+    /// Installs what these parts need and is missing. Where that may not be done, the message has the
+    /// line to run.
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
         if parts.contains(&Part::Emulator) {
@@ -328,9 +325,6 @@ fn exists(pattern: &str) -> bool {
 }
 
 /// Installs the libraries of a Rust target if they are missing.
-///
-/// # Errors
-/// When they are missing and cannot be installed; the message has the command to run.
 pub fn rust_target(target: &str) -> Outcome {
     let is_there = || -> Outcome<bool> {
         let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
@@ -352,9 +346,6 @@ pub fn rust_target(target: &str) -> Outcome {
 
 /// Provides a program that cargo installs, in the PATH or in `target/tools`; returns the PATH with
 /// it.
-///
-/// # Errors
-/// When it is missing and cannot be installed.
 pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
     let tools = workspace::target_dir().join("tools");
     let mut folders = vec![tools.join("bin")];
@@ -368,9 +359,6 @@ pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
 
 /// Provides a program that cargo installs in `target/tools`, in exactly this version; returns its
 /// path. `options` are for `cargo install`.
-///
-/// # Errors
-/// When it is missing and cannot be installed.
 pub fn pinned_tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
     let program = workspace::target_dir().join("tools/bin").join(name);
     let program = program.with_extension(env::consts::EXE_EXTENSION);

@@ -23,9 +23,6 @@ pub fn line() -> String {
 }
 
 /// Whether this is the compiler of a release.
-///
-/// # Errors
-/// When it is another one; with what that means and what to do.
 pub fn check(line: &str) -> Outcome {
     let version = line.split_whitespace().nth(1).unwrap_or("unknown");
     let release = release();

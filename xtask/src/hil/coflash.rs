@@ -32,9 +32,6 @@ pub struct Answer {
 
 impl Answer {
     /// The answer of a call that had to succeed.
-    ///
-    /// # Errors
-    /// The message of coflash, with its advice.
     pub fn good(self) -> Outcome<Self> {
         if self.code == Some(0) {
             Ok(self)
@@ -73,18 +70,12 @@ impl Coflash {
     }
 
     /// Calls coflash, which prints one document.
-    ///
-    /// # Errors
-    /// When it cannot be started, or does not end.
     pub fn call(&self, words: &[&str]) -> Outcome<Answer> {
         let ended = Running::start(&mut self.command(words, "--json"), false)?.wait(LIMIT)?;
         Ok(answer(ended))
     }
 
     /// Flashes a program, and does `act` in the middle: when a third of the bytes is in the device.
-    ///
-    /// # Errors
-    /// When coflash cannot be started, does not end, or ends before that; and the error of `act`.
     pub fn flash_until_middle(
         &self,
         words: &[&str],

@@ -16,9 +16,6 @@ const LOOK: Duration = Duration::from_millis(20);
 const LAST_OUTPUT: Duration = Duration::from_secs(1);
 
 /// The words of a command line; quotes keep a word together, and no shell reads it.
-///
-/// # Errors
-/// When there is no word, or a quote is not closed.
 pub fn words(line: &str) -> Outcome<Vec<String>> {
     let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
     for character in line.chars() {
@@ -74,9 +71,6 @@ pub struct Running {
 
 impl Running {
     /// Starts a program. With `piped`, the caller reads its standard output ([`Self::child`]).
-    ///
-    /// # Errors
-    /// When it cannot be started.
     pub fn start(command: &mut Command, piped: bool) -> Outcome<Self> {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().map_err(|error| process::not_started(command, &error))?;
@@ -91,9 +85,6 @@ impl Running {
     }
 
     /// Waits for the end.
-    ///
-    /// # Errors
-    /// When the program still runs so long after its start; it is ended then.
     pub fn wait(mut self, limit: Duration) -> Outcome<Ended> {
         loop {
             let status = self.child.try_wait().map_err(|error| format!("`{}`: {error}.", self.line))?;
@@ -124,9 +115,6 @@ impl Drop for Running {
 }
 
 /// Runs a program to its end.
-///
-/// # Errors
-/// When it cannot be started, fails, or still runs after this time.
 pub fn succeed(command: &mut Command, limit: Duration) -> Outcome {
     let ended = Running::start(command, false)?.wait(limit)?;
     match ended.code {

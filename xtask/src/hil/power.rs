@@ -18,9 +18,6 @@ pub struct Power {
 
 impl Power {
     /// Takes the command line with `{state}` in it.
-    ///
-    /// # Errors
-    /// When it is no command line, or `{state}` is missing.
     pub fn new(line: &str) -> Outcome<Self> {
         let words = command::words(line)?;
         if !words.iter().any(|word| word.contains("{state}")) {
@@ -32,9 +29,6 @@ impl Power {
     }
 
     /// Checks that the program exists.
-    ///
-    /// # Errors
-    /// When it does not.
     pub fn is_there(&self) -> Outcome {
         if command::is_there(&self.words[0]) {
             return Ok(());
@@ -43,9 +37,6 @@ impl Power {
     }
 
     /// Switches the supply.
-    ///
-    /// # Errors
-    /// When the command fails or does not end.
     pub fn switch(&self, on: bool) -> Outcome {
         let state = if on { "on" } else { "off" };
         let mut words = self.words.iter().map(|word| word.replace("{state}", state));
@@ -56,9 +47,6 @@ impl Power {
     }
 
     /// Switches the supply off and on again.
-    ///
-    /// # Errors
-    /// As for [`Self::switch`].
     pub fn cycle(&self) -> Outcome {
         self.switch(false)?;
         std::thread::sleep(DARK);

@@ -23,9 +23,6 @@ pub struct Probe {
 
 impl Probe {
     /// The probe of this command line, or probe-rs.
-    ///
-    /// # Errors
-    /// When it is no command line.
     pub fn new(line: Option<&str>, board: &Layout) -> Outcome<Self> {
         let words = command::words(line.unwrap_or(PROBE_RS))?;
         // probe-rs takes the beginning of a name: STM32F407VG is STM32F407VGTx.
@@ -33,9 +30,6 @@ impl Probe {
     }
 
     /// Checks that the program exists.
-    ///
-    /// # Errors
-    /// When it does not; the message tells how to get it.
     pub fn is_there(&self) -> Outcome {
         let program = &self.words[0];
         if command::is_there(program) {
@@ -49,17 +43,11 @@ impl Probe {
     }
 
     /// Writes a file into the flash.
-    ///
-    /// # Errors
-    /// When the program fails or does not end.
     pub fn download(&self, elf: &Path) -> Outcome {
         self.run("download", Some(elf))
     }
 
     /// Resets the board.
-    ///
-    /// # Errors
-    /// When the program fails or does not end.
     pub fn reset(&self) -> Outcome {
         self.run("reset", None)
     }

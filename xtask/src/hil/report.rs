@@ -77,9 +77,6 @@ impl Report {
     }
 
     /// The result of the run.
-    ///
-    /// # Errors
-    /// When a step failed.
     pub fn outcome(&self) -> Outcome {
         match self.count("FAILED") {
             0 => Ok(()),

@@ -12,9 +12,6 @@ use crate::{process, setup, workspace, Outcome};
 pub const PROFILE: &str = "dist";
 
 /// Builds `coflash` from the workspace at `root`.
-///
-/// # Errors
-/// When the target is missing, or the build fails.
 pub fn program(root: &Path, target_dir: &Path, target: &str) -> Outcome<PathBuf> {
     setup::rust_target(target)?;
     let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));

@@ -32,9 +32,6 @@ pub struct Job {
 
 /// The jobs of a program with the tests that `chosen` takes; and how many tests it has with
 /// `#[ignore]`.
-///
-/// # Errors
-/// When the program does not list its tests.
 pub fn jobs(
     program: &Program,
     place: Option<&str>,
