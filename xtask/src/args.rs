@@ -1,6 +1,8 @@
 //! The arguments of a command line. A job takes the options it knows; [`Args::none_left`] refuses
 //! the rest.
 
+use std::ops::RangeInclusive;
+
 use crate::Outcome;
 
 /// The arguments after `cargo xtask JOB`.
@@ -58,6 +60,16 @@ impl Args {
         Ok(found)
     }
 
+    /// Takes `NAME NUMBER`, with a number in this range.
+    pub fn number(&mut self, name: &str, range: RangeInclusive<u64>) -> Outcome<Option<u64>> {
+        let Some(text) = self.value(name)? else { return Ok(None) };
+        let number = text.parse().ok().filter(|number| range.contains(number));
+        let (least, most) = range.into_inner();
+        number
+            .map(Some)
+            .ok_or_else(|| format!("{name} takes a number from {least} to {most}, not \"{text}\"."))
+    }
+
     /// All words that were not taken, for the program that the job starts.
     pub fn rest(self) -> Vec<String> {
         let mut words = self.own;
@@ -106,6 +118,10 @@ mod tests {
         assert!(args("--board").value("--board").is_err());
         assert!(args("--board --yes").value("--board").is_err());
         assert!(args("--board a --board b").value("--board").is_err());
+        for wrong in ["0", "128", "x", "-1", "1.5"] {
+            assert!(args(&format!("--node={wrong}")).number("--node", 1..=127).is_err(), "{wrong}");
+        }
+        assert_eq!(args("--node 127").number("--node", 1..=127), Ok(Some(127)));
         assert!(args("nonsense").none_left().unwrap_err().contains("nonsense"));
         assert!(args("-- x").none_left().is_err());
         assert!(args("").none_left().is_ok());

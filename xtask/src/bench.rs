@@ -28,20 +28,18 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let images = build::images(board, &["bootloader", "bootloader-sealed", "app-v1"])?;
-    let mut bench = process::cargo("run");
-    bench.args(build::tests_args(board)).args(["--bin", "bench"]);
-    bench.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
+    build::images(board, &["bootloader", "bootloader-sealed", "app-v1"])?;
+    let mut bench = build::tests_program(board, "bench");
     // Optimised, as a user runs it.
     let cost = || {
         process::run(process::cargo("build").args(["--release", "--package", "coboot-node"]))?;
         let mut cost = process::cargo("run");
-        cost.args(["--release", "--package", "coboot-node", "--example", "cost"]);
+        cost.args(["--release", "--package", "coboot-node", "--example", "cost", "--"]);
         Ok::<_, String>(cost)
     };
     if json {
-        let mut facts = process::json(&process::output(bench.args(["--", "--json"]))?)?;
-        facts["host"] = process::json(&process::output(cost()?.args(["--", "--json"]))?)?;
+        let mut facts = process::json(&process::output(bench.arg("--json"))?)?;
+        facts["host"] = process::json(&process::output(cost()?.arg("--json"))?)?;
         println!("{facts:#}");
         (facts["percent"], facts["failed"]) = verdict(&facts);
         return evidence::record("bench", facts);

@@ -12,7 +12,7 @@ use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{Part, Setup};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{pack, process, workspace, Outcome};
+use crate::{files, pack, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--unpacked] [--board BOARD] [--yes]
@@ -258,11 +258,7 @@ fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> 
     let sources = workspace::root().join("examples/c");
     let dir = workspace::firmware_dir(board);
     let work = dir.join("c").join(name);
-    fs::create_dir_all(&work)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&work)))?;
-    let (layout, script) = (work.join("layout.x"), board.linker_script(Image::Program(number)).to_string());
-    fs::write(&layout, script)
-        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&layout)))?;
+    files::write(&work.join("layout.x"), board.linker_script(Image::Program(number)).to_string())?;
     let mut objects = Vec::new();
     for source in C_SOURCES.into_iter().chain(more) {
         let file_name = Path::new(source).file_name().expect("a source is a file");
@@ -330,13 +326,6 @@ pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<
 /// The folders with the files of the boards.
 pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
 
-/// The files in such a folder.
-pub fn board_files(folder: &str) -> Outcome<Vec<PathBuf>> {
-    let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
-    let entries = fs::read_dir(workspace::root().join(folder)).map_err(unreadable)?;
-    entries.map(|entry| Ok(entry.map_err(unreadable)?.path())).collect()
-}
-
 /// The arguments that set the board for cargo; they override the variable `COBOOT_BOARD`.
 pub fn board_args(board: &Layout) -> [String; 4] {
     let value = format!("env.COBOOT_BOARD.value=\"{}\"", board.board);
@@ -372,6 +361,17 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     board_args(board).into_iter().chain(["--package=coboot-tests".to_owned()]).collect()
 }
 
+/// The command that runs a program of that crate with the firmware of a board; its arguments follow.
+pub fn tests_program(board: &Layout, name: &str) -> Command {
+    let mut cargo = process::cargo("run");
+    cargo.args(tests_args(board)).args(["--bin", name]);
+    cargo
+        .env("COBOOT_BOARD", board.board)
+        .env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board))
+        .arg("--");
+    cargo
+}
+
 /// Cargo's folder for the firmware of a board: one for each chip. Cargo locks its folder, so this
 /// allows builds of two chips and of a host crate at once; two chips share no HAL anyway.
 fn target_dir(board: &Layout) -> PathBuf {
@@ -400,9 +400,7 @@ fn build(board: &Layout, variant: &Variant, product: &Product) -> Outcome<Vec<u8
 
 /// The ELF file of cargo's last build of a package.
 fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
-    let path = target_dir(board).join(TARGET).join(PROFILE).join(package);
-    fs::read(&path)
-        .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
+    files::bytes(&target_dir(board).join(TARGET).join(PROFILE).join(package))
 }
 
 /// The step after the link: a bootloader is packed.
@@ -416,14 +414,10 @@ fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
 
 /// Writes an image into the board's folder, under its name, and prints its size.
 fn put(board: &Layout, name: &str, region: Region, file: &[u8]) -> Outcome {
-    let dir = workspace::firmware_dir(board);
-    fs::create_dir_all(&dir)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
-    let to = dir.join(format!("{name}.elf"));
+    let to = workspace::firmware_dir(board).join(format!("{name}.elf"));
     // An unchanged file is not written, so that its time does not change.
     if fs::read(&to).ok().as_deref() != Some(file) {
-        fs::write(&to, file)
-            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
+        files::write(&to, file)?;
     }
     report(&to, region)
 }

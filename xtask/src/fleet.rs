@@ -2,9 +2,8 @@
 //! table, its picture, and what docs/bench.md has measured.
 
 use std::fmt::Write;
-use std::fs;
 
-use crate::{workspace, Outcome};
+use crate::{files, Outcome};
 
 /// Bits of a frame with 8 bytes of data: 111 with the intermission, and stuff bits as code has
 /// them on average.
@@ -91,7 +90,7 @@ struct Measured {
 
 /// The rows of docs/bench.md for fleets: boards, way, block size, lost frames, seconds.
 fn measured() -> Outcome<Vec<Measured>> {
-    let page = read("docs/bench.md")?;
+    let page = files::ours("docs/bench.md")?;
     let row = |line: &str| {
         let line = line.replace("one by one", "one-by-one").replace("1 in ", "");
         let words: Vec<&str> = line.split_whitespace().collect();
@@ -107,11 +106,6 @@ fn measured() -> Outcome<Vec<Measured>> {
         return Err("docs/bench.md has no rows for fleets.".to_string());
     }
     Ok(rows)
-}
-
-fn read(file: &str) -> Outcome<String> {
-    let path = workspace::root().join(file);
-    fs::read_to_string(&path).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&path)))
 }
 
 const WAYS: [(Way, &str, &str); 3] = [
@@ -161,7 +155,7 @@ fn table() -> String {
 
 #[test]
 fn the_page_has_the_table_of_the_model() {
-    let page = read("docs/fleet.md").unwrap();
+    let page = files::ours("docs/fleet.md").unwrap();
     assert!(page.contains(&table()), "docs/fleet.md has another table than:\n{}", table());
 }
 
@@ -181,7 +175,7 @@ fn the_model_fits_what_was_measured() {
 /// are where they were measured.
 #[test]
 fn the_picture_has_the_model_and_what_was_measured() {
-    let picture = read("docs/diagrams/fleet.svg").unwrap();
+    let picture = files::ours("docs/diagrams/fleet.svg").unwrap();
     for (way, _, colour) in WAYS {
         for lost in [0.0, 1e-3] {
             let case = |devices| Case { way, devices, bit_rate: 1e6, kib: 256.0, block: way.block(), lost };

@@ -1,10 +1,9 @@
 //! The links of the pages: each must lead to a file of the repository, and to an existing heading.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::{Component, Path, PathBuf};
 
-use crate::{workspace, Outcome};
+use crate::{files, workspace, Outcome};
 
 /// The pages outside `docs/` and `examples/`.
 pub const ELSEWHERE: [&str; 6] = [
@@ -30,45 +29,23 @@ pub struct Link {
 /// Every page, as a path from the root of the repository: all in `docs/`, the README of each
 /// example, and those of [`ELSEWHERE`].
 pub fn pages() -> Outcome<Vec<PathBuf>> {
-    let mut pages: Vec<PathBuf> = ELSEWHERE.iter().map(PathBuf::from).collect();
-    for example in within(Path::new("examples"))? {
-        let page = example.join("README.md");
-        if workspace::root().join(&page).is_file() {
-            pages.push(page);
-        }
-    }
-    let mut folders = vec![PathBuf::from("docs")];
-    while let Some(folder) = folders.pop() {
-        for name in within(&folder)? {
-            if workspace::root().join(&name).is_dir() {
-                folders.push(name);
-            } else if name.extension().is_some_and(|extension| extension == "md") {
-                pages.push(name);
-            }
-        }
-    }
+    let root = workspace::root();
+    let mut pages = files::below(&root.join("docs"), &[])?;
+    pages.retain(|page| files::is(page, "md"));
+    let examples =
+        files::within(&root.join("examples"))?.into_iter().map(|example| example.join("README.md"));
+    pages.extend(examples.filter(|page| page.is_file()));
+    let from_the_root = pages.iter().map(|page| page.strip_prefix(root).unwrap_or(page).to_owned());
+    let mut pages: Vec<PathBuf> = from_the_root.chain(ELSEWHERE.map(PathBuf::from)).collect();
     pages.sort();
     Ok(pages)
-}
-
-/// The files in a folder, as paths from the root of the repository.
-fn within(folder: &Path) -> Outcome<Vec<PathBuf>> {
-    let entries = fs::read_dir(workspace::root().join(folder))
-        .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
-    Ok(entries.flatten().map(|entry| folder.join(entry.file_name())).collect())
-}
-
-/// The text of a page.
-pub fn text(page: &Path) -> Outcome<String> {
-    fs::read_to_string(workspace::root().join(page))
-        .map_err(|error| format!("{} cannot be read: {error}.", page.display()))
 }
 
 /// All links of all pages that stay within the repository.
 pub fn all() -> Outcome<Vec<Link>> {
     let mut links = Vec::new();
     for page in pages()? {
-        links.extend(of_page(&page, &text(&page)?));
+        links.extend(of_page(&page, &files::ours(&page)?));
     }
     Ok(links)
 }
@@ -77,7 +54,7 @@ pub fn all() -> Outcome<Vec<Link>> {
 pub fn faults() -> Outcome<Vec<String>> {
     let mut known: BTreeMap<PathBuf, BTreeSet<String>> = BTreeMap::new();
     for page in pages()? {
-        let headings = headings(&text(&page)?).into_iter().collect();
+        let headings = headings(&files::ours(&page)?).into_iter().collect();
         known.insert(page, headings);
     }
     let fault = |link: &Link| {
@@ -86,8 +63,7 @@ pub fn faults() -> Outcome<Vec<String>> {
             return Some(format!("{}: {shown} is not there, or is no file", link.place));
         }
         // The site has pages only.
-        if link.file.extension().is_some_and(|extension| extension == "md") && !known.contains_key(&link.file)
-        {
+        if files::is(&link.file, "md") && !known.contains_key(&link.file) {
             return Some(format!("{}: {shown} is no page of the site (xtask/src/links.rs)", link.place));
         }
         let heading = link.heading.as_ref()?;
@@ -210,10 +186,11 @@ mod tests {
     #[test]
     fn every_decision_is_in_their_list() {
         let page = Path::new("docs/decisions.md");
-        let listed: Vec<_> = of_page(page, &text(page).unwrap()).into_iter().map(|link| link.file).collect();
-        let mut decisions = within(Path::new("docs/adr")).unwrap();
-        decisions.sort();
-        assert_eq!(listed, decisions);
+        let listed: Vec<_> =
+            of_page(page, &files::ours(page).unwrap()).into_iter().map(|link| link.file).collect();
+        let decisions = files::within(&workspace::root().join("docs/adr")).unwrap();
+        let from_the_root = decisions.iter().map(|file| file.strip_prefix(workspace::root()).unwrap());
+        assert_eq!(listed, from_the_root.collect::<Vec<_>>());
     }
 
     #[test]

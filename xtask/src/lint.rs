@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, product, workspace, Outcome};
+use crate::{build, files, process, product, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
@@ -56,7 +56,7 @@ pub fn formatting() -> Outcome<Vec<String>> {
     for folder in build::BOARD_FOLDERS.into_iter().chain([product::FOLDER]) {
         let mut rustfmt = std::process::Command::new("rustfmt");
         rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
-        if process::run(rustfmt.args(build::board_files(folder)?)).is_err() {
+        if process::run(rustfmt.args(files::within(&workspace::root().join(folder))?)).is_err() {
             problems.push(format!("a file in {folder} is not formatted; `rustfmt` on the file does it."));
         }
     }
