@@ -1,7 +1,6 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
 use std::collections::VecDeque;
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
@@ -11,19 +10,14 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, process, setup, workspace, Outcome};
+use crate::{corpus, evidence, files, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
 
-Runs the fuzz targets of tests/fuzz: SDO server, SDO client, the wire between them, LSS, debugger interface,
-program download by blocks and in one piece,
-downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
-parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
-configuration files, requests to coflash ui, sealed images, as files and as they arrive, with their
-signatures and their compression; as many at a time as there are cores. What they find in this run is
-built upon in the next one.
-The counts of a run of all targets go to target/evidence/fuzz.json.
+Runs the fuzz targets of tests/fuzz/fuzz_targets, as many at a time as there are cores. What they find
+in this run is built upon in the next one. The counts of a run of all targets go to
+target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
   --inputs N      how many inputs each target tries, in place of a time
@@ -57,14 +51,12 @@ const COMMANDS: [(&str, u32); 9] = [
     ("signature", 512),
     ("streams", 1024),
 ];
-/// The feature for sealed images.
-const SEALED: &str = "sealed";
-/// The targets that need it.
-const SEALED_TARGETS: [&str; 1] = ["sealed_stream"];
+/// The target that needs the feature for sealed images.
+const SEALED: &str = "sealed_stream";
 /// The features of a target.
 fn features(target: &str) -> &'static str {
-    if SEALED_TARGETS.contains(&target) {
-        SEALED
+    if target == SEALED {
+        "sealed"
     } else {
         ""
     }
@@ -85,14 +77,13 @@ fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
         build
     };
     process::run(build().arg("--bins"))?;
-    // Only those: the others would be replaced by what they are with the feature.
-    let sealed = SEALED_TARGETS.iter().flat_map(|target| ["--bin", target]);
-    process::run(build().args(["--features", SEALED]).args(sealed))?;
+    // Only that one: the others would be replaced by what they are with the feature.
+    process::run(build().args(["--features", features(SEALED), "--bin", SEALED]))?;
     for target in targets {
         let mut program = Command::new(programs.join("debug").join(target));
         // They are unpacked anew: a name may have gone.
         let kept = target_dir().join("kept").join(target);
-        let _ = fs::remove_dir_all(&kept);
+        files::remove(&kept)?;
         program.arg(corpus::unpack(&kept_file(target), kept)?);
         let found = found(target);
         program.args(found.is_dir().then_some(found));
@@ -118,11 +109,13 @@ fn folder() -> PathBuf {
 }
 
 pub fn run(mut args: Args) -> Outcome {
-    let (seconds, inputs) = (args.value("--seconds")?, args.value("--inputs")?);
-    if seconds.is_some() && inputs.is_some() {
-        return Err("--seconds and --inputs do not go together.".into());
-    }
-    let (seconds, inputs) = (self::seconds(seconds)?, self::inputs(inputs)?);
+    // The fuzzer would run without end with 0.
+    let most = i32::MAX as u64;
+    let end = match (args.number("--seconds", 1..=most)?, args.number("--inputs", 1..=most)?) {
+        (Some(_), Some(_)) => return Err("--seconds and --inputs do not go together.".into()),
+        (None, Some(inputs)) => format!("-runs={inputs}"),
+        (seconds, None) => format!("-max_total_time={}", seconds.unwrap_or(30)),
+    };
     let only = args.value("--target")?;
     let (keep, replay) = (args.flag("--keep"), args.flag("--replay"));
     args.none_left()?;
@@ -143,15 +136,11 @@ pub fn run(mut args: Args) -> Outcome {
         return replay_all(&folder, &targets);
     }
     toolchain()?;
-    let tools = Tools { path: setup::tool("cargo-fuzz", CARGO_FUZZ)? };
+    let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
     println!("Building the fuzz targets ...");
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let end = match inputs {
-        Some(inputs) => format!("-runs={inputs}"),
-        None => format!("-max_total_time={seconds}"),
-    };
     let queue = Mutex::new(VecDeque::from(targets));
     let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
     let all = || {
@@ -181,8 +170,8 @@ pub fn run(mut args: Args) -> Outcome {
     })?
     .concat();
     ended.sort();
-    let is_failed = |(target, counts): &(String, Option<_>)| counts.is_none().then(|| target.clone());
-    let failed: Vec<String> = ended.iter().filter_map(is_failed).collect();
+    let failed = ended.iter().filter(|(_, counts)| counts.is_none());
+    let failed: Vec<&str> = failed.map(|(target, _)| target.as_str()).collect();
     if is_whole {
         evidence::record("fuzz", counted(&ended, failed.len()))?;
     }
@@ -214,15 +203,14 @@ fn counted(ended: &[(String, Option<[u64; 4]>)], failed: usize) -> Value {
     })
 }
 
-/// The PATH with cargo-fuzz.
 struct Tools {
-    path: OsString,
+    cargo_fuzz: PathBuf,
 }
 
 impl Tools {
     fn command(&self, word: &str, target: &str) -> Command {
         let mut command = Command::new("rustup");
-        command.args(["run", "nightly", "cargo", "fuzz", word]);
+        command.args(["run", "nightly"]).arg(&self.cargo_fuzz).args(["fuzz", word]);
         // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
         command.arg("--sanitizer=none").arg("--fuzz-dir").arg(folder());
         // Each of the two is built with options of its own.
@@ -232,7 +220,7 @@ impl Tools {
             programs.push("without-compares");
         }
         command.args(["--features", features(target), target]).current_dir(workspace::root());
-        command.env("PATH", &self.path).env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
+        command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
         command
     }
 
@@ -242,7 +230,7 @@ impl Tools {
         // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
         let corpus = corpus::unpack(&kept_file(target), found(target))?;
         let log = target_dir().join(target).with_extension("log");
-        let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
+        let file = fs::File::create(&log).map_err(|error| format!("{}: {error}.", log.display()))?;
         let mut command = self.command("run", target);
         command.arg(&corpus);
         let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
@@ -271,44 +259,15 @@ impl Tools {
     }
 }
 
-fn seconds(value: Option<String>) -> Outcome<u32> {
-    let Some(value) = value else { return Ok(30) };
-    // The fuzzer would run without end with 0.
-    match value.parse() {
-        Ok(seconds @ 1..) => Ok(seconds),
-        _ => Err(format!("--seconds takes a number from 1 on, not \"{value}\".")),
-    }
-}
-
-fn inputs(value: Option<String>) -> Outcome<Option<u64>> {
-    let Some(value) = value else { return Ok(None) };
-    match value.parse() {
-        Ok(inputs @ 1..) => Ok(Some(inputs)),
-        _ => Err(format!("--inputs takes a number from 1 on, not \"{value}\".")),
-    }
-}
-
 /// The targets, from the names of their files.
 fn targets(folder: &Path) -> Outcome<Vec<String>> {
-    let folder = folder.join("fuzz_targets");
-    let files = fs::read_dir(&folder)
-        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
-    let mut names: Vec<String> = files
-        .flatten()
-        .map(|file| file.path())
-        .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))
-        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
-        .collect();
-    names.sort();
-    Ok(names)
+    let mut sources = files::within(&folder.join("fuzz_targets"))?;
+    sources.retain(|file| files::is(file, "rs"));
+    Ok(sources.iter().filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned())).collect())
 }
 
 fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
-}
-
-fn unwritable(path: &Path, error: &std::io::Error) -> String {
-    format!("{} cannot be written: {error}.", workspace::shown(path))
 }
 
 /// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
@@ -341,19 +300,11 @@ fn edges(said: &str) -> Option<u64> {
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
 /// the input.
 fn excerpt(said: &str) -> String {
-    let mut text = String::new();
-    let mut more = 0;
-    for line in said.lines() {
-        if line.contains("panicked at") || line.contains("ERROR: libFuzzer") {
-            more = 4;
-        }
-        let input = line.contains("Test unit written to");
-        if more > 0 || input {
-            text += &format!("    {line}\n");
-        }
-        more -= i32::from(more > 0);
-    }
-    text
+    let begin = ["panicked at", "ERROR: libFuzzer"];
+    let lines = said.lines().skip_while(|line| !begin.iter().any(|words| line.contains(words)));
+    let (text, rest): (Vec<_>, Vec<_>) = lines.enumerate().partition(|(number, _)| *number < 8);
+    let input = rest.into_iter().filter(|(_, line)| line.contains("Test unit written to"));
+    text.into_iter().chain(input).map(|(_, line)| format!("    {line}\n")).collect()
 }
 
 #[cfg(test)]
@@ -374,17 +325,6 @@ mod tests {
         }
         for (name, _) in COMMANDS {
             assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");
-        }
-    }
-
-    #[test]
-    fn a_time_is_a_number_from_one_on() {
-        assert_eq!(seconds(None), Ok(30));
-        assert_eq!(seconds(Some("5".into())), Ok(5));
-        assert_eq!((inputs(None), inputs(Some("10000000".into()))), (Ok(None), Ok(Some(10_000_000))));
-        for wrong in ["0", "-1", "x", "", "1.5"] {
-            assert!(seconds(Some(wrong.into())).is_err(), "{wrong}");
-            assert!(inputs(Some(wrong.into())).is_err(), "{wrong}");
         }
     }
 
