@@ -127,8 +127,8 @@ pub fn count(name: &str, ended: Outcome, summary: &mut Summary) {
 /// Runs jobs, as many side by side as there are cores; the slow ones begin first.
 pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
     let rank = |job: &Job| {
-        let is_of = |slow: &&str| job.tests.first().is_some_and(|test| test.starts_with(*slow));
-        SLOW.iter().position(is_of).unwrap_or(SLOW.len())
+        let module = job.tests.first().and_then(|test| test.split("::").next());
+        SLOW.split(' ').position(|slow| Some(slow) == module).unwrap_or(usize::MAX)
     };
     jobs.sort_by_key(|job| std::cmp::Reverse(rank(job)));
     let (queue, shared) = (Mutex::new(jobs), Mutex::new(summary));
