@@ -29,9 +29,12 @@ impl Args {
 
     /// Whether an option is there, with its value; it is not taken.
     pub fn has(&self, name: &str) -> bool {
-        self.own
-            .iter()
-            .any(|word| word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('=')))
+        self.position(name).is_some()
+    }
+
+    fn position(&self, name: &str) -> Option<usize> {
+        let is_it = |rest: &str| rest.is_empty() || rest.starts_with('=');
+        self.own.iter().position(|word| word.strip_prefix(name).is_some_and(is_it))
     }
 
     /// Takes a flag; returns whether it was there.
@@ -44,9 +47,7 @@ impl Args {
     /// Takes `NAME VALUE` or `NAME=VALUE`.
     pub fn value(&mut self, name: &str) -> Outcome<Option<String>> {
         let mut found = None;
-        while let Some(at) = self.own.iter().position(|word| {
-            word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('='))
-        }) {
+        while let Some(at) = self.position(name) {
             let word = self.own.remove(at);
             let value = match word.split_once('=') {
                 Some((_, value)) => value.to_owned(),

@@ -124,22 +124,7 @@ fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
 /// The fields that differ from their default.
 fn words(row: &Row) -> String {
     let others = FIELDS.iter().zip(row).filter(|(_, value)| **value > 0);
-    let words: Vec<_> = others
-        .map(
-            |((name, values), value)| {
-                if values.len() > 2 {
-                    format!("{name}={value}")
-                } else {
-                    (*name).to_owned()
-                }
-            },
-        )
-        .collect();
-    if words.is_empty() {
-        "the default".to_owned()
-    } else {
-        words.join(" ")
-    }
+    others.map(|((name, _), value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
 }
 
 /// Whether a product may have these choices (`Product::checked`): a rescue window delays a program

@@ -135,18 +135,9 @@ impl Setup {
         }
         println!("Installing {} ...", missing.join(", "));
         let apt_get = |words: &[&str]| {
-            let mut command = if root { Command::new("env") } else { Command::new("sudo") };
-            if !root {
-                command.arg("env");
-            }
-            command.args([
-                "DEBIAN_FRONTEND=noninteractive",
-                "apt-get",
-                "-qq",
-                "-o",
-                "DPkg::Lock::Timeout=300",
-            ]);
-            process::run(command.args(words))
+            let mut command = Command::new(if root { "env" } else { "sudo" });
+            command.args((!root).then_some("env")).args(["DEBIAN_FRONTEND=noninteractive", "apt-get"]);
+            process::run(command.args(["-qq", "-o", "DPkg::Lock::Timeout=300"]).args(words))
         };
         // A new machine has no package lists. If one of several sources cannot be reached, the
         // install may still work; if not, it reports that.
@@ -156,14 +147,13 @@ impl Setup {
             .map_err(|problem| format!("{problem} By hand it is:\n\n    {by_hand}"))?;
         let still = missing_packages(parts, is_there);
         if still.is_empty() {
-            Ok(())
-        } else {
-            Err(format!(
-                "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front \
-                 of the system's in PATH?",
-                still.join(", ")
-            ))
+            return Ok(());
         }
+        Err(format!(
+            "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front of the \
+             system's in PATH?",
+            still.join(", ")
+        ))
     }
 }
 

@@ -56,37 +56,23 @@ struct Stage {
     run: fn(&mut Summary) -> Outcome,
 }
 
+const fn stage(
+    name: &'static str,
+    about: &'static str,
+    minutes: u32,
+    tier: Tier,
+    run: fn(&mut Summary) -> Outcome,
+) -> Stage {
+    Stage { name, about, minutes, tier, run }
+}
+
 /// All stages, in the order in which they run.
 const STAGES: &[Stage] = &[
-    Stage {
-        name: "product",
-        about: "the default board, device and tool",
-        minutes: 12,
-        tier: Tier::Product,
-        run: product,
-    },
-    Stage {
-        name: "ci",
-        about: "Chromium, tools of others, other chips, pages",
-        minutes: 8,
-        tier: Tier::Ci,
-        run: ci,
-    },
-    Stage { name: "slow", about: "tests that take minutes", minutes: 25, tier: Tier::All, run: slow },
-    Stage {
-        name: "boards",
-        about: "every test with firmware, for each other chip",
-        minutes: 25,
-        tier: Tier::All,
-        run: boards,
-    },
-    Stage {
-        name: "jobs",
-        about: "power cuts, attacker, QEMU, replay, chips, two builds",
-        minutes: 45,
-        tier: Tier::All,
-        run: jobs,
-    },
+    stage("product", "the default board, device and tool", 12, Tier::Product, product),
+    stage("ci", "Chromium, tools of others, other chips, pages", 8, Tier::Ci, ci),
+    stage("slow", "tests that take minutes", 25, Tier::All, slow),
+    stage("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
+    stage("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
 ];
 
 /// What `--all` does not run, since it goes on for hours.
