@@ -264,7 +264,7 @@ fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> 
         let file_name = Path::new(source).file_name().expect("a source is a file");
         let object = work.join(file_name).with_extension("o");
         let mut clang = process::clang();
-        clang.current_dir(&sources).args(C_FLAGS);
+        clang.current_dir(&sources).args(C_FLAGS.split(' '));
         clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
         clang.arg(format!("-DINTERRUPT_LINES={}", board.chip.interrupts));
         process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
@@ -289,23 +289,9 @@ const PROBE: &str = "../../tests/c/probe.c";
 /// The compiler's arguments. The application does not use the FPU, so it is compiled for a chip
 /// without one; the functions of the bootloader that it calls have no floating-point arguments or
 /// results.
-const C_FLAGS: &[&str] = &[
-    "--target=thumbv7em-none-eabi",
-    "-mcpu=cortex-m4",
-    "-mfloat-abi=soft",
-    "-std=c11",
-    "-ffreestanding",
-    "-fno-builtin",
-    "-ffunction-sections",
-    "-fdata-sections",
-    "-Os",
-    "-g",
-    "-fdebug-compilation-dir=examples/c",
-    "-I.",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-];
+const C_FLAGS: &str =
+    "--target=thumbv7em-none-eabi -mcpu=cortex-m4 -mfloat-abi=soft -std=c11 -ffreestanding -fno-builtin \
+    -ffunction-sections -fdata-sections -Os -g -fdebug-compilation-dir=examples/c -I. -Wall -Wextra -Werror";
 
 /// The linker of the Rust toolchain, which also links the rest of the firmware.
 fn rust_lld() -> Outcome<PathBuf> {

@@ -146,15 +146,12 @@ pub fn run(mut args: Args) -> Outcome {
     let all = || {
         let mut ended = Vec::new();
         while let Some(target) = next() {
-            let counts = tools.fuzz(&target, &end)?;
-            if let Some([runs, seconds, ..]) = counts {
-                println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-                if keep {
-                    process::output(tools.command("cmin", &target).arg(found(&target)))?;
-                    corpus::keep(&found(&target), &kept_file(&target))?;
-                }
+            let row = tools.fuzz(&target, &end)?;
+            if keep && !is_failed(&row) {
+                process::output(tools.command("cmin", &target).arg(found(&target)))?;
+                corpus::keep(&found(&target), &kept_file(&target))?;
             }
-            ended.push((target, counts));
+            ended.push(row);
         }
         Outcome::Ok(ended)
     };
@@ -169,11 +166,11 @@ pub fn run(mut args: Args) -> Outcome {
         workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
     })?
     .concat();
-    ended.sort();
-    let failed = ended.iter().filter(|(_, counts)| counts.is_none());
-    let failed: Vec<&str> = failed.map(|(target, _)| target.as_str()).collect();
+    ended.sort_by_key(|row| row["target"].to_string());
+    let failed: Vec<_> =
+        ended.iter().filter(|row| is_failed(row)).map(|row| row["target"].to_string()).collect();
     if is_whole {
-        evidence::record("fuzz", counted(&ended, failed.len()))?;
+        evidence::record("fuzz", counted(&ended))?;
     }
     if failed.is_empty() {
         Ok(())
@@ -186,20 +183,19 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
+/// Whether a target has failed, of which a run has this row.
+fn is_failed(row: &Value) -> bool {
+    row["inputs"].is_null()
+}
+
 /// What a run has counted: the facts of the evidence.
-fn counted(ended: &[(String, Option<[u64; 4]>)], failed: usize) -> Value {
-    let rows = ended.iter().filter_map(|(target, counts)| {
-        let [inputs, seconds, edges, corpus] = (*counts)?;
-        Some(
-            json!({"target": target, "inputs": inputs, "seconds": seconds, "edges": edges, "corpus": corpus}),
-        )
-    });
-    let inputs: Vec<u64> = ended.iter().filter_map(|(_, counts)| Some((*counts)?[0])).collect();
+fn counted(rows: &[Value]) -> Value {
+    let inputs: Vec<u64> = rows.iter().filter_map(|row| row["inputs"].as_u64()).collect();
     json!({
         "inputs": inputs.iter().sum::<u64>(),
         "fewest_of_a_target": inputs.iter().min(),
-        "failed": failed,
-        "targets": rows.collect::<Vec<_>>(),
+        "failed": rows.len() - inputs.len(),
+        "targets": rows,
     })
 }
 
@@ -224,9 +220,9 @@ impl Tools {
         command
     }
 
-    /// Runs a target until this end: an option of the fuzzer. Returns inputs, seconds, edges and the
-    /// files in the corpus; `None`, and prints why, if it failed.
-    fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
+    /// Runs a target until this end: an option of the fuzzer. Prints and returns what it has counted;
+    /// why it failed, if it did.
+    fn fuzz(&self, target: &str, end: &str) -> Outcome<Value> {
         // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
         let corpus = corpus::unpack(&kept_file(target), found(target))?;
         let log = target_dir().join(target).with_extension("log");
@@ -241,21 +237,18 @@ impl Tools {
         let status = command.status().map_err(|error| process::not_started(&command, &error))?;
         let said = fs::read(&log).unwrap_or_default();
         let said = String::from_utf8_lossy(&said);
-        match (status.success(), runs(&said)) {
-            (true, Some(runs @ 1..)) => {
-                let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
-                Ok(Some([runs, started.elapsed().as_secs(), edges(&said).unwrap_or(0), files]))
-            }
-            (good, _) => {
-                let words = if good { "ran no input" } else { "FAILED" };
-                println!(
-                    "  {target:<16} {words}; all of it is in {}\n{}",
-                    workspace::shown(&log),
-                    excerpt(&said)
-                );
-                Ok(None)
-            }
+        let runs = runs(&said).filter(|runs| status.success() && *runs > 0);
+        if let Some(runs) = runs {
+            let seconds = started.elapsed().as_secs();
+            println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+            let files = files::within(&corpus)?.len();
+            return Ok(
+                json!({"target": target, "inputs": runs, "seconds": seconds, "edges": edges(&said), "corpus": files}),
+            );
         }
+        let words = if status.success() { "ran no input" } else { "FAILED" };
+        println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
+        Ok(json!({"target": target}))
     }
 }
 
@@ -343,10 +336,13 @@ mod tests {
 
     #[test]
     fn counts_add_up_over_the_targets() {
-        let of = |target: &str, counts| (target.to_owned(), counts);
-        let ended = [of("lss", Some([10, 2, 700, 30])), of("lzma", None), of("ui", Some([5, 1, 60, 7]))];
-        let facts = counted(&ended, 1);
+        let rows = [
+            json!({"target": "lss", "inputs": 10}),
+            json!({"target": "lzma"}),
+            json!({"target": "ui", "inputs": 5}),
+        ];
+        let facts = counted(&rows);
         assert_eq!((&facts["inputs"], &facts["fewest_of_a_target"]), (&json!(15), &json!(5)));
-        assert_eq!((&facts["failed"], &facts["targets"][1]["edges"]), (&json!(1), &json!(60)));
+        assert_eq!((&facts["failed"], &facts["targets"][0]["target"]), (&json!(1), &json!("lss")));
     }
 }

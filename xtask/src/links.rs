@@ -126,19 +126,14 @@ pub fn plain(path: &Path) -> PathBuf {
 /// digits, `_` and `-` stay, a blank becomes `-`, all else is removed; the second of two equal
 /// names gets `-1` at its end.
 fn headings(text: &str) -> Vec<String> {
-    let mut is_code = false;
     let mut names: Vec<String> = Vec::new();
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
-    for line in text.lines() {
-        if line.trim_start().starts_with("```") {
-            is_code = !is_code;
-        }
+    for line in prose(text).into_iter().map(|(_, parts)| parts.concat()) {
         let level = line.len() - line.trim_start_matches('#').len();
-        let words = line[level..].trim();
-        if is_code || !(1..=6).contains(&level) || !line[level..].starts_with(' ') {
+        if !(1..=6).contains(&level) || !line[level..].starts_with(' ') {
             continue;
         }
-        let kept = words.to_lowercase();
+        let kept = line[level..].trim().to_lowercase();
         let kept = kept.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
         let name: String = kept.map(|c| if c == ' ' { '-' } else { c }).collect();
         let count = seen.entry(name.clone()).or_insert(0);

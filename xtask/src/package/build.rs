@@ -1,6 +1,5 @@
 //! Builds the programs with cargo, so that the same sources give the same bytes in every folder.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
@@ -65,15 +64,7 @@ fn reproducible<'c>(command: &'c mut Command, root: &Path) -> &'c mut Command {
         Some(home) => PathBuf::from(home),
         None => Path::new(&env::var_os("HOME").unwrap_or_default()).join(".cargo"),
     };
-    let mut flags = OsString::new();
-    for (folder, name) in [(root, "/coboot"), (cargo_home.as_path(), "/cargo")] {
-        if !flags.is_empty() {
-            flags.push("\u{1f}");
-        }
-        flags.push("--remap-path-prefix=");
-        flags.push(folder);
-        flags.push("=");
-        flags.push(name);
-    }
+    let flag = |folder: &Path, name| format!("--remap-path-prefix={}={name}", folder.display());
+    let flags = [flag(root, "/coboot"), flag(&cargo_home, "/cargo")].join("\u{1f}");
     command.current_dir(root).env("CARGO_ENCODED_RUSTFLAGS", flags).env_remove("RUSTFLAGS")
 }
