@@ -25,27 +25,16 @@ attack. The counts go to target/evidence/attacker.json.
 ";
 
 /// The images of the attack, on the board with two programs.
-const IMAGES: [&str; 12] = [
-    "bootloader",
-    "bootloader-esacademy",
-    "bootloader-lift",
-    "bootloader-sealed",
-    "bootloader-virtual-can",
-    "app-v1",
-    "app-v2",
-    "app-program-2",
-    "app-lift",
-    "app-lift-v2",
-    "app-virtual-can",
-    "app-virtual-can-v2",
-];
+const IMAGES: &str =
+    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can app-v1 \
+    app-v2 app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    build::images(&TWO, &IMAGES)?;
+    build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
     evidence::begin("attacker")?;
     let mut attack = build::tests_program(DEFAULT, "attack");
     for (option, value) in [("--frames", frames), ("--seed", seed)] {

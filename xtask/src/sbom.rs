@@ -158,35 +158,24 @@ mod tests {
 
     /// The output of cargo-cyclonedx 0.5.7, shortened.
     const MADE: &str = r#"{
-  "bomFormat": "CycloneDX",
-  "specVersion": "1.5",
-  "version": 1,
+  "bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,
   "serialNumber": "urn:uuid:855bf0d1-408e-4889-8c6f-9b56e1ec443b",
   "metadata": {
     "timestamp": "2026-11-22T13:26:08.454115787Z",
     "component": {
-      "type": "application",
+      "type": "application", "name": "bootloader", "version": "0.1.0",
       "bom-ref": "path+file:///home/me/coboot/bootloader#0.1.0",
-      "name": "bootloader",
-      "version": "0.1.0",
       "purl": "pkg:cargo/bootloader@0.1.0?download_url=file://."
     }
   },
-  "components": [
-    {
-      "type": "library",
-      "bom-ref": "registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0",
-      "name": "crc",
-      "version": "3.4.0",
-      "purl": "pkg:cargo/crc@3.4.0"
-    }
-  ],
-  "dependencies": [
-    {
-      "ref": "path+file:///home/me/coboot/bootloader#0.1.0",
-      "dependsOn": ["registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0"]
-    }
-  ]
+  "components": [{
+    "bom-ref": "registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0",
+    "type": "library", "name": "crc", "version": "3.4.0", "purl": "pkg:cargo/crc@3.4.0"
+  }],
+  "dependencies": [{
+    "ref": "path+file:///home/me/coboot/bootloader#0.1.0",
+    "dependsOn": ["registry+https://github.com/rust-lang/crates.io-index#crc@3.4.0"]
+  }]
 }"#;
 
     const CRATES: [&str; 2] = ["bootloader 0.1.0", "crc 3.4.0"];

@@ -2,9 +2,8 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::{BufRead as _, BufReader};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 
 use object::elf::PT_INTERP;
 use object::read::elf::{ElfFile64, ProgramHeader as _};
@@ -12,32 +11,7 @@ use object::read::pe::PeFile64;
 use object::{Architecture, LittleEndian, Object as _};
 
 use super::{build, package_crates, Release, LINUX, SUMS, VERSION};
-use crate::setup::{self, Setup};
-use crate::{files, process, workspace, Outcome};
-
-pub fn part(release: &Release, setup: &Setup, part: &str) -> Outcome {
-    let root = release.empty("check")?;
-    match part {
-        "source" => source(release, &root)?,
-        "linux" => linux(release, &root)?,
-        "deb" => debian(release, &root)?,
-        "windows" => {
-            windows(&files::bytes(&release.windows())?)?;
-        }
-        "python" => {
-            setup.prepare(&[setup::Part::Python])?;
-            wheel(release, &root)?;
-        }
-        // The job that makes it checks it.
-        "sbom" => {}
-        _ => {
-            // One of the crates is the emulator.
-            setup.prepare(&[setup::Part::Emulator])?;
-            crates(release, &root)?;
-        }
-    }
-    files::remove(&root)
-}
+use crate::{files, process, setup, workspace, Outcome};
 
 /// Checks the sums, with the program that users have for it.
 pub fn sums(dist: &Path) -> Outcome {
@@ -45,7 +19,7 @@ pub fn sums(dist: &Path) -> Outcome {
 }
 
 /// The sources build without a connection, and give the same program as the repository.
-fn source(release: &Release, root: &Path) -> Outcome {
+pub fn source(release: &Release, root: &Path) -> Outcome {
     unpack(&release.source(), root)?;
     let sources = root.join(format!("coboot-{VERSION}"));
     let theirs = build::program(&sources, &root.join("target"), LINUX)?;
@@ -66,7 +40,7 @@ fn source(release: &Release, root: &Path) -> Outcome {
     Ok(())
 }
 
-fn linux(release: &Release, root: &Path) -> Outcome {
+pub fn linux(release: &Release, root: &Path) -> Outcome {
     unpack(&release.linux(), root)?;
     let folder = root.join(format!("coflash-{VERSION}"));
     for file in ["LICENSE-MIT", "LICENSE-APACHE", "README.md", "THIRD-PARTY.txt", "udev/70-coflash.rules"] {
@@ -75,7 +49,7 @@ fn linux(release: &Release, root: &Path) -> Outcome {
     works(&folder, "coflash")
 }
 
-fn debian(release: &Release, root: &Path) -> Outcome {
+pub fn debian(release: &Release, root: &Path) -> Outcome {
     let base = root.join("var/lib/dpkg");
     for folder in ["info", "updates", "triggers"] {
         files::make(&base.join(folder))?;
@@ -120,7 +94,7 @@ fn debian(release: &Release, root: &Path) -> Outcome {
 }
 
 /// The wheel updates a node, in an environment of its own.
-fn wheel(release: &Release, root: &Path) -> Outcome {
+pub fn wheel(release: &Release, root: &Path) -> Outcome {
     let wheel = files::within(&release.dist)?.into_iter().find(|file| files::is(file, "whl"));
     let wheel = wheel.ok_or("target/dist has no wheel; `cargo xtask package python` makes it.")?;
     process::run(Command::new("python3").args(["-m", "venv"]).arg(root.join("venv")))?;
@@ -129,61 +103,29 @@ fn wheel(release: &Release, root: &Path) -> Outcome {
     process::run(Command::new(&python).args(pip).arg(wheel))?;
     process::run(process::cargo("build").args(["--quiet", "--package", "coboot-node"]))?;
     let node = workspace::target_dir().join("debug/coboot-node");
-    let node = Node::start(&node, root)?;
-    let program = root.join("program.bin");
-    files::write(&program, sample())?;
-    let script = "import sys, coflash\n\
-                  report = coflash.flash(sys.argv[1], 5, sys.argv[2], board='stm32f407g-disc1', address=0x08010000, verify=True)\n\
-                  print(report['size'])";
+    files::write(&root.join("program.bin"), sample())?;
     let mut flash = Command::new(&python);
-    flash.args(["-I", "-c", script, &node.bus]).arg(&program).current_dir(root);
-    let said = process::output(&mut flash)?;
-    said_in(&said, &sample().len().to_string(), "coflash.flash")
+    flash.args(["-I", "-c", UPDATE]).arg(node).current_dir(root);
+    said_in(&process::output(&mut flash)?, &sample().len().to_string(), "coflash.flash")
 }
 
-/// A node on a bus of its own; it ends when it is dropped.
-struct Node {
-    child: Child,
-    bus: String,
-}
-
-impl Node {
-    fn start(program: &Path, folder: &Path) -> Outcome<Self> {
-        let mut command = Command::new(program);
-        command.args([
-            "--listen",
-            "127.0.0.1:0",
-            "--node",
-            "5",
-            "--flash",
-            "instant",
-            "--stand-in",
-            "--folder",
-        ]);
-        command.arg(folder).stdout(Stdio::piped());
-        let mut child = command.spawn().map_err(|error| process::not_started(&command, &error))?;
-        let mut said = BufReader::new(child.stdout.take().ok_or("the node has no output.")?);
-        let mut line = String::new();
-        let read = said.read_line(&mut line);
-        let node = Self { child, bus: line.trim().strip_prefix("bus: ").unwrap_or_default().to_owned() };
-        if read.is_err() || node.bus.is_empty() {
-            return Err(format!("the node says \"{}\" and not where its bus is.", line.trim()));
-        }
-        // The rest of its output must be read, so that the pipe does not fill up.
-        std::thread::spawn(move || std::io::copy(&mut said, &mut std::io::sink()));
-        Ok(node)
-    }
-}
-
-impl Drop for Node {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
+/// Starts a node on a bus of its own, and updates it.
+const UPDATE: &str = "
+import subprocess, sys, coflash
+node = [sys.argv[1], '--listen', '127.0.0.1:0', '--node', '5', '--flash', 'instant', '--stand-in', '--folder', '.']
+node = subprocess.Popen(node, stdout=subprocess.PIPE, text=True)
+try:
+    bus = node.stdout.readline().removeprefix('bus: ').strip()
+    report = coflash.flash(bus, 5, 'program.bin', board='stm32f407g-disc1', address=0x08010000, verify=True)
+    print(report['size'])
+finally:
+    node.kill()
+";
 
 /// The crates build from the files for the registry, and `coflash` installs from its folder.
-fn crates(release: &Release, root: &Path) -> Outcome {
+pub fn crates(release: &Release, root: &Path) -> Outcome {
+    // One of the crates is the emulator.
+    release.setup.prepare(&[setup::Part::Emulator])?;
     process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     let mut install = process::bare_cargo();
     install.args(["install", "--locked", "--debug", "--quiet", "--no-track", "--path"]);
@@ -236,8 +178,12 @@ fn is_static(file: &[u8]) -> bool {
     elf.elf_program_headers().iter().all(|segment| segment.p_type(LittleEndian) != PT_INTERP)
 }
 
-/// Checks the program for Windows: it is one of x86-64, and uses the libraries of Windows alone.
-fn windows(file: &[u8]) -> Outcome {
+pub fn windows(release: &Release, _: &Path) -> Outcome {
+    runs_on_windows(&files::bytes(&release.windows())?)
+}
+
+/// Checks a program for Windows: it is one of x86-64, and uses the libraries of Windows alone.
+fn runs_on_windows(file: &[u8]) -> Outcome {
     let none = |error| format!("the program for Windows is none: {error}.");
     let program = PeFile64::parse(file).map_err(none)?;
     if program.architecture() != Architecture::X86_64 {
@@ -299,7 +245,7 @@ mod tests {
     fn what_is_no_program_for_windows_is_told() {
         let program = fs::read(std::env::current_exe().unwrap()).unwrap();
         for file in [&b""[..], b"MZ", &[b'M', b'Z', 0, 0, 0xFF], &[0xFF; 64], &program] {
-            assert!(windows(file).is_err());
+            assert!(runs_on_windows(file).is_err());
         }
     }
 

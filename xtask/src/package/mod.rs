@@ -48,8 +48,33 @@ const WINDOWS: &str = "x86_64-pc-windows-gnu";
 /// The version; all members of the workspace have the same one.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// The names of the parts, in the order in which they are made.
-const PARTS: [&str; 7] = ["source", "linux", "deb", "windows", "python", "sbom", "crates"];
+/// A part of what is handed out.
+struct Part {
+    name: &'static str,
+    make: fn(&Release) -> Outcome,
+    /// Checks it in an empty folder.
+    check: fn(&Release, &Path) -> Outcome,
+}
+
+const fn part(
+    name: &'static str,
+    make: fn(&Release) -> Outcome,
+    check: fn(&Release, &Path) -> Outcome,
+) -> Part {
+    Part { name, make, check }
+}
+
+/// The parts, in the order in which they are made.
+const PARTS: [Part; 7] = [
+    part("source", source, check::source),
+    part("linux", linux, check::linux),
+    part("deb", deb::make, check::debian),
+    part("windows", windows, check::windows),
+    part("python", python, check::wheel),
+    // The job that makes it checks it.
+    part("sbom", bills, |_, _| Ok(())),
+    part("crates", crates, check::crates),
+];
 
 /// The folders of a release, and the time of its files.
 struct Release {
@@ -60,6 +85,7 @@ struct Release {
     /// The time of the commit, in seconds since 1970: all files in archives have this time.
     epoch: String,
     draft: bool,
+    setup: Setup,
 }
 
 impl Release {
@@ -96,7 +122,7 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     let checked = args.flag("--check");
     let draft = args.flag("--draft");
-    let parts = parts(args.rest())?;
+    let parts = parts(&args.rest())?;
     if !draft {
         toolchain::check(&toolchain::line())
             .map_err(|other| format!("{other} Or add --draft for a trial."))?;
@@ -108,20 +134,23 @@ pub fn run(mut args: Args) -> Outcome {
         build: target.join("dist-build"),
         epoch: git(&["log", "-1", "--format=%ct"])?.trim().to_owned(),
         draft,
+        setup,
     };
-    if parts == PARTS {
+    if parts.len() == PARTS.len() {
         files::remove(&release.dist)?;
     }
     files::make(&release.dist)?;
     for part in &parts {
-        println!("== {part}");
-        make(&release, &setup, part)?;
+        println!("== {}", part.name);
+        (part.make)(&release)?;
     }
     sums(&release.dist)?;
     if checked {
         for part in &parts {
-            println!("== check: {part}");
-            check::part(&release, &setup, part)?;
+            println!("== check: {}", part.name);
+            let root = release.empty("check")?;
+            (part.check)(&release, &root)?;
+            files::remove(&root)?;
         }
         check::sums(&release.dist)?;
     }
@@ -129,12 +158,13 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The named parts, or all parts if none is named; in the order of [`PARTS`].
-fn parts(words: Vec<String>) -> Outcome<Vec<&'static str>> {
-    if let Some(unknown) = words.iter().find(|word| !PARTS.contains(&word.as_str())) {
-        return Err(format!("there is no part \"{unknown}\"; there is: {}.", PARTS.join(", ")));
+fn parts(words: &[String]) -> Outcome<Vec<&'static Part>> {
+    let names = PARTS.each_ref().map(|part| part.name);
+    if let Some(unknown) = words.iter().find(|word| !names.contains(&word.as_str())) {
+        return Err(format!("there is no part \"{unknown}\"; there is: {}.", names.join(", ")));
     }
-    let wanted = |part: &&str| words.is_empty() || words.iter().any(|word| word == part);
-    Ok(PARTS.into_iter().filter(wanted).collect())
+    let is_wanted = |part: &&Part| words.is_empty() || words.iter().any(|word| word == part.name);
+    Ok(PARTS.iter().filter(is_wanted).collect())
 }
 
 /// Whether a commit may be released: there are no other changes, and it has the tag of its version.
@@ -158,28 +188,16 @@ fn releasable(status: &str, tags: &str) -> Outcome {
     Ok(())
 }
 
-fn make(release: &Release, setup: &Setup, part: &str) -> Outcome {
-    match part {
-        "source" => source(release),
-        "linux" => linux(release),
-        "deb" => {
-            setup.prepare(&[setup::Part::Deb])?;
-            deb::make(release)
-        }
-        "windows" => {
-            setup.prepare(&[setup::Part::Windows])?;
-            let program = build::program(workspace::root(), &release.build, WINDOWS)?;
-            files::copy(&program, &release.windows())?;
-            notices_beside(release)
-        }
-        "python" => {
-            setup.prepare(&[setup::Part::Python])?;
-            build::wheel(release)?;
-            notices_beside(release)
-        }
-        "sbom" => bills(release),
-        _ => crates(release),
-    }
+fn windows(release: &Release) -> Outcome {
+    release.setup.prepare(&[setup::Part::Windows])?;
+    files::copy(&build::program(workspace::root(), &release.build, WINDOWS)?, &release.windows())?;
+    notices_beside(release)
+}
+
+fn python(release: &Release) -> Outcome {
+    release.setup.prepare(&[setup::Part::Python])?;
+    build::wheel(release)?;
+    notices_beside(release)
 }
 
 /// The sources of the commit. git sorts them and gives each the commit's time.
@@ -225,7 +243,7 @@ fn bills(release: &Release) -> Outcome {
     files::copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
 }
 
-/// The crates for the registry. [`check::part`] checks their contents.
+/// The crates for the registry. [`check::crates`] checks their contents.
 fn crates(release: &Release) -> Outcome {
     process::run(package_crates(release)?.arg("--no-verify"))
 }
@@ -272,11 +290,14 @@ mod tests {
 
     #[test]
     fn parts_are_made_in_their_order_and_each_once() {
-        let words = |text: &str| text.split_whitespace().map(str::to_owned).collect();
-        assert_eq!(parts(words("")), Ok(PARTS.to_vec()));
-        assert_eq!(parts(words("deb source deb")), Ok(vec!["source", "deb"]));
-        assert!(parts(words("deb rpm")).unwrap_err().contains("\"rpm\""));
-        assert!(parts(words("--chekc")).unwrap_err().contains("--chekc"));
+        let parts = |text: &str| {
+            let words: Vec<_> = text.split_whitespace().map(str::to_owned).collect();
+            parts(&words).map(|parts| parts.iter().map(|part| part.name).collect::<Vec<_>>())
+        };
+        assert_eq!(parts("").map(|parts| parts.len()), Ok(PARTS.len()));
+        assert_eq!(parts("deb source deb"), Ok(vec!["source", "deb"]));
+        assert!(parts("deb rpm").unwrap_err().contains("\"rpm\""));
+        assert!(parts("--chekc").unwrap_err().contains("--chekc"));
     }
 
     #[test]

@@ -152,13 +152,13 @@ pub fn run(mut args: Args) -> Outcome {
             println!("== {}: {}", stage.name, stage.about);
             if let Err(problem) = (stage.run)(&mut summary) {
                 println!("{problem}");
-                summary.broken(format!("{}: something did not build or broke off", stage.name));
+                summary.failed.push(format!("{}: something did not build or broke off", stage.name));
             }
         }
     }
     evidence::record(&name, summary.as_json())?;
     println!();
-    for name in summary.failed() {
+    for name in &summary.failed {
         println!("FAILED: {name}");
     }
     if all {
@@ -166,7 +166,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     println!("{} min", started.elapsed().as_secs().div_ceil(60));
     println!("{}", summary.line());
-    match summary.failed().len() {
+    match summary.failed.len() {
         0 if summary.is_empty() => Err("no test ran.".into()),
         0 => Ok(()),
         1 => Err("1 test failed; its output is above.".into()),

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::{OsStr, OsString};
 use std::io::{Read, Write};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
@@ -60,26 +60,19 @@ pub struct Summary {
     /// Passed and failed tests, and seconds, by job.
     counts: BTreeMap<String, (usize, usize, f64)>,
     /// What failed, and what did not get as far as a test.
-    failed: Vec<String>,
+    pub failed: Vec<String>,
     /// Tests with `#[ignore]`.
     pub skipped: usize,
 }
 
 impl Summary {
-    /// Something that should have run, and could not.
-    pub fn broken(&mut self, what: String) {
-        self.failed.push(what);
-    }
-
-    /// The names of what failed.
-    pub fn failed(&self) -> &[String] {
-        &self.failed
+    fn passed(&self) -> usize {
+        self.counts.values().map(|(passed, ..)| passed).sum()
     }
 
     /// The last line of a run.
     pub fn line(&self) -> String {
-        let passed: usize = self.counts.values().map(|(passed, ..)| passed).sum();
-        let mut line = format!("{passed} passed, {} failed", self.failed.len());
+        let mut line = format!("{} passed, {} failed", self.passed(), self.failed.len());
         if self.skipped > 0 {
             line += &format!(", {} skipped", self.skipped);
         }
@@ -96,9 +89,8 @@ impl Summary {
         let jobs = self.counts.iter().map(|(name, (passed, failed, seconds))| {
             json!({ "tests": name, "passed": passed, "failed": failed, "seconds": (seconds * 10.0).round() / 10.0 })
         });
-        let passed: usize = self.counts.values().map(|(passed, ..)| passed).sum();
         json!({
-            "passed": passed,
+            "passed": self.passed(),
             "failed": self.failed.len(),
             "skipped": self.skipped,
             "jobs": jobs.collect::<Vec<_>>(),
@@ -249,17 +241,13 @@ fn output(command: &mut Command) -> Outcome<(Vec<u8>, End)> {
                 return Ok((printed, if passed { End::Passed } else { End::Failed }));
             }
             Err(RecvTimeoutError::Timeout) => {
-                kill(&mut child);
+                // An error means that it has just ended.
+                let _ = child.kill();
+                let _ = child.wait();
                 return Ok((printed, End::Never));
             }
         }
     }
-}
-
-fn kill(child: &mut Child) {
-    // An error means that it has just ended.
-    let _ = child.kill();
-    let _ = child.wait();
 }
 
 /// The result in a line of libtest, `test line::silence ... ok`; `None` for every other line.
@@ -296,7 +284,7 @@ mod tests {
         let mut summary = Summary { skipped: 2, ..Summary::default() };
         summary.add(&job, &ran);
         assert_eq!(summary.line(), "1 passed, 2 failed, 2 skipped");
-        assert_eq!(summary.failed(), ["device::line line::a", "device::line line::c"]);
+        assert_eq!(summary.failed, ["device::line line::a", "device::line line::c"]);
         assert_eq!(summary.as_json()["jobs"][0]["failed"], 2);
         // A program that fails and prints no result: nothing passed.
         assert!(job.run().passed.is_empty());
