@@ -199,14 +199,9 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     Ok(workspace::firmware_dir(board))
 }
 
-/// Builds all images of a board except those in C, and prints their sizes; returns their folder.
-pub fn all(board: &Layout) -> Outcome<PathBuf> {
-    images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
-}
-
-/// Builds the images with these names for several boards, or everything ([`all`] and
-/// [`c_applications`]) where there are no names; several chips at once, since the last step of each
-/// image uses only one core.
+/// Builds the images with these names for several boards, or everything, the applications in C
+/// too, where there are no names; several chips at once, since the last step of each image uses only
+/// one core.
 pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
     let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     chips.sort_unstable();
@@ -221,7 +216,7 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
                         if !names.is_empty() {
                             return images(board, names).map(drop);
                         }
-                        all(board)?;
+                        images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())?;
                         c_applications(board)
                     })
                 })

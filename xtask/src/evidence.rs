@@ -41,13 +41,7 @@ const fn part(name: &'static str, counts: &'static str, job: &'static str, about
 
 const PARTS: [Part; 11] = [
     part("tests", "passed", "test", "All host crates, and the built firmware in the emulator."),
-    part(
-        "powercut",
-        "states",
-        "powercut --full",
-        "The power fails in a flash operation; then the device answers or runs a whole program. On a model of the \
-         flash, and with the built firmware, at every state of its flash.",
-    ),
+    part("powercut", "states", "powercut --full", "After a cut the device answers or runs a whole program."),
     part("attacker", "frames", "attack", "A seeded attacker and a legal master on one bus."),
     part("fuzz", "inputs", "fuzz", "Random inputs for what meets the bus or a file."),
     part("cpu", "words", "opinion --json", "The same programs on QEMU's Cortex-M4 and on the emulator."),

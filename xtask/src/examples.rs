@@ -26,96 +26,68 @@ minutes once.
 /// The board of all examples: their pages name it.
 const BOARD: &Layout = &stm32f407g_disc1::LAYOUT;
 
-/// A program that is built from a folder of `examples/`.
-struct Example {
-    /// The name of its image without the prefix `example-`.
-    name: &'static str,
-    /// The folder within `examples/`.
-    folder: &'static str,
-    tools: Tools,
-}
-
 /// The build tool of an example.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tools {
-    /// CMake with a toolchain file of `examples/c/cmake/`; the version is for the program's label.
-    Cmake { toolchain: &'static str, version: u32 },
-    /// Cargo: the program of this name, with features of its package.
-    Cargo { program: &'static str, features: &'static str },
-    /// `cargo generate` with the folder as the template, then Cargo.
-    Template,
+    /// CMake with a toolchain file of `examples/c/cmake/`.
+    Cmake,
+    /// Cargo: the program of this name.
+    Cargo(&'static str),
 }
 
-const EXAMPLES: &[Example] = &[
-    cmake("c", "c", "arm-none-eabi-gcc", 1),
-    cmake("c-v2", "c", "clang", 2),
-    cmake("cpp", "cpp", "arm-none-eabi-gcc", 1),
-    cmake("cpp-v2", "cpp", "clang", 2),
-    cargo("no-stack", "no-stack", "no-stack", ""),
-    cargo("no-stack-v2", "no-stack", "no-stack", "version-2"),
-    cargo("embassy", "embassy", "embassy", ""),
-    cargo("embassy-v2", "embassy", "embassy", "version-2"),
-    cargo("rtic", "rtic", "rtic-example", ""),
-    cargo("rtic-v2", "rtic", "rtic-example", "version-2"),
-    Example { name: "template", folder: "no-stack", tools: Tools::Template },
+/// The folders of `examples/`.
+const EXAMPLES: [(&str, Tools); 5] = [
+    ("c", Tools::Cmake),
+    ("cpp", Tools::Cmake),
+    ("no-stack", Tools::Cargo("no-stack")),
+    ("embassy", Tools::Cargo("embassy")),
+    ("rtic", Tools::Cargo("rtic-example")),
 ];
-
-const fn cmake(name: &'static str, folder: &'static str, toolchain: &'static str, version: u32) -> Example {
-    Example { name, folder, tools: Tools::Cmake { toolchain, version } }
-}
-
-const fn cargo(
-    name: &'static str,
-    folder: &'static str,
-    program: &'static str,
-    features: &'static str,
-) -> Example {
-    Example { name, folder, tools: Tools::Cargo { program, features } }
-}
-
+/// The name for a new project of the template, which is in the folder no-stack.
+const TEMPLATE: &str = "template";
 /// What makes a project of a template, and its version.
 const GENERATE: (&str, &str) = ("cargo-generate", "0.23.7");
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
-    let names = args.rest();
-    let chosen = names.iter().map(|name| by_name(name)).collect::<Outcome<Vec<_>>>()?;
+    let chosen = args.rest();
+    let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
+    if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
+        return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));
+    }
     setup.prepare(&[Part::Examples, Part::Firmware])?;
     if chosen.is_empty() {
         return all();
     }
-    chosen.into_iter().try_for_each(build)
+    chosen.iter().try_for_each(|name| build(name))
 }
 
 /// Builds all examples but the template, and prints their sizes. The tools must be installed.
 pub fn all() -> Outcome {
-    EXAMPLES.iter().filter(|example| example.tools != Tools::Template).try_for_each(build)
+    names().try_for_each(|name| build(&name))
 }
 
-fn by_name(name: &str) -> Outcome<&'static Example> {
-    EXAMPLES.iter().find(|example| example.name == name).ok_or_else(|| {
-        let known: Vec<_> = EXAMPLES.iter().map(|example| example.name).collect();
-        format!("there is no example \"{name}\"; there are: {}.", known.join(", "))
-    })
+/// The names of all examples but the template.
+fn names() -> impl Iterator<Item = String> {
+    EXAMPLES.iter().flat_map(|(folder, _)| [(*folder).to_owned(), format!("{folder}-v2")])
 }
 
-fn build(example: &Example) -> Outcome {
-    let folder = workspace::root().join("examples").join(example.folder);
+fn build(name: &str) -> Outcome {
+    let (name_of_folder, is_second) = name.strip_suffix("-v2").map_or((name, false), |folder| (folder, true));
+    let folder = workspace::root().join("examples").join(name_of_folder);
     let work = workspace::target_dir().join("examples");
-    let built = match example.tools {
-        Tools::Cmake { toolchain, version } => {
-            by_cmake(&folder, &work.join(example.name), toolchain, version)?
-        }
-        Tools::Cargo { program, features } => by_cargo(&folder, &work.join("rust"), program, features)?,
-        Tools::Template => template(&folder, &work)?,
+    let built = match EXAMPLES.iter().find(|(known, _)| *known == name_of_folder) {
+        Some((_, Tools::Cmake)) => by_cmake(&folder, &work.join(name), is_second)?,
+        Some((_, Tools::Cargo(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
+        None => template(&workspace::root().join("examples/no-stack"), &work)?,
     };
-    let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", example.name));
+    let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", name));
     files::copy(&built, &image)?;
     report(&image, BOARD.programs[0])
 }
 
 /// Builds a folder with CMake; returns the program.
-fn by_cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<PathBuf> {
+fn by_cmake(folder: &Path, work: &Path, is_second: bool) -> Outcome<PathBuf> {
+    let (toolchain, version) = if is_second { ("clang", 2) } else { ("arm-none-eabi-gcc", 1) };
     // The folder is deleted first: CMake keeps the compiler and the folders of the previous run.
     files::remove(work)?;
     let toolchain = workspace::root().join("examples/c/cmake").join(toolchain).with_extension("cmake");
@@ -130,7 +102,8 @@ fn by_cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcom
 }
 
 /// Builds a package; returns the program. All packages share `work`, and so their dependencies.
-fn by_cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<PathBuf> {
+fn by_cargo(folder: &Path, work: &Path, program: &str, is_second: bool) -> Outcome<PathBuf> {
+    let features = if is_second { "version-2" } else { "" };
     let mut cargo = process::cargo_on(folder, "build");
     // Cargo looks for the folder's own settings from its current folder.
     cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
@@ -180,8 +153,7 @@ mod tests {
     fn the_numbers_of_the_examples_are_up_to_date() {
         let map = BOARD.linker_script(Image::Program(1)).to_string();
         let lines = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
-        for example in EXAMPLES.iter().filter(|example| matches!(example.tools, Tools::Cmake { .. })) {
-            let folder = Path::new("examples").join(example.folder);
+        for folder in ["examples/c", "examples/cpp"].map(Path::new) {
             let file = folder.join("layout.x");
             let command = "cargo xtask layout --ld program-1 --board";
             let mend = format!("{command} {} > {}", BOARD.board, file.display());
@@ -227,12 +199,11 @@ mod tests {
     }
 
     #[test]
-    fn each_example_has_its_page_and_an_unknown_name_lists_them() {
-        for example in EXAMPLES {
-            let page = workspace::root().join("examples").join(example.folder).join("README.md");
+    fn each_example_has_its_page() {
+        for (folder, _) in &EXAMPLES {
+            let page = workspace::root().join("examples").join(folder).join("README.md");
             assert!(page.exists(), "{}", page.display());
         }
-        let unknown = by_name("cmake");
-        assert!(unknown.is_err_and(|problem| problem.contains("there are: c, c-v2, cpp, cpp-v2, ")));
+        assert_eq!(names().take(3).collect::<Vec<_>>(), ["c", "c-v2", "cpp"]);
     }
 }

@@ -15,9 +15,10 @@ use crate::{files, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask setup [--yes]
 
-Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
-clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C and the programs of the emulator's tests, gcc-arm-none-eabi for the examples, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+Brings the machine to where every other job runs: by rustup the Rust target thumbv7em-none-eabihf, rustfmt and
+clippy; by apt-get what builds the emulator's CPU (cmake, make, pkg-config, libclang), compilers for the chip
+(clang, gcc-arm-none-eabi), gdb-multiarch, chromium and python3 with venv; and a Python environment in
+target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
