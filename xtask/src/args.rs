@@ -1,6 +1,8 @@
 //! The arguments of a command line. A job takes the options it knows; [`Args::none_left`] refuses
 //! the rest.
 
+use std::ops::RangeInclusive;
+
 use crate::Outcome;
 
 /// The arguments after `cargo xtask JOB`.
@@ -27,9 +29,12 @@ impl Args {
 
     /// Whether an option is there, with its value; it is not taken.
     pub fn has(&self, name: &str) -> bool {
-        self.own
-            .iter()
-            .any(|word| word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('=')))
+        self.position(name).is_some()
+    }
+
+    fn position(&self, name: &str) -> Option<usize> {
+        let is_it = |rest: &str| rest.is_empty() || rest.starts_with('=');
+        self.own.iter().position(|word| word.strip_prefix(name).is_some_and(is_it))
     }
 
     /// Takes a flag; returns whether it was there.
@@ -40,14 +45,9 @@ impl Args {
     }
 
     /// Takes `NAME VALUE` or `NAME=VALUE`.
-    ///
-    /// # Errors
-    /// When the value is missing, or the option is there twice.
     pub fn value(&mut self, name: &str) -> Outcome<Option<String>> {
         let mut found = None;
-        while let Some(at) = self.own.iter().position(|word| {
-            word.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('='))
-        }) {
+        while let Some(at) = self.position(name) {
             let word = self.own.remove(at);
             let value = match word.split_once('=') {
                 Some((_, value)) => value.to_owned(),
@@ -61,6 +61,16 @@ impl Args {
         Ok(found)
     }
 
+    /// Takes `NAME NUMBER`, with a number in this range.
+    pub fn number(&mut self, name: &str, range: RangeInclusive<u64>) -> Outcome<Option<u64>> {
+        let Some(text) = self.value(name)? else { return Ok(None) };
+        let number = text.parse().ok().filter(|number| range.contains(number));
+        let (least, most) = range.into_inner();
+        number
+            .map(Some)
+            .ok_or_else(|| format!("{name} takes a number from {least} to {most}, not \"{text}\"."))
+    }
+
     /// All words that were not taken, for the program that the job starts.
     pub fn rest(self) -> Vec<String> {
         let mut words = self.own;
@@ -69,9 +79,6 @@ impl Args {
     }
 
     /// Checks that all words were taken, for a job that passes none on.
-    ///
-    /// # Errors
-    /// When a word is left.
     pub fn none_left(self) -> Outcome {
         match self.rest().first() {
             None => Ok(()),
@@ -112,6 +119,10 @@ mod tests {
         assert!(args("--board").value("--board").is_err());
         assert!(args("--board --yes").value("--board").is_err());
         assert!(args("--board a --board b").value("--board").is_err());
+        for wrong in ["0", "128", "x", "-1", "1.5"] {
+            assert!(args(&format!("--node={wrong}")).number("--node", 1..=127).is_err(), "{wrong}");
+        }
+        assert_eq!(args("--node 127").number("--node", 1..=127), Ok(Some(127)));
         assert!(args("nonsense").none_left().unwrap_err().contains("nonsense"));
         assert!(args("-- x").none_left().is_err());
         assert!(args("").none_left().is_ok());

@@ -8,12 +8,13 @@
 //! `unsafe`.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::args::Args;
-use crate::{ordered, process, rooms, workspace, Outcome};
 use serde_json::Value;
+
+use crate::args::Args;
+use crate::process::list;
+use crate::{files, modules, ordered, process, rooms, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask arrows
@@ -27,58 +28,31 @@ the owner of the product ordered by name (xtask/src/ordered.rs).
 ";
 
 /// The crates of ours that one of our crates may depend on. Dev- and build-dependencies follow the
-/// same rule.
-struct Rule {
-    name: &'static str,
-    may_use: &'static [&'static str],
-}
-
-/// The permitted dependencies. A new crate needs a row.
-const RULES: &[Rule] = &[
-    Rule { name: "shared-abi", may_use: &[] },
-    Rule { name: "canopen", may_use: &[KIT] },
-    Rule { name: "seal", may_use: &[] },
-    Rule { name: "boot-core", may_use: &["canopen", "seal", "shared-abi", KIT] },
-    Rule { name: "coboot-app", may_use: &["canopen", "shared-abi"] },
+/// same rule. A new crate needs a row.
+const RULES: &[(&str, &str)] = &[
+    ("shared-abi", ""),
+    ("canopen", "kit"),
+    ("seal", ""),
+    ("boot-core", "canopen seal shared-abi kit"),
+    ("coboot-app", "canopen shared-abi"),
     // Only on the host: build scripts and tools.
-    Rule { name: "coboot-linker", may_use: &["shared-abi"] },
-    Rule { name: "bsp", may_use: &["canopen", "shared-abi"] },
-    Rule { name: "bootloader", may_use: &["boot-core", "bsp", "coboot-linker", "seal", "shared-abi"] },
-    Rule { name: "app-template", may_use: &["canopen", "coboot-app", "coboot-linker", "bsp"] },
-    Rule {
-        name: "app-template-v2",
-        may_use: &["app-template", "canopen", "coboot-app", "coboot-linker", "bsp"],
-    },
-    Rule {
-        name: "test-app",
-        may_use: &["app-template", "canopen", "coboot-app", "coboot-linker", "bsp", "shared-abi"],
-    },
-    Rule { name: "vendor-can", may_use: &[] },
-    Rule { name: "coflash", may_use: &["canopen", "coboot-linker", "seal", "shared-abi", "vendor-can", KIT] },
-    Rule { name: "coflash-native", may_use: &["canopen", "coflash", "shared-abi"] },
-    Rule {
-        name: "coboot-node",
-        may_use: &["boot-core", "canopen", "coboot-app", "coflash", "shared-abi", KIT],
-    },
-    Rule { name: "emulator", may_use: &["shared-abi"] },
-    Rule { name: KIT, may_use: &["boot-core", "canopen", "coboot-app", "shared-abi"] },
-    Rule {
-        name: "coboot-tests",
-        may_use: &[
-            "app-template",
-            "boot-core",
-            "bsp",
-            "canopen",
-            "coboot-app",
-            "coboot-node",
-            "coflash",
-            "emulator",
-            "seal",
-            "shared-abi",
-            KIT,
-        ],
-    },
-    Rule { name: "xtask", may_use: &["shared-abi", KIT] },
+    ("coboot-linker", "shared-abi"),
+    ("bsp", "canopen shared-abi"),
+    ("bootloader", "boot-core bsp coboot-linker seal shared-abi"),
+    ("app-template", "canopen coboot-app coboot-linker bsp"),
+    ("app-template-v2", "app-template canopen coboot-app coboot-linker bsp"),
+    ("test-app", "app-template canopen coboot-app coboot-linker bsp shared-abi"),
+    ("vendor-can", ""),
+    ("coflash", "canopen coboot-linker seal shared-abi vendor-can kit"),
+    ("coflash-native", "canopen coflash shared-abi"),
+    ("coboot-node", "boot-core canopen coboot-app coflash shared-abi kit"),
+    ("emulator", "shared-abi"),
+    (KIT, "boot-core canopen coboot-app shared-abi"),
+    (
+        "coboot-tests",
+        "app-template boot-core bsp canopen coboot-app coboot-node coflash emulator seal shared-abi kit",
+    ),
+    ("xtask", "shared-abi kit"),
 ];
 
 /// What the tests share: in no package, and so a dev-dependency, of crates that have tests with it.
@@ -103,8 +77,7 @@ const COMMAND_LINE: &str = "src/bin";
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    let metadata = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
-    let metadata = process::json(&metadata)?;
+    let metadata = process::metadata()?;
     let packages = packages(&metadata)?;
     let mut broken = broken_arrows(&packages);
     broken.extend(ordered::broken(&metadata)?);
@@ -113,10 +86,10 @@ pub fn run(args: Args) -> Outcome {
     };
     let command_line = emulator.folder.join(COMMAND_LINE);
     for path in sources(&emulator.folder)?.into_iter().filter(|path| !path.starts_with(&command_line)) {
-        for (line, module) in foreign_modules(&read(&path)?) {
+        for used in foreign_modules(&files::text(&path)?) {
             broken.push(format!(
-                "{}:{line}: the emulator uses shared_abi::{module}; of shared-abi it may use `{GEOMETRY}` alone \
-                 (its knowledge comes from the reference manual)",
+                "{}: the emulator uses {used}; of shared_abi it may use `{GEOMETRY}` alone (its knowledge comes from \
+                 the reference manual)",
                 workspace::shown(&path)
             ));
         }
@@ -124,7 +97,7 @@ pub fn run(args: Args) -> Outcome {
     for package in packages.iter().filter(|package| PURE.contains(&package.name.as_str())) {
         let roots = ["src/lib.rs", "src/main.rs"].map(|root| package.folder.join(root));
         for root in roots.iter().filter(|root| root.exists()) {
-            if !read(root)?.lines().any(|line| line.trim() == FORBID) {
+            if !files::text(root)?.lines().any(|line| line.trim() == FORBID) {
                 broken.push(format!("{}: {FORBID} is missing", workspace::shown(root)));
             }
         }
@@ -134,7 +107,7 @@ pub fn run(args: Args) -> Outcome {
         let mut files = Vec::new();
         for path in sources(&package.folder)? {
             if let Ok(inside) = path.strip_prefix(&root) {
-                files.push((inside.to_string_lossy().replace('\\', "/"), read(&path)?));
+                files.push((inside.to_string_lossy().replace('\\', "/"), files::text(&path)?));
             }
         }
         broken.extend(rooms::broken(&package.name, &files));
@@ -152,10 +125,6 @@ pub fn run(args: Args) -> Outcome {
     ))
 }
 
-fn read(path: &Path) -> Outcome<String> {
-    fs::read_to_string(path).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(path)))
-}
-
 /// A crate of the workspace.
 #[derive(Debug, PartialEq, Eq)]
 struct Package {
@@ -169,41 +138,34 @@ struct Package {
 
 /// Reads the output of `cargo metadata --no-deps`.
 fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
+    let has_other = |value: &Value, kinds: &str, not: &str| list(value, kinds).any(|kind| kind != not);
+    let is_library = |target: &&Value| {
+        has_other(target, "kind", "custom-build") && has_other(target, "crate_types", "bin")
+    };
     let mut libraries = BTreeMap::new();
-    for package in metadata["packages"].as_array().into_iter().flatten() {
-        let is_library = |target: &&Value| {
-            target["kind"].as_array().into_iter().flatten().any(|kind| kind.as_str() != Some("custom-build"))
-                && target["crate_types"]
-                    .as_array()
-                    .into_iter()
-                    .flatten()
-                    .any(|kind| kind.as_str() != Some("bin"))
-        };
-        let library = package["targets"].as_array().into_iter().flatten().find(is_library);
+    for package in list(metadata, "packages") {
+        let library = list(package, "targets").find(is_library).and_then(|library| library["name"].as_str());
         if let (Some(name), Some(library)) = (package["name"].as_str(), library) {
-            let library = library["name"].as_str().unwrap_or_default().replace('_', "-");
-            libraries.insert(name.to_owned(), library);
+            libraries.insert(name, library.replace('_', "-"));
         }
     }
     let called = |package: &str| libraries.get(package).map_or(package, String::as_str).to_owned();
     let package = |value: &Value| -> Option<Package> {
-        let mut dependencies = Vec::new();
-        for dependency in value["dependencies"].as_array().into_iter().flatten() {
+        let dependency = |dependency: &Value| {
             let kind = match dependency["kind"].as_str() {
                 None => "normal",
                 Some("dev") => "dev",
                 Some(_) => "build",
             };
-            dependencies.push((called(dependency["name"].as_str()?), kind));
-        }
-        let manifest = Path::new(value["manifest_path"].as_str()?);
+            Some((called(dependency["name"].as_str()?), kind))
+        };
         Some(Package {
             name: called(value["name"].as_str()?),
-            folder: manifest.parent()?.to_owned(),
-            dependencies,
+            folder: Path::new(value["manifest_path"].as_str()?).parent()?.to_owned(),
+            dependencies: list(value, "dependencies").map(dependency).collect::<Option<_>>()?,
         })
     };
-    let found: Option<Vec<_>> = metadata["packages"].as_array().into_iter().flatten().map(package).collect();
+    let found: Option<Vec<_>> = list(metadata, "packages").map(package).collect();
     found
         .filter(|packages| !packages.is_empty())
         .ok_or_else(|| "cargo metadata printed something unexpected.".into())
@@ -211,7 +173,7 @@ fn packages(metadata: &Value) -> Outcome<Vec<Package>> {
 
 /// The dependencies that no rule permits, as messages.
 fn broken_arrows(packages: &[Package]) -> Vec<String> {
-    let rules: BTreeMap<_, _> = RULES.iter().map(|rule| (rule.name, rule.may_use)).collect();
+    let rules: BTreeMap<_, _> = RULES.iter().copied().collect();
     let mut broken = Vec::new();
     for package in packages {
         let name = package.name.as_str();
@@ -225,8 +187,8 @@ fn broken_arrows(packages: &[Package]) -> Vec<String> {
                 rules.contains_key(dependency) || packages.iter().any(|package| package.name == dependency);
             // A crate is among its own dev-dependencies in order to test with all its features.
             let itself = dependency == name && *kind == "dev";
-            if ours && !itself && !may_use.contains(&dependency) {
-                broken.push(format!("{name} -> {dependency} ({kind}): not among its arrows ({may_use:?})"));
+            if ours && !itself && !may_use.split(' ').any(|name| name == dependency) {
+                broken.push(format!("{name} -> {dependency} ({kind}): not among its arrows ({may_use})"));
             }
             if dependency == KIT && *kind != "dev" && !MAY_CONTAIN_KIT.contains(&name) {
                 broken.push(format!(
@@ -248,80 +210,17 @@ fn broken_arrows(packages: &[Package]) -> Vec<String> {
 
 /// All Rust sources below a crate's folder.
 fn sources(folder: &Path) -> Outcome<Vec<PathBuf>> {
-    let mut sources = Vec::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(folder) = folders.pop() {
-        let entries = fs::read_dir(&folder)
-            .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
-        for path in entries.flatten().map(|entry| entry.path()) {
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.extension().is_some_and(|extension| extension == "rs") {
-                sources.push(path);
-            }
-        }
-    }
-    sources.sort();
+    let mut sources = files::below(folder, &[])?;
+    sources.retain(|file| files::is(file, "rs"));
     Ok(sources)
 }
 
-/// Uses of shared-abi other than `shared_abi::geometry`, with their line numbers. Each foreign
-/// member of a group (`use shared_abi::{…}`) counts; so does an alias of the whole crate.
-fn foreign_modules(source: &str) -> Vec<(usize, String)> {
-    let mut found = Vec::new();
-    // Comments are removed (in place, to keep the line numbers): they may name any module.
-    let code: String = source
-        .split_inclusive('\n')
-        .map(|line| match line.find("//") {
-            Some(at) => format!("{}\n", &line[..at]),
-            None => line.to_owned(),
-        })
-        .collect();
-    for (at, krate) in code.match_indices("shared_abi") {
-        let part_of_a_word = |letter: char| letter.is_alphanumeric() || letter == '_';
-        let rest = &code[at + krate.len()..];
-        if code[..at].ends_with(part_of_a_word) || rest.starts_with(part_of_a_word) {
-            continue;
-        }
-        let line = code[..at].matches('\n').count() + 1;
-        let Some(path) = rest.trim_start().strip_prefix("::") else {
-            found.push((line, "(the crate under another name)".to_owned()));
-            continue;
-        };
-        let path = path.trim_start();
-        match path.strip_prefix('{') {
-            None => found.extend(foreign(path).map(|module| (line, module))),
-            Some(group) => found.extend(members(group).filter_map(foreign).map(|module| (line, module))),
-        }
-    }
-    found
-}
-
-/// The first word of a path, unless it is the geometry.
-fn foreign(path: &str) -> Option<String> {
-    let end = path.find(|letter: char| !letter.is_alphanumeric() && letter != '_').unwrap_or(path.len());
-    let module = if end == 0 { path.get(..1).unwrap_or("") } else { &path[..end] };
-    (module != GEOMETRY).then(|| module.to_owned())
-}
-
-/// The members of a group, without its opening brace; inner braces belong to a member.
-fn members(group: &str) -> impl Iterator<Item = &str> {
-    let mut depth = 1;
-    let mut borders = vec![0];
-    for (at, letter) in group.char_indices() {
-        match letter {
-            '{' => depth += 1,
-            '}' => depth -= 1,
-            ',' if depth == 1 => borders.push(at + 1),
-            _ => {}
-        }
-        if depth == 0 {
-            borders.push(at + 1);
-            break;
-        }
-    }
-    let ranges: Vec<_> = borders.windows(2).map(|pair| (pair[0], pair[1] - 1)).collect();
-    ranges.into_iter().map(|(from, to)| group[from..to].trim()).filter(|member| !member.is_empty())
+/// What a source names of shared-abi besides its geometry, as paths; the crate alone is a glob or an
+/// alias.
+fn foreign_modules(source: &str) -> Vec<String> {
+    let mut paths = modules::paths(&modules::without_comments(source));
+    paths.retain(|path| path[0] == "shared_abi" && path.get(1).is_none_or(|module| module != GEOMETRY));
+    paths.iter().map(|path| path.join("::")).collect()
 }
 
 #[cfg(test)]
@@ -463,28 +362,31 @@ mod tests {
 
     #[test]
     fn the_emulator_may_use_the_geometry_alone() {
-        let modules = |source| foreign_modules(source);
-        assert_eq!(modules("use shared_abi::geometry::{Geometry, Region};\n"), []);
-        assert_eq!(modules("use shared_abi::geometry;\nlet x = my_shared_abi::layout;"), []);
-        assert_eq!(modules("// shared_abi::layout\n/// [`shared_abi::layout`]\nuse a; // shared_abi::x"), []);
-        assert_eq!(modules("use shared_abi::{geometry::{Region, Sector}, geometry};"), []);
-        assert_eq!(modules("\nuse shared_abi::layout::Layout;"), [(2, "layout".into())]);
-        assert_eq!(
-            modules("use shared_abi::{geometry::{Region, Sector}, handoff,\n  warm_start::{WarmStart}};"),
-            [(1, "handoff".into()), (1, "warm_start".into())]
-        );
-        assert_eq!(modules("let y = shared_abi::vectors::check(0);"), [(1, "vectors".into())]);
-        assert_eq!(modules("use shared_abi::*;"), [(1, "*".into())]);
-        assert_eq!(modules("use shared_abi as abi;").len(), 1);
-        assert_eq!(modules("extern crate shared_abi;").len(), 1);
-        assert_eq!(modules("use shared_abi::{").len(), 0);
+        for (source, foreign) in [
+            ("use shared_abi::geometry::{Geometry, Region};", &[][..]),
+            ("use shared_abi::geometry;\nlet x = my_shared_abi::layout;", &[]),
+            ("// shared_abi::layout\n/// [`shared_abi::layout`]\nuse a; // shared_abi::x", &[]),
+            ("use shared_abi::{geometry::{Region, Sector}, geometry};", &[]),
+            ("use shared_abi::layout::Layout;", &["shared_abi::layout::Layout"]),
+            (
+                "use shared_abi::{geometry::{Region, Sector}, handoff,\n  warm_start::{WarmStart}};",
+                &["shared_abi::handoff", "shared_abi::warm_start::WarmStart"],
+            ),
+            ("let y = shared_abi::vectors::check(0);", &["shared_abi::vectors::check"]),
+            ("#[cfg(test)]\nmod tests { use shared_abi::layout; }", &["shared_abi::layout"]),
+            ("use shared_abi::*;", &["shared_abi"]),
+            ("use shared_abi as abi;", &["shared_abi"]),
+            ("extern crate shared_abi;", &["shared_abi"]),
+        ] {
+            assert_eq!(foreign_modules(source), foreign, "{source}");
+        }
     }
 
     #[test]
     fn every_rule_speaks_of_crates_that_have_one() {
-        for rule in RULES {
-            for used in rule.may_use {
-                assert!(RULES.iter().any(|other| other.name == *used), "{} -> {used}", rule.name);
+        for (name, may_use) in RULES {
+            for used in may_use.split_terminator(' ') {
+                assert!(RULES.iter().any(|(other, _)| *other == used), "{name} -> {used}");
             }
         }
     }

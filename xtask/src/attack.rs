@@ -1,13 +1,13 @@
 //! `cargo xtask attack`: the standing attacker of the bus.
 
-use std::fs;
+use std::path::Path;
 
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT as TWO;
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, evidence, process, workspace, Outcome};
+use crate::{build, evidence, process, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask attack [--frames N] [--seed S] [--yes]
@@ -25,39 +25,23 @@ attack. The counts go to target/evidence/attacker.json.
 ";
 
 /// The images of the attack, on the board with two programs.
-const IMAGES: [&str; 12] = [
-    "bootloader",
-    "bootloader-esacademy",
-    "bootloader-lift",
-    "bootloader-sealed",
-    "bootloader-virtual-can",
-    "app-v1",
-    "app-v2",
-    "app-program-2",
-    "app-lift",
-    "app-lift-v2",
-    "app-virtual-can",
-    "app-virtual-can-v2",
-];
+const IMAGES: &str =
+    "bootloader bootloader-esacademy bootloader-lift bootloader-sealed bootloader-virtual-can app-v1 \
+    app-v2 app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    build::images(&TWO, &IMAGES)?;
+    build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
     evidence::begin("attacker")?;
-    let counts = evidence::file_for("attacker");
-    let mut attack = process::cargo("run");
-    attack.args(build::tests_args(DEFAULT)).args(["--bin", "attack", "--"]);
+    let mut attack = build::tests_program(DEFAULT, "attack");
     for (option, value) in [("--frames", frames), ("--seed", seed)] {
         attack.args(value.map(|value| [option.to_owned(), value]).into_iter().flatten());
     }
-    attack.arg("--evidence").arg(&counts);
-    attack.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(DEFAULT));
-    // A rule that was broken is a result, too.
-    let ended = process::run(&mut attack);
-    let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
-    evidence::record_text("attacker", &fs::read_to_string(&counts).map_err(unread)?)?;
+    let run = |file: &Path| process::run(attack.arg("--evidence").arg(file));
+    let (facts, ended) = evidence::facts_of("attacker", run)?;
+    evidence::record("attacker", facts)?;
     ended
 }

@@ -4,12 +4,11 @@
 //! is the same in the site, in the repository, and on a server that shows Markdown.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::args::Args;
-use crate::{links, process, setup, workspace, Outcome};
+use crate::{files, links, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask docs
@@ -32,17 +31,14 @@ const SUMMARY: &str = "docs/SUMMARY.md";
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     let mut faults = links::faults()?;
-    faults.extend(not_in(&links::text(Path::new(SUMMARY))?, &links::pages()?));
+    faults.extend(not_in(&files::ours(SUMMARY)?, &links::pages()?));
     refuse("the pages", &faults)?;
 
-    let mdbook = setup::pinned_tool(MDBOOK, VERSION, &FEATURES)?;
+    let mdbook = setup::tool(MDBOOK, VERSION, &FEATURES)?;
     let copy = workspace::target_dir().join("book-source");
     let book = workspace::target_dir().join("book");
-    for old in [&copy, &book] {
-        if old.exists() {
-            fs::remove_dir_all(old).map_err(|error| failed("removed", old, &error))?;
-        }
-    }
+    files::remove(&copy)?;
+    files::remove(&book)?;
     gather(&copy)?;
     let mut build = Command::new(mdbook);
     build.arg("build").arg("--dest-dir").arg(&book).arg(&copy);
@@ -58,10 +54,6 @@ fn refuse(what: &str, faults: &[String]) -> Outcome {
         return Ok(());
     }
     Err(format!("{what}: {} to be mended:\n    {}", faults.len(), faults.join("\n    ")))
-}
-
-fn failed(done: &str, path: &Path, error: &std::io::Error) -> String {
-    format!("{} cannot be {done}: {error}.", workspace::shown(path))
 }
 
 /// The pages that are missing in the summary, as messages.
@@ -82,25 +74,17 @@ fn gather(to: &Path) -> Outcome {
     let mut files: BTreeSet<PathBuf> = links::pages()?.into_iter().collect();
     files.extend(links::all()?.into_iter().map(|link| link.file));
     for file in files {
-        copy(&workspace::root().join(&file), &to.join("src").join(&file))?;
+        files::copy(&workspace::root().join(&file), &to.join("src").join(&file))?;
     }
     for (file, place) in [("docs/book.toml", "book.toml"), ("docs/site.css", "site.css")] {
-        copy(&workspace::root().join(file), &to.join(place))?;
+        files::copy(&workspace::root().join(file), &to.join(place))?;
     }
-    let summary = to.join("src/SUMMARY.md");
-    fs::write(&summary, from_the_root(&links::text(Path::new(SUMMARY))?))
-        .map_err(|error| failed("written", &summary, &error))
+    files::write(&to.join("src/SUMMARY.md"), from_the_root(&files::ours(SUMMARY)?))
 }
 
 /// The summary with links from the root of the repository.
 fn from_the_root(summary: &str) -> String {
     summary.replace("](", "](docs/").replace("](docs/../", "](")
-}
-
-fn copy(from: &Path, to: &Path) -> Outcome {
-    let folder = to.parent().expect("every copy lies in a folder");
-    fs::create_dir_all(folder).map_err(|error| failed("made", folder, &error))?;
-    fs::copy(from, to).map(drop).map_err(|error| failed("copied", from, &error))
 }
 
 /// The warnings and errors in mdBook's output.
@@ -111,18 +95,12 @@ fn warnings(said: &str) -> Vec<String> {
 
 /// The broken references of the site: to a missing file, or to a missing place of a page.
 fn broken(book: &Path) -> Outcome<Vec<String>> {
+    // Each reference is looked up among the paths of the pages.
+    let book = book.canonicalize().unwrap_or_else(|_| book.to_owned());
     let mut pages = BTreeMap::new();
-    let mut folders = vec![book.to_owned()];
-    while let Some(folder) = folders.pop() {
-        let entries = fs::read_dir(&folder).map_err(|error| failed("read", &folder, &error))?;
-        for path in entries.flatten().map(|entry| entry.path()) {
-            if path.is_dir() {
-                folders.push(path);
-            } else if path.extension().is_some_and(|extension| extension == "html") {
-                let html = fs::read_to_string(&path).map_err(|error| failed("read", &path, &error))?;
-                pages.insert(path, html);
-            }
-        }
+    for page in files::below(&book, &[])?.into_iter().filter(|file| files::is(file, "html")) {
+        let html = files::text(&page)?;
+        pages.insert(page, html);
     }
     let mut faults = BTreeSet::new();
     for (page, html) in &pages {
@@ -137,10 +115,7 @@ fn broken(book: &Path) -> Outcome<Vec<String>> {
                 continue;
             };
             let there = |html: &String| attributes(html, "id").any(|id| id == place);
-            let book = book.canonicalize().unwrap_or_else(|_| book.to_owned());
-            let known =
-                pages.iter().find(|(path, _)| path.strip_prefix(&book).ok() == file.strip_prefix(&book).ok());
-            if !place.is_empty() && !known.is_some_and(|(_, html)| there(html)) {
+            if !place.is_empty() && !pages.get(&file).is_some_and(there) {
                 faults.insert(format!("{}: {target} has no such place", workspace::shown(page)));
             }
         }
@@ -161,7 +136,7 @@ mod tests {
 
     #[test]
     fn the_summary_has_every_page() {
-        let summary = links::text(Path::new(SUMMARY)).unwrap();
+        let summary = files::ours(SUMMARY).unwrap();
         assert_eq!(not_in(&summary, &links::pages().unwrap()), Vec::<String>::new());
         let without = summary.replace("(protocol.md)", "(security.md)");
         let faults = not_in(&without, &links::pages().unwrap());
@@ -183,16 +158,14 @@ mod tests {
 
     #[test]
     fn a_reference_that_leads_nowhere_is_found_in_the_site() {
-        let site = std::env::temp_dir().join(format!("coboot-site-{}", std::process::id()));
-        fs::create_dir_all(site.join("docs")).unwrap();
+        let site = kit::folder::Folder::below(std::env::temp_dir(), "coboot-site");
         let index = r##"<a href="docs/a.html#there">a</a><a href="https://example.invalid/x">b</a>"##;
-        fs::write(site.join("index.html"), index).unwrap();
-        fs::write(site.join("docs/a.html"), r##"<h1 id="there"><img src="../index.html"></h1>"##).unwrap();
+        let page = site.join("docs/a.html");
+        files::write(&site.join("index.html"), index).unwrap();
+        files::write(&page, r##"<h1 id="there"><img src="../index.html"></h1>"##).unwrap();
         assert_eq!(broken(&site), Ok(Vec::new()));
-        fs::write(site.join("docs/a.html"), r##"<h1 id="here"><img src="b.png"><a href="#gone">c</a></h1>"##)
-            .unwrap();
+        files::write(&page, r##"<h1 id="here"><img src="b.png"><a href="#gone">c</a></h1>"##).unwrap();
         let faults = broken(&site).unwrap();
-        fs::remove_dir_all(&site).unwrap();
         let of = |words: &str| faults.iter().filter(|fault| fault.contains(words)).count();
         assert_eq!((faults.len(), of("a.html#there has"), of("b.png is not"), of("#gone has")), (3, 1, 1, 1));
     }

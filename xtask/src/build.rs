@@ -12,7 +12,7 @@ use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{Part, Setup};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{process, ram_image, workspace, Outcome};
+use crate::{files, process, ram_image, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD] [--yes]
@@ -113,9 +113,6 @@ const fn application(name: &'static str, package: &'static str, features: &'stat
 
 impl Variant {
     /// The image with this name, if the board has it.
-    ///
-    /// # Errors
-    /// When there is none; the message lists the existing ones.
     pub fn by_name(board: &Layout, name: &str) -> Outcome<&'static Self> {
         Self::of(board).find(|variant| variant.name == name).ok_or_else(|| {
             let known: Vec<_> = Self::of(board).map(|variant| variant.name).collect();
@@ -129,9 +126,6 @@ impl Variant {
     }
 
     /// The product of the image.
-    ///
-    /// # Errors
-    /// When its file is missing.
     pub fn product(&self) -> Outcome<Product> {
         self.product.map_or_else(|| Ok(Product::default()), Product::named)
     }
@@ -200,9 +194,6 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// Builds images of a board by their names, and prints their sizes; returns their folder.
-///
-/// # Errors
-/// When an image does not build, or is not an image of this board.
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
@@ -212,20 +203,9 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     Ok(workspace::firmware_dir(board))
 }
 
-/// Builds all images of a board except those in C, and prints their sizes; returns their folder.
-///
-/// # Errors
-/// As for [`images`].
-pub fn all(board: &Layout) -> Outcome<PathBuf> {
-    images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())
-}
-
-/// Builds the images with these names for several boards, or everything ([`all`] and
-/// [`c_applications`]) where there are no names; several chips at once, since the last step of each
-/// image uses only one core.
-///
-/// # Errors
-/// As for [`images`]; the first error.
+/// Builds the images with these names for several boards, or everything, the applications in C
+/// too, where there are no names; several chips at once, since the last step of each image uses only
+/// one core.
 pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
     let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     chips.sort_unstable();
@@ -240,7 +220,7 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
                         if !names.is_empty() {
                             return images(board, names).map(drop);
                         }
-                        all(board)?;
+                        images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())?;
                         c_applications(board)
                     })
                 })
@@ -255,9 +235,6 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
 
 /// Builds the application in C for each program of a board, and the same with the tests' object
 /// 2100h. A board without a header in examples/c/boards has none.
-///
-/// # Errors
-/// When it does not build, or is not an image of this board.
 pub fn c_applications(board: &Layout) -> Outcome {
     let sources = workspace::root().join("examples/c");
     if !sources.join("boards").join(board.board).with_extension("h").exists() {
@@ -280,17 +257,13 @@ fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> 
     let sources = workspace::root().join("examples/c");
     let dir = workspace::firmware_dir(board);
     let work = dir.join("c").join(name);
-    fs::create_dir_all(&work)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&work)))?;
-    let (layout, script) = (work.join("layout.x"), board.linker_script(Image::Program(number)).to_string());
-    fs::write(&layout, script)
-        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&layout)))?;
+    files::write(&work.join("layout.x"), board.linker_script(Image::Program(number)).to_string())?;
     let mut objects = Vec::new();
     for source in C_SOURCES.into_iter().chain(more) {
         let file_name = Path::new(source).file_name().expect("a source is a file");
         let object = work.join(file_name).with_extension("o");
         let mut clang = process::clang();
-        clang.current_dir(&sources).args(C_FLAGS);
+        clang.current_dir(&sources).args(C_FLAGS.split(' '));
         clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
         clang.arg(format!("-DINTERRUPT_LINES={}", board.chip.interrupts));
         process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
@@ -315,23 +288,9 @@ const PROBE: &str = "../../tests/c/probe.c";
 /// The compiler's arguments. The application does not use the FPU, so it is compiled for a chip
 /// without one; the functions of the bootloader that it calls have no floating-point arguments or
 /// results.
-const C_FLAGS: &[&str] = &[
-    "--target=thumbv7em-none-eabi",
-    "-mcpu=cortex-m4",
-    "-mfloat-abi=soft",
-    "-std=c11",
-    "-ffreestanding",
-    "-fno-builtin",
-    "-ffunction-sections",
-    "-fdata-sections",
-    "-Os",
-    "-g",
-    "-fdebug-compilation-dir=examples/c",
-    "-I.",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-];
+const C_FLAGS: &str =
+    "--target=thumbv7em-none-eabi -mcpu=cortex-m4 -mfloat-abi=soft -std=c11 -ffreestanding -fno-builtin \
+    -ffunction-sections -fdata-sections -Os -g -fdebug-compilation-dir=examples/c -I. -Wall -Wextra -Werror";
 
 /// The linker of the Rust toolchain, which also links the rest of the firmware.
 fn rust_lld() -> Outcome<PathBuf> {
@@ -343,9 +302,6 @@ fn rust_lld() -> Outcome<PathBuf> {
 }
 
 /// Builds a bootloader for examination; returns its ELF file.
-///
-/// # Errors
-/// When it does not build.
 pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
@@ -354,16 +310,6 @@ pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<
 
 /// The folders with the files of the boards.
 pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
-
-/// The files in such a folder.
-///
-/// # Errors
-/// When it cannot be read.
-pub fn board_files(folder: &str) -> Outcome<Vec<PathBuf>> {
-    let unreadable = |error: std::io::Error| format!("{folder} cannot be read: {error}.");
-    let entries = fs::read_dir(workspace::root().join(folder)).map_err(unreadable)?;
-    entries.map(|entry| Ok(entry.map_err(unreadable)?.path())).collect()
-}
 
 /// The arguments that set the board for cargo; they override the variable `COBOOT_BOARD`.
 pub fn board_args(board: &Layout) -> [String; 4] {
@@ -400,6 +346,17 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
     board_args(board).into_iter().chain(["--package=coboot-tests".to_owned()]).collect()
 }
 
+/// The command that runs a program of that crate with the firmware of a board; its arguments follow.
+pub fn tests_program(board: &Layout, name: &str) -> Command {
+    let mut cargo = process::cargo("run");
+    cargo.args(tests_args(board)).args(["--bin", name]);
+    cargo
+        .env("COBOOT_BOARD", board.board)
+        .env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board))
+        .arg("--");
+    cargo
+}
+
 /// Cargo's folder for the firmware of a board: one for each chip. Cargo locks its folder, so this
 /// allows builds of two chips and of a host crate at once; two chips share no HAL anyway.
 fn target_dir(board: &Layout) -> PathBuf {
@@ -422,9 +379,7 @@ fn build(board: &Layout, variant: &Variant, product: &Product) -> Outcome<Vec<u8
 
 /// The ELF file of cargo's last build of a package.
 fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
-    let path = target_dir(board).join(TARGET).join(PROFILE).join(package);
-    fs::read(&path)
-        .map_err(|error| format!("cargo built {package}, but {} cannot be read: {error}.", path.display()))
+    files::bytes(&target_dir(board).join(TARGET).join(PROFILE).join(package))
 }
 
 /// The step after the link: a bootloader gets the CRC of its RAM image.
@@ -438,22 +393,15 @@ fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
 
 /// Writes an image into the board's folder, under its name, and prints its size.
 fn put(board: &Layout, variant: &Variant, name: &str, file: &[u8]) -> Outcome {
-    let dir = workspace::firmware_dir(board);
-    fs::create_dir_all(&dir)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&dir)))?;
-    let to = dir.join(format!("{name}.elf"));
+    let to = workspace::firmware_dir(board).join(format!("{name}.elf"));
     // An unchanged file is not written, so that its time does not change.
     if fs::read(&to).ok().as_deref() != Some(file) {
-        fs::write(&to, file)
-            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&to)))?;
+        files::write(&to, file)?;
     }
     report(&to, &variant.regions(board))
 }
 
 /// Prints the size of an image.
-///
-/// # Errors
-/// When it lies outside its flash.
 pub fn report(image: &Path, regions: &[Region]) -> Outcome {
     let flash = Flash::of(&footprint::read(image)?, regions)
         .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;

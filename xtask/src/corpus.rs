@@ -4,11 +4,9 @@
 //! An input is a line with its name and its length, its bytes, and a line feed. A person gives names;
 //! what the fuzzer has found has a number.
 
-use std::fs;
-use std::io::Error;
 use std::path::{Path, PathBuf};
 
-use crate::{workspace, Outcome};
+use crate::{files, workspace, Outcome};
 
 /// The most bytes of what the fuzzer has found that are kept for a target, and of one input.
 const KEPT: usize = 96 * 1024;
@@ -17,19 +15,12 @@ const LONGEST: usize = 4 * 1024;
 /// A name and the bytes of an input.
 type Input = (String, Vec<u8>);
 
-fn failed(path: &Path) -> impl Fn(Error) -> String + '_ {
-    move |error| format!("{}: {error}.", workspace::shown(path))
-}
-
 /// The inputs of a file; none if there is no file.
-///
-/// # Errors
-/// When it cannot be read, or its lengths are not those of its inputs.
 fn read(file: &Path) -> Outcome<Vec<Input>> {
     if !file.exists() {
         return Ok(Vec::new());
     }
-    let bytes = fs::read(file).map_err(failed(file))?;
+    let bytes = files::bytes(file)?;
     let (mut rest, mut inputs) = (&bytes[..], Vec::new());
     while !rest.is_empty() {
         let input = next(&mut rest)
@@ -50,29 +41,23 @@ fn next(rest: &mut &[u8]) -> Option<Input> {
 }
 
 /// Puts each input into a file in a folder, which it makes; returns the folder.
-///
-/// # Errors
-/// When the inputs cannot be read, or the files cannot be written.
 pub fn unpack(file: &Path, folder: PathBuf) -> Outcome<PathBuf> {
-    fs::create_dir_all(&folder).map_err(failed(&folder))?;
+    files::make(&folder)?;
     for (name, bytes) in read(file)? {
-        fs::write(folder.join(name), bytes).map_err(failed(&folder))?;
+        files::write(&folder.join(name), bytes)?;
     }
     Ok(folder)
 }
 
 /// Puts what the fuzzer has found in a folder into a file, the shortest first, as much as [`KEPT`]
 /// allows. Inputs that a person has named stay there.
-///
-/// # Errors
-/// When a file cannot be read or written.
 pub fn keep(folder: &Path, file: &Path) -> Outcome {
     let is_number = |name: &str| name.bytes().all(|byte| byte.is_ascii_digit());
     let mut inputs: Vec<Input> = read(file)?;
     inputs.retain(|(name, _)| !is_number(name));
     let mut found = Vec::new();
-    for path in fs::read_dir(folder).map_err(failed(folder))?.flatten().map(|entry| entry.path()) {
-        let bytes = fs::read(&path).map_err(failed(&path))?;
+    for path in files::within(folder)? {
+        let bytes = files::bytes(&path)?;
         if bytes.len() <= LONGEST && !inputs.iter().any(|(_, named)| *named == bytes) {
             found.push((bytes.len(), bytes));
         }
@@ -90,22 +75,24 @@ pub fn keep(folder: &Path, file: &Path) -> Outcome {
         text.extend_from_slice(&bytes);
         text.push(b'\n');
     }
-    fs::write(file, text).map_err(failed(file))
+    files::write(file, text)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
+    use kit::folder::Folder;
+
     use super::*;
 
-    fn folder(name: &str) -> PathBuf {
-        let folder = std::env::temp_dir().join(format!("coboot-corpus-{name}-{}", std::process::id()));
-        fs::create_dir_all(&folder).unwrap();
-        folder
+    fn folder() -> Folder {
+        Folder::below(std::env::temp_dir(), "coboot-corpus")
     }
 
     #[test]
     fn what_was_kept_takes_part_in_the_next_smallest_corpus() {
-        let folder = folder("added");
+        let folder = folder();
         let (corpus, file) = (folder.join("corpus"), folder.join("a-target"));
         unpack(&file, corpus.clone()).expect("a target without kept inputs");
         fs::write(corpus.join("b"), "new\n1 1\n").unwrap();
@@ -113,12 +100,11 @@ mod tests {
         fs::remove_dir_all(&corpus).unwrap();
         unpack(&file, corpus.clone()).unwrap();
         assert_eq!(fs::read(corpus.join("0000")).unwrap(), b"new\n1 1\n");
-        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
     fn what_is_kept_is_short_and_a_persons_seeds_stay() {
-        let folder = folder("kept");
+        let folder = folder();
         let (corpus, file) = (folder.join("corpus"), folder.join("a-target"));
         fs::create_dir_all(&corpus).unwrap();
         fs::write(&file, "by-hand 1\nx\n0000 14\nan earlier one\n").unwrap();
@@ -135,12 +121,11 @@ mod tests {
         assert_eq!(kept[0], ("by-hand".to_owned(), b"x".to_vec()));
         assert_eq!(kept[1], ("0000".to_owned(), vec![0; 100]));
         assert!(kept[2..].iter().all(|(_, bytes)| bytes.len() == LONGEST));
-        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
     fn a_damaged_file_is_refused() {
-        let folder = folder("damaged");
+        let folder = folder();
         let file = folder.join("a-target");
         for text in
             ["a", "a 1", "a 1\n", "a 1\nxx", "a 2\nx\n", "../a 1\nx\n", " 1\nx\n", "a x\nx\n", "a 1\nx\nb"]
@@ -148,13 +133,12 @@ mod tests {
             fs::write(&file, text).unwrap();
             assert!(read(&file).is_err(), "{text:?}");
         }
-        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
     fn the_kept_inputs_are_whole_and_few() {
         let kept = workspace::root().join("tests/fuzz/corpus");
-        for file in fs::read_dir(kept).unwrap().flatten().map(|entry| entry.path()) {
+        for file in files::within(&kept).unwrap() {
             if file.file_name().is_some_and(|name| name != ".gitattributes") {
                 assert!(!read(&file).unwrap().is_empty(), "{}", file.display());
                 assert!(file.metadata().unwrap().len() < 200_000, "{}", file.display());

@@ -26,16 +26,13 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
     let bootloader = if is_sealed { "bootloader-sealed" } else { "bootloader" };
-    let images = build::images(board, &[bootloader, "app-v1", "app-v2"])?;
-
-    let mut demo = process::cargo("run");
-    demo.args(build::tests_args(board)).args(["--bin", "demo", "--"]);
+    build::images(board, &[bootloader, "app-v1", "app-v2"])?;
+    let mut demo = build::tests_program(board, "demo");
     if is_sealed {
         demo.arg("--sealed");
     }
     if let Some(trace) = trace {
         demo.args(["--trace", &trace]);
     }
-    demo.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
     process::run(&mut demo)
 }

@@ -24,14 +24,14 @@ const WORKSPACES: [&str; 2] = ["", "tests/fuzz"];
 pub fn run(mut args: Args) -> Outcome {
     let advisories = args.flag("--advisories");
     args.none_left()?;
-    let path = setup::tool("cargo-deny", VERSION)?;
+    let program = setup::tool("cargo-deny", VERSION, &[])?;
     let checks: &[&str] = if advisories { &["advisories"] } else { &["licenses", "sources", "bans"] };
     // All workspaces are checked, so that one run shows all problems.
     let mut problems = Vec::new();
     for folder in WORKSPACES {
         let root = workspace::root();
-        let mut deny = Command::new("cargo-deny");
-        deny.env("PATH", &path).current_dir(root).arg("--all-features");
+        let mut deny = Command::new(&program);
+        deny.current_dir(root).arg("--all-features");
         deny.arg("--manifest-path").arg(root.join(folder).join("Cargo.toml"));
         deny.arg("--config").arg(root.join("deny.toml"));
         // An exception may be for the other workspace.

@@ -1,11 +1,12 @@
 //! `cargo xtask diagrams`: draws the graphs of the documents from text.
 
-use std::fs;
 use std::path::PathBuf;
 use std::process::Command;
 
+use sha2::{Digest, Sha256};
+
 use crate::args::Args;
-use crate::{process, workspace, Outcome};
+use crate::{files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask diagrams
@@ -15,57 +16,31 @@ files are checked in; a test fails if one is older than what it is drawn from. T
 drawn by hand, and tests compare their numbers.
 ";
 
-/// The names of the sources, without the ending.
-fn sources() -> Outcome<Vec<String>> {
-    let folder = path("");
-    let entries = fs::read_dir(&folder)
-        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
-    let files = entries.flatten().filter_map(|entry| entry.file_name().into_string().ok());
-    let mut names: Vec<_> = files.filter_map(|file| Some(file.strip_suffix(".dot")?.to_owned())).collect();
-    names.sort();
-    Ok(names)
-}
-
-/// The text of a source.
-fn source(name: &str) -> Outcome<String> {
-    let source = path(&format!("{name}.dot"));
-    fs::read_to_string(&source)
-        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&source)))
+/// The sources.
+fn sources() -> Outcome<Vec<PathBuf>> {
+    let mut sources = files::within(&workspace::root().join("docs/diagrams"))?;
+    sources.retain(|file| files::is(file, "dot"));
+    Ok(sources)
 }
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    for name in sources()? {
-        let text = source(&name)?;
-        let drawn = process::output(Command::new("dot").arg("-Tsvg").arg(path(&format!("{name}.dot"))))
+    for source in sources()? {
+        let drawn = process::output(Command::new("dot").arg("-Tsvg").arg(&source))
             .map_err(|problem| format!("{problem} Graphviz is needed: sudo apt-get install -y graphviz"))?;
-        write(&path(&format!("{name}.svg")), &marked(&drawn, &text)?)?;
+        // What is in front changes with the version of Graphviz.
+        let from = drawn.find("<svg").ok_or("Graphviz drew no SVG.")?;
+        let mark = mark(&files::bytes(&source)?);
+        files::write(&source.with_extension("svg"), format!("{mark}\n{}", &drawn[from..]))?;
     }
     Ok(())
 }
 
-fn path(file: &str) -> PathBuf {
-    workspace::root().join("docs/diagrams").join(file)
-}
-
-fn write(file: &PathBuf, text: &str) -> Outcome {
-    fs::write(file, text).map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(file)))
-}
-
-/// The picture with the mark of its source, and without the parts that change with the version of
-/// Graphviz.
-fn marked(drawn: &str, source: &str) -> Outcome<String> {
-    let from = drawn.find("<svg").ok_or("Graphviz drew no SVG.")?;
-    Ok(format!("{}\n{}", mark(source), &drawn[from..]))
-}
-
-/// A hash of the text (64-bit FNV-1a). The sources are compared by it, since pictures of another
-/// version of Graphviz differ in every line.
-fn mark(source: &str) -> String {
-    let hash = source.bytes().fold(0xCBF2_9CE4_8422_2325_u64, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3)
-    });
-    format!("<!-- drawn by `cargo xtask diagrams` from {hash:016x} -->")
+/// The first line of a picture, with a hash of its source. The sources are compared by it, since
+/// pictures of another version of Graphviz differ in every line.
+fn mark(source: &[u8]) -> String {
+    let hash: String = Sha256::digest(source)[..8].iter().map(|byte| format!("{byte:02x}")).collect();
+    format!("<!-- drawn by `cargo xtask diagrams` from {hash} -->")
 }
 
 #[cfg(test)]
@@ -75,34 +50,21 @@ mod tests {
 
     use super::*;
 
-    fn picture(file: &str) -> String {
-        fs::read_to_string(workspace::root().join("docs").join(file)).unwrap()
-    }
-
     #[test]
     fn the_pictures_are_those_of_their_sources() {
-        let drawn = sources().unwrap();
-        assert!(drawn.len() > 5, "{drawn:?}");
-        for name in drawn {
-            let picture = picture(&format!("diagrams/{name}.svg"));
-            assert!(
-                picture.starts_with(&mark(&source(&name).unwrap())),
-                "{name}.svg is old: run `cargo xtask diagrams`"
-            );
+        let sources = sources().unwrap();
+        assert!(sources.len() > 5, "{sources:?}");
+        for source in sources {
+            let picture = files::text(&source.with_extension("svg")).unwrap();
+            let is_new = picture.starts_with(&mark(&files::bytes(&source).unwrap()));
+            assert!(is_new, "the picture of {} is old: run `cargo xtask diagrams`", source.display());
         }
-    }
-
-    /// Test vectors of FNV's authors for "" and "foobar".
-    #[test]
-    fn the_mark_is_fnv_1a() {
-        assert!(mark("").contains("cbf29ce484222325"));
-        assert!(mark("foobar").contains("85944171f73967e8"));
     }
 
     /// Name, address, size and sectors of each region, and no other region.
     #[test]
     fn the_memory_map_shows_every_region() {
-        let map = picture("diagrams/memory.svg");
+        let map = files::ours("docs/diagrams/memory.svg").unwrap();
         let mut texts =
             map.lines().filter_map(|line| line.split_once("weight=\"normal\">")?.1.split('<').next());
         let remark = |region: &Region| {
@@ -134,13 +96,14 @@ mod tests {
 
     #[test]
     fn the_windows_in_the_picture_are_those_of_the_text() {
-        let text = picture("pictures/two-windows.txt");
+        let text = files::ours("docs/pictures/two-windows.txt").unwrap();
         let line = |line: &str| {
             let text = line.strip_prefix("<text")?.split_once('>')?.1.strip_suffix("</text>")?;
             let title = if line.contains("middle") { "== " } else { "" };
             Some(format!("{title}{}", text.replace("&lt;", "<").replace("&amp;", "&")))
         };
-        let drawn: Vec<_> = picture("pictures/two-windows.svg").lines().filter_map(line).collect();
+        let drawn: Vec<_> =
+            files::ours("docs/pictures/two-windows.svg").unwrap().lines().filter_map(line).collect();
         assert_eq!(drawn, text.lines().collect::<Vec<_>>());
     }
 
@@ -148,7 +111,7 @@ mod tests {
     /// names.
     #[test]
     fn the_way_back_has_its_times_in_their_places() {
-        let picture = picture("diagrams/way-back.svg");
+        let picture = files::ours("docs/diagrams/way-back.svg").unwrap();
         let x =
             |time: &str| ((96.0 + (time.parse::<f64>().unwrap() + 2.0) / 24.0 * 640.0) * 10.0).round() / 10.0;
         let panels: Vec<&str> = picture.split("\npanel ").skip(1).collect();

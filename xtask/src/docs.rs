@@ -1,12 +1,13 @@
 //! Compares the quotes in the documents with their sources.
 
-use std::fs;
+use std::sync::LazyLock;
 
+use kit::pages::{self, Shown};
+use serde_json::Value;
 use shared_abi::layout::BOARDS;
 
 use crate::build::{C_APPLICATION, VARIANTS};
-use crate::{workspace, JOBS};
-use kit::pages::{self, Shown};
+use crate::{files, process, workspace, JOBS};
 
 /// A block of code in a document that names its source file.
 struct Quote {
@@ -50,13 +51,11 @@ fn missing(quote: &[String], source: &str) -> Option<String> {
 
 #[test]
 fn the_guides_show_code_as_it_is() {
-    let root = workspace::root();
     for (document, least) in [("docs/application.md", 10), ("docs/first-hour.md", 1)] {
-        let found = quotes(&fs::read_to_string(root.join(document)).unwrap());
+        let found = quotes(&files::ours(document).unwrap());
         assert!(found.len() >= least, "{document}: {} quotes", found.len());
         for Quote { file, lines } in found {
-            let source = fs::read_to_string(root.join(&file)).expect(&file);
-            let gone = missing(&lines, &source);
+            let gone = missing(&lines, &files::ours(&file).unwrap());
             assert_eq!(gone, None, "{document} quotes what {file} does not have: copy it from there");
         }
     }
@@ -73,25 +72,8 @@ fn a_quote_that_has_changed_is_found() {
 }
 
 /// Commands that are not part of this repository: of a shell, of the system, of other projects.
-const FOREIGN: [&str; 17] = [
-    "cd",
-    "export",
-    "ip",
-    "apt",
-    "base64",
-    "candump",
-    "canopend",
-    "cmake",
-    "cocomm",
-    "npm",
-    "node",
-    "openssl",
-    "pip",
-    "sha256sum",
-    "tar",
-    "unzip",
-    "west",
-];
+const FOREIGN: &str =
+    "cd export ip apt base64 candump canopend cmake cocomm npm node openssl pip sha256sum tar unzip west";
 /// Cargo's own jobs on pages; their arguments name packages of the workspace.
 const CARGO: [&str; 5] = ["build", "check", "install", "run", "test"];
 
@@ -137,22 +119,16 @@ pub fn check(shown: &Shown) -> Option<String> {
             let missing = all.iter().filter(ours).find(|file| !workspace::root().join(file).exists());
             missing.map(|file| format!("there is no {file}"))
         }
-        [program, ..] if FOREIGN.contains(program) => None,
+        [program, ..] if FOREIGN.split(' ').any(|known| known == *program) => None,
         words => Some(format!("nobody knows {words:?}")),
     }
 }
 
-/// Whether a folder of the workspace contains the package of this name.
+/// Whether the workspace contains the package of this name.
 fn is_package(name: &str) -> bool {
-    let workspace = fs::read_to_string(workspace::root().join("Cargo.toml")).expect("the workspace has one");
-    let named = format!("name = \"{name}\"");
-    // The members, and what else is in quotes: no package has such a folder.
-    workspace.split('"').any(|folder| {
-        let manifest =
-            fs::read_to_string(workspace::root().join(folder).join("Cargo.toml")).unwrap_or_default();
-        let package = manifest.split("\n[").next().unwrap_or_default();
-        package.starts_with("[package]") && package.lines().any(|line| line == named)
-    })
+    static METADATA: LazyLock<Value> =
+        LazyLock::new(|| process::metadata().expect("cargo knows the workspace"));
+    process::list(&METADATA, "packages").any(|package| package["name"] == name)
 }
 
 /// The fault of a job's arguments, if there is one.

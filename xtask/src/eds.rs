@@ -1,12 +1,10 @@
 //! `cargo xtask eds`: writes the EDS files, from the object dictionaries of the firmware.
 
-use std::fs;
-
 use shared_abi::layout;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask eds [--board BOARD] [--out FOLDER] [--yes]
@@ -33,9 +31,6 @@ pub fn run(mut args: Args) -> Outcome {
         None if board.board == layout::DEFAULT.board => workspace::root().join("docs/eds"),
         None => workspace::target_dir().join("eds").join(board.board),
     };
-    fs::create_dir_all(&folder)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
-    let mut eds = process::cargo("run");
-    eds.arg("--quiet").args(build::tests_args(board)).args(["--bin=eds", "--"]).arg(&folder);
-    process::run(&mut eds)
+    files::make(&folder)?;
+    process::run(build::tests_program(board, "eds").arg(&folder))
 }

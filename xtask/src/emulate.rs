@@ -1,7 +1,6 @@
 //! `cargo xtask emulate`: runs an emulated board for other programs.
 
 use crate::args::Args;
-use crate::build::VARIANTS;
 use crate::setup::{Part, Setup};
 use crate::{build, process, workspace, Outcome};
 
@@ -42,7 +41,7 @@ pub fn run(mut args: Args) -> Outcome {
     emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board", board.board]);
     if !another {
         let standard = if virtual_can { "bootloader-virtual-can" } else { "bootloader" };
-        let bootloader = log.unwrap_or(standard);
+        let bootloader = log.as_deref().unwrap_or(standard);
         let dir = build::images(board, &[bootloader])?;
         emulator.arg("--bootloader").arg(dir.join(format!("{bootloader}.elf")));
     }
@@ -53,37 +52,34 @@ pub fn run(mut args: Args) -> Outcome {
     process::run(&mut emulator)
 }
 
-/// The prefix of the names of the bootloaders with a log.
-const LOG: &str = "bootloader-log-";
+/// The ways in which a bootloader can log its work.
+const LOGS: [&str; 3] = ["rtt", "defmt", "uart"];
 
 /// The name of the bootloader for the option `--log`.
-fn log(args: &mut Args) -> Outcome<Option<&'static str>> {
-    let wanted = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
-    let Some(wanted) = wanted else { return Ok(None) };
-    // Those with another dialect are only for the tests.
-    let standard = || VARIANTS.iter().filter(|variant| variant.product.is_none());
-    let ways = || standard().filter_map(|variant| Some((variant.name.strip_prefix(LOG)?, variant.name)));
-    let found = ways().find(|(way, _)| *way == wanted);
-    found.map(|(_, name)| Some(name)).ok_or_else(|| {
-        let ways: Vec<_> = ways().map(|(way, _)| way).collect();
-        format!("--log={wanted} is no way; there are {}.", ways.join(", "))
-    })
+fn log(args: &mut Args) -> Outcome<Option<String>> {
+    let way = if args.flag("--log") { Some(LOGS[0].to_owned()) } else { args.value("--log")? };
+    match way {
+        Some(way) if !LOGS.contains(&&*way) => {
+            Err(format!("--log={way} is no way; there are {}.", LOGS.join(", ")))
+        }
+        way => Ok(way.map(|way| format!("bootloader-log-{way}"))),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn asked(words: &str) -> Outcome<Option<&'static str>> {
-        log(&mut Args::new(words.split_whitespace().map(str::to_owned)))
-    }
+    use crate::build::VARIANTS;
 
     #[test]
-    fn the_ways_of_the_log() {
+    fn the_ways_of_the_log_have_a_bootloader() {
+        let asked = |words: &str| log(&mut Args::new(words.split_whitespace().map(str::to_owned)));
         assert_eq!(asked(""), Ok(None));
-        assert_eq!(asked("--log --verbose"), Ok(Some("bootloader-log-rtt")));
-        assert_eq!(asked("--log=uart"), Ok(Some("bootloader-log-uart")));
-        assert_eq!(asked("--log=defmt"), Ok(Some("bootloader-log-defmt")));
+        assert_eq!(asked("--log --verbose"), Ok(Some("bootloader-log-rtt".into())));
+        for way in LOGS {
+            let name = asked(&format!("--log={way}")).unwrap().unwrap();
+            assert!(VARIANTS.iter().any(|variant| variant.name == name), "{name}");
+        }
         assert!(asked("--log=smoke").unwrap_err().ends_with("rtt, defmt, uart."));
     }
 }

@@ -1,7 +1,6 @@
 //! `cargo xtask examples`: builds the programs in `examples/`, each with its own tools as its page
 //! says, outside the workspace.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -10,26 +9,16 @@ use shared_abi::layout::{stm32f407g_disc1, Layout};
 use crate::args::Args;
 use crate::build::report;
 use crate::setup::{self, Part, Setup};
-use crate::{process, workspace, Outcome};
+use crate::{files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask examples [NAME...] [--yes]
 
 Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
-target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all of them:
-
-  c       C by CMake, with arm-none-eabi-gcc
-  c-v2    the same as version 2, with clang
-  cpp           C++17 by CMake, with arm-none-eabi-g++
-  cpp-v2        the same as version 2, with clang++
-  no-stack      Rust without a CANopen stack: a main loop
-  no-stack-v2   the same as version 2
-  embassy       Rust on Embassy
-  embassy-v2    the same as version 2
-  rtic          Rust on RTIC, with a CANopen stack of its own
-  rtic-v2       the same as version 2
-  template      a new project, which `cargo generate` makes of no-stack. Only if it is named: the first time
-                cargo-generate is built, which takes some minutes
+target/firmware/stm32f407g-disc1/example-NAME.elf. A NAME is a folder of examples/, or with -v2 the same
+program as version 2 (c-v2 and cpp-v2 by clang). Without a NAME it builds all of them, but not `template`:
+a new project, which `cargo generate` makes of no-stack. cargo-generate is built first, which takes some
+minutes once.
 
   --yes         installs what is missing with sudo
 ";
@@ -37,112 +26,70 @@ target/firmware/stm32f407g-disc1/example-NAME.elf. Without a NAME it builds all 
 /// The board of all examples: their pages name it.
 const BOARD: &Layout = &stm32f407g_disc1::LAYOUT;
 
-/// A program that is built from a folder of `examples/`.
-struct Example {
-    /// The name of its image without the prefix `example-`.
-    name: &'static str,
-    /// The folder within `examples/`.
-    folder: &'static str,
-    tools: Tools,
-}
-
 /// The build tool of an example.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Tools {
-    /// CMake with a toolchain file of `examples/c/cmake/`; the version is for the program's label.
-    Cmake { toolchain: &'static str, version: u32 },
-    /// Cargo: the program of this name, with features of its package.
-    Cargo { program: &'static str, features: &'static str },
-    /// `cargo generate` with the folder as the template, then Cargo.
-    Template,
+    /// CMake with a toolchain file of `examples/c/cmake/`.
+    Cmake,
+    /// Cargo: the program of this name.
+    Cargo(&'static str),
 }
 
-const EXAMPLES: &[Example] = &[
-    Example { name: "c", folder: "c", tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 } },
-    Example { name: "c-v2", folder: "c", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
-    Example {
-        name: "cpp",
-        folder: "cpp",
-        tools: Tools::Cmake { toolchain: "arm-none-eabi-gcc", version: 1 },
-    },
-    Example { name: "cpp-v2", folder: "cpp", tools: Tools::Cmake { toolchain: "clang", version: 2 } },
-    Example {
-        name: "no-stack",
-        folder: "no-stack",
-        tools: Tools::Cargo { program: "no-stack", features: "" },
-    },
-    Example {
-        name: "no-stack-v2",
-        folder: "no-stack",
-        tools: Tools::Cargo { program: "no-stack", features: "version-2" },
-    },
-    Example { name: "embassy", folder: "embassy", tools: Tools::Cargo { program: "embassy", features: "" } },
-    Example {
-        name: "embassy-v2",
-        folder: "embassy",
-        tools: Tools::Cargo { program: "embassy", features: "version-2" },
-    },
-    Example { name: "rtic", folder: "rtic", tools: Tools::Cargo { program: "rtic-example", features: "" } },
-    Example {
-        name: "rtic-v2",
-        folder: "rtic",
-        tools: Tools::Cargo { program: "rtic-example", features: "version-2" },
-    },
-    Example { name: "template", folder: "no-stack", tools: Tools::Template },
+/// The folders of `examples/`.
+const EXAMPLES: [(&str, Tools); 5] = [
+    ("c", Tools::Cmake),
+    ("cpp", Tools::Cmake),
+    ("no-stack", Tools::Cargo("no-stack")),
+    ("embassy", Tools::Cargo("embassy")),
+    ("rtic", Tools::Cargo("rtic-example")),
 ];
-
+/// The name for a new project of the template, which is in the folder no-stack.
+const TEMPLATE: &str = "template";
 /// What makes a project of a template, and its version.
 const GENERATE: (&str, &str) = ("cargo-generate", "0.23.7");
 
 pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
-    let names = args.rest();
-    let chosen = names.iter().map(|name| by_name(name)).collect::<Outcome<Vec<_>>>()?;
+    let chosen = args.rest();
+    let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
+    if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
+        return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));
+    }
     setup.prepare(&[Part::Examples, Part::Firmware])?;
     if chosen.is_empty() {
         return all();
     }
-    chosen.into_iter().try_for_each(build)
+    chosen.iter().try_for_each(|name| build(name))
 }
 
 /// Builds all examples but the template, and prints their sizes. The tools must be installed.
-///
-/// # Errors
-/// When an example does not build, or is not an image of its board.
 pub fn all() -> Outcome {
-    EXAMPLES.iter().filter(|example| example.tools != Tools::Template).try_for_each(build)
+    names().try_for_each(|name| build(&name))
 }
 
-fn by_name(name: &str) -> Outcome<&'static Example> {
-    EXAMPLES.iter().find(|example| example.name == name).ok_or_else(|| {
-        let known: Vec<_> = EXAMPLES.iter().map(|example| example.name).collect();
-        format!("there is no example \"{name}\"; there are: {}.", known.join(", "))
-    })
+/// The names of all examples but the template.
+fn names() -> impl Iterator<Item = String> {
+    EXAMPLES.iter().flat_map(|(folder, _)| [(*folder).to_owned(), format!("{folder}-v2")])
 }
 
-fn build(example: &Example) -> Outcome {
-    let folder = workspace::root().join("examples").join(example.folder);
+fn build(name: &str) -> Outcome {
+    let (name_of_folder, is_second) = name.strip_suffix("-v2").map_or((name, false), |folder| (folder, true));
+    let folder = workspace::root().join("examples").join(name_of_folder);
     let work = workspace::target_dir().join("examples");
-    let built = match example.tools {
-        Tools::Cmake { toolchain, version } => cmake(&folder, &work.join(example.name), toolchain, version)?,
-        Tools::Cargo { program, features } => cargo(&folder, &work.join("rust"), program, features)?,
-        Tools::Template => template(&folder, &work)?,
+    let built = match EXAMPLES.iter().find(|(known, _)| *known == name_of_folder) {
+        Some((_, Tools::Cmake)) => by_cmake(&folder, &work.join(name), is_second)?,
+        Some((_, Tools::Cargo(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
+        None => template(&workspace::root().join("examples/no-stack"), &work)?,
     };
-    let images = workspace::firmware_dir(BOARD);
-    let image = images.join(format!("example-{}.elf", example.name));
-    fs::create_dir_all(&images)
-        .and_then(|()| fs::copy(&built, &image))
-        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&image)))?;
+    let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", name));
+    files::copy(&built, &image)?;
     report(&image, &BOARD.programs[..1])
 }
 
 /// Builds a folder with CMake; returns the program.
-fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<PathBuf> {
+fn by_cmake(folder: &Path, work: &Path, is_second: bool) -> Outcome<PathBuf> {
+    let (toolchain, version) = if is_second { ("clang", 2) } else { ("arm-none-eabi-gcc", 1) };
     // The folder is deleted first: CMake keeps the compiler and the folders of the previous run.
-    if work.exists() {
-        fs::remove_dir_all(work)
-            .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(work)))?;
-    }
+    files::remove(work)?;
     let toolchain = workspace::root().join("examples/c/cmake").join(toolchain).with_extension("cmake");
     let mut configure = Command::new("cmake");
     configure.arg("-S").arg(folder).arg("-B").arg(work);
@@ -155,7 +102,8 @@ fn cmake(folder: &Path, work: &Path, toolchain: &str, version: u32) -> Outcome<P
 }
 
 /// Builds a package; returns the program. All packages share `work`, and so their dependencies.
-fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<PathBuf> {
+fn by_cargo(folder: &Path, work: &Path, program: &str, is_second: bool) -> Outcome<PathBuf> {
+    let features = if is_second { "version-2" } else { "" };
     let mut cargo = process::cargo_on(folder, "build");
     // Cargo looks for the folder's own settings from its current folder.
     cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
@@ -168,14 +116,10 @@ fn cargo(folder: &Path, work: &Path, program: &str, features: &str) -> Outcome<P
 fn template(folder: &Path, work: &Path) -> Outcome<PathBuf> {
     const NAME: &str = "from-template";
     let (tool, version) = GENERATE;
-    let tool = setup::pinned_tool(tool, version, &[])?;
+    let tool = setup::tool(tool, version, &[])?;
     let project = work.join(NAME);
-    if project.exists() {
-        fs::remove_dir_all(&project)
-            .map_err(|error| format!("{} cannot be removed: {error}.", workspace::shown(&project)))?;
-    }
-    fs::create_dir_all(work)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(work)))?;
+    files::remove(&project)?;
+    files::make(work)?;
     let house = workspace::root().display().to_string().replace('\\', "/");
     let mut generate = Command::new(tool);
     // `--no-workspace`: the project is below the repository, but no member of its workspace.
@@ -191,8 +135,7 @@ fn template(folder: &Path, work: &Path) -> Outcome<PathBuf> {
     }
     process::output(&mut generate)?;
     // The versions that the example is tested with; cargo writes the project's name into the copy.
-    fs::copy(folder.join("Cargo.lock"), project.join("Cargo.lock"))
-        .map_err(|error| format!("{} cannot be written to: {error}.", workspace::shown(&project)))?;
+    files::copy(&folder.join("Cargo.lock"), &project.join("Cargo.lock"))?;
     let mut cargo = process::cargo_on(&project, "build");
     cargo.current_dir(&project).args(["--release", "--target-dir"]).arg(work.join("rust"));
     process::output(&mut cargo)?;
@@ -205,36 +148,24 @@ mod tests {
 
     use super::*;
 
-    /// The numbers in the repository's files are those of the board.
+    /// The memory map and the interrupt lines in the files of an example by CMake are the board's.
     #[test]
-    fn the_memory_maps_of_the_examples_are_up_to_date() {
+    fn the_numbers_of_the_examples_are_up_to_date() {
         let map = BOARD.linker_script(Image::Program(1)).to_string();
-        for example in EXAMPLES.iter().filter(|example| matches!(example.tools, Tools::Cmake { .. })) {
-            let path = workspace::root().join("examples").join(example.folder).join("layout.x");
-            let line = format!(
-                "cargo xtask layout --ld program-1 --board {} > {}",
-                BOARD.board,
-                workspace::shown(&path)
-            );
-            assert!(fs::read_to_string(&path).unwrap() == map, "{} is old: {line}", path.display());
-        }
-    }
-
-    /// The interrupt lines that a CMakeLists.txt names are the chip's.
-    #[test]
-    fn the_examples_name_the_interrupt_lines_of_the_chip() {
-        for example in EXAMPLES.iter().filter(|example| matches!(example.tools, Tools::Cmake { .. })) {
-            let path = workspace::root().join("examples").join(example.folder).join("CMakeLists.txt");
-            let line = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
-            assert!(fs::read_to_string(&path).unwrap().contains(&line), "{}: {line}", path.display());
+        let lines = format!("set(INTERRUPT_LINES {} ", BOARD.chip.interrupts);
+        for folder in ["examples/c", "examples/cpp"].map(Path::new) {
+            let file = folder.join("layout.x");
+            let command = "cargo xtask layout --ld program-1 --board";
+            let mend = format!("{command} {} > {}", BOARD.board, file.display());
+            assert!(files::ours(&file).unwrap() == map, "{} is old: {mend}", file.display());
+            assert!(files::ours(folder.join("CMakeLists.txt")).unwrap().contains(&lines), "{lines}");
         }
     }
 
     /// Each file of the template is the example's, with the answers that fit the example.
     #[test]
     fn the_template_is_the_example() {
-        let folder = workspace::root().join("examples/no-stack");
-        let read = |file: &str| fs::read_to_string(folder.join(file)).unwrap();
+        let read = |file: &str| files::ours(Path::new("examples/no-stack").join(file)).unwrap();
         for file in ["Cargo.toml", "src/identity.rs"] {
             let mut text = read(&format!("{file}.liquid"));
             // The crates of coboot from a folder, not from a git repository.
@@ -258,8 +189,7 @@ mod tests {
     /// The boards that the template offers exist, and have the chip of its program.
     #[test]
     fn the_template_offers_boards_that_there_are() {
-        let path = workspace::root().join("examples/no-stack/cargo-generate.toml");
-        let text = fs::read_to_string(path).unwrap();
+        let text = files::ours("examples/no-stack/cargo-generate.toml").unwrap();
         let choices = text.lines().find_map(|line| line.strip_prefix("choices = ")).unwrap();
         let names: Vec<_> = choices.split('"').skip(1).step_by(2).collect();
         assert_eq!(names.first(), Some(&BOARD.board));
@@ -269,15 +199,11 @@ mod tests {
     }
 
     #[test]
-    fn the_help_lists_every_example_and_each_has_its_page() {
-        for example in EXAMPLES {
-            let listed = HELP.lines().any(|line| line.trim_start().split(' ').next() == Some(example.name));
-            assert!(listed, "{}", example.name);
-            let page = workspace::root().join("examples").join(example.folder).join("README.md");
+    fn each_example_has_its_page() {
+        for (folder, _) in &EXAMPLES {
+            let page = workspace::root().join("examples").join(folder).join("README.md");
             assert!(page.exists(), "{}", page.display());
-            assert!(by_name(example.name).is_ok_and(|found| found.folder == example.folder));
         }
-        let unknown = by_name("cmake");
-        assert!(unknown.is_err_and(|problem| problem.contains("there are: c, c-v2, cpp, cpp-v2, ")));
+        assert_eq!(names().take(3).collect::<Vec<_>>(), ["c", "c-v2", "cpp"]);
     }
 }

@@ -2,9 +2,8 @@
 //! table, its picture, and what docs/bench.md has measured.
 
 use std::fmt::Write;
-use std::fs;
 
-use crate::{workspace, Outcome};
+use crate::{files, Outcome};
 
 /// Bits of a frame with 8 bytes of data: 111 with the intermission, and stuff bits as code has
 /// them on average.
@@ -91,7 +90,7 @@ struct Measured {
 
 /// The rows of docs/bench.md for fleets: boards, way, block size, lost frames, seconds.
 fn measured() -> Outcome<Vec<Measured>> {
-    let page = read("docs/bench.md")?;
+    let page = files::ours("docs/bench.md")?;
     let row = |line: &str| {
         let line = line.replace("one by one", "one-by-one").replace("1 in ", "");
         let words: Vec<&str> = line.split_whitespace().collect();
@@ -109,16 +108,9 @@ fn measured() -> Outcome<Vec<Measured>> {
     Ok(rows)
 }
 
-fn read(file: &str) -> Outcome<String> {
-    let path = workspace::root().join(file);
-    fs::read_to_string(&path).map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&path)))
-}
-
-const WAYS: [(Way, &str, &str); 3] = [
-    (Way::InTurn, "one after the other", "#9ca3af"),
-    (Way::OneByOne, "at the same time", "#2563eb"),
-    (Way::Together, "together", "#dc2626"),
-];
+/// The ways with their colours.
+const WAYS: [(Way, &str); 3] =
+    [(Way::InTurn, "#9ca3af"), (Way::OneByOne, "#2563eb"), (Way::Together, "#dc2626")];
 
 fn clock(seconds: f64) -> String {
     let seconds = seconds.round() as u32;
@@ -147,7 +139,7 @@ fn table() -> String {
     for bit_rate in RATES {
         for devices in COUNTS {
             let _ = write!(table, "| {} | {devices} |", bit_rate / 1e3);
-            for (way, ..) in WAYS {
+            for (way, _) in WAYS {
                 let of = |lost| {
                     clock(Case { way, devices, bit_rate, kib: 256.0, block: way.block(), lost }.seconds())
                 };
@@ -161,7 +153,7 @@ fn table() -> String {
 
 #[test]
 fn the_page_has_the_table_of_the_model() {
-    let page = read("docs/fleet.md").unwrap();
+    let page = files::ours("docs/fleet.md").unwrap();
     assert!(page.contains(&table()), "docs/fleet.md has another table than:\n{}", table());
 }
 
@@ -181,8 +173,8 @@ fn the_model_fits_what_was_measured() {
 /// are where they were measured.
 #[test]
 fn the_picture_has_the_model_and_what_was_measured() {
-    let picture = read("docs/diagrams/fleet.svg").unwrap();
-    for (way, _, colour) in WAYS {
+    let picture = files::ours("docs/diagrams/fleet.svg").unwrap();
+    for (way, colour) in WAYS {
         for lost in [0.0, 1e-3] {
             let case = |devices| Case { way, devices, bit_rate: 1e6, kib: 256.0, block: way.block(), lost };
             let [from, to] = [1.0, 94.0].map(|devices| {

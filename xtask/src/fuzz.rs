@@ -1,7 +1,6 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
 use std::collections::VecDeque;
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Mutex, PoisonError};
@@ -11,19 +10,14 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, process, setup, workspace, Outcome};
+use crate::{corpus, evidence, files, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
 
-Runs the fuzz targets of tests/fuzz: SDO server, SDO client, the wire between them, LSS, debugger interface,
-program download by blocks and in one piece,
-downloads that go on behind a cut, with both SDO servers, the checks of coflash conform,
-parameter journal, firmware files, candump logs, the text of SLCAN and socketcand, job and
-configuration files, requests to coflash ui, sealed images, as files and as they arrive, with their
-signatures and their compression; as many at a time as there are cores. What they find in this run is
-built upon in the next one.
-The counts of a run of all targets go to target/evidence/fuzz.json.
+Runs the fuzz targets of tests/fuzz/fuzz_targets, as many at a time as there are cores. What they find
+in this run is built upon in the next one. The counts of a run of all targets go to
+target/evidence/fuzz.json.
 
   --seconds N     how long each target runs (default: 30)
   --inputs N      how many inputs each target tries, in place of a time
@@ -57,14 +51,12 @@ const COMMANDS: [(&str, u32); 9] = [
     ("signature", 512),
     ("streams", 1024),
 ];
-/// The feature for sealed images.
-const SEALED: &str = "sealed";
-/// The targets that need it.
-const SEALED_TARGETS: [&str; 1] = ["sealed_stream"];
+/// The target that needs the feature for sealed images.
+const SEALED: &str = "sealed_stream";
 /// The features of a target.
 fn features(target: &str) -> &'static str {
-    if SEALED_TARGETS.contains(&target) {
-        SEALED
+    if target == SEALED {
+        "sealed"
     } else {
         ""
     }
@@ -85,14 +77,13 @@ fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
         build
     };
     process::run(build().arg("--bins"))?;
-    // Only those: the others would be replaced by what they are with the feature.
-    let sealed = SEALED_TARGETS.iter().flat_map(|target| ["--bin", target]);
-    process::run(build().args(["--features", SEALED]).args(sealed))?;
+    // Only that one: the others would be replaced by what they are with the feature.
+    process::run(build().args(["--features", features(SEALED), "--bin", SEALED]))?;
     for target in targets {
         let mut program = Command::new(programs.join("debug").join(target));
         // They are unpacked anew: a name may have gone.
         let kept = target_dir().join("kept").join(target);
-        let _ = fs::remove_dir_all(&kept);
+        files::remove(&kept)?;
         program.arg(corpus::unpack(&kept_file(target), kept)?);
         let found = found(target);
         program.args(found.is_dir().then_some(found));
@@ -118,11 +109,13 @@ fn folder() -> PathBuf {
 }
 
 pub fn run(mut args: Args) -> Outcome {
-    let (seconds, inputs) = (args.value("--seconds")?, args.value("--inputs")?);
-    if seconds.is_some() && inputs.is_some() {
-        return Err("--seconds and --inputs do not go together.".into());
-    }
-    let (seconds, inputs) = (self::seconds(seconds)?, self::inputs(inputs)?);
+    // The fuzzer would run without end with 0.
+    let most = i32::MAX as u64;
+    let end = match (args.number("--seconds", 1..=most)?, args.number("--inputs", 1..=most)?) {
+        (Some(_), Some(_)) => return Err("--seconds and --inputs do not go together.".into()),
+        (None, Some(inputs)) => format!("-runs={inputs}"),
+        (seconds, None) => format!("-max_total_time={}", seconds.unwrap_or(30)),
+    };
     let only = args.value("--target")?;
     let (keep, replay) = (args.flag("--keep"), args.flag("--replay"));
     args.none_left()?;
@@ -143,29 +136,22 @@ pub fn run(mut args: Args) -> Outcome {
         return replay_all(&folder, &targets);
     }
     toolchain()?;
-    let tools = Tools { path: setup::tool("cargo-fuzz", CARGO_FUZZ)? };
+    let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
     println!("Building the fuzz targets ...");
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let end = match inputs {
-        Some(inputs) => format!("-runs={inputs}"),
-        None => format!("-max_total_time={seconds}"),
-    };
     let queue = Mutex::new(VecDeque::from(targets));
     let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
     let all = || {
         let mut ended = Vec::new();
         while let Some(target) = next() {
-            let counts = tools.fuzz(&target, &end)?;
-            if let Some([runs, seconds, ..]) = counts {
-                println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-                if keep {
-                    process::output(tools.command("cmin", &target).arg(found(&target)))?;
-                    corpus::keep(&found(&target), &kept_file(&target))?;
-                }
+            let row = tools.fuzz(&target, &end)?;
+            if keep && !is_failed(&row) {
+                process::output(tools.command("cmin", &target).arg(found(&target)))?;
+                corpus::keep(&found(&target), &kept_file(&target))?;
             }
-            ended.push((target, counts));
+            ended.push(row);
         }
         Outcome::Ok(ended)
     };
@@ -180,11 +166,11 @@ pub fn run(mut args: Args) -> Outcome {
         workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
     })?
     .concat();
-    ended.sort();
-    let is_failed = |(target, counts): &(String, Option<_>)| counts.is_none().then(|| target.clone());
-    let failed: Vec<String> = ended.iter().filter_map(is_failed).collect();
+    ended.sort_by_key(|row| row["target"].to_string());
+    let failed: Vec<_> =
+        ended.iter().filter(|row| is_failed(row)).map(|row| row["target"].to_string()).collect();
     if is_whole {
-        evidence::record("fuzz", counted(&ended, failed.len()))?;
+        evidence::record("fuzz", counted(&ended))?;
     }
     if failed.is_empty() {
         Ok(())
@@ -197,32 +183,30 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
+/// Whether a target has failed, of which a run has this row.
+fn is_failed(row: &Value) -> bool {
+    row["inputs"].is_null()
+}
+
 /// What a run has counted: the facts of the evidence.
-fn counted(ended: &[(String, Option<[u64; 4]>)], failed: usize) -> Value {
-    let rows = ended.iter().filter_map(|(target, counts)| {
-        let [inputs, seconds, edges, corpus] = (*counts)?;
-        Some(
-            json!({"target": target, "inputs": inputs, "seconds": seconds, "edges": edges, "corpus": corpus}),
-        )
-    });
-    let inputs: Vec<u64> = ended.iter().filter_map(|(_, counts)| Some((*counts)?[0])).collect();
+fn counted(rows: &[Value]) -> Value {
+    let inputs: Vec<u64> = rows.iter().filter_map(|row| row["inputs"].as_u64()).collect();
     json!({
         "inputs": inputs.iter().sum::<u64>(),
         "fewest_of_a_target": inputs.iter().min(),
-        "failed": failed,
-        "targets": rows.collect::<Vec<_>>(),
+        "failed": rows.len() - inputs.len(),
+        "targets": rows,
     })
 }
 
-/// The PATH with cargo-fuzz.
 struct Tools {
-    path: OsString,
+    cargo_fuzz: PathBuf,
 }
 
 impl Tools {
     fn command(&self, word: &str, target: &str) -> Command {
         let mut command = Command::new("rustup");
-        command.args(["run", "nightly", "cargo", "fuzz", word]);
+        command.args(["run", "nightly"]).arg(&self.cargo_fuzz).args(["fuzz", word]);
         // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
         command.arg("--sanitizer=none").arg("--fuzz-dir").arg(folder());
         // Each of the two is built with options of its own.
@@ -232,17 +216,17 @@ impl Tools {
             programs.push("without-compares");
         }
         command.args(["--features", features(target), target]).current_dir(workspace::root());
-        command.env("PATH", &self.path).env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
+        command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
         command
     }
 
-    /// Runs a target until this end: an option of the fuzzer. Returns inputs, seconds, edges and the
-    /// files in the corpus; `None`, and prints why, if it failed.
-    fn fuzz(&self, target: &str, end: &str) -> Outcome<Option<[u64; 4]>> {
+    /// Runs a target until this end: an option of the fuzzer. Prints and returns what it has counted;
+    /// why it failed, if it did.
+    fn fuzz(&self, target: &str, end: &str) -> Outcome<Value> {
         // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
         let corpus = corpus::unpack(&kept_file(target), found(target))?;
         let log = target_dir().join(target).with_extension("log");
-        let file = fs::File::create(&log).map_err(|error| unwritable(&log, &error))?;
+        let file = fs::File::create(&log).map_err(|error| format!("{}: {error}.", log.display()))?;
         let mut command = self.command("run", target);
         command.arg(&corpus);
         let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
@@ -253,62 +237,30 @@ impl Tools {
         let status = command.status().map_err(|error| process::not_started(&command, &error))?;
         let said = fs::read(&log).unwrap_or_default();
         let said = String::from_utf8_lossy(&said);
-        match (status.success(), runs(&said)) {
-            (true, Some(runs @ 1..)) => {
-                let files = fs::read_dir(&corpus).map_or(0, |files| files.count() as u64);
-                Ok(Some([runs, started.elapsed().as_secs(), edges(&said).unwrap_or(0), files]))
-            }
-            (good, _) => {
-                let words = if good { "ran no input" } else { "FAILED" };
-                println!(
-                    "  {target:<16} {words}; all of it is in {}\n{}",
-                    workspace::shown(&log),
-                    excerpt(&said)
-                );
-                Ok(None)
-            }
+        let runs = runs(&said).filter(|runs| status.success() && *runs > 0);
+        if let Some(runs) = runs {
+            let seconds = started.elapsed().as_secs();
+            println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+            let files = files::within(&corpus)?.len();
+            return Ok(
+                json!({"target": target, "inputs": runs, "seconds": seconds, "edges": edges(&said), "corpus": files}),
+            );
         }
-    }
-}
-
-fn seconds(value: Option<String>) -> Outcome<u32> {
-    let Some(value) = value else { return Ok(30) };
-    // The fuzzer would run without end with 0.
-    match value.parse() {
-        Ok(seconds @ 1..) => Ok(seconds),
-        _ => Err(format!("--seconds takes a number from 1 on, not \"{value}\".")),
-    }
-}
-
-fn inputs(value: Option<String>) -> Outcome<Option<u64>> {
-    let Some(value) = value else { return Ok(None) };
-    match value.parse() {
-        Ok(inputs @ 1..) => Ok(Some(inputs)),
-        _ => Err(format!("--inputs takes a number from 1 on, not \"{value}\".")),
+        let words = if status.success() { "ran no input" } else { "FAILED" };
+        println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
+        Ok(json!({"target": target}))
     }
 }
 
 /// The targets, from the names of their files.
 fn targets(folder: &Path) -> Outcome<Vec<String>> {
-    let folder = folder.join("fuzz_targets");
-    let files = fs::read_dir(&folder)
-        .map_err(|error| format!("{} cannot be read: {error}.", workspace::shown(&folder)))?;
-    let mut names: Vec<String> = files
-        .flatten()
-        .map(|file| file.path())
-        .filter(|path| path.extension().is_some_and(|extension| extension == "rs"))
-        .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
-        .collect();
-    names.sort();
-    Ok(names)
+    let mut sources = files::within(&folder.join("fuzz_targets"))?;
+    sources.retain(|file| files::is(file, "rs"));
+    Ok(sources.iter().filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned())).collect())
 }
 
 fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
-}
-
-fn unwritable(path: &Path, error: &std::io::Error) -> String {
-    format!("{} cannot be written: {error}.", workspace::shown(path))
 }
 
 /// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
@@ -341,19 +293,11 @@ fn edges(said: &str) -> Option<u64> {
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
 /// the input.
 fn excerpt(said: &str) -> String {
-    let mut text = String::new();
-    let mut more = 0;
-    for line in said.lines() {
-        if line.contains("panicked at") || line.contains("ERROR: libFuzzer") {
-            more = 4;
-        }
-        let input = line.contains("Test unit written to");
-        if more > 0 || input {
-            text += &format!("    {line}\n");
-        }
-        more -= i32::from(more > 0);
-    }
-    text
+    let begin = ["panicked at", "ERROR: libFuzzer"];
+    let lines = said.lines().skip_while(|line| !begin.iter().any(|words| line.contains(words)));
+    let (text, rest): (Vec<_>, Vec<_>) = lines.enumerate().partition(|(number, _)| *number < 8);
+    let input = rest.into_iter().filter(|(_, line)| line.contains("Test unit written to"));
+    text.into_iter().chain(input).map(|(_, line)| format!("    {line}\n")).collect()
 }
 
 #[cfg(test)]
@@ -377,17 +321,6 @@ mod tests {
         }
     }
 
-    #[test]
-    fn a_time_is_a_number_from_one_on() {
-        assert_eq!(seconds(None), Ok(30));
-        assert_eq!(seconds(Some("5".into())), Ok(5));
-        assert_eq!((inputs(None), inputs(Some("10000000".into()))), (Ok(None), Ok(Some(10_000_000))));
-        for wrong in ["0", "-1", "x", "", "1.5"] {
-            assert!(seconds(Some(wrong.into())).is_err(), "{wrong}");
-            assert!(inputs(Some(wrong.into())).is_err(), "{wrong}");
-        }
-    }
-
     /// Lines as libFuzzer prints them.
     #[test]
     fn the_fuzzers_words_are_understood() {
@@ -403,10 +336,13 @@ mod tests {
 
     #[test]
     fn counts_add_up_over_the_targets() {
-        let of = |target: &str, counts| (target.to_owned(), counts);
-        let ended = [of("lss", Some([10, 2, 700, 30])), of("lzma", None), of("ui", Some([5, 1, 60, 7]))];
-        let facts = counted(&ended, 1);
+        let rows = [
+            json!({"target": "lss", "inputs": 10}),
+            json!({"target": "lzma"}),
+            json!({"target": "ui", "inputs": 5}),
+        ];
+        let facts = counted(&rows);
         assert_eq!((&facts["inputs"], &facts["fewest_of_a_target"]), (&json!(15), &json!(5)));
-        assert_eq!((&facts["failed"], &facts["targets"][1]["edges"]), (&json!(1), &json!(60)));
+        assert_eq!((&facts["failed"], &facts["targets"][0]["target"]), (&json!(1), &json!("lss")));
     }
 }

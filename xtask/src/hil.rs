@@ -6,22 +6,19 @@
 mod bench;
 mod coflash;
 mod command;
-mod power;
-mod probe;
-mod report;
 mod steps;
 
-use std::fs;
+use std::path::Path;
 use std::time::Instant;
+
+use serde_json::{json, Value};
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, workspace, Outcome};
-use bench::Bench;
+use crate::{build, files, process, workspace, Outcome};
+use bench::{Bench, Done};
 use coflash::Coflash;
-use power::Power;
-use probe::Probe;
-use report::{Line, Report, Verdict};
+use command::CommandLine;
 
 pub const HELP: &str = "\
 usage: cargo xtask hil --bus URL [--board BOARD] [--probe COMMAND] [--power-command COMMAND] [--node N]
@@ -46,78 +43,68 @@ the main job and the update suite on its CAN bus. Programs that are in the board
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let bus = args.value("--bus")?.ok_or("--bus is missing: name the bus, for example socketcan:can0.")?;
-    let node = node(args.value("--node")?)?;
-    let probe = Probe::new(args.value("--probe")?.as_deref(), board)?;
-    let power = args.value("--power-command")?.map(|line| Power::new(&line)).transpose()?;
-    let json = args.value("--json")?;
+    let node = args.number("--node", 1..=127)?.unwrap_or(1);
+    let probe = args.value("--probe")?.unwrap_or("probe-rs {action} --chip {chip} {elf}".into());
+    let probe = CommandLine::new("--probe", &probe)?;
+    let power = args.value("--power-command")?;
+    if power.as_ref().is_some_and(|line| !line.contains("{state}")) {
+        return Err("--power-command needs {state}; on and off stand in its place.".into());
+    }
+    let power = power.map(|line| CommandLine::new("--power-command", &line)).transpose()?;
+    let report = args.value("--json")?;
     let setup = Setup::from(&mut args);
     args.none_left()?;
-    // The build takes minutes; a program that is missing is reported before.
-    probe.is_there()?;
-    if let Some(power) = &power {
-        power.is_there()?;
-    }
     setup.prepare(&[Part::Firmware])?;
 
     let started = Instant::now();
-    build::images(board, &build::MAIN)?;
+    let images = build::images(board, &build::MAIN)?;
     process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
-    let mut report = Report::new(board.board, &bus, node);
-    report.take(Line {
-        name: "build the images and coflash",
-        verdict: Verdict::Passed(workspace::shown(&workspace::firmware_dir(board))),
-        seconds: started.elapsed().as_secs_f64(),
-    });
-
+    let built = Done::Passed(workspace::shown(&images));
+    let mut lines = vec![line("build the images and coflash", started, Ok(built))];
     let work = workspace::target_dir().join("hil").join(board.board);
-    fs::create_dir_all(&work).map_err(|error| format!("{}: {error}.", workspace::shown(&work)))?;
-    let images = workspace::firmware_dir(board);
-    let coflash = Coflash::new(bus, node);
+    let coflash = Coflash { bus, node };
     let mut bench = Bench { board, probe, power, coflash, images, work, installed: None, conform: None };
-    play(&mut bench, &mut report);
-
-    report.conform = bench.conform;
-    print!("{}", report.summary());
-    if let Some(file) = json {
-        fs::write(&file, format!("{:#}\n", report.json()))
-            .map_err(|error| format!("{file} cannot be written: {error}."))?;
-    }
-    report.outcome()
-}
-
-/// Carries out all steps. Those after a failed step that they rest on are left out.
-fn play(bench: &mut Bench, report: &mut Report) {
     let mut stopped_by = None;
     for step in steps::STEPS {
         let started = Instant::now();
-        let verdict = match stopped_by {
-            Some(name) => Verdict::LeftOut(format!("\"{name}\" failed")),
-            None => (step.run)(bench).unwrap_or_else(Verdict::Failed),
+        let ended = match stopped_by {
+            Some(name) => Ok(Done::LeftOut(format!("\"{name}\" failed"))),
+            None => (step.run)(&mut bench),
         };
-        if step.others_need_it && matches!(verdict, Verdict::Failed(_)) {
+        if step.others_need_it && ended.is_err() {
             stopped_by = Some(step.name);
         }
-        report.take(Line { name: step.name, verdict, seconds: started.elapsed().as_secs_f64() });
+        lines.push(line(step.name, started, ended));
+    }
+    let count = |outcome: &str| lines.iter().filter(|line| line["outcome"] == outcome).count();
+    let failed = count("failed");
+    println!("{} passed, {failed} failed, {} left out", count("passed"), count("left out"));
+    if let Some(file) = report {
+        let report = json!({
+            "board": board.board,
+            "bus": bench.coflash.bus,
+            "node": node,
+            "passed": failed == 0,
+            "steps": lines,
+            "conform": bench.conform,
+        });
+        files::write(Path::new(&file), format!("{report:#}\n"))?;
+    }
+    match failed {
+        0 => Ok(()),
+        1 => Err("1 step failed; its line above says what to do.".into()),
+        failed => Err(format!("{failed} steps failed; their lines above say what to do.")),
     }
 }
 
-/// The node-ID; 1 if none is given.
-fn node(text: Option<String>) -> Outcome<u8> {
-    let Some(text) = text else { return Ok(1) };
-    let number = text.parse().ok().filter(|number| (1..=127).contains(number));
-    number.ok_or_else(|| format!("--node {text}: a node-ID is a number from 1 to 127."))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_node_id_is_1_to_127() {
-        assert_eq!(node(None), Ok(1));
-        assert_eq!(node(Some("127".into())), Ok(127));
-        for wrong in ["0", "128", "x", "-1", ""] {
-            assert!(node(Some(wrong.into())).unwrap_err().contains("1 to 127"), "{wrong}");
-        }
-    }
+/// Prints how a step ended; returns it for the report.
+fn line(name: &str, started: Instant, ended: Outcome<Done>) -> Value {
+    let (outcome, text) = match ended {
+        Ok(Done::Passed(text)) => ("passed", text),
+        Ok(Done::LeftOut(text)) => ("left out", text),
+        Err(text) => ("failed", text),
+    };
+    let seconds = (started.elapsed().as_secs_f64() * 10.0).round() / 10.0;
+    println!("{outcome:<8} {seconds:>6} s  {name}  {text}");
+    json!({"step": name, "outcome": outcome, "text": text, "seconds": seconds})
 }

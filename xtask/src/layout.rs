@@ -47,11 +47,10 @@ fn image_by_name(board: &Layout, name: &str) -> Outcome<Image> {
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
-
     use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
     use super::*;
+    use crate::files;
 
     #[test]
     fn an_image_is_chosen_by_name_and_only_one_that_exists() {
@@ -65,7 +64,7 @@ mod tests {
     /// The map in the README is the one that `cargo xtask layout` prints.
     #[test]
     fn the_readme_shows_the_map_as_it_is() {
-        let readme = fs::read_to_string(workspace::root().join("README.md")).unwrap();
+        let readme = files::ours("README.md").unwrap();
         let (_, behind) =
             readme.split_once("<!-- memory map: `cargo xtask layout` prints it -->\n\n```text\n").unwrap();
         let (copy, _) = behind.split_once("```").unwrap();
@@ -78,7 +77,7 @@ mod tests {
     /// The block in the guide for applications can be linked unchanged: it is the printed one.
     #[test]
     fn the_guide_shows_the_linker_block_as_it_is() {
-        let guide = fs::read_to_string(workspace::root().join("docs/application.md")).unwrap();
+        let guide = files::ours("docs/application.md").unwrap();
         let command = "cargo xtask layout --ld program-1 --board stm32f407g-disc1";
         let (_, behind) = guide.split_once(&format!("<!-- printed by: {command} -->\n```text\n")).unwrap();
         let (copy, _) = behind.split_once("```").unwrap();

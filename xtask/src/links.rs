@@ -1,10 +1,9 @@
 //! The links of the pages: each must lead to a file of the repository, and to an existing heading.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::{Component, Path, PathBuf};
 
-use crate::{workspace, Outcome};
+use crate::{files, workspace, Outcome};
 
 /// The pages outside `docs/` and `examples/`.
 pub const ELSEWHERE: [&str; 6] = [
@@ -29,67 +28,33 @@ pub struct Link {
 
 /// Every page, as a path from the root of the repository: all in `docs/`, the README of each
 /// example, and those of [`ELSEWHERE`].
-///
-/// # Errors
-/// When a folder cannot be read.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
-    let mut pages: Vec<PathBuf> = ELSEWHERE.iter().map(PathBuf::from).collect();
-    for example in within(Path::new("examples"))? {
-        let page = example.join("README.md");
-        if workspace::root().join(&page).is_file() {
-            pages.push(page);
-        }
-    }
-    let mut folders = vec![PathBuf::from("docs")];
-    while let Some(folder) = folders.pop() {
-        for name in within(&folder)? {
-            if workspace::root().join(&name).is_dir() {
-                folders.push(name);
-            } else if name.extension().is_some_and(|extension| extension == "md") {
-                pages.push(name);
-            }
-        }
-    }
+    let root = workspace::root();
+    let mut pages = files::below(&root.join("docs"), &[])?;
+    pages.retain(|page| files::is(page, "md"));
+    let examples =
+        files::within(&root.join("examples"))?.into_iter().map(|example| example.join("README.md"));
+    pages.extend(examples.filter(|page| page.is_file()));
+    let from_the_root = pages.iter().map(|page| page.strip_prefix(root).unwrap_or(page).to_owned());
+    let mut pages: Vec<PathBuf> = from_the_root.chain(ELSEWHERE.map(PathBuf::from)).collect();
     pages.sort();
     Ok(pages)
 }
 
-/// The files in a folder, as paths from the root of the repository.
-fn within(folder: &Path) -> Outcome<Vec<PathBuf>> {
-    let entries = fs::read_dir(workspace::root().join(folder))
-        .map_err(|error| format!("{} cannot be read: {error}.", folder.display()))?;
-    Ok(entries.flatten().map(|entry| folder.join(entry.file_name())).collect())
-}
-
-/// The text of a page.
-///
-/// # Errors
-/// When it cannot be read.
-pub fn text(page: &Path) -> Outcome<String> {
-    fs::read_to_string(workspace::root().join(page))
-        .map_err(|error| format!("{} cannot be read: {error}.", page.display()))
-}
-
 /// All links of all pages that stay within the repository.
-///
-/// # Errors
-/// When a page cannot be read.
 pub fn all() -> Outcome<Vec<Link>> {
     let mut links = Vec::new();
     for page in pages()? {
-        links.extend(of_page(&page, &text(&page)?));
+        links.extend(of_page(&page, &files::ours(&page)?));
     }
     Ok(links)
 }
 
 /// The faults of the pages' links, one a line.
-///
-/// # Errors
-/// When a page cannot be read.
 pub fn faults() -> Outcome<Vec<String>> {
     let mut known: BTreeMap<PathBuf, BTreeSet<String>> = BTreeMap::new();
     for page in pages()? {
-        let headings = headings(&text(&page)?).into_iter().collect();
+        let headings = headings(&files::ours(&page)?).into_iter().collect();
         known.insert(page, headings);
     }
     let fault = |link: &Link| {
@@ -98,8 +63,7 @@ pub fn faults() -> Outcome<Vec<String>> {
             return Some(format!("{}: {shown} is not there, or is no file", link.place));
         }
         // The site has pages only.
-        if link.file.extension().is_some_and(|extension| extension == "md") && !known.contains_key(&link.file)
-        {
+        if files::is(&link.file, "md") && !known.contains_key(&link.file) {
             return Some(format!("{}: {shown} is no page of the site (xtask/src/links.rs)", link.place));
         }
         let heading = link.heading.as_ref()?;
@@ -162,19 +126,14 @@ pub fn plain(path: &Path) -> PathBuf {
 /// digits, `_` and `-` stay, a blank becomes `-`, all else is removed; the second of two equal
 /// names gets `-1` at its end.
 fn headings(text: &str) -> Vec<String> {
-    let mut is_code = false;
     let mut names: Vec<String> = Vec::new();
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
-    for line in text.lines() {
-        if line.trim_start().starts_with("```") {
-            is_code = !is_code;
-        }
+    for line in prose(text).into_iter().map(|(_, parts)| parts.concat()) {
         let level = line.len() - line.trim_start_matches('#').len();
-        let words = line[level..].trim();
-        if is_code || !(1..=6).contains(&level) || !line[level..].starts_with(' ') {
+        if !(1..=6).contains(&level) || !line[level..].starts_with(' ') {
             continue;
         }
-        let kept = words.to_lowercase();
+        let kept = line[level..].trim().to_lowercase();
         let kept = kept.chars().filter(|c| c.is_alphanumeric() || matches!(c, ' ' | '-' | '_'));
         let name: String = kept.map(|c| if c == ' ' { '-' } else { c }).collect();
         let count = seen.entry(name.clone()).or_insert(0);
@@ -222,10 +181,11 @@ mod tests {
     #[test]
     fn every_decision_is_in_their_list() {
         let page = Path::new("docs/decisions.md");
-        let listed: Vec<_> = of_page(page, &text(page).unwrap()).into_iter().map(|link| link.file).collect();
-        let mut decisions = within(Path::new("docs/adr")).unwrap();
-        decisions.sort();
-        assert_eq!(listed, decisions);
+        let listed: Vec<_> =
+            of_page(page, &files::ours(page).unwrap()).into_iter().map(|link| link.file).collect();
+        let decisions = files::within(&workspace::root().join("docs/adr")).unwrap();
+        let from_the_root = decisions.iter().map(|file| file.strip_prefix(workspace::root()).unwrap());
+        assert_eq!(listed, from_the_root.collect::<Vec<_>>());
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, process, product, words, workspace, Outcome};
+use crate::{build, files, process, product, words, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD] [--yes]
@@ -48,9 +48,6 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// Checks the formatting of all files; returns the problems.
-///
-/// # Errors
-/// When the folders of the boards cannot be read.
 pub fn formatting() -> Outcome<Vec<String>> {
     let mut problems = Vec::new();
     if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
@@ -60,7 +57,7 @@ pub fn formatting() -> Outcome<Vec<String>> {
     for folder in build::BOARD_FOLDERS.into_iter().chain([product::FOLDER]) {
         let mut rustfmt = std::process::Command::new("rustfmt");
         rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
-        if process::run(rustfmt.args(build::board_files(folder)?)).is_err() {
+        if process::run(rustfmt.args(files::within(&workspace::root().join(folder))?)).is_err() {
             problems.push(format!("a file in {folder} is not formatted; `rustfmt` on the file does it."));
         }
     }
@@ -75,9 +72,6 @@ pub fn clippy(args: &[impl AsRef<std::ffi::OsStr>]) -> Option<String> {
 }
 
 /// The outcome of several checks.
-///
-/// # Errors
-/// When there is a problem; the message has all.
 pub fn all_good(problems: &[String]) -> Outcome {
     if problems.is_empty() {
         Ok(())

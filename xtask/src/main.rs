@@ -27,6 +27,7 @@ mod elf;
 mod emulate;
 mod evidence;
 mod examples;
+mod files;
 #[cfg(test)]
 mod fleet;
 mod footprint;

@@ -54,6 +54,11 @@ fn module(path: &str) -> Option<Module> {
     Some(parts)
 }
 
+/// A source without its comments, which may name what is not there.
+pub fn without_comments(text: &str) -> String {
+    text.lines().map(|line| line.split("//").next().unwrap_or_default()).collect::<Vec<_>>().join("\n")
+}
+
 /// A source without comments, strings and tests.
 pub fn code(text: &str) -> String {
     let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
@@ -78,8 +83,8 @@ pub fn paths(code: &str) -> Vec<Vec<String>> {
             at += tokens[at..].iter().position(|token| token == ")").unwrap_or(1);
         } else if is_name(&tokens[at]) && next == Some("::") {
             at = tree(&tokens, at, &mut Vec::new(), &mut found);
-        } else if tokens[at] == "use" && next.is_some_and(is_name) {
-            // A single name is a path, too: `use x;`.
+        } else if ["use", "crate"].contains(&&*tokens[at]) && next.is_some_and(is_name) {
+            // A single name is a path, too: `use x;`, `extern crate x;`.
             at = tree(&tokens, at + 1, &mut Vec::new(), &mut found);
         } else {
             at += 1;

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use crate::args::Args;
 use crate::setup::{self, Part, Setup};
-use crate::{coverage, evidence, process, workspace, Outcome};
+use crate::{coverage, evidence, files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [--yes] [OPTIONS]
@@ -44,26 +44,23 @@ pub fn run(mut args: Args) -> Outcome {
     }
     // The tests of sealed images are in the crate that builds the emulator.
     Setup::from(&mut args).prepare(&[Part::Emulator])?;
-    let program = setup::pinned_tool("cargo-mutants", VERSION, &[])?;
+    let program = setup::tool("cargo-mutants", VERSION, &[])?;
     let folder = workspace::target_dir().join("mutants");
-    let unwritable = |error| format!("{} cannot be written: {error}.", workspace::shown(&folder));
-    fs::create_dir_all(&folder).map_err(unwritable)?;
+    files::make(&folder)?;
     let mut options = args.rest();
     // A choice of files or lines is no result of a commit.
     let is_result = options.is_empty() && base.is_none();
     options.extend(shard.iter().map(|shard| format!("--shard={shard}")));
     if let Some(base) = base {
-        let diff = process::output(
-            Command::new("git").current_dir(workspace::root()).args(["diff", &base, "--", "*.rs"]),
-        )?;
-        fs::write(folder.join("change.diff"), diff).map_err(unwritable)?;
-        options.push(format!("--in-diff={}", folder.join("change.diff").display()));
+        let change = folder.join("change.diff");
+        files::write(&change, process::git(&["diff", &base, "--", "*.rs"])?)?;
+        options.push(format!("--in-diff={}", change.display()));
     }
     // Runs cargo-mutants; counts the changes that a test has noticed, and returns the others.
     let mut caught = 0;
     let mut mutants = |package: &str, name: &str, words: &[String]| -> Outcome<Vec<String>> {
         // What an earlier run has left would count.
-        let _ = fs::remove_dir_all(folder.join(name));
+        files::remove(&folder.join(name))?;
         let mut mutants = Command::new(&program);
         mutants.args(["mutants", "--package", package, "--output"]).arg(folder.join(name)).args(words);
         // One crate is built again for each change, and nobody debugs it.

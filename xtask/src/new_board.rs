@@ -1,13 +1,10 @@
 //! `cargo xtask new-board`: creates the three files of a port. It changes no other file.
 
-use std::fs;
-use std::path::Path;
-
 use shared_abi::geometry::{self, Geometry, Line, Region, CHIPS};
 use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
-use crate::{workspace, Outcome};
+use crate::{files, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask new-board NAME --chip CHIP
@@ -35,7 +32,7 @@ pub fn run(mut args: Args) -> Outcome {
         }
     }
     for (path, text) in &files {
-        write(&root.join(path), text)?;
+        files::write(&root.join(path), text)?;
         println!("  new      {path}");
     }
     if chip.line.can_controllers() > 2 {
@@ -46,10 +43,6 @@ pub fn run(mut args: Args) -> Outcome {
          Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test update main_job::"
     );
     Ok(())
-}
-
-fn write(path: &Path, text: &str) -> Outcome {
-    fs::write(path, text).map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(path)))
 }
 
 fn chip_by_name(name: &str) -> Outcome<&'static Geometry> {

@@ -1,12 +1,12 @@
 //! `cargo xtask opinion`: the emulated CPU and board beside ones that others wrote.
 
-use std::fs;
+use std::path::Path;
 
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
 use crate::setup::{Part, Setup};
-use crate::{build, evidence, process, workspace, Outcome};
+use crate::{build, evidence, process, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json] [--yes]
@@ -40,11 +40,9 @@ fn cpu(json: bool) -> Outcome {
         return process::run(&mut test);
     }
     evidence::begin("cpu")?;
-    let result = evidence::file_for("cpu");
-    // A difference is a result, too.
-    let ended = process::run(test.env("COBOOT_CPU_EVIDENCE", &result));
-    let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&result));
-    evidence::record_text("cpu", &fs::read_to_string(&result).map_err(unread)?)?;
+    let run = |file: &Path| process::run(test.env("COBOOT_CPU_EVIDENCE", file));
+    let (facts, ended) = evidence::facts_of("cpu", run)?;
+    evidence::record("cpu", facts)?;
     ended
 }
 

@@ -2,13 +2,14 @@
 //! crates and functions that must not be lost when the rest is moved.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs;
 use std::path::Path;
 
 use serde_json::Value;
 
+use crate::modules::without_comments;
+use crate::process::list;
 use crate::workspace::{self, TARGET};
-use crate::{process, Outcome};
+use crate::{files, process, Outcome};
 
 /// The paths at the top level.
 const TOP_LEVEL: [&str; 6] = ["Cargo.toml", "bootloader", "app-template", "shared-abi", "linker", "tests"];
@@ -44,53 +45,28 @@ struct House {
 }
 
 /// The orders that are not kept, as messages.
-///
-/// # Errors
-/// When the repository cannot be read.
 pub fn broken(metadata: &Value) -> Outcome<Vec<String>> {
     let root = workspace::root();
     let mut house = House::default();
-    for path in TOP_LEVEL {
-        gather(root, path, &mut house.files)?;
+    for path in TOP_LEVEL.map(|path| root.join(path)) {
+        let files = if path.is_dir() { files::below(&path, &[])? } else { vec![path] };
+        for file in files.iter().filter(|file| file.exists()) {
+            let is_source = files::is(file, "rs");
+            let text = if is_source { without_comments(&files::text(file)?) } else { String::new() };
+            let file = file.strip_prefix(root).unwrap_or(file);
+            house.files.insert(file.to_string_lossy().replace('\\', "/"), text);
+        }
     }
-    let mut tree = process::cargo("tree");
-    tree.args(["--package", "bootloader", "--target", TARGET, "--edges", "normal", "--prefix", "none"]);
-    let tree = process::output(&mut tree)?;
-    house.image = tree.lines().filter_map(|line| Some(line.split(' ').next()?.to_owned())).collect();
+    let tree = process::tree(&["--package", "bootloader", "--target", TARGET, "--edges", "normal"])?;
+    house.image = tree.iter().filter_map(|krate| Some(krate.split(' ').next()?.to_owned())).collect();
     house.tests = test_programs(metadata, root);
     Ok(house.broken())
 }
 
-/// Reads a file, or the files below a folder; a path that does not exist has none.
-fn gather(root: &Path, path: &str, files: &mut BTreeMap<String, String>) -> Outcome {
-    let place = root.join(path);
-    if !place.is_dir() {
-        if place.exists() {
-            let is_source = place.extension().is_some_and(|extension| extension == "rs");
-            let text = if is_source { fs::read_to_string(&place) } else { Ok(String::new()) };
-            let text = text.map_err(|error| format!("{path} cannot be read: {error}."))?;
-            files.insert(path.to_owned(), code(&text));
-        }
-        return Ok(());
-    }
-    let entries = fs::read_dir(&place).map_err(|error| format!("{path} cannot be read: {error}."))?;
-    for entry in entries.flatten() {
-        gather(root, &format!("{path}/{}", entry.file_name().to_string_lossy()), files)?;
-    }
-    Ok(())
-}
-
-/// A source without its comments: they may name what is not there.
-fn code(text: &str) -> String {
-    text.lines().map(|line| line.split("//").next().unwrap_or_default()).collect::<Vec<_>>().join("\n")
-}
-
 /// The test programs in the output of `cargo metadata`.
 fn test_programs(metadata: &Value, root: &Path) -> Vec<(String, String)> {
-    let list = |value: &Value, key: &str| value[key].as_array().cloned().unwrap_or_default();
-    let packages = list(metadata, "packages").into_iter();
-    let targets = packages.flat_map(|package| list(&package, "targets"));
-    let tests = targets.filter(|target| list(target, "kind").iter().any(|kind| kind == "test"));
+    let targets = list(metadata, "packages").flat_map(|package| list(package, "targets"));
+    let tests = targets.filter(|target| list(target, "kind").any(|kind| kind == "test"));
     tests
         .filter_map(|target| {
             let source = Path::new(target["src_path"].as_str()?);
@@ -234,7 +210,7 @@ mod tests {
             let mut house = house();
             let file = house.files.get_mut(&format!("{program}/src/main.rs")).unwrap();
             assert!(file.contains(from), "{from}");
-            *file = code(&file.replace(from, to));
+            *file = without_comments(&file.replace(from, to));
             house.broken()
         };
         for program in PROGRAMS {

@@ -1,8 +1,6 @@
 //! `cargo xtask pairs`: builds bootloaders so that every pair of choices of a product is together
 //! in at least one.
 
-use std::fs;
-
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
@@ -10,7 +8,7 @@ use crate::elf::Elf;
 use crate::footprint::Flash;
 use crate::product::Product;
 use crate::setup::{Part, Setup};
-use crate::{build, workspace, Outcome};
+use crate::{build, files, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask pairs [--spread] [--yes]
@@ -79,13 +77,10 @@ pub fn run(mut args: Args) -> Outcome {
     let rows = covering();
     let mut largest = 0;
     let folder = workspace::target_dir().join("pairs");
-    fs::create_dir_all(&folder)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
     for (number, row) in rows.iter().enumerate() {
         println!("{:>2}  {}", number + 1, words(row));
         let path = folder.join(format!("pairs-{:02}.rs", number + 1));
-        fs::write(&path, file(row))
-            .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&path)))?;
+        files::write(&path, file(row))?;
         let product = Product::of_file(&path)?;
         let one = [BOARDS[number % BOARDS.len()]];
         for board in if spread { &one[..] } else { BOARDS } {
@@ -127,22 +122,7 @@ fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
 /// The fields that differ from their default.
 fn words(row: &Row) -> String {
     let others = FIELDS.iter().zip(row).filter(|(_, value)| **value > 0);
-    let words: Vec<_> = others
-        .map(
-            |((name, values), value)| {
-                if values.len() > 2 {
-                    format!("{name}={value}")
-                } else {
-                    (*name).to_owned()
-                }
-            },
-        )
-        .collect();
-    if words.is_empty() {
-        "the default".to_owned()
-    } else {
-        words.join(" ")
-    }
+    others.map(|((name, _), value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
 }
 
 /// Whether a product may have these choices (`Product::checked`): a rescue window delays a program

@@ -1,37 +1,14 @@
 //! The paths on the pages: a path in backticks is that of a file or a folder of the repository.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::{links, workspace};
+use crate::{files, links, workspace};
 
 /// Folders without our files, and pages about the past, which use old names.
 const FOREIGN: [&str; 4] = ["target", ".git", "node_modules", "adr"];
 /// Files that are not in the repository: those of a user, of a package, and what a job makes.
-const ELSEWHERE: [&str; 5] = [
-    "coflash/coflash.toml",
-    ".vscode/launch.json",
-    "udev/70-coflash.rules",
-    "docs/evidence.md",
-    "build/app.elf",
-];
-
-/// Every file of the repository outside [`FOREIGN`], as a path from its root.
-fn files() -> Vec<PathBuf> {
-    let root = workspace::root();
-    let (mut files, mut folders) = (Vec::new(), vec![root.to_owned()]);
-    while let Some(folder) = folders.pop() {
-        for entry in fs::read_dir(folder).unwrap().flatten() {
-            let path = entry.path();
-            if !path.is_dir() {
-                files.push(path.strip_prefix(root).unwrap().to_owned());
-            } else if !FOREIGN.iter().any(|name| path.ends_with(name)) {
-                folders.push(path);
-            }
-        }
-    }
-    files
-}
+const ELSEWHERE: [&str; 4] =
+    ["coflash/coflash.toml", ".vscode/launch.json", "udev/70-coflash.rules", "build/app.elf"];
 
 /// The word as a path, if it is one: with a slash and a small letter, and without a blank. What
 /// `cargo` and CMake build is none.
@@ -66,11 +43,13 @@ fn is_there(path: &str, page: &Path, files: &[PathBuf]) -> bool {
 
 #[test]
 fn paths_on_the_pages_are_those_of_files() {
-    let files = files();
+    let root = workspace::root();
+    let files = files::below(root, &FOREIGN).unwrap();
+    let files: Vec<_> = files.iter().map(|file| file.strip_prefix(root).unwrap().to_owned()).collect();
     let mut faults = Vec::new();
     let mut count = 0;
-    for page in files.iter().filter(|file| file.extension().is_some_and(|extension| extension == "md")) {
-        let text = links::text(page).unwrap();
+    for page in files.iter().filter(|file| files::is(file, "md")) {
+        let text = files::ours(page).unwrap();
         for (number, parts) in links::prose(&text) {
             for path in parts.into_iter().skip(1).step_by(2).filter_map(path_of) {
                 count += 1;

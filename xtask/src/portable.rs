@@ -47,12 +47,13 @@ pub fn run(mut args: Args) -> Outcome {
             }
         }
     }
-    match (&broken[..], &left_out[..]) {
-        ([], []) => Ok(()),
-        ([], missing) if strict => Err(format!("left out: {}.", missing.join(", "))),
-        ([], _) => Ok(()),
-        (broken, _) => Err(format!("does not compile for {}.", broken.join(", "))),
+    if !broken.is_empty() {
+        return Err(format!("does not compile for {}.", broken.join(", ")));
     }
+    if strict && !left_out.is_empty() {
+        return Err(format!("left out: {}.", left_out.join(", ")));
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! `cargo xtask powercut`: tests that no power cut bricks a device.
 
-use std::fs;
+use std::path::Path;
 use std::process::Command;
 
 use serde_json::json;
@@ -37,33 +37,27 @@ pub fn run(mut args: Args) -> Outcome {
     let point = args.value("--reproduce")?;
     args.none_left()?;
     setup.prepare(&[Part::Firmware, Part::Emulator])?;
-    let point = point.map(|point| ["--reproduce".to_owned(), point]);
-    let only: Vec<String> = [full.then(|| "--full".to_owned()), every_way.then(|| "--every-way".to_owned())]
-        .into_iter()
-        .flatten()
-        .chain(point.iter().flatten().cloned())
-        .collect();
-    if point.is_some() {
-        return process::run(&mut command(board, &only)?);
+    if let Some(point) = point {
+        return process::run(&mut command(board, &["--reproduce", &point])?);
     }
+    let only: Vec<_> =
+        full.then_some("--full").into_iter().chain(every_way.then_some("--every-way")).collect();
     evidence::begin("powercut")?;
     let (mut boards, mut problems) = (Vec::new(), Vec::new());
-    let mut cut = |board, only: &[String]| -> Outcome {
-        let counts = evidence::file_for("powercut");
+    let mut cut = |board, only: &[&str]| -> Outcome {
         let mut powercut = command(board, only)?;
-        // A violation is a result, too.
-        problems.extend(
-            process::run(powercut.args(json.then_some("--json")).arg("--evidence").arg(&counts)).err(),
-        );
-        let unread = |error| format!("{} cannot be read: {error}.", workspace::shown(&counts));
-        boards.push(process::json(&fs::read_to_string(&counts).map_err(unread)?)?);
+        powercut.args(json.then_some("--json"));
+        let run = |file: &Path| process::run(powercut.arg("--evidence").arg(file));
+        let (facts, ended) = evidence::facts_of("powercut", run)?;
+        boards.push(facts);
+        problems.extend(ended.err());
         Ok(())
     };
     cut(board, &only)?;
     if full && !chosen_board {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
-            cut(other, &["--twentieth".to_owned()])?;
+            cut(other, &["--twentieth"])?;
         }
     }
     let sum = |name: &str| boards.iter().filter_map(|board| board[name].as_u64()).sum::<u64>();
@@ -86,11 +80,10 @@ fn is_of_its_own(board: &Layout) -> bool {
 const IMAGES: [&str; 4] = ["bootloader", "bootloader-sealed", "app-v1", "app-v2"];
 
 /// The program that cuts the power on a board, after its images were built.
-fn command(board: &Layout, arguments: &[String]) -> Outcome<Command> {
-    let images = build::images(board, &IMAGES)?;
-    let mut powercut = process::cargo("run");
-    powercut.args(build::tests_args(board)).args(["--bin", "powercut", "--"]).args(arguments);
-    powercut.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", images);
+fn command(board: &Layout, arguments: &[&str]) -> Outcome<Command> {
+    build::images(board, &IMAGES)?;
+    let mut powercut = build::tests_program(board, "powercut");
+    powercut.args(arguments);
     Ok(powercut)
 }
 

@@ -1,9 +1,10 @@
 //! Starts other programs.
 
+use std::collections::BTreeSet;
 use std::env;
 use std::ffi::OsStr;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 
@@ -17,7 +18,7 @@ pub fn cargo(subcommand: &str) -> Command {
 
 /// The cargo that started this program, on the package in a folder, in the caller's folder.
 pub fn cargo_on(folder: &Path, subcommand: &str) -> Command {
-    let mut command = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    let mut command = bare_cargo();
     command.arg(subcommand).arg("--manifest-path").arg(folder.join("Cargo.toml"));
     if env::var_os("CARGO_TARGET_DIR").is_some() {
         // The path may be relative, and a job may start cargo in another folder.
@@ -26,15 +27,39 @@ pub fn cargo_on(folder: &Path, subcommand: &str) -> Command {
     command
 }
 
+/// The cargo that started this program, on the package in the caller's folder.
+pub fn bare_cargo() -> Command {
+    Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()))
+}
+
+/// What cargo says of the crates of the workspace.
+pub fn metadata() -> Outcome<Value> {
+    json(&output(cargo("metadata").args(["--no-deps", "--format-version", "1"]))?)
+}
+
+/// The crates that `cargo tree` lists, as `NAME VERSION`.
+pub fn tree(words: &[&str]) -> Outcome<BTreeSet<String>> {
+    let form = ["--locked", "--prefix", "none", "--no-dedupe", "--format", "{p}"];
+    let said = output(cargo("tree").args(form).args(words))?;
+    // `name v1.2.3`, and more.
+    let krate = |line: &str| {
+        let mut words = line.split(' ');
+        Some(format!("{} {}", words.next()?, words.next()?.strip_prefix('v')?))
+    };
+    Ok(said.lines().filter_map(krate).collect())
+}
+
+/// git in the repository; returns what it prints.
+pub fn git(words: &[&str]) -> Outcome<String> {
+    output(Command::new("git").current_dir(workspace::root()).args(words))
+}
+
 /// The C compiler for the chip: clang, or the program in the variable `CLANG`.
 pub fn clang() -> Command {
     Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()))
 }
 
 /// Runs a program to its end; its output is shown.
-///
-/// # Errors
-/// When it cannot be started, or fails.
 pub fn run(command: &mut Command) -> Outcome {
     let status = command.status().map_err(|error| not_started(command, &error))?;
     if status.success() {
@@ -45,37 +70,34 @@ pub fn run(command: &mut Command) -> Outcome {
 }
 
 /// Runs a program to its end and returns its standard output.
-///
-/// # Errors
-/// When it cannot be started, fails, or its output is not UTF-8.
 pub fn output(command: &mut Command) -> Outcome<String> {
-    let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
-    if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        return Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()));
-    }
-    String::from_utf8(output.stdout).map_err(|_| format!("`{}` printed what is no text.", line(command)))
+    String::from_utf8(ended(command)?.stdout)
+        .map_err(|_| format!("`{}` printed what is no text.", line(command)))
 }
 
 /// Reads JSON that a program has printed.
-///
-/// # Errors
-/// When it is none.
 pub fn json(text: &str) -> Outcome<Value> {
     serde_json::from_str(text).map_err(|error| format!("a program printed what is no JSON: {error}."))
 }
 
+/// The entries of a list in a JSON object; none if there is no list of this name.
+pub fn list<'v>(value: &'v Value, name: &str) -> impl Iterator<Item = &'v Value> {
+    value[name].as_array().into_iter().flatten()
+}
+
 /// Runs a program to its end and returns its standard error.
-///
-/// # Errors
-/// When it cannot be started, or fails.
 pub fn messages(command: &mut Command) -> Outcome<String> {
+    Ok(String::from_utf8_lossy(&ended(command)?.stderr).into_owned())
+}
+
+fn ended(command: &mut Command) -> Outcome<Output> {
     let output = command.stdin(Stdio::null()).output().map_err(|error| not_started(command, &error))?;
-    let said = String::from_utf8_lossy(&output.stderr).into_owned();
-    if !output.status.success() {
-        return Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()));
+    if output.status.success() {
+        return Ok(output);
     }
-    Ok(said)
+    let said = if output.stderr.is_empty() { &output.stdout } else { &output.stderr };
+    let said = String::from_utf8_lossy(said);
+    Err(format!("`{}` failed ({}): {}", line(command), output.status, said.trim()))
 }
 
 /// Whether a program can be started and succeeds; its output is not shown.
@@ -92,9 +114,8 @@ pub fn not_started(command: &Command, error: &std::io::Error) -> String {
 
 /// The command as text, with enough of it to recognise it.
 pub fn line(command: &Command) -> String {
-    let mut line = String::from("");
-    let name = std::path::Path::new(command.get_program()).file_name().unwrap_or(command.get_program());
-    line += &name.to_string_lossy();
+    let name = Path::new(command.get_program()).file_name().unwrap_or(command.get_program());
+    let mut line = name.to_string_lossy().into_owned();
     let mut args = command.get_args().peekable();
     while let Some(arg) = args.next() {
         if arg == "--manifest-path" {

@@ -25,9 +25,6 @@ impl Product {
     }
 
     /// The product of a file in `bootloader/products`.
-    ///
-    /// # Errors
-    /// When there is no such file.
     pub fn named(name: &str) -> Outcome<Self> {
         if name == DEFAULT {
             return Ok(Self::default());
@@ -40,9 +37,6 @@ impl Product {
     }
 
     /// The product of this file.
-    ///
-    /// # Errors
-    /// When there is no such file, or its name is no name of a product.
     pub fn of_file(file: &Path) -> Outcome<Self> {
         let path = file.canonicalize().map_err(|error| format!("{}: {error}.", file.display()))?;
         let name = path.file_stem().and_then(|name| name.to_str()).unwrap_or_default().to_owned();
@@ -58,9 +52,6 @@ impl Product {
     }
 
     /// The product that a command line names: by a path with `.rs`, or a name.
-    ///
-    /// # Errors
-    /// When there is none.
     pub fn chosen(word: &str) -> Outcome<Self> {
         if word.ends_with(".rs") {
             Self::of_file(Path::new(word))

@@ -1,16 +1,14 @@
 //! `cargo xtask reproduce`: the same sources give the same firmware, wherever they lie.
 
-use std::env;
-use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
 use serde_json::json;
 
 use crate::args::Args;
-use crate::elf::Elf;
+use crate::elf::{Elf, Segment};
 use crate::setup::{Part, Setup};
-use crate::{evidence, process, toolchain, workspace, Outcome};
+use crate::{evidence, files, process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask reproduce [--board BOARD] [--yes]
@@ -37,14 +35,13 @@ pub fn run(mut args: Args) -> Outcome {
     setup.prepare(&[Part::Firmware])?;
     evidence::begin("reproduce")?;
     let base = workspace::target_dir().join("reproduce");
-    let _ = fs::remove_dir_all(&base);
-    fs::create_dir_all(&base)
-        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&base)))?;
+    files::remove(&base)?;
+    files::make(&base)?;
     for folder in FOLDERS {
         let clone = base.join(folder);
         let mut git = Command::new("git");
         process::run(git.args(["clone", "--quiet", "--local"]).arg(workspace::root()).arg(&clone))?;
-        let mut build = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        let mut build = process::bare_cargo();
         build.args(["xtask", "build", "--board", board.board]).args(IMAGES).current_dir(&clone);
         process::run(build.env_remove("CARGO_TARGET_DIR").env_remove("CARGO_MANIFEST_DIR"))?;
     }
@@ -57,71 +54,27 @@ pub fn run(mut args: Args) -> Outcome {
         });
         let (one, other) = (one?, other?);
         let bytes: usize = one.iter().map(|(_, bytes)| bytes.len()).sum();
-        let differs = first_difference(&one, &other);
-        match differs {
-            None => println!("  {image:<18} {bytes:>6} bytes, the same"),
-            Some(address) => println!("  {image:<18} DIFFERS from {address:#010x} on"),
-        }
-        failed += usize::from(differs.is_some());
-        rows.push(json!({"image": image, "bytes": bytes, "same": differs.is_none()}));
+        let same = one == other;
+        println!("  {image:<18} {bytes:>6} bytes, {}", if same { "the same" } else { "DIFFERENT" });
+        failed += usize::from(!same);
+        rows.push(json!({"image": image, "bytes": bytes, "same": same}));
     }
     let facts = json!({"board": board.board, "compared": IMAGES.len(), "failed": failed, "images": rows});
     evidence::record("reproduce", facts)?;
     if failed > 0 {
         return Err(format!("{failed} images differ; both builds are in {}.", workspace::shown(&base)));
     }
-    let _ = fs::remove_dir_all(&base);
     toolchain::notice();
-    Ok(())
+    files::remove(&base)
 }
 
 /// The pieces of an image that go into the flash, by address.
-type Pieces = Vec<(u32, Vec<u8>)>;
-
-fn loaded(path: &PathBuf) -> Outcome<Pieces> {
-    let file = fs::read(path).map_err(|error| unread(path, &error))?;
+fn loaded(path: &Path) -> Outcome<Vec<(u32, Vec<u8>)>> {
+    let file = files::bytes(path)?;
     let elf = Elf::parse(&file).map_err(|problem| format!("{}: {problem}", workspace::shown(path)))?;
-    let piece = |segment: &crate::elf::Segment| {
+    let piece = |segment: &Segment| {
         let bytes = &file[segment.offset as usize..][..segment.file_size as usize];
         (segment.load_address, bytes.to_vec())
     };
     Ok(elf.segments.iter().filter(|segment| segment.file_size > 0).map(piece).collect())
-}
-
-fn unread(path: &Path, error: &std::io::Error) -> String {
-    format!("{} cannot be read: {error}.", workspace::shown(path))
-}
-
-/// The first address at which two images differ.
-fn first_difference(one: &Pieces, other: &Pieces) -> Option<u32> {
-    let flat = |pieces: &Pieces| -> Vec<(u32, u8)> {
-        let bytes = |(base, bytes): &(u32, Vec<u8>)| -> Vec<(u32, u8)> {
-            (*base..).zip(bytes.iter().copied()).collect()
-        };
-        pieces.iter().flat_map(bytes).collect()
-    };
-    let (one, other) = (flat(one), flat(other));
-    let shorter = one.len().min(other.len());
-    let differs = one.iter().zip(&other).find(|(a, b)| a != b).map(|(a, _)| a.0);
-    differs.or_else(|| one.get(shorter).or(other.get(shorter)).map(|(address, _)| *address))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_difference_is_found_wherever_it_is() {
-        let image = vec![(0x100, vec![1, 2, 3]), (0x200, vec![4])];
-        assert_eq!(first_difference(&image, &image.clone()), None);
-        for (other, address) in [
-            (vec![(0x100, vec![1, 9, 3]), (0x200, vec![4])], 0x101),
-            (vec![(0x100, vec![1, 2, 3]), (0x200, vec![5])], 0x200),
-            (vec![(0x100, vec![1, 2, 3])], 0x200),
-            (vec![(0x100, vec![1, 2, 3]), (0x200, vec![4, 5])], 0x201),
-            (vec![(0x100, vec![1, 2, 3]), (0x204, vec![4])], 0x200),
-        ] {
-            assert_eq!(first_difference(&image, &other), Some(address));
-        }
-    }
 }

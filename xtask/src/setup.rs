@@ -4,21 +4,21 @@
 //! missing, this takes a fraction of a second.
 
 use std::collections::BTreeSet;
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
 use crate::args::Args;
 use crate::workspace::TARGET;
-use crate::{process, workspace, Outcome};
+use crate::{files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask setup [--yes]
 
-Brings the machine to where every other job runs: the Rust target thumbv7em-none-eabihf, rustfmt and
-clippy (by rustup); cmake, make, pkg-config and libclang to build the emulator's CPU, clang for the application
-in C and the programs of the emulator's tests, gcc-arm-none-eabi for the examples, gdb-multiarch, chromium for the tests of the page, python3 with venv (by apt-get); and a Python environment in target/python with tests/python/requirements.txt.
+Brings the machine to where every other job runs: by rustup the Rust target thumbv7em-none-eabihf, rustfmt and
+clippy; by apt-get what builds the emulator's CPU (cmake, make, pkg-config, libclang), compilers for the chip
+(clang, gcc-arm-none-eabi), gdb-multiarch, chromium and python3 with venv; and a Python environment in
+target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
@@ -85,11 +85,8 @@ impl Setup {
         Self { yes: args.flag("--yes") }
     }
 
-    /// Installs what these parts need and is missing.
-    ///
-    /// # Errors
-    /// When something is missing and cannot be installed or may not be; the message has the command
-    /// to run.
+    /// Installs what these parts need and is missing. Where that may not be done, the message has the
+    /// line to run.
     pub fn prepare(&self, parts: &[Part]) -> Outcome {
         self.packages(parts)?;
         if parts.contains(&Part::Emulator) {
@@ -99,10 +96,13 @@ impl Setup {
             rust_target(TARGET)?;
         }
         if parts.contains(&Part::Lint) {
-            rust_components()?;
+            component("rustfmt", process::succeeds("rustfmt", &["--version"]))?;
+            component("clippy", process::succeeds("clippy-driver", &["--version"]))?;
         }
         if parts.contains(&Part::Coverage) {
-            llvm_tools()?;
+            let installed =
+                process::output(Command::new("rustup").args(["component", "list", "--installed"]));
+            component("llvm-tools", installed.is_ok_and(|list| list.contains("llvm-tools")))?;
         }
         if parts.contains(&Part::Python) {
             python_environment()?;
@@ -112,7 +112,7 @@ impl Setup {
 
     /// Installs Debian's packages.
     fn packages(&self, parts: &[Part]) -> Outcome {
-        let missing = missing_packages(parts, Tool::is_there);
+        let missing = missing_packages(parts, is_there);
         if missing.is_empty() {
             return Ok(());
         }
@@ -136,18 +136,9 @@ impl Setup {
         }
         println!("Installing {} ...", missing.join(", "));
         let apt_get = |words: &[&str]| {
-            let mut command = if root { Command::new("env") } else { Command::new("sudo") };
-            if !root {
-                command.arg("env");
-            }
-            command.args([
-                "DEBIAN_FRONTEND=noninteractive",
-                "apt-get",
-                "-qq",
-                "-o",
-                "DPkg::Lock::Timeout=300",
-            ]);
-            process::run(command.args(words))
+            let mut command = Command::new(if root { "env" } else { "sudo" });
+            command.args((!root).then_some("env")).args(["DEBIAN_FRONTEND=noninteractive", "apt-get"]);
+            process::run(command.args(["-qq", "-o", "DPkg::Lock::Timeout=300"]).args(words))
         };
         // A new machine has no package lists. If one of several sources cannot be reached, the
         // install may still work; if not, it reports that.
@@ -155,121 +146,73 @@ impl Setup {
         let install = ["install", "-y", "--no-install-recommends"];
         apt_get(&[&install[..], &missing[..]].concat())
             .map_err(|problem| format!("{problem} By hand it is:\n\n    {by_hand}"))?;
-        let still = missing_packages(parts, Tool::is_there);
+        let still = missing_packages(parts, is_there);
         if still.is_empty() {
-            Ok(())
-        } else {
-            Err(format!(
-                "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front \
-                 of the system's in PATH?",
-                still.join(", ")
-            ))
+            return Ok(());
         }
+        Err(format!(
+            "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front of the \
+             system's in PATH?",
+            still.join(", ")
+        ))
     }
 }
 
-/// A program or library that Debian packages.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Tool {
-    CCompiler,
-    Make,
-    Cmake,
-    PkgConfig,
-    Libclang,
-    Clang,
-    ArmGcc,
-    Python,
-    Venv,
-    Gdb,
-    Chromium,
-    Dpkg,
-    Mingw,
-    Qemu,
+/// Whether what a package of Debian and Ubuntu brings is there.
+fn is_there(package: &str) -> bool {
+    let works = |program: &str| process::succeeds(program, &["--version"]);
+    match package {
+        "build-essential" => {
+            process::succeeds(env::var_os("CC").unwrap_or_else(|| "cc".into()), &["--version"])
+        }
+        // cmake works with either.
+        "make" => works("make") || works("ninja"),
+        "libclang-dev" => libclang_is_there(),
+        // clang without the target for Arm is of no use here.
+        "clang" => {
+            let arm = ["--target=thumbv7em-none-eabi", "-E", "-x", "c", "/dev/null"];
+            process::succeeds(process::clang().get_program(), &arm)
+        }
+        // C and C++ without their libraries, which are ten times as large: the examples do not need
+        // them.
+        "gcc-arm-none-eabi" => works("arm-none-eabi-g++"),
+        // Debian's python3 does not contain ensurepip.
+        "python3-venv" => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
+        // The tests look for it in the same places.
+        "chromium" => match env::var_os("COBOOT_CHROMIUM") {
+            Some(chromium) => process::succeeds(chromium, &["--version"]),
+            None => works("chromium") || works("chromium-browser"),
+        },
+        "dpkg" => works("dpkg-deb"),
+        "gcc-mingw-w64-x86-64" => works("x86_64-w64-mingw32-gcc"),
+        program => works(program),
+    }
 }
 
-impl Tool {
-    /// The package with the program, on Debian and Ubuntu.
-    fn package(self) -> &'static str {
+impl Part {
+    /// What it needs, by the names of Debian's packages.
+    fn packages(self) -> &'static [&'static str] {
         match self {
-            Self::CCompiler => "build-essential",
-            Self::Make => "make",
-            Self::Cmake => "cmake",
-            Self::PkgConfig => "pkg-config",
-            Self::Libclang => "libclang-dev",
-            Self::Clang => "clang",
-            Self::ArmGcc => "gcc-arm-none-eabi",
-            Self::Python => "python3",
-            Self::Venv => "python3-venv",
-            Self::Gdb => "gdb-multiarch",
-            Self::Chromium => "chromium",
-            Self::Dpkg => "dpkg",
-            Self::Mingw => "gcc-mingw-w64-x86-64",
-            Self::Qemu => "qemu-system-arm",
-        }
-    }
-
-    fn is_there(self) -> bool {
-        match self {
-            Self::CCompiler => {
-                let compiler = env::var_os("CC").unwrap_or_else(|| "cc".into());
-                process::succeeds(compiler, &["--version"])
-            }
-            // cmake works with either.
-            Self::Make => {
-                process::succeeds("make", &["--version"]) || process::succeeds("ninja", &["--version"])
-            }
-            Self::Cmake => process::succeeds("cmake", &["--version"]),
-            // Without it the configure script inside Unicorn stops, and the build then lacks a
+            // Without pkg-config the configure script inside Unicorn stops, and the build then lacks a
             // header.
-            Self::PkgConfig => process::succeeds("pkg-config", &["--version"]),
-            Self::Libclang => libclang_is_there(),
-            // clang without the target for Arm is of no use here.
-            Self::Clang => {
-                let arm = ["--target=thumbv7em-none-eabi", "-E", "-x", "c", "/dev/null"];
-                process::succeeds(process::clang().get_program(), &arm)
-            }
-            // C and C++ without their libraries, which are ten times as large: the examples do not
-            // need them.
-            Self::ArmGcc => process::succeeds("arm-none-eabi-g++", &["--version"]),
-            Self::Python => process::succeeds("python3", &["--version"]),
-            // Debian's python3 does not contain ensurepip.
-            Self::Venv => process::succeeds("python3", &["-c", "import venv, ensurepip"]),
-            Self::Gdb => process::succeeds("gdb-multiarch", &["--version"]),
-            Self::Dpkg => process::succeeds("dpkg-deb", &["--version"]),
-            Self::Mingw => process::succeeds("x86_64-w64-mingw32-gcc", &["--version"]),
-            Self::Qemu => process::succeeds("qemu-system-arm", &["--version"]),
-            // The tests look for it in the same places.
-            Self::Chromium => match env::var_os("COBOOT_CHROMIUM") {
-                Some(chromium) => process::succeeds(chromium, &["--version"]),
-                None => ["chromium", "chromium-browser"]
-                    .iter()
-                    .any(|name| process::succeeds(name, &["--version"])),
-            },
+            Self::Emulator => &["build-essential", "make", "cmake", "pkg-config", "libclang-dev", "clang"],
+            Self::C => &["clang"],
+            Self::Examples => &["gcc-arm-none-eabi", "clang", "make", "cmake"],
+            Self::Gdb => &["gdb-multiarch"],
+            Self::Browser => &["chromium"],
+            Self::Deb => &["dpkg"],
+            Self::Windows => &["gcc-mingw-w64-x86-64"],
+            Self::Qemu => &["qemu-system-arm"],
+            Self::Python if !python_environment_is_there() => &["python3", "python3-venv"],
+            Self::Python | Self::Firmware | Self::Lint | Self::Coverage => &[],
         }
     }
 }
 
 /// The missing packages for these parts, each once.
-fn missing_packages(parts: &[Part], is_there: impl Fn(Tool) -> bool) -> Vec<&'static str> {
-    let mut tools = Vec::new();
-    for part in parts {
-        tools.extend_from_slice(match part {
-            Part::Emulator => {
-                &[Tool::CCompiler, Tool::Make, Tool::Cmake, Tool::PkgConfig, Tool::Libclang, Tool::Clang]
-            }
-            Part::C => &[Tool::Clang],
-            Part::Examples => &[Tool::ArmGcc, Tool::Clang, Tool::Make, Tool::Cmake],
-            Part::Gdb => &[Tool::Gdb],
-            Part::Browser => &[Tool::Chromium],
-            Part::Deb => &[Tool::Dpkg],
-            Part::Windows => &[Tool::Mingw],
-            Part::Qemu => &[Tool::Qemu],
-            Part::Python if !python_environment_is_there() => &[Tool::Python, Tool::Venv],
-            Part::Python | Part::Firmware | Part::Lint | Part::Coverage => &[],
-        });
-    }
-    let missing: BTreeSet<_> = tools.into_iter().filter(|&tool| !is_there(tool)).map(Tool::package).collect();
-    missing.into_iter().collect()
+fn missing_packages(parts: &[Part], is_there: impl Fn(&str) -> bool) -> Vec<&'static str> {
+    let needed: BTreeSet<_> = parts.iter().flat_map(|part| part.packages()).copied().collect();
+    needed.into_iter().filter(|package| !is_there(package)).collect()
 }
 
 /// Whether libclang with the compiler's own headers is in a folder in which the bindings' generator
@@ -279,15 +222,14 @@ fn libclang_is_there() -> bool {
         // The user has set the path; the build reports it if it is wrong.
         return true;
     }
-    let homes = ["/usr/lib/llvm-*/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib"];
-    let library = homes.iter().any(|home| {
-        // For example `libclang-14.so.14`; libclang-cpp is another library.
-        ["libclang.so", "libclang.so.*", "libclang-1*", "libclang-2*"]
-            .iter()
-            .any(|name| exists(&format!("{home}/{name}")))
-    });
-    let headers = ["/usr/lib/llvm-*/lib/clang", "/usr/lib/clang", "/usr/lib64/clang", "/usr/local/lib/clang"];
-    library && headers.iter().any(|home| exists(&format!("{home}/*/include/stdbool.h")))
+    // For example `libclang-14.so.14`; libclang-cpp is another library.
+    exists("{/usr/lib/llvm-*/lib,/usr/lib/*-linux-gnu,/usr/lib64,/usr/lib,/usr/local/lib}/libclang{.so,.so.*,-1*,-2*}")
+        && exists("{/usr/lib/llvm-*/lib,/usr/lib,/usr/lib64,/usr/local/lib}/clang/*/include/stdbool.h")
+}
+
+/// Whether a path of this pattern of the shell exists.
+fn exists(pattern: &str) -> bool {
+    process::succeeds("bash", &["-c", &format!("ls -d {pattern} | grep -q .")])
 }
 
 /// Removes what CMake has noted about Unicorn in another folder: after `target/` was copied or moved,
@@ -307,30 +249,7 @@ fn renew_cmake(target: &Path) {
     }
 }
 
-/// Whether a path exists; a component may contain one `*`.
-fn exists(pattern: &str) -> bool {
-    fn below(folder: &Path, parts: &[&str]) -> bool {
-        let Some((part, rest)) = parts.split_first() else { return folder.exists() };
-        match part.split_once('*') {
-            None => below(&folder.join(part), rest),
-            Some((start, end)) => fs::read_dir(folder).into_iter().flatten().flatten().any(|entry| {
-                let name = entry.file_name();
-                let name = name.to_string_lossy();
-                name.len() >= start.len() + end.len()
-                    && name.starts_with(start)
-                    && name.ends_with(end)
-                    && below(&entry.path(), rest)
-            }),
-        }
-    }
-    let parts: Vec<_> = pattern.trim_start_matches('/').split('/').collect();
-    below(Path::new("/"), &parts)
-}
-
 /// Installs the libraries of a Rust target if they are missing.
-///
-/// # Errors
-/// When they are missing and cannot be installed; the message has the command to run.
 pub fn rust_target(target: &str) -> Outcome {
     let is_there = || -> Outcome<bool> {
         let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
@@ -350,44 +269,19 @@ pub fn rust_target(target: &str) -> Outcome {
     ))
 }
 
-/// Provides a program that cargo installs, in the PATH or in `target/tools`; returns the PATH with
-/// it.
-///
-/// # Errors
-/// When it is missing and cannot be installed.
-pub fn tool(name: &str, version: &str) -> Outcome<OsString> {
-    let tools = workspace::target_dir().join("tools");
-    let mut folders = vec![tools.join("bin")];
-    folders.extend(env::split_paths(&env::var_os("PATH").unwrap_or_default()));
-    let there = |folder: &PathBuf| folder.join(name).with_extension(env::consts::EXE_EXTENSION).is_file();
-    if !folders.iter().any(there) {
-        install(name, version, &[])?;
-    }
-    env::join_paths(folders).map_err(|error| format!("the PATH cannot be extended: {error}."))
-}
-
-/// Provides a program that cargo installs in `target/tools`, in exactly this version; returns its
+/// Provides a program that cargo installs, in exactly this version, in `target/tools`; returns its
 /// path. `options` are for `cargo install`.
-///
-/// # Errors
-/// When it is missing and cannot be installed.
-pub fn pinned_tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
-    let program = workspace::target_dir().join("tools/bin").join(name);
-    let program = program.with_extension(env::consts::EXE_EXTENSION);
+pub fn tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
+    let tools = workspace::target_dir().join("tools");
+    let program = tools.join("bin").join(name);
     // Some subcommands of cargo print their version only as one.
     let words = [name.strip_prefix("cargo-"), None].map(|word| word.into_iter().chain(["--version"]));
     let mut said = words.into_iter().map(|words| process::output(Command::new(&program).args(words)));
-    if !said.any(|said| said.is_ok_and(|said| said.trim_end().ends_with(version))) {
-        install(name, version, options)?;
+    if said.any(|said| said.is_ok_and(|said| said.trim_end().ends_with(version))) {
+        return Ok(program);
     }
-    Ok(program)
-}
-
-/// Installs a program into `target/tools`.
-fn install(name: &str, version: &str, options: &[&str]) -> Outcome {
-    let tools = workspace::target_dir().join("tools");
     println!("Installing {name} {version} into {} ...", workspace::shown(&tools));
-    let mut install = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    let mut install = process::bare_cargo();
     install.args(["install", "--quiet", "--locked", name, "--version", version]).args(options);
     install.arg("--root").arg(&tools).env("CARGO_TARGET_DIR", tools.join("build"));
     // It runs for seconds and compiles for minutes: an optimised one takes twice as long in all.
@@ -399,39 +293,20 @@ fn install(name: &str, version: &str, options: &[&str]) -> Outcome {
     process::run(&mut install)
         .map_err(|problem| format!("{problem} It needs a connection to crates.io, once."))?;
     // The build files are large and not needed again.
-    let _ = fs::remove_dir_all(tools.join("build"));
-    Ok(())
+    files::remove(&tools.join("build"))?;
+    Ok(program)
 }
 
-fn rust_components() -> Outcome {
-    let is_there = |name: &str| process::succeeds(name, &["--version"]);
-    let missing: Vec<_> = [("rustfmt", "rustfmt"), ("clippy", "clippy-driver")]
-        .into_iter()
-        .filter(|(_, program)| !is_there(program))
-        .map(|(component, _)| component)
-        .collect();
-    if missing.is_empty() {
+/// Installs a component of the Rust toolchain if it is missing.
+fn component(name: &str, is_there: bool) -> Outcome {
+    if is_there {
         return Ok(());
     }
-    add_components(&missing)
-}
-
-fn llvm_tools() -> Outcome {
-    let installed = process::output(Command::new("rustup").args(["component", "list", "--installed"]));
-    if installed.is_ok_and(|list| list.contains("llvm-tools")) {
-        return Ok(());
-    }
-    add_components(&["llvm-tools"])
-}
-
-fn add_components(missing: &[&str]) -> Outcome {
-    println!("Adding {} to the Rust toolchain ...", missing.join(" and "));
-    process::run(Command::new("rustup").args(["component", "add"]).args(missing)).map_err(|_| {
+    println!("Adding {name} to the Rust toolchain ...");
+    process::run(Command::new("rustup").args(["component", "add", name])).map_err(|_| {
         format!(
-            "{} could not be added. With rustup and a connection, this line does it:\n\n    \
-             rustup component add {}",
-            missing.join(" and "),
-            missing.join(" ")
+            "{name} could not be added. With rustup and a connection, this line does it:\n\n    \
+             rustup component add {name}"
         )
     })
 }
@@ -468,9 +343,7 @@ fn python_environment() -> Outcome {
             .arg(requirements()),
     )
     .map_err(|problem| format!("{problem} It needs a connection to the Python package index, once."))?;
-    fs::copy(requirements(), stamp())
-        .map(drop)
-        .map_err(|error| format!("{} cannot be written: {error}.", workspace::shown(&stamp())))
+    files::copy(&requirements(), &stamp())
 }
 
 #[cfg(test)]
@@ -479,14 +352,14 @@ mod tests {
 
     #[test]
     fn only_what_a_part_needs_and_is_missing_is_installed_and_once() {
-        let nothing = |_| false;
+        let nothing = |_: &str| false;
         assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
         assert_eq!(
             missing_packages(&[Part::Emulator, Part::Emulator], nothing),
             ["build-essential", "clang", "cmake", "libclang-dev", "make", "pkg-config"]
         );
         assert_eq!(
-            missing_packages(&[Part::Emulator], |tool| !matches!(tool, Tool::Cmake | Tool::Libclang)),
+            missing_packages(&[Part::Emulator], |package| !["cmake", "libclang-dev"].contains(&package)),
             ["cmake", "libclang-dev"]
         );
         assert_eq!(missing_packages(&[Part::C], nothing), ["clang"]);
@@ -496,7 +369,7 @@ mod tests {
         );
         assert_eq!(missing_packages(&[Part::Browser], nothing), ["chromium"]);
         assert_eq!(missing_packages(&[Part::Windows, Part::Deb], nothing), ["dpkg", "gcc-mingw-w64-x86-64"]);
-        assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_| true).is_empty());
+        assert!(missing_packages(&[Part::C, Part::Emulator, Part::Python], |_: &str| true).is_empty());
     }
 
     /// The line is CMake's.
@@ -519,12 +392,11 @@ mod tests {
     #[test]
     fn a_pattern_finds_what_is_there() {
         let root = env!("CARGO_MANIFEST_DIR");
-        assert!(exists(&format!("{root}/src/setup.rs")));
-        assert!(exists(&format!("{root}/s*c/set*.rs")));
-        assert!(exists(&format!("{root}/*/setup.rs")));
-        assert!(!exists(&format!("{root}/*/setup.py")));
-        assert!(!exists(&format!("{root}/src/setup.rs*setup.rs")));
-        assert!(!exists("/no/such/folder/*/at.all"));
+        for (pattern, there) in
+            [("src/setup.rs", true), ("{x,*}/set*.rs", true), ("{src,*}/setup.{py,c*}", false)]
+        {
+            assert_eq!(exists(&format!("{root}/{pattern}*")), there, "{pattern}");
+        }
     }
 
     /// Only exact versions, so that every machine runs the same client.

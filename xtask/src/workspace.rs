@@ -39,9 +39,6 @@ pub fn firmware_dir(board: &Layout) -> PathBuf {
 }
 
 /// Takes `--board`.
-///
-/// # Errors
-/// When there is no such board.
 pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
     let Some(name) = args.value("--board")? else { return Ok(layout::DEFAULT) };
     layout::by_name(&name).ok_or_else(|| {

@@ -2,17 +2,16 @@
 //! relay, socketcand the bus.
 #![cfg(unix)]
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::thread;
-use std::time::{Duration, Instant};
 
 use kit::folder::Folder;
 
-/// The time after which a run counts as hanging, on the wall clock. It may build everything.
-const PATIENCE: Duration = Duration::from_secs(1800);
+/// The seconds after which a run counts as hanging, on the wall clock. It may build everything.
+const PATIENCE: &str = "1800";
 
 /// The emulated board as a process, with a bootloader of another product in its flash.
 struct Board {
@@ -70,25 +69,13 @@ impl Drop for Board {
 }
 
 /// Runs the job; whether it succeeded, and what it printed.
-fn hil(folder: &Path, words: &[&str]) -> (bool, String) {
-    let said = folder.join("said.txt");
-    let out = File::create(&said).unwrap();
+fn hil(words: &[&str]) -> (bool, String) {
     let board = std::env::var("COBOOT_BOARD").expect("run `cargo xtask test`");
-    let mut job = Command::new(env!("CARGO_BIN_EXE_xtask"));
-    job.args(["hil", "--board", &board]).args(words).stdin(Stdio::null());
-    let mut job = job.stdout(out.try_clone().unwrap()).stderr(out).spawn().unwrap();
-    let started = Instant::now();
-    let status = loop {
-        if let Some(status) = job.try_wait().unwrap() {
-            break status;
-        }
-        if started.elapsed() > PATIENCE {
-            let _ = job.kill();
-            panic!("it hangs: {}", fs::read_to_string(said).unwrap());
-        }
-        thread::sleep(Duration::from_millis(50));
-    };
-    (status.success(), fs::read_to_string(said).unwrap())
+    let mut job = Command::new("timeout");
+    job.args([PATIENCE, env!("CARGO_BIN_EXE_xtask"), "hil", "--board", &board]).args(words);
+    let ended = job.stdin(Stdio::null()).output().unwrap();
+    let said = [ended.stdout, ended.stderr].concat();
+    (ended.status.success(), String::from_utf8(said).unwrap())
 }
 
 #[test]
@@ -98,7 +85,7 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
     let (probe, relay) = (board.probe(&folder), board.relay());
     let report = folder.join("report.json");
     let words = ["--bus", &board.bus, "--probe", &probe, "--power-command", &relay, "--json"];
-    let (good, said) = hil(&folder, &[&words[..], &[report.to_str().unwrap()]].concat());
+    let (good, said) = hil(&[&words[..], &[report.to_str().unwrap()]].concat());
     assert!(good, "{said}");
     assert!(said.contains(" 0 failed"), "{said}");
     for step in ["flash the bootloader", "cut the power", "Ctrl-C", "another device", "damaged"] {
@@ -117,7 +104,7 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
         (vec!["--bus", bus, "--probe", "false {elf}"], "probe is plugged in"),
         (vec!["--probe", "true"], "--bus is missing"),
     ] {
-        let (good, said) = hil(&folder, &words);
+        let (good, said) = hil(&words);
         assert!(!good && said.contains(told), "{words:?}: {said}");
     }
 }

@@ -1,33 +1,30 @@
 //! The steps, in their order: the set-up, the conformance checks, the main job, the update suite.
 
-use std::fs;
-use std::path::PathBuf;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::bench::Bench;
-use super::coflash::{Answer, Coflash};
-use super::command::{self, Running};
-use super::report::Verdict;
-use crate::Outcome;
 use serde_json::Value;
+
+use super::bench::{switch, Bench, Done};
+use super::coflash::{self, Answer};
+use crate::{files, process, Outcome};
 
 /// A step.
 pub struct Step {
     /// Its name in the report.
     pub name: &'static str,
-    /// Whether the steps after it make no sense without it.
+    /// Whether the steps behind it make no sense without it.
     pub others_need_it: bool,
-    /// Carries it out. The error says why it failed and what to do.
-    pub run: fn(&mut Bench) -> Outcome<Verdict>,
+    /// Carries it out. The error tells why it failed and what to do.
+    pub run: fn(&mut Bench) -> Outcome<Done>,
 }
 
-const fn needed(name: &'static str, run: fn(&mut Bench) -> Outcome<Verdict>) -> Step {
+const fn needed(name: &'static str, run: fn(&mut Bench) -> Outcome<Done>) -> Step {
     Step { name, others_need_it: true, run }
 }
 
-const fn step(name: &'static str, run: fn(&mut Bench) -> Outcome<Verdict>) -> Step {
+const fn step(name: &'static str, run: fn(&mut Bench) -> Outcome<Done>) -> Step {
     Step { name, others_need_it: false, run }
 }
 
@@ -64,11 +61,11 @@ const NO_BUS: i32 = 4;
 const REFUSED: i32 = 6;
 const CANCELLED: i32 = 130;
 
-fn passed(text: impl Into<String>) -> Outcome<Verdict> {
-    Ok(Verdict::Passed(text.into()))
+fn passed(text: impl Into<String>) -> Outcome<Done> {
+    Ok(Done::Passed(text.into()))
 }
 
-fn open_bus(bench: &mut Bench) -> Outcome<Verdict> {
+fn open_bus(bench: &mut Bench) -> Outcome<Done> {
     // The device need not answer yet.
     let answer = bench.coflash.call(&["info"])?;
     if answer.code == Some(NO_BUS) {
@@ -77,19 +74,16 @@ fn open_bus(bench: &mut Bench) -> Outcome<Verdict> {
     passed("")
 }
 
-fn flash_bootloader(bench: &mut Bench) -> Outcome<Verdict> {
-    bench.probe.download(&bench.images.join("bootloader.elf"))?;
+fn flash_bootloader(bench: &mut Bench) -> Outcome<Done> {
+    bench.probe("download", &image(bench, "bootloader.elf"))?;
     passed("")
 }
 
-fn restart(bench: &mut Bench) -> Outcome<Verdict> {
-    match &bench.power {
-        Some(power) => power.cycle().and_then(|()| passed("power")),
-        None => bench.probe.reset().and_then(|()| passed("reset by the probe")),
-    }
+fn restart(bench: &mut Bench) -> Outcome<Done> {
+    bench.restart().and_then(passed)
 }
 
-fn device_answers(bench: &mut Bench) -> Outcome<Verdict> {
+fn device_answers(bench: &mut Bench) -> Outcome<Done> {
     let info = info_after_start(bench).map_err(|error| {
         format!("{error} The probe has flashed the bootloader: look at bit rate, termination and node-ID.")
     })?;
@@ -97,13 +91,9 @@ fn device_answers(bench: &mut Bench) -> Outcome<Verdict> {
     passed(format!("\"{}\", version \"{}\"", word("name"), word("software_version")))
 }
 
-fn conform(bench: &mut Bench) -> Outcome<Verdict> {
-    let asked = Running::start(Coflash::plain().args(["conform", "--help"]), false)?;
-    if asked.wait(START)?.code != Some(0) {
-        return Ok(Verdict::LeftOut("this coflash has no command conform".into()));
-    }
+fn conform(bench: &mut Bench) -> Outcome<Done> {
     let answer = bench.coflash.call(&["conform"])?;
-    bench.conform = crate::process::json(&answer.said).ok();
+    bench.conform = process::json(&answer.said).ok();
     match (answer.code, &bench.conform) {
         (Some(0), _) => passed(""),
         (_, Some(_)) if answer.value["error"].is_null() => {
@@ -114,7 +104,7 @@ fn conform(bench: &mut Bench) -> Outcome<Verdict> {
 }
 
 /// Flashes a program, compares its CRC with the file, and sees it run.
-fn install(bench: &mut Bench, image: &str, options: &[&str]) -> Outcome<Verdict> {
+fn install(bench: &mut Bench, image: &str, options: &[&str]) -> Outcome<Done> {
     let answer = flash(bench, image, options)?.good()?;
     let crc = number(&answer.value["crc"]).ok_or("coflash told no CRC of the program.")?;
     bench.installed = Some(crc);
@@ -124,14 +114,17 @@ fn install(bench: &mut Bench, image: &str, options: &[&str]) -> Outcome<Verdict>
 }
 
 fn flash(bench: &Bench, image: &str, options: &[&str]) -> Outcome<Answer> {
-    let words = flash_words(bench, image);
-    bench.coflash.call(&[&words.each_ref().map(String::as_str), options].concat())
+    bench.coflash.call(&[&flash_words(bench, &self::image(bench, image)), options].concat())
 }
 
 /// The words of a download with a comparison at its end.
-fn flash_words(bench: &Bench, image: &str) -> [String; 5] {
-    let file = bench.images.join(image).display().to_string();
-    ["flash".into(), file, "--board".into(), bench.board.board.into(), "--verify".into()]
+fn flash_words<'w>(bench: &Bench, file: &'w str) -> [&'w str; 5] {
+    ["flash", file, "--board", bench.board.board, "--verify"]
+}
+
+/// The path of an image of the board.
+fn image(bench: &Bench, name: &str) -> String {
+    bench.images.join(name).display().to_string()
 }
 
 /// Checks that the application runs, and that it is the last one that was installed.
@@ -154,7 +147,7 @@ fn holds_installed(bench: &Bench, info: &Value) -> Outcome {
     Err(format!("the program in the device has CRC {held}, and the one that was installed {wanted}."))
 }
 
-fn call_back(bench: &mut Bench) -> Outcome<Verdict> {
+fn call_back(bench: &mut Bench) -> Outcome<Done> {
     bench.coflash.call(&["enter", "--within", "10000"])?.good()?;
     let info = bench.coflash.call(&["info"])?.good()?.value;
     if info["bootloader"] != Value::Bool(true) {
@@ -163,21 +156,20 @@ fn call_back(bench: &mut Bench) -> Outcome<Verdict> {
     passed("")
 }
 
-fn starts_by_itself(bench: &mut Bench) -> Outcome<Verdict> {
+fn starts_by_itself(bench: &mut Bench) -> Outcome<Done> {
     let how = restart(bench)?;
     runs_installed(bench)?;
     Ok(how)
 }
 
-fn power_cut(bench: &mut Bench) -> Outcome<Verdict> {
+fn power_cut(bench: &mut Bench) -> Outcome<Done> {
     let Some(power) = &bench.power else {
-        return Ok(Verdict::LeftOut("there is no --power-command".into()));
+        return Ok(Done::LeftOut("there is no --power-command".into()));
     };
-    let words = flash_words(bench, V1);
-    let words = words.each_ref().map(String::as_str);
-    let cut = bench.coflash.flash_until_middle(&words, |_| power.switch(false));
+    let image = image(bench, V1);
+    let cut = bench.coflash.flash_until_middle(&flash_words(bench, &image), |_| switch(power, "off"));
     // The board gets its power back, whatever happened.
-    power.switch(true)?;
+    switch(power, "on")?;
     if cut?.code == Some(0) {
         return Err("the update ended well without power: --power-command does not reach this board.".into());
     }
@@ -188,34 +180,29 @@ fn power_cut(bench: &mut Bench) -> Outcome<Verdict> {
     install(bench, V1, &[])
 }
 
-fn damaged_file(bench: &mut Bench) -> Outcome<Verdict> {
-    let damaged = damaged(bench)?.display().to_string();
-    let answer = bench.coflash.call(&["flash", &damaged])?;
+fn damaged_file(bench: &mut Bench) -> Outcome<Done> {
+    // A block file with one bit changed in its middle.
+    files::make(&bench.work)?;
+    let file = bench.work.join("damaged.blk");
+    let mut convert = Command::new(coflash::program());
+    convert.args(["convert", &image(bench, V2), "--board", bench.board.board]).arg(&file);
+    process::output(&mut convert)?;
+    let mut bytes = files::bytes(&file)?;
+    let middle = bytes.len() / 2;
+    *bytes.get_mut(middle).ok_or("the block file is empty.")? ^= 1;
+    files::write(&file, bytes)?;
+    let answer = bench.coflash.call(&["flash", &file.display().to_string()])?;
     refused(bench, &answer, BAD_FILE)
 }
 
-/// A block file with one bit changed in its middle.
-fn damaged(bench: &Bench) -> Outcome<PathBuf> {
-    let file = bench.work.join("damaged.blk");
-    let mut convert: Command = Coflash::plain();
-    convert.arg("convert").arg(bench.images.join(V2)).args(["--board", bench.board.board]).arg(&file);
-    command::succeed(&mut convert, START)?;
-    let told = |error| format!("{}: {error}.", file.display());
-    let mut bytes = fs::read(&file).map_err(told)?;
-    let middle = bytes.len() / 2;
-    *bytes.get_mut(middle).ok_or("the block file is empty.")? ^= 1;
-    fs::write(&file, bytes).map_err(told)?;
-    Ok(file)
-}
-
-fn wrong_identity(bench: &mut Bench) -> Outcome<Verdict> {
+fn wrong_identity(bench: &mut Bench) -> Outcome<Done> {
     let answer = flash(bench, V2, &["--vid", "0x7FFFFFFF", "--pid", "1"])?;
     refused(bench, &answer, REFUSED)
 }
 
 /// Checks that a download was refused with this exit code, and that the device holds the old
 /// program.
-fn refused(bench: &Bench, answer: &Answer, code: i32) -> Outcome<Verdict> {
+fn refused(bench: &Bench, answer: &Answer, code: i32) -> Outcome<Done> {
     match answer.code {
         Some(0) => return Err("it was accepted, and must not be.".into()),
         Some(found) if found == code => {}
@@ -225,16 +212,9 @@ fn refused(bench: &Bench, answer: &Answer, code: i32) -> Outcome<Verdict> {
     passed(answer.value["error"]["what"].as_str().unwrap_or_default())
 }
 
-fn interrupted(bench: &mut Bench) -> Outcome<Verdict> {
-    if !cfg!(unix) {
-        return Ok(Verdict::LeftOut("only Unix sends Ctrl-C to another program".into()));
-    }
-    let words = flash_words(bench, V2);
-    let words = words.each_ref().map(String::as_str);
-    let answer = bench.coflash.flash_until_middle(&words, |running| {
-        let process = running.child().id().to_string();
-        command::succeed(Command::new("kill").args(["-INT", &process]), START)
-    })?;
+fn interrupted(bench: &mut Bench) -> Outcome<Done> {
+    let ctrl_c = |process: u32| process::run(Command::new("kill").args(["-INT", &process.to_string()]));
+    let answer = bench.coflash.flash_until_middle(&flash_words(bench, &image(bench, V2)), ctrl_c)?;
     if answer.code != Some(CANCELLED) {
         return Err(format!("Ctrl-C did not cancel the update: {}", answer.problem()));
     }

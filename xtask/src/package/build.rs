@@ -1,23 +1,19 @@
 //! Builds the programs with cargo, so that the same sources give the same bytes in every folder.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-use super::{copy, notices, remove, unreadable, write, Release, LINUX};
-use crate::{process, setup, workspace, Outcome};
+use super::{notices, Release, LINUX};
+use crate::{files, process, setup, workspace, Outcome};
 
 /// Cargo's profile of the released programs.
 pub const PROFILE: &str = "dist";
 
 /// Builds `coflash` from the workspace at `root`.
-///
-/// # Errors
-/// When the target is missing, or the build fails.
 pub fn program(root: &Path, target_dir: &Path, target: &str) -> Outcome<PathBuf> {
     setup::rust_target(target)?;
-    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    let mut cargo = process::bare_cargo();
     cargo.args(["build", "--package", "coflash", "--profile", PROFILE, "--locked", "--target", target]);
     cargo.arg("--target-dir").arg(target_dir).arg("--manifest-path").arg(root.join("Cargo.toml"));
     if target == LINUX {
@@ -33,8 +29,7 @@ pub fn program(root: &Path, target_dir: &Path, target: &str) -> Outcome<PathBuf>
 
 /// Builds the wheel for the Python of this system.
 pub fn wheel(release: &Release) -> Outcome {
-    let entries = fs::read_dir(&release.dist).map_err(|error| unreadable(&release.dist, &error))?;
-    for old in entries.flatten().map(|entry| entry.path()).filter(|path| is_wheel(path)) {
+    for old in files::within(&release.dist)?.iter().filter(|file| files::is(file, "whl")) {
         let _ = fs::remove_file(old);
     }
     let mut maturin = Command::new(setup::python());
@@ -44,27 +39,22 @@ pub fn wheel(release: &Release) -> Outcome {
     process::run(reproducible(&mut maturin, workspace::root()))
 }
 
-/// Whether a file is a wheel, judged by its name.
-pub fn is_wheel(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension == "whl")
-}
-
 /// The program for Linux, and beside it the files for other folders of a system: `man`,
 /// `completions`, `udev`, `THIRD-PARTY.txt`.
 pub fn with_extras(release: &Release, folder: &Path) -> Outcome {
     let built = program(workspace::root(), &release.build, LINUX)?;
     let program = folder.join("coflash");
-    copy(&built, &program)?;
+    files::copy(&built, &program)?;
     let man = folder.join("man");
-    remove(&man)?;
+    files::remove(&man)?;
     process::output(Command::new(&program).args(["man", "--out"]).arg(&man))?;
     for (shell, file) in [("bash", "coflash.bash"), ("zsh", "_coflash"), ("fish", "coflash.fish")] {
         let script = process::output(Command::new(&program).args(["completions", shell]))?;
-        write(&folder.join("completions").join(file), &script)?;
+        files::write(&folder.join("completions").join(file), script)?;
     }
     let rules = "70-coflash.rules";
-    copy(&workspace::root().join("coflash/packaging").join(rules), &folder.join("udev").join(rules))?;
-    write(&folder.join("THIRD-PARTY.txt"), &notices::text()?)
+    files::copy(&workspace::root().join("coflash/packaging").join(rules), &folder.join("udev").join(rules))?;
+    files::write(&folder.join("THIRD-PARTY.txt"), notices::text()?)
 }
 
 /// Removes this machine's folders from the paths that the compiler writes into a program (the
@@ -74,15 +64,7 @@ fn reproducible<'c>(command: &'c mut Command, root: &Path) -> &'c mut Command {
         Some(home) => PathBuf::from(home),
         None => Path::new(&env::var_os("HOME").unwrap_or_default()).join(".cargo"),
     };
-    let mut flags = OsString::new();
-    for (folder, name) in [(root, "/coboot"), (cargo_home.as_path(), "/cargo")] {
-        if !flags.is_empty() {
-            flags.push("\u{1f}");
-        }
-        flags.push("--remap-path-prefix=");
-        flags.push(folder);
-        flags.push("=");
-        flags.push(name);
-    }
+    let flag = |folder: &Path, name| format!("--remap-path-prefix={}={name}", folder.display());
+    let flags = [flag(root, "/coboot"), flag(&cargo_home, "/cargo")].join("\u{1f}");
     command.current_dir(root).env("CARGO_ENCODED_RUSTFLAGS", flags).env_remove("RUSTFLAGS")
 }

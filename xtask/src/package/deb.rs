@@ -1,20 +1,20 @@
 //! Makes the package for Debian and Ubuntu with cargo-deb; `[package.metadata.deb]` in
 //! coflash/Cargo.toml says what is in it.
 
-use std::fs;
 use std::process::Command;
 
-use super::{build, remove, unreadable, write, Release, LINUX, VERSION};
-use crate::{process, setup, workspace, Outcome};
+use super::{build, Release, LINUX, VERSION};
+use crate::{files, process, setup, workspace, Outcome};
 
 /// The version of cargo-deb that the job installs.
 const CARGO_DEB: &str = "3.8.0";
 
 pub fn make(release: &Release) -> Outcome {
-    let cargo_deb = setup::pinned_tool("cargo-deb", CARGO_DEB, &[])?;
+    release.setup.prepare(&[setup::Part::Deb])?;
+    let cargo_deb = setup::tool("cargo-deb", CARGO_DEB, &[])?;
     // Beside the program, where the metadata names them.
     let parts = release.build.join(LINUX).join(build::PROFILE).join("deb");
-    remove(&parts)?;
+    files::remove(&parts)?;
     build::with_extras(release, &parts)?;
     // Debian requires a changelog, with the date in the form of a mail.
     let mut date = Command::new("date");
@@ -24,9 +24,8 @@ pub fn make(release: &Release) -> Outcome {
          -- coboot <coboot@example.invalid>  {}",
         process::output(&mut date)?
     );
-    write(&parts.join("changelog"), &changelog)?;
-    let pages = fs::read_dir(parts.join("man")).map_err(|error| unreadable(&parts, &error))?;
-    let pages = pages.flatten().map(|page| page.path());
+    files::write(&parts.join("changelog"), changelog)?;
+    let pages = files::within(&parts.join("man"))?;
     process::run(Command::new("gzip").args(["-9", "--no-name"]).arg(parts.join("changelog")).args(pages))?;
     let mut deb = Command::new(cargo_deb);
     deb.arg("--manifest-path").arg(workspace::root().join("coflash/Cargo.toml"));

@@ -11,14 +11,13 @@ mod workflow;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::{fs, io};
 
 use sha2::{Digest, Sha256};
 
 use crate::args::Args;
+use crate::process::list;
 use crate::setup::{self, Setup};
-use crate::{process, sbom, toolchain, workspace, Outcome};
-use serde_json::Value;
+use crate::{files, process, sbom, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask package [--check] [--draft] [--yes] [PART ...]
@@ -49,8 +48,33 @@ const WINDOWS: &str = "x86_64-pc-windows-gnu";
 /// The version; all members of the workspace have the same one.
 const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// The names of the parts, in the order in which they are made.
-const PARTS: [&str; 7] = ["source", "linux", "deb", "windows", "python", "sbom", "crates"];
+/// A part of what is handed out.
+struct Part {
+    name: &'static str,
+    make: fn(&Release) -> Outcome,
+    /// Checks it in an empty folder.
+    check: fn(&Release, &Path) -> Outcome,
+}
+
+const fn part(
+    name: &'static str,
+    make: fn(&Release) -> Outcome,
+    check: fn(&Release, &Path) -> Outcome,
+) -> Part {
+    Part { name, make, check }
+}
+
+/// The parts, in the order in which they are made.
+const PARTS: [Part; 7] = [
+    part("source", source, check::source),
+    part("linux", linux, check::linux),
+    part("deb", deb::make, check::debian),
+    part("windows", windows, check::windows),
+    part("python", python, check::wheel),
+    // The job that makes it checks it.
+    part("sbom", bills, |_, _| Ok(())),
+    part("crates", crates, check::crates),
+];
 
 /// The folders of a release, and the time of its files.
 struct Release {
@@ -61,6 +85,7 @@ struct Release {
     /// The time of the commit, in seconds since 1970: all files in archives have this time.
     epoch: String,
     draft: bool,
+    setup: Setup,
 }
 
 impl Release {
@@ -87,8 +112,8 @@ impl Release {
     /// An empty folder with this name among the intermediate files.
     fn empty(&self, name: &str) -> Outcome<PathBuf> {
         let folder = self.build.join(name);
-        remove(&folder)?;
-        fs::create_dir_all(&folder).map_err(|error| unwritable(&folder, &error))?;
+        files::remove(&folder)?;
+        files::make(&folder)?;
         Ok(folder)
     }
 }
@@ -97,7 +122,7 @@ pub fn run(mut args: Args) -> Outcome {
     let setup = Setup::from(&mut args);
     let checked = args.flag("--check");
     let draft = args.flag("--draft");
-    let parts = parts(args.rest())?;
+    let parts = parts(&args.rest())?;
     if !draft {
         toolchain::check(&toolchain::line())
             .map_err(|other| format!("{other} Or add --draft for a trial."))?;
@@ -109,20 +134,23 @@ pub fn run(mut args: Args) -> Outcome {
         build: target.join("dist-build"),
         epoch: git(&["log", "-1", "--format=%ct"])?.trim().to_owned(),
         draft,
+        setup,
     };
-    if parts == PARTS {
-        remove(&release.dist)?;
+    if parts.len() == PARTS.len() {
+        files::remove(&release.dist)?;
     }
-    fs::create_dir_all(&release.dist).map_err(|error| unwritable(&release.dist, &error))?;
+    files::make(&release.dist)?;
     for part in &parts {
-        println!("== {part}");
-        make(&release, &setup, part)?;
+        println!("== {}", part.name);
+        (part.make)(&release)?;
     }
     sums(&release.dist)?;
     if checked {
         for part in &parts {
-            println!("== check: {part}");
-            check::part(&release, &setup, part)?;
+            println!("== check: {}", part.name);
+            let root = release.empty("check")?;
+            (part.check)(&release, &root)?;
+            files::remove(&root)?;
         }
         check::sums(&release.dist)?;
     }
@@ -130,12 +158,13 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The named parts, or all parts if none is named; in the order of [`PARTS`].
-fn parts(words: Vec<String>) -> Outcome<Vec<&'static str>> {
-    if let Some(unknown) = words.iter().find(|word| !PARTS.contains(&word.as_str())) {
-        return Err(format!("there is no part \"{unknown}\"; there is: {}.", PARTS.join(", ")));
+fn parts(words: &[String]) -> Outcome<Vec<&'static Part>> {
+    let names = PARTS.each_ref().map(|part| part.name);
+    if let Some(unknown) = words.iter().find(|word| !names.contains(&word.as_str())) {
+        return Err(format!("there is no part \"{unknown}\"; there is: {}.", names.join(", ")));
     }
-    let wanted = |part: &&str| words.is_empty() || words.iter().any(|word| word == part);
-    Ok(PARTS.into_iter().filter(wanted).collect())
+    let is_wanted = |part: &&Part| words.is_empty() || words.iter().any(|word| word == part.name);
+    Ok(PARTS.iter().filter(is_wanted).collect())
 }
 
 /// Whether a commit may be released: there are no other changes, and it has the tag of its version.
@@ -159,39 +188,26 @@ fn releasable(status: &str, tags: &str) -> Outcome {
     Ok(())
 }
 
-fn make(release: &Release, setup: &Setup, part: &str) -> Outcome {
-    match part {
-        "source" => source(release),
-        "linux" => linux(release),
-        "deb" => {
-            setup.prepare(&[setup::Part::Deb])?;
-            deb::make(release)
-        }
-        "windows" => {
-            setup.prepare(&[setup::Part::Windows])?;
-            let program = build::program(workspace::root(), &release.build, WINDOWS)?;
-            copy(&program, &release.windows())?;
-            notices_beside(release)
-        }
-        "python" => {
-            setup.prepare(&[setup::Part::Python])?;
-            build::wheel(release)?;
-            notices_beside(release)
-        }
-        "sbom" => bills(release),
-        _ => crates(release),
-    }
+fn windows(release: &Release) -> Outcome {
+    release.setup.prepare(&[setup::Part::Windows])?;
+    files::copy(&build::program(workspace::root(), &release.build, WINDOWS)?, &release.windows())?;
+    notices_beside(release)
+}
+
+fn python(release: &Release) -> Outcome {
+    release.setup.prepare(&[setup::Part::Python])?;
+    build::wheel(release)?;
+    notices_beside(release)
 }
 
 /// The sources of the commit. git sorts them and gives each the commit's time.
 fn source(release: &Release) -> Outcome {
     let tar = release.build.join("source.tar");
-    fs::create_dir_all(&release.build).map_err(|error| unwritable(&release.build, &error))?;
-    let mut archive = git_command(&["-c", "tar.umask=0022", "archive", "--format=tar"]);
-    archive.arg(format!("--prefix=coboot-{VERSION}/")).arg("--output").arg(&tar).arg("HEAD");
-    process::run(&mut archive)?;
+    files::make(&release.build)?;
+    let (prefix, output) = (format!("--prefix=coboot-{VERSION}/"), tar.display().to_string());
+    git(&["-c", "tar.umask=0022", "archive", "--format=tar", &prefix, "--output", &output, "HEAD"])?;
     process::run(Command::new("gzip").args(["-9", "--no-name", "--force"]).arg(&tar))?;
-    copy(&release.build.join("source.tar.gz"), &release.source())
+    files::copy(&release.build.join("source.tar.gz"), &release.source())
 }
 
 /// The program for Linux and its other files, as an archive.
@@ -202,7 +218,7 @@ fn linux(release: &Release) -> Outcome {
     build::with_extras(release, &folder)?;
     for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/README.md"] {
         let from = workspace::root().join(file);
-        copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
+        files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
     let mut tar = Command::new("tar");
     tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner", "--mode=u+rw,go+r-w"]);
@@ -210,24 +226,24 @@ fn linux(release: &Release) -> Outcome {
     process::run(
         tar.arg("--directory").arg(&stage).arg("--create").arg("--file").arg(release.linux()).arg(name),
     )?;
-    remove(&stage)
+    files::remove(&stage)
 }
 
 /// The notices of the crates in the program, for the release files that cannot contain them.
 fn notices_beside(release: &Release) -> Outcome {
-    write(&release.file("-THIRD-PARTY.txt"), &notices::text()?)
+    files::write(&release.file("-THIRD-PARTY.txt"), notices::text()?)
 }
 
 fn bills(release: &Release) -> Outcome {
     sbom::run(Args::new(std::iter::empty()))?;
     let folder = workspace::target_dir().join("sbom");
     let board = shared_abi::layout::DEFAULT.board;
-    copy(&folder.join("coflash-all-systems.cdx.json"), &release.file(".cdx.json"))?;
+    files::copy(&folder.join("coflash-all-systems.cdx.json"), &release.file(".cdx.json"))?;
     let bootloader = release.dist.join(format!("bootloader-{VERSION}-{board}.cdx.json"));
-    copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
+    files::copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
 }
 
-/// The crates for the registry. [`check::part`] checks their contents.
+/// The crates for the registry. [`check::crates`] checks their contents.
 fn crates(release: &Release) -> Outcome {
     process::run(package_crates(release)?.arg("--no-verify"))
 }
@@ -235,93 +251,37 @@ fn crates(release: &Release) -> Outcome {
 /// `cargo package` of all crates that may be published. One call does all, since they depend on
 /// each other and none is in the registry yet.
 fn package_crates(release: &Release) -> Outcome<Command> {
-    let said = process::output(process::cargo("metadata").args(["--no-deps", "--format-version", "1"]))?;
     let mut command = process::cargo("package");
     command.args(["--locked", "--target-dir"]).arg(&release.build);
-    for name in published(&process::json(&said)?) {
-        command.args(["--package", &name]);
-    }
+    // The packages without `publish = false`.
+    let metadata = process::metadata()?;
+    let published = list(&metadata, "packages").filter(|package| package["publish"].is_null());
+    command.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
     if release.draft {
         command.arg("--allow-dirty");
     }
     Ok(command)
 }
 
-/// The packages without `publish = false`.
-fn published(metadata: &Value) -> Vec<String> {
-    let packages = metadata["packages"].as_array().into_iter().flatten();
-    let published = packages.filter(|package| package["publish"].is_null());
-    published.filter_map(|package| package["name"].as_str().map(str::to_owned)).collect()
-}
-
 /// Writes SHA256SUMS in the form for `sha256sum --check`.
 fn sums(dist: &Path) -> Outcome {
-    let entries = fs::read_dir(dist).map_err(|error| unreadable(dist, &error))?;
-    let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
-    files.sort();
     let mut text = String::new();
-    for file in files.iter().filter(|file| !file.ends_with(SUMS)) {
-        let bytes = fs::read(file).map_err(|error| unreadable(file, &error))?;
+    for file in files::within(dist)?.iter().filter(|file| !file.ends_with(SUMS)) {
+        let bytes = files::bytes(file)?;
         let sum: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         let _ = writeln!(text, "{sum}  {name}");
         println!("{:>9} KiB  {}", bytes.len().div_ceil(1024), workspace::shown(file));
     }
-    write(&dist.join(SUMS), &text)
+    files::write(&dist.join(SUMS), text)
 }
 
 const SUMS: &str = "SHA256SUMS";
 
-fn git_command(words: &[&str]) -> Command {
-    let mut git = Command::new("git");
-    git.arg("-C").arg(workspace::root()).args(words);
-    git
-}
-
 fn git(words: &[&str]) -> Outcome<String> {
-    process::output(&mut git_command(words)).map_err(|problem| {
+    process::git(words).map_err(|problem| {
         format!("{problem}\nA package needs the commit that it is made of: run this in a clone of the repository.")
     })
-}
-
-fn copy(from: &Path, to: &Path) -> Outcome {
-    let copied = || -> io::Result<()> {
-        if let Some(folder) = to.parent() {
-            fs::create_dir_all(folder)?;
-        }
-        fs::copy(from, to).map(drop)
-    };
-    copied().map_err(|error| {
-        format!("{} cannot be copied to {}: {error}.", workspace::shown(from), workspace::shown(to))
-    })
-}
-
-fn write(file: &Path, text: &str) -> Outcome {
-    let written = || -> io::Result<()> {
-        if let Some(folder) = file.parent() {
-            fs::create_dir_all(folder)?;
-        }
-        fs::write(file, text)
-    };
-    written().map_err(|error| unwritable(file, &error))
-}
-
-/// Removes a folder with its contents, if it exists.
-fn remove(folder: &Path) -> Outcome {
-    match fs::remove_dir_all(folder) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => {
-            Err(format!("{} cannot be removed: {error}.", workspace::shown(folder)))
-        }
-        _ => Ok(()),
-    }
-}
-
-fn unwritable(path: &Path, error: &io::Error) -> String {
-    format!("{} cannot be written: {error}.", workspace::shown(path))
-}
-
-fn unreadable(path: &Path, error: &io::Error) -> String {
-    format!("{} cannot be read: {error}.", workspace::shown(path))
 }
 
 #[cfg(test)]
@@ -330,11 +290,14 @@ mod tests {
 
     #[test]
     fn parts_are_made_in_their_order_and_each_once() {
-        let words = |text: &str| text.split_whitespace().map(str::to_owned).collect();
-        assert_eq!(parts(words("")), Ok(PARTS.to_vec()));
-        assert_eq!(parts(words("deb source deb")), Ok(vec!["source", "deb"]));
-        assert!(parts(words("deb rpm")).unwrap_err().contains("\"rpm\""));
-        assert!(parts(words("--chekc")).unwrap_err().contains("--chekc"));
+        let parts = |text: &str| {
+            let words: Vec<_> = text.split_whitespace().map(str::to_owned).collect();
+            parts(&words).map(|parts| parts.iter().map(|part| part.name).collect::<Vec<_>>())
+        };
+        assert_eq!(parts("").map(|parts| parts.len()), Ok(PARTS.len()));
+        assert_eq!(parts("deb source deb"), Ok(vec!["source", "deb"]));
+        assert!(parts("deb rpm").unwrap_err().contains("\"rpm\""));
+        assert!(parts("--chekc").unwrap_err().contains("--chekc"));
     }
 
     #[test]
@@ -353,16 +316,10 @@ mod tests {
         }
     }
 
-    #[test]
-    fn what_is_not_for_the_registry_stays_here() {
-        let text = r#"{"packages":[{"name":"a","publish":null},{"name":"b","publish":[]}]}"#;
-        assert_eq!(published(&process::json(text).unwrap()), ["a"]);
-    }
-
     /// Each adapter that the tool supports has a rule, and the rules name no other.
     #[test]
     fn the_udev_rules_are_those_of_the_adapters() {
-        let read = |file: &str| fs::read_to_string(workspace::root().join("coflash").join(file)).unwrap();
+        let read = |file: &str| files::ours(Path::new("coflash").join(file)).unwrap();
         let mut wanted = Vec::new();
         for (file, constant, subsystem) in
             [("src/bus/gs_usb/usb.rs", "const DEVICES", "usb"), ("src/bus/ports.rs", "const SLCAN", "tty")]

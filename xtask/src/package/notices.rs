@@ -3,12 +3,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
-use std::fs;
 use std::path::{Path, PathBuf};
 
-use super::unreadable;
-use crate::{process, workspace, Outcome};
 use serde_json::Value;
+
+use crate::{files, process, Outcome};
 
 /// Parts that are not crates, by name, with the file of the licence.
 const OTHERS: [(&str, &str); 1] =
@@ -19,29 +18,18 @@ const NOTICES: [&str; 6] = ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTIC
 /// The notices of all crates that are linked into `coflash`, of every system. The same Cargo.lock
 /// gives the same text.
 pub fn text() -> Outcome<String> {
-    let tree = ["--locked", "--package", "coflash", "--prefix", "none", "--edges", "normal", "--no-dedupe"];
-    let mut cargo = process::cargo("tree");
-    let tree = process::output(cargo.args(tree).args(["--target", "all", "--format", "{p}"]))?;
-    let linked: BTreeSet<String> = tree.lines().filter_map(name_and_version).collect();
+    let linked = process::tree(&["--package", "coflash", "--edges", "normal", "--target", "all"])?;
     let metadata = process::output(process::cargo("metadata").args(["--locked", "--format-version", "1"]))?;
     let mut crates = BTreeMap::new();
-    for package in process::json(&metadata)?["packages"].as_array().into_iter().flatten() {
+    for package in process::list(&process::json(&metadata)?, "packages") {
         if let Some((line, folder)) = of(package, &linked) {
             crates.insert(line, notices_in(&folder)?);
         }
     }
     for (line, file) in OTHERS {
-        let file = workspace::root().join(file);
-        let text = fs::read_to_string(&file).map_err(|error| unreadable(&file, &error))?;
-        crates.insert(line.to_owned(), vec![text]);
+        crates.insert(line.to_owned(), vec![files::ours(file)?]);
     }
     Ok(page(&crates))
-}
-
-/// Converts `name v1.2.3 (…)` to `name 1.2.3`.
-fn name_and_version(line: &str) -> Option<String> {
-    let mut words = line.split(' ');
-    Some(format!("{} {}", words.next()?, words.next()?.strip_prefix('v')?))
 }
 
 /// The entry of another author's crate that is linked, and its folder.
@@ -56,15 +44,11 @@ fn of(package: &Value, linked: &BTreeSet<String>) -> Option<(String, PathBuf)> {
 
 /// The texts in a crate's folder that must go with a copy.
 fn notices_in(folder: &Path) -> Outcome<Vec<String>> {
-    let entries = fs::read_dir(folder).map_err(|error| unreadable(folder, &error))?;
-    let is_notice = |path: &PathBuf| {
+    let is_notice = |path: &&PathBuf| {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_uppercase();
         path.is_file() && NOTICES.iter().any(|start| name.starts_with(start))
     };
-    let mut files: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).filter(is_notice).collect();
-    files.sort();
-    let read = |file: &PathBuf| fs::read_to_string(file).map_err(|error| unreadable(file, &error));
-    files.iter().map(read).collect()
+    files::within(folder)?.iter().filter(is_notice).map(|file| files::text(file)).collect()
 }
 
 /// The page: all names with their licences, then every text once, with the names of its crates.

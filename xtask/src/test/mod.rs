@@ -17,7 +17,8 @@ use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
 use crate::setup::{self, Setup};
 use crate::{
-    attack, build, chips, evidence, examples, fuzz, opinion, powercut, process, reproduce, workspace, Outcome,
+    attack, build, chips, evidence, examples, files, fuzz, opinion, powercut, process, reproduce, workspace,
+    Outcome,
 };
 
 mod plan;
@@ -25,7 +26,7 @@ mod programs;
 mod runner;
 
 pub const HELP: &str = "\
-usage: cargo xtask test [--ci | --all [--part K/N] | --board BOARD | --list | WORDS] [--yes]
+usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | --list | WORDS] [--yes]
 
 Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
@@ -33,7 +34,7 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --ci            what .ci/run adds: Chromium, tools of others, the other chips, the pages
   --all           everything: the two above, the tests that take minutes, and the jobs of the night
                   that end by themselves
-  --part K/N      with --all: the K-th of N parts that take about the same time
+  --part NAME     with --all: this part alone; --all lists the names at its beginning
   --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   --yes           installs what is missing with sudo
@@ -55,37 +56,23 @@ struct Stage {
     run: fn(&mut Summary) -> Outcome,
 }
 
+const fn stage(
+    name: &'static str,
+    about: &'static str,
+    minutes: u32,
+    tier: Tier,
+    run: fn(&mut Summary) -> Outcome,
+) -> Stage {
+    Stage { name, about, minutes, tier, run }
+}
+
 /// All stages, in the order in which they run.
 const STAGES: &[Stage] = &[
-    Stage {
-        name: "product",
-        about: "the default board, device and tool",
-        minutes: 12,
-        tier: Tier::Product,
-        run: product,
-    },
-    Stage {
-        name: "ci",
-        about: "Chromium, tools of others, other chips, pages",
-        minutes: 8,
-        tier: Tier::Ci,
-        run: ci,
-    },
-    Stage { name: "slow", about: "tests that take minutes", minutes: 25, tier: Tier::All, run: slow },
-    Stage {
-        name: "boards",
-        about: "every test with firmware, for each other chip",
-        minutes: 25,
-        tier: Tier::All,
-        run: boards,
-    },
-    Stage {
-        name: "jobs",
-        about: "power cuts, attacker, QEMU, replay, chips, two builds",
-        minutes: 45,
-        tier: Tier::All,
-        run: jobs,
-    },
+    stage("product", "the default board, device and tool", 12, Tier::Product, product),
+    stage("ci", "Chromium, tools of others, other chips, pages", 8, Tier::Ci, ci),
+    stage("slow", "tests that take minutes", 25, Tier::All, slow),
+    stage("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
+    stage("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
 ];
 
 /// What `--all` does not run, since it goes on for hours.
@@ -112,15 +99,16 @@ pub fn run(mut args: Args) -> Outcome {
     if part.is_some() && !all {
         return Err("--part goes with --all.".into());
     }
-    let stages: Vec<&Stage> = match &part {
-        Some(part) => share(part)?,
-        None if all => STAGES.iter().collect(),
-        None => STAGES.iter().filter(|stage| stage.name == if for_ci { "ci" } else { "product" }).collect(),
-    };
+    let chosen = part.as_deref().or((!all).then_some(if for_ci { "ci" } else { "product" }));
+    let is_chosen = |stage: &&Stage| chosen.is_none_or(|name| name == stage.name);
+    let stages: Vec<&Stage> = STAGES.iter().filter(is_chosen).collect();
+    if stages.is_empty() {
+        let names = STAGES.iter().map(|stage| stage.name).collect::<Vec<_>>();
+        return Err(format!("--part takes one of {}.", names.join(", ")));
+    }
     if all {
         for stage in STAGES {
-            let chosen = stages.iter().any(|other| other.name == stage.name);
-            let word = if chosen { "runs" } else { "in another part" };
+            let word = if is_chosen(&stage) { "runs" } else { "in another part" };
             println!("{:<8} {:>3} min  {:<54} {word}", stage.name, stage.minutes, stage.about);
         }
         println!("{NOT_RUN}\n");
@@ -149,7 +137,7 @@ pub fn run(mut args: Args) -> Outcome {
     let started = Instant::now();
     // Each part of a run has a record of its own; the page adds them up.
     let name = match &part {
-        Some(part) => format!("tests-all-{}", part.replace('/', "-")),
+        Some(part) => format!("tests-all-{part}"),
         None if all => "tests-all".into(),
         None if for_ci => "tests-ci".into(),
         None if chosen_board => format!("tests-{}", board.board),
@@ -164,13 +152,13 @@ pub fn run(mut args: Args) -> Outcome {
             println!("== {}: {}", stage.name, stage.about);
             if let Err(problem) = (stage.run)(&mut summary) {
                 println!("{problem}");
-                summary.broken(format!("{}: something did not build or broke off", stage.name));
+                summary.failed.push(format!("{}: something did not build or broke off", stage.name));
             }
         }
     }
     evidence::record(&name, summary.as_json())?;
     println!();
-    for name in summary.failed() {
+    for name in &summary.failed {
         println!("FAILED: {name}");
     }
     if all {
@@ -178,7 +166,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     println!("{} min", started.elapsed().as_secs().div_ceil(60));
     println!("{}", summary.line());
-    match summary.failed().len() {
+    match summary.failed.len() {
         0 if summary.is_empty() => Err("no test ran.".into()),
         0 => Ok(()),
         1 => Err("1 test failed; its output is above.".into()),
@@ -186,34 +174,11 @@ pub fn run(mut args: Args) -> Outcome {
     }
 }
 
-/// The stages of one part of several: consecutive ones, by their minutes.
-fn share(part: &str) -> Outcome<Vec<&'static Stage>> {
-    let wrong = || format!("--part takes K/N with K from 1 to N and N from 1 to {}, as 2/4.", STAGES.len());
-    let (which, of) = part.split_once('/').ok_or_else(wrong)?;
-    let (which, of): (u32, u32) = (which.parse().map_err(|_| wrong())?, of.parse().map_err(|_| wrong())?);
-    if which == 0 || which > of || of as usize > STAGES.len() {
-        return Err(wrong());
-    }
-    let total: u32 = STAGES.iter().map(|stage| stage.minutes).sum();
-    let mut before = 0;
-    let mut chosen = Vec::new();
-    for (number, stage) in (0..).zip(STAGES) {
-        // By the middle of the stage; each of the last parts has a stage left.
-        let part =
-            ((before + stage.minutes / 2) * of / total).max(of.saturating_sub(STAGES.len() as u32 - number));
-        if part + 1 == which {
-            chosen.push(stage);
-        }
-        before += stage.minutes;
-    }
-    Ok(chosen)
-}
-
 /// Waits until no other run uses the build results of this clone.
 fn alone() -> Outcome<File> {
     let path = workspace::target_dir().join("tests.lock");
     let wrong = |error: std::io::Error| format!("{} cannot be locked: {error}.", workspace::shown(&path));
-    std::fs::create_dir_all(workspace::target_dir()).map_err(wrong)?;
+    files::make(&workspace::target_dir())?;
     let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(wrong)?;
     if file.try_lock().is_err() {
         println!(
@@ -227,8 +192,7 @@ fn alone() -> Outcome<File> {
 /// Checks that the disk has room for a run from an empty folder, unless there are results already.
 fn room() -> Outcome {
     let folder = workspace::target_dir();
-    std::fs::create_dir_all(&folder)
-        .map_err(|error| format!("{} cannot be made: {error}.", workspace::shown(&folder)))?;
+    files::make(&folder)?;
     // POSIX: the fourth column of the second line is the free space in units of 1024 bytes.
     let said = process::output(std::process::Command::new("df").arg("-kP").arg(&folder)).unwrap_or_default();
     let free = said.lines().nth(1).and_then(|line| line.split_whitespace().nth(3)?.parse::<u64>().ok());
@@ -408,22 +372,4 @@ fn jobs(summary: &mut Summary) -> Outcome {
         runner::count(&format!("cargo xtask {name}"), run(Args::new(words)), summary);
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_stage_is_in_one_part_and_no_part_is_empty() {
-        for of in 1..=STAGES.len() {
-            let parts: Vec<_> = (1..=of).map(|which| share(&format!("{which}/{of}")).ok().unwrap()).collect();
-            assert!(parts.iter().all(|part| !part.is_empty()), "{of}");
-            let names: Vec<_> = parts.concat().iter().map(|stage| stage.name).collect();
-            assert_eq!(names, STAGES.iter().map(|stage| stage.name).collect::<Vec<_>>(), "{of}");
-        }
-        for wrong in ["", "1", "0/2", "3/2", "1/99", "a/b", "1/2/3"] {
-            assert!(share(wrong).is_err(), "{wrong}");
-        }
-    }
 }

@@ -67,22 +67,8 @@ pub const LATER: &[Later] = &[
 
 /// Test modules that take longest, the slowest first: they begin first, so that no core waits for
 /// one of them at the end.
-pub const SLOW: &[&str] = &[
-    "powercut::",
-    "fleet::",
-    "powercut_board::",
-    "streams::",
-    "application::",
-    "ui::",
-    "device::",
-    "conform::",
-    "resume::",
-    "refusals::",
-    "program_control::",
-    "attacker::",
-    "throughput::",
-    "clients::",
-];
+pub const SLOW: &str = "powercut fleet powercut_board streams application ui device conform resume refusals \
+                        program_control attacker throughput clients";
 
 /// The images of a board that the tests of a tier need.
 pub struct Images {

@@ -21,9 +21,6 @@ pub struct Program {
 }
 
 /// Builds the test programs of packages; `arguments` select them for cargo.
-///
-/// # Errors
-/// When something does not build.
 pub fn build(arguments: &[String]) -> Outcome<Vec<Program>> {
     let mut cargo = process::cargo("test");
     cargo.args(["--no-run", "--message-format=json-render-diagnostics"]).args(arguments);
@@ -69,9 +66,6 @@ impl Program {
     }
 
     /// The tests: those that run, and the number of the others (`#[ignore]`).
-    ///
-    /// # Errors
-    /// When the program does not list them.
     pub fn tests(&self) -> Outcome<(Vec<String>, usize)> {
         let list = |more: &[&str]| -> Outcome<Vec<String>> {
             let said = process::output(self.command().args(["--list", "--format=terse"]).args(more))?;

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::{OsStr, OsString};
 use std::io::{Read, Write};
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Mutex, PoisonError};
 use std::thread;
@@ -32,9 +32,6 @@ pub struct Job {
 
 /// The jobs of a program with the tests that `chosen` takes; and how many tests it has with
 /// `#[ignore]`.
-///
-/// # Errors
-/// When the program does not list its tests.
 pub fn jobs(
     program: &Program,
     place: Option<&str>,
@@ -63,26 +60,19 @@ pub struct Summary {
     /// Passed and failed tests, and seconds, by job.
     counts: BTreeMap<String, (usize, usize, f64)>,
     /// What failed, and what did not get as far as a test.
-    failed: Vec<String>,
+    pub failed: Vec<String>,
     /// Tests with `#[ignore]`.
     pub skipped: usize,
 }
 
 impl Summary {
-    /// Something that should have run, and could not.
-    pub fn broken(&mut self, what: String) {
-        self.failed.push(what);
-    }
-
-    /// The names of what failed.
-    pub fn failed(&self) -> &[String] {
-        &self.failed
+    fn passed(&self) -> usize {
+        self.counts.values().map(|(passed, ..)| passed).sum()
     }
 
     /// The last line of a run.
     pub fn line(&self) -> String {
-        let passed: usize = self.counts.values().map(|(passed, ..)| passed).sum();
-        let mut line = format!("{passed} passed, {} failed", self.failed.len());
+        let mut line = format!("{} passed, {} failed", self.passed(), self.failed.len());
         if self.skipped > 0 {
             line += &format!(", {} skipped", self.skipped);
         }
@@ -99,9 +89,8 @@ impl Summary {
         let jobs = self.counts.iter().map(|(name, (passed, failed, seconds))| {
             json!({ "tests": name, "passed": passed, "failed": failed, "seconds": (seconds * 10.0).round() / 10.0 })
         });
-        let passed: usize = self.counts.values().map(|(passed, ..)| passed).sum();
         json!({
-            "passed": passed,
+            "passed": self.passed(),
             "failed": self.failed.len(),
             "skipped": self.skipped,
             "jobs": jobs.collect::<Vec<_>>(),
@@ -130,8 +119,8 @@ pub fn count(name: &str, ended: Outcome, summary: &mut Summary) {
 /// Runs jobs, as many side by side as there are cores; the slow ones begin first.
 pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
     let rank = |job: &Job| {
-        let is_of = |slow: &&str| job.tests.first().is_some_and(|test| test.starts_with(*slow));
-        SLOW.iter().position(is_of).unwrap_or(SLOW.len())
+        let module = job.tests.first().and_then(|test| test.split("::").next());
+        SLOW.split(' ').position(|slow| Some(slow) == module).unwrap_or(usize::MAX)
     };
     jobs.sort_by_key(|job| std::cmp::Reverse(rank(job)));
     let (queue, shared) = (Mutex::new(jobs), Mutex::new(summary));
@@ -252,17 +241,13 @@ fn output(command: &mut Command) -> Outcome<(Vec<u8>, End)> {
                 return Ok((printed, if passed { End::Passed } else { End::Failed }));
             }
             Err(RecvTimeoutError::Timeout) => {
-                kill(&mut child);
+                // An error means that it has just ended.
+                let _ = child.kill();
+                let _ = child.wait();
                 return Ok((printed, End::Never));
             }
         }
     }
-}
-
-fn kill(child: &mut Child) {
-    // An error means that it has just ended.
-    let _ = child.kill();
-    let _ = child.wait();
 }
 
 /// The result in a line of libtest, `test line::silence ... ok`; `None` for every other line.
@@ -299,7 +284,7 @@ mod tests {
         let mut summary = Summary { skipped: 2, ..Summary::default() };
         summary.add(&job, &ran);
         assert_eq!(summary.line(), "1 passed, 2 failed, 2 skipped");
-        assert_eq!(summary.failed(), ["device::line line::a", "device::line line::c"]);
+        assert_eq!(summary.failed, ["device::line line::a", "device::line line::c"]);
         assert_eq!(summary.as_json()["jobs"][0]["failed"], 2);
         // A program that fails and prints no result: nothing passed.
         assert!(job.run().passed.is_empty());
