@@ -80,9 +80,11 @@ mod tests {
         };
         let [a, b] = LAYOUT.parameters;
         for (name, region) in [
-            ("bootloader", LAYOUT.bootloader),
+            ("resident part", LAYOUT.bootloader),
             ("parameters A", a),
             ("parameters B", b),
+            ("data", LAYOUT.data.unwrap()),
+            ("RAM image", LAYOUT.home.unwrap()),
             ("program 1", LAYOUT.programs[0]),
             ("code and data", LAYOUT.ram),
             ("handoff", LAYOUT.handoff),

@@ -332,7 +332,10 @@ mod tests {
     fn the_map_is_the_one_that_people_make() {
         let file = layout_file("x", &STM32F429ZI);
         for line in [
-            "programs: &[Region::new(0x0801_0000, 1984 * 1024)],",
+            "bootloader: Region::new(0x0800_0000, 16 * 1024),",
+            "home: Some(Region::new(0x0801_0000, 64 * 1024)),",
+            "data: Some(Region::new(0x0800_C000, 16 * 1024)),",
+            "programs: &[Region::new(0x0802_0000, 1920 * 1024)],",
             "ram: Region::new(0x2000_0000, 192 * 1024 - 64),",
             "handoff: Region::new(0x2002_FFC0, 48),",
             "warm_start: Region::new(0x2002_FFF0, 16),",

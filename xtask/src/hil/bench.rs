@@ -44,7 +44,7 @@ impl Bench {
         })
     }
 
-    /// Switches the power off and on again, or resets the board if there is no relay; tells which.
+    /// Switches the power off and on again, or resets the board if there is no relay; returns which.
     pub fn restart(&self) -> Outcome<&'static str> {
         let Some(power) = &self.power else {
             return self.probe("reset", "").map(|()| "reset by the probe");

@@ -14,9 +14,9 @@ use crate::{files, process, Outcome};
 pub struct Step {
     /// Its name in the report.
     pub name: &'static str,
-    /// Whether the steps behind it make no sense without it.
+    /// Whether the steps after it make no sense without it.
     pub others_need_it: bool,
-    /// Carries it out. The error tells why it failed and what to do.
+    /// Carries it out. The error says why it failed and what to do.
     pub run: fn(&mut Bench) -> Outcome<Done>,
 }
 
