@@ -1,5 +1,5 @@
 //! The flash controller (RM0090 section 3), at register level: it starts operations and polls them.
-//! The resident part and the RAM part both use it, one at a time.
+//! The resident part and the RAM image both use it, one at a time.
 //!
 //! The HAL's driver does not fit: it erases in units of 128 KiB, programs by bytes and does not
 //! clear error flags.

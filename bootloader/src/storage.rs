@@ -1,4 +1,4 @@
-//! The flash and the store for the RAM part: flash operations are started and polled here, and the
+//! The flash and the store for the RAM image: flash operations are started and polled here, and the
 //! resident part does everything else ([`shared_abi::services`]).
 
 use core::task::Poll;
@@ -26,7 +26,7 @@ fn sector([number, base, size]: [u32; 3]) -> Sector {
     Sector { number: number as u8, region: Region::new(base, size) }
 }
 
-/// The flash, for the RAM part.
+/// The flash, for the RAM image.
 pub struct BootFlash(FlashController);
 
 impl BootFlash {

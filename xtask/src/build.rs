@@ -122,7 +122,14 @@ impl Variant {
 
     /// The images of a board.
     pub fn of(board: &Layout) -> impl Iterator<Item = &'static Self> + '_ {
-        VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len())
+        let fits = |variant: &&Self| board.home.is_some() || !variant.needs_split();
+        VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len()).filter(fits)
+    }
+
+    /// Whether only the split map has room for it: bootloaders with sealed images, logs, the debugger.
+    fn needs_split(&self) -> bool {
+        self.is_bootloader() && !self.features.is_empty() && self.features != "virtual-can"
+            || self.features == "debugger"
     }
 
     /// The product of the image.

@@ -1,5 +1,5 @@
 //! The flash for the resident part, with sectors, CRC unit (RM0090 section 4) and blank check. The
-//! RAM part uses these through [`services`](crate::services).
+//! RAM image uses these through [`shared_abi::services`].
 
 use core::task::Poll;
 

@@ -6,7 +6,7 @@
 //! | `main.rs` | vectors and Reset, and the tables at the layout's fixed address | start-up |
 //! | `stage.rs` | from the reset to the jump, or to the rest of the bootloader | jump, handoff |
 //! | `callgate.rs` | services for the application | its ABI |
-//! | `service_table.rs` | services for the RAM part: all access to non-volatile data | their ABI |
+//! | `service_table.rs` | services for the RAM image: all access to non-volatile data | their ABI |
 //! | `flash.rs` | the flash with sectors and CRC unit | registers |
 //! | `flash_lock.rs` | locks the flash for a sealed program (feature `sealed`) | assembly |
 //! | `storing.rs` | stores a value while nothing else runs | no |

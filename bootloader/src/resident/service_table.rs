@@ -1,4 +1,4 @@
-//! The services for the RAM part of the bootloader: all access to non-volatile data.
+//! The services for the RAM image of the bootloader: all access to non-volatile data.
 
 use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters as _, Value};
@@ -29,7 +29,7 @@ const _: () = assert!(
 
 /// The flash, for one call. The boot stage has left the clock of the CRC unit on.
 fn flash() -> ResidentFlash {
-    // SAFETY: the RAM part, which owns the chip, calls one service at a time from one priority,
+    // SAFETY: the RAM image, which owns the chip, calls one service at a time from one priority,
     // while no operation runs. It does not use the controller or the CRC unit during the call.
     unsafe { ResidentFlash::steal(true) }
 }

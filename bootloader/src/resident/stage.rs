@@ -126,7 +126,7 @@ pub unsafe extern "C" fn stage() -> ! {
     SCB::sys_reset()
 }
 
-/// The report to the RAM part.
+/// The report to the RAM image.
 fn boot_report(
     decision: &BootDecision,
     request: Option<BootRequest>,

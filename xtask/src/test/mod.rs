@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
-use self::plan::{Tier, IMAGES, OF_EACH_CHIP};
+use self::plan::{Tier, IMAGES, OF_EACH_CHIP, SPLIT_ALONE};
 use self::programs::Program;
 use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
@@ -350,6 +350,11 @@ fn on_board(
     let mut programs = board_programs(board)?;
     programs.retain(|program| program.package == "coboot-tests");
     let mut jobs = Vec::new();
+    let is_of = |program: &str, test: &str, row: &(&str, &str)| program == row.0 && test.starts_with(row.1);
+    let has = |program: &str, test: &str| {
+        board.home.is_some() || !SPLIT_ALONE.iter().any(|row| is_of(program, test, row))
+    };
+    let chosen = |program: &str, test: &str| has(program, test) && chosen(program, test);
     add(&mut jobs, summary, &programs, Some(board.board), board, chosen)?;
     runner::run(jobs, summary);
     Ok(())

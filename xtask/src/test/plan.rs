@@ -108,6 +108,15 @@ pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("update", "conform::"),
 ];
 
+/// Tests of images that only a board with the split map has: sealed, with a log, with the debugger.
+pub const SPLIT_ALONE: &[(&str, &str)] = &[
+    ("device", "debugger::"),
+    ("device", "image::a_ram_image_runs_on_the_resident_part_of_another_bootloader"),
+    ("device", "log::"),
+    ("foreign", "gdb_door::"),
+    ("sealed", ""),
+];
+
 /// The table [`LATER`], as a page has it.
 pub fn table() -> String {
     let mut table = String::from("| tests | first run by | why not earlier |\n|---|---|---|\n");
