@@ -24,7 +24,7 @@ pub(super) struct Provision {
     #[command(flatten)]
     input: Input,
 
-    /// The file to write: .hex or .bin; by default the bootloader's name with .hex.
+    /// The file to write, Intel HEX; by default the bootloader's name with .hex.
     #[arg(long, short, value_name = "OUT")]
     output: Option<PathBuf>,
 
@@ -45,15 +45,11 @@ impl Provision {
         let unnamed = || Failure::usage("the address of the keys is unknown", "give --board or --layout");
         let layout = self.map.layout()?.ok_or_else(unnamed)?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("hex"));
-        let extension = output.extension().map(|extension| extension.to_ascii_lowercase());
-        let binary = match extension.as_ref().and_then(|extension| extension.to_str()) {
-            Some("hex") => false,
-            Some("bin") => true,
-            _ => {
-                let what = format!("{}: the name does not show the format", output.display());
-                return Err(Failure::usage(what, "name the file with .hex or .bin"));
-            }
-        };
+        // A raw image would fill the parameters between the two parts of the bootloader.
+        if !output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("hex")) {
+            let what = format!("{}: the file is Intel HEX", output.display());
+            return Err(Failure::usage(what, "name it with .hex"));
+        }
         if output == path {
             let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
@@ -70,17 +66,7 @@ impl Provision {
             .map_err(|fault| Failure::usage(fault.to_string(), "see coflash provision --help"))?;
         let made =
             provision(&image, layout, &block).map_err(|fault| Failure::file(path, &fault.to_string()))?;
-        if binary {
-            let mut flash = vec![0xFF; layout.bootloader.size as usize];
-            for (address, data) in made.segments() {
-                // `provision` has refused data outside the region.
-                let at = (address - layout.bootloader.base) as usize;
-                flash[at..at + data.len()].copy_from_slice(&data);
-            }
-            write_secret(&output, &flash, self.overwrite)?;
-        } else {
-            write_secret(&output, ihex::emit(&made), self.overwrite)?;
-        }
+        write_secret(&output, ihex::emit(&made), self.overwrite)?;
         let root_ids: Vec<u32> = roots.iter().map(PublicKey::id).collect();
         let kek_ids: Vec<u32> = keks.iter().map(Kek::id).collect();
         let ids = |ids: &[u32]| {

@@ -582,8 +582,10 @@ impl Attack {
         let journal = Journal::open(&view, layout.parameters);
         let stored = journal.get(&view, Key::NODE).map(|[id, rate, ..]| (id as u8, rate as u8));
         self.model.stored_is(stored)?;
-        if now[place(layout.bootloader)] != self.flash[place(layout.bootloader)] {
-            return Err(Broken::Program("the bootloader itself has changed".into()));
+        for own in [Some(layout.bootloader), layout.home, layout.data].into_iter().flatten() {
+            if now[place(own)] != self.flash[place(own)] {
+                return Err(Broken::Program(format!("{:08X}h: the bootloader, or the data", own.base)));
+            }
         }
         for (program, region) in (1..).zip(layout.programs) {
             let at = usize::from(program) - 1;

@@ -2,6 +2,7 @@
 
 use seal::key_block::SIZE;
 use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
+use shared_abi::ram_image::MAGIC;
 
 use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
@@ -10,16 +11,25 @@ use crate::file::range::AddressRange;
 /// Why a bootloader cannot get a key block.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ProvisionFault {
-    /// The image is not in the bootloader's region.
+    /// The board has no place for keys.
+    #[error("the board has the compact memory map, which has no place for keys: sealed devices need the split one")]
+    Compact,
+    /// A part of the image is outside the bootloader's flash.
     #[error(
-        "it lies at {found}, but the bootloader of this board lies at {region}: give the bootloader of this board"
+        "it has data at {found}, but the bootloader of this board is at {resident} and {home}: give the bootloader of \
+         this board, as ELF or Intel HEX"
     )]
     Elsewhere {
-        /// The place of the image.
+        /// The part.
         found: AddressRange,
-        /// The place of the bootloader.
-        region: AddressRange,
+        /// The place of the resident part.
+        resident: AddressRange,
+        /// The place of the RAM image.
+        home: AddressRange,
     },
+    /// There is no RAM image, or one without a CRC.
+    #[error("it has no RAM image with a CRC at {0:#010x}: give what `cargo xtask build` has made")]
+    NoRamImage(u32),
     /// The image does not begin at the CPU's start address.
     #[error(
         "it begins at {found:#010x} and not at {start:#010x}, where the CPU starts after a reset: it is not a bootloader"
@@ -38,20 +48,27 @@ pub enum ProvisionFault {
     Occupied(AddressRange),
 }
 
+/// The offset of the CRC in the header of the RAM image.
+const CRC_OFFSET: u32 = 4;
+
 /// Adds a key block to a bootloader image.
 ///
 /// # Errors
 /// See [`ProvisionFault`].
 pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Result<Image, ProvisionFault> {
-    let region = AddressRange::from(layout.bootloader);
+    let home = AddressRange::from(layout.home.ok_or(ProvisionFault::Compact)?);
+    let resident = AddressRange::from(layout.bootloader);
+    for (address, data) in bootloader.segments() {
+        let found = AddressRange { first: address, last: address.saturating_add(data.len() as u32 - 1) };
+        if !resident.contains(&found) && !home.contains(&found) {
+            return Err(ProvisionFault::Elsewhere { found, resident, home });
+        }
+    }
     let found = bootloader.span();
-    if !region.contains(&found) {
-        return Err(ProvisionFault::Elsewhere { found, region });
+    if found.first != resident.first {
+        return Err(ProvisionFault::Start { found: found.first, start: resident.first });
     }
-    if found.first != region.first {
-        return Err(ProvisionFault::Start { found: found.first, start: region.first });
-    }
-    if bootloader.bytes(region.first + MARK_OFFSET) != Some(KNOWS_SEALED_IMAGES.to_le_bytes()) {
+    if bootloader.bytes(resident.first + MARK_OFFSET) != Some(KNOWS_SEALED_IMAGES.to_le_bytes()) {
         return Err(ProvisionFault::Open);
     }
     let place = AddressRange::from(layout.key_block());
@@ -59,10 +76,18 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     if bootloader.part(place).is_some_and(|there| there.only_byte() != Some(0xFF)) {
         return Err(ProvisionFault::Occupied(place));
     }
-    let own = AddressRange { first: region.first, last: place.first - 1 };
+    let no_crc = [Some([0; 4]), None];
+    if bootloader.bytes(home.first) != Some(MAGIC.to_le_bytes())
+        || no_crc.contains(&bootloader.bytes(home.first + CRC_OFFSET))
+    {
+        return Err(ProvisionFault::NoRamImage(home.first));
+    }
+    let own = AddressRange { first: resident.first, last: place.first - 1 };
     let mut pieces = Pieces::default();
-    for (address, data) in bootloader.part(own).iter().flat_map(Image::segments) {
-        pieces.add(address, data, Place::File);
+    for part in [own, home] {
+        for (address, data) in bootloader.part(part).iter().flat_map(Image::segments) {
+            pieces.add(address, data, Place::File);
+        }
     }
     pieces.add(place.first, block.to_vec(), Place::File);
     Ok(pieces.in_order())
@@ -73,51 +98,72 @@ mod tests {
     use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
     use super::*;
-    use crate::file::raw;
 
-    fn image(address: u32, bytes: &[u8]) -> Image {
-        raw::read(bytes, Some(address)).unwrap()
+    fn image(pieces: &[(u32, &[u8])]) -> Image {
+        let mut image = Pieces::default();
+        for (address, data) in pieces {
+            image.add(*address, data.to_vec(), Place::File);
+        }
+        image.in_order()
     }
 
-    /// The first `size` bytes of a bootloader, with these bytes as its mark.
-    fn bootloader(mark: &[u8; 4], size: usize) -> Vec<u8> {
+    /// The first `size` bytes of a resident part, with these bytes as its mark.
+    fn resident(mark: &[u8; 4], size: usize) -> Vec<u8> {
         let mut bytes = vec![0x5A; size];
         bytes[0x1C..0x20].copy_from_slice(mark);
         bytes
     }
 
+    const BASE: u32 = LAYOUT.bootloader.base;
+    const HOME: u32 = LAYOUT.home.unwrap().base;
+    const RAM_IMAGE: [u8; 12] = *b"CBI2\x01\0\0\0\x40\0\0\0";
+
     #[test]
     fn a_bootloader_that_knows_no_sealed_images_gets_no_keys() {
-        let base = LAYOUT.bootloader.base;
-        let provision = |bytes: &[u8]| provision(&image(base, bytes), &LAYOUT, &[7; SIZE]);
-        assert!(provision(&bootloader(b"CBS1", 0x400)).is_ok());
+        let provision =
+            |bytes: &[u8]| provision(&image(&[(BASE, bytes), (HOME, &RAM_IMAGE)]), &LAYOUT, &[7; SIZE]);
+        assert!(provision(&resident(b"CBS1", 0x400)).is_ok());
         for none in [b"CBS2", b"\0\0\0\0", b"\xFF\xFF\xFF\xFF"] {
-            assert_eq!(provision(&bootloader(none, 0x400)), Err(ProvisionFault::Open));
+            assert_eq!(provision(&resident(none, 0x400)), Err(ProvisionFault::Open));
         }
-        assert_eq!(provision(&bootloader(b"CBS1", 0x400)[..0x1F]), Err(ProvisionFault::Open), "cut off");
+        assert_eq!(provision(&resident(b"CBS1", 0x400)[..0x1F]), Err(ProvisionFault::Open), "cut off");
     }
 
     #[test]
-    fn the_keys_lie_at_the_end_of_the_bootloaders_flash() {
-        let (base, size) = (LAYOUT.bootloader.base, LAYOUT.bootloader.size);
-        let own = bootloader(b"CBS1", 0x400);
-        let whole = [&own[..], &vec![0xFF; size as usize - 0x400]].concat();
+    fn the_keys_are_at_the_end_of_the_first_sector() {
+        let size = LAYOUT.bootloader.size as usize;
+        let own = resident(b"CBS1", 0x400);
+        let whole = [&own[..], &vec![0xFF; size - 0x400]].concat();
         for bytes in [&whole[..], &whole[..0x400], &whole[..0x401]] {
-            let made = provision(&image(base, bytes), &LAYOUT, &[7; SIZE]).unwrap();
-            assert_eq!(made.span(), AddressRange { first: base, last: base + size - 1 });
-            assert_eq!(made.bytes(base + size - 256), Some([7; 256]));
-            assert_eq!(made.bytes::<0x400>(base).as_ref().map(|bytes| &bytes[..]), Some(&own[..]));
+            let made = provision(&image(&[(BASE, bytes), (HOME, &RAM_IMAGE)]), &LAYOUT, &[7; SIZE]).unwrap();
+            assert_eq!(made.bytes(BASE + 0x3F00), Some([7; 256]));
+            assert_eq!(made.bytes::<0x400>(BASE).as_ref().map(|bytes| &bytes[..]), Some(&own[..]));
+            assert_eq!(made.bytes(HOME), Some(RAM_IMAGE));
+            // No load of it touches the sectors between the two.
+            let between = AddressRange { first: 0x0800_4000, last: 0x0800_FFFF };
+            assert!(made.part(between).is_none());
         }
         let place = AddressRange::from(LAYOUT.key_block());
         let mut taken = whole.clone();
-        taken[size as usize - 1] = 0;
-        let provision = |image| super::provision(&image, &LAYOUT, &[7; SIZE]).unwrap_err();
-        assert_eq!(provision(image(base, &taken)), ProvisionFault::Occupied(place));
-        let start = ProvisionFault::Start { found: base + 4, start: base };
-        assert_eq!(provision(image(base + 4, &[0; 8])), start);
-        let program = image(LAYOUT.programs[0].base, &[0; 8]);
-        assert!(matches!(provision(program), ProvisionFault::Elsewhere { .. }));
-        let long = vec![0; size as usize + 1];
-        assert!(matches!(provision(image(base, &long)), ProvisionFault::Elsewhere { .. }));
+        taken[size - 1] = 0;
+        let provision =
+            |pieces: &[(u32, &[u8])]| super::provision(&image(pieces), &LAYOUT, &[7; SIZE]).unwrap_err();
+        assert_eq!(provision(&[(BASE, &taken), (HOME, &RAM_IMAGE)]), ProvisionFault::Occupied(place));
+        let start = ProvisionFault::Start { found: BASE + 4, start: BASE };
+        assert_eq!(provision(&[(BASE + 4, &[0; 8])]), start);
+        for elsewhere in [LAYOUT.programs[0].base, LAYOUT.parameters[0].base, LAYOUT.data.unwrap().base] {
+            let found = provision(&[(BASE, &own), (elsewhere, &[0; 8])]);
+            assert!(matches!(found, ProvisionFault::Elsewhere { .. }), "{found}");
+        }
+        let long = vec![0; size + 1];
+        assert!(matches!(provision(&[(BASE, &long)]), ProvisionFault::Elsewhere { .. }));
+        let none = ProvisionFault::NoRamImage(HOME);
+        assert_eq!(provision(&[(BASE, &own)]), none);
+        for damaged in [&b"CBI1\x01\0\0\0"[..], b"CBI2\0\0\0\0", b"CBI2\x01"] {
+            assert_eq!(provision(&[(BASE, &own), (HOME, damaged)]), none);
+        }
+        let compact = &shared_abi::layout::nucleo_f446re::LAYOUT;
+        let refused = super::provision(&image(&[(BASE, &own)]), compact, &[7; SIZE]);
+        assert_eq!(refused, Err(ProvisionFault::Compact));
     }
 }

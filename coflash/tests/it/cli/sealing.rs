@@ -13,6 +13,7 @@ use crate::tool::{coflash, folder, serve, Done};
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
 use kit::folder::Folder;
+use kit::ihex::{intel_hex, END_OF_FILE};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
@@ -544,11 +545,14 @@ fn a_module_signs_in_two_steps() {
     openssl(&[&words[..], &["-sigfile", &signature]].concat());
 }
 
-/// 1000 bytes of a bootloader, with this word among its vectors.
-fn bootloader(mark: &[u8; 4]) -> Vec<u8> {
-    let mut bytes = vec![0x5A; 1000];
-    bytes[0x1C..0x20].copy_from_slice(mark);
-    bytes
+/// A bootloader as Intel HEX: 992 bytes of a resident part with this word among its vectors, and the
+/// beginning of a RAM image.
+fn bootloader(mark: &[u8; 4]) -> String {
+    let mut resident = vec![0x5A; 992];
+    resident[0x1C..0x20].copy_from_slice(mark);
+    let image = b"CBI2\x01\0\0\0\x40\0\0\0\0\0\0\0";
+    let resident = intel_hex(LAYOUT.bootloader.base, &resident);
+    [resident.trim_end().trim_end_matches(END_OF_FILE), &intel_hex(LAYOUT.home.unwrap().base, image)].concat()
 }
 
 fn words_of(root: &str) -> [&str; 4] {
@@ -559,29 +563,20 @@ fn words_of(root: &str) -> [&str; 4] {
 fn a_bootloader_gets_its_keys() {
     let room = Room::new("provision");
     let bootloader = bootloader(b"CBS1");
-    let boot = room.0.file("boot.bin", &bootloader);
+    let boot = room.0.file("boot.hex", bootloader.as_bytes());
     let (root, kek) = (room.path("root.pub"), room.path("kek.pem"));
     let words = ["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek];
     let more = ["--counter", "7", "--epoch", "2", "--for-tests"];
-    let out = room.path("production.bin");
+    let out = room.path("production.hex");
     let done = room.good(&[&words[..], &more, &["-o", &out]].concat());
     let secret = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
     assert!(done.out.contains(&format!("key-encryption keys  {:08X}h", secret.id())), "{}", done.out);
-    let flash = room.bytes("production.bin");
-    assert_eq!(flash.len(), LAYOUT.bootloader.size as usize);
-    assert_eq!(flash[..1000], bootloader);
-    let block = &flash[flash.len() - 256..];
+    let image = ihex::read(&room.bytes("production.hex")).unwrap();
+    let block: [u8; 256] = image.bytes(LAYOUT.key_block().base).unwrap();
+    assert_eq!(image.byte_count(), 992 + 16 + 256);
     assert_eq!(block[..16], *b"CBKB\x01\0\0\0\x07\0\0\0\x02\0\0\0");
     let public = PublicKey::from_pem(&String::from_utf8(room.bytes("root.pub")).unwrap()).unwrap();
     assert_eq!(block[20..52], public.bytes());
-    // The same as Intel HEX.
-    room.good(&[&words[..], &more, &["-o", &room.path("production.hex")]].concat());
-    let image = ihex::read(&room.bytes("production.hex")).unwrap();
-    assert_eq!(
-        image.bytes(LAYOUT.key_block().base).map(|bytes: [u8; 256]| bytes.to_vec()),
-        Some(block.to_vec())
-    );
-    assert_eq!(image.byte_count(), 1256);
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt as _;
@@ -589,7 +584,7 @@ fn a_bootloader_gets_its_keys() {
     }
     for (more, exit, words) in [
         (&["-o", &out][..], 2, "exists already"),
-        (&["-o", &room.path("x.elf")], 2, "name the file with .hex or .bin"),
+        (&["-o", &room.path("x.bin")], 2, "name it with .hex"),
         (&["-o", &room.path("x.hex"), "--root", &root], 2, "a key was given twice"),
         (&["-o", &room.path("x.hex"), "--kek", &kek], 2, "a key was given twice"),
     ] {
@@ -613,7 +608,7 @@ fn a_bootloader_gets_its_keys() {
     assert_eq!(again.exit, 3);
     assert!(again.err.contains("the place of the keys"), "{}", again.err);
     // For any other file keys have no meaning.
-    let other = room.0.file("other.bin", &self::bootloader(b"CBS2"));
+    let other = room.0.file("other.hex", self::bootloader(b"CBS2").as_bytes());
     let out = room.path("none.hex");
     let done = coflash(&[&["provision", &other][..], &words_of(&root), &["-o", &out]].concat());
     assert!(done.exit == 3 && done.err.contains("support for sealed images"), "{}", done.err);

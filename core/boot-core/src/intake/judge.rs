@@ -61,12 +61,13 @@ impl Judge<'_> {
         if self.region.contains(place.base, place.size) {
             return Ok(());
         }
-        let secured = [self.layout.bootloader, self.layout.parameters[0], self.layout.parameters[1]];
+        let [first, second] = self.layout.parameters.map(Some);
+        let secured = [Some(self.layout.bootloader), self.layout.home, first, second, self.layout.data];
         let touches = |region: &Region| {
             // Written without a sum: an address near the end of the address space must not wrap.
             place.base < region.end() && (place.base >= region.base || region.base - place.base < place.size)
         };
-        let secured = secured.iter().any(touches);
+        let secured = secured.iter().flatten().any(touches);
         Err(Refusal::unfit(if secured { FlashError::Secured } else { FlashError::Address }))
     }
 
