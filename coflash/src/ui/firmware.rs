@@ -169,11 +169,11 @@ mod tests {
         assert!(words(b":020000040801F1\n", "app.hex").starts_with("app.hex: "));
     }
 
-    /// Four bytes of Intel HEX at 0801_0000h; the CRC is the output of GNU `gzip` for EFh BEh ADh
+    /// Four bytes of Intel HEX at 0802_0000h; the CRC is the output of GNU `gzip` for EFh BEh ADh
     /// DEh.
     #[test]
     fn a_program_is_read_and_a_board_judges_its_place() {
-        let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
+        let hex = b":020000040802F0\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
         let loaded = load(Arc::new(hex.clone()), "../x/app.hex", &Settings::default()).unwrap();
         assert_eq!((loaded.shown.name.as_str(), loaded.shown.program_size), ("app.hex", 4));
         assert!(loaded.shown.inspection.starts_with("Intel HEX, well-formed"), "{}", loaded.shown.inspection);
