@@ -6,11 +6,11 @@ use shared_abi::layout::stm32f407g_disc1_two::LAYOUT as TWO;
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, evidence, process, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask attack [--frames N] [--seed S] [--yes]
+usage: cargo xtask attack [--frames N] [--seed S]
 
 Attacks emulated boards with the built firmware, and nodes without a chip, in virtual time: two
 masters that do what masters do, mixed with noise, floods, frames that are nearly right, errors on
@@ -21,7 +21,6 @@ attack. The counts go to target/evidence/attacker.json.
   --frames N      the frames of the masters on the boards (default: 200000, about two minutes); the
                   nodes, which are faster, get twenty times as many
   --seed S        the first seed (default: 1)
-  --yes           installs what is missing with sudo
 ";
 
 /// The images of the attack, on the board with two programs.
@@ -30,10 +29,9 @@ const IMAGES: &str =
     app-v2 app-program-2 app-lift app-lift-v2 app-virtual-can app-virtual-can-v2";
 
 pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
     build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
     evidence::begin("attacker")?;
     let mut attack = build::tests_program(DEFAULT, "attack");

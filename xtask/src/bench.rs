@@ -3,11 +3,11 @@
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask bench [--json] [--board BOARD] [--yes]
+usage: cargo xtask bench [--json] [--board BOARD]
 
 Downloads programs of 64, 256 and 900 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
 time, and prints how long that took beside what the wire and the flash allow at best; how busy the
@@ -19,15 +19,13 @@ is a file.
   --json          prints the tables as JSON: downloads, bus, forms, fleets, host; and keeps them in
                   target/evidence/bench.json
   --board BOARD   the board (default: stm32f407g-disc1)
-  --yes           installs what is missing with sudo
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let json = args.flag("--json");
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
     build::images(board, &["bootloader", "bootloader-sealed", "app-v1"])?;
     let mut bench = build::tests_program(board, "bench");
     // Optimised, as a user runs it.

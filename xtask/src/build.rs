@@ -10,12 +10,12 @@ use shared_abi::layout::{Image, Layout};
 use crate::args::Args;
 use crate::footprint::{self, Flash};
 use crate::product::Product;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::workspace::{PROFILE, TARGET};
 use crate::{files, process, ram_image, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD] [--yes]
+usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]
 
 Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
 bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
@@ -25,7 +25,6 @@ app-c is the application in C, for each program of the board, and with the tests
   --product FILE  the product of the bootloaders: a file like bootloader/products/default.rs, or the name
                   of a file there. Its name is in the file of the image (bootloader-NAME.elf) and in 100Ah
   --board BOARD   the board (default: stm32f407g-disc1)
-  --yes           installs what is missing with sudo
 ";
 
 /// An image of a board.
@@ -170,7 +169,6 @@ pub fn bootloader_flash(board: &Layout) -> Vec<Region> {
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
-    let setup = Setup::from(&mut args);
     let every = args.flag("--all");
     let product = args.value("--product")?.map(|word| Product::chosen(&word)).transpose()?;
     let product = product.filter(|product| !product.is_default());
@@ -185,7 +183,7 @@ pub fn run(mut args: Args) -> Outcome {
         _ if every => return Err("--all and names do not go together.".into()),
         names => names.iter().map(|name| Variant::by_name(board, name)).collect::<Outcome<_>>()?,
     };
-    setup.prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
+    setup::prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
     for variant in chosen {
         let (name, product) = match &product {
             Some(product) if variant.is_bootloader() => (variant.name_of(product)?, product.clone()),

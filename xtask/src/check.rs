@@ -1,27 +1,24 @@
 //! `cargo xtask check`: what to run before each commit.
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{arrows, lint, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask check [--yes]
+usage: cargo xtask check
 
 What to run before each commit, some two minutes on two cores when the crates of others are compiled: formatting,
 clippy over the host crates with their tests, who depends on whom, and the unit tests of the crates
 without hardware.
-
-  --yes           installs what is missing with sudo
 ";
 
 /// The crates that need neither a chip nor an emulator to be tested.
 const PURE: [&str; 6] =
     ["coboot-abi", "coboot-canopen", "coboot-seal", "coboot-core", "coboot-app", "coboot-linker"];
 
-pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
+pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    setup.prepare(&[Part::Lint, Part::Emulator])?;
+    setup::prepare(&[Part::Lint, Part::Emulator])?;
     // All checks run, so that one run shows all problems.
     let mut problems = lint::formatting()?;
     problems.extend(lint::clippy(lint::HOST_CRATES));

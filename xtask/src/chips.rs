@@ -5,23 +5,20 @@ use shared_abi::geometry::{self, Geometry, CHIPS};
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, process, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask chips [CHIP...] [--yes]
+usage: cargo xtask chips [CHIP...]
 
 Lays down a board for each chip in a copy of the repository, builds bootloader and application for it, and plays
 the main job on the emulated chip (tests/port/porting.rs). Without a CHIP it takes one of each line and size of
 flash: packages differ in nothing that is built. The first chip of a line takes a minute and a half, the next
 ones 20 seconds: half an hour for all on two cores. So this is a job of its own and no part of
 .ci/run.
-
-  --yes    installs what is missing with sudo
 ";
 
-pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
+pub fn run(args: Args) -> Outcome {
     let names = args.rest();
     let chips = match names.as_slice() {
         [] => kinds(),
@@ -30,7 +27,7 @@ pub fn run(mut args: Args) -> Outcome {
             .map(|name| geometry::by_name(name).ok_or_else(|| format!("no chip \"{name}\" is known.")))
             .collect::<Outcome<_>>()?,
     };
-    setup.prepare(&[Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
     let chips: Vec<_> = chips.iter().map(|chip| chip.chip).collect();
     println!("{}", chips.join(", "));
     let mut test = process::cargo("test");

@@ -7,18 +7,17 @@ use serde_json::{json, Value};
 
 use crate::args::Args;
 use crate::process::list;
-use crate::setup::{self, Part, Setup};
+use crate::setup::{self, Part};
 use crate::{evidence, files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask coverage [--yes]
+usage: cargo xtask coverage
 
 Counts which lines of the crates without an operating system are reached by tests on the host: each
 crate's own tests, those of the core with sealed images, and the tests of sealed images on the model
 of the flash. What the built firmware does in the emulator is not counted. The result goes to
 target/evidence/coverage.json, and the lines that no test reaches to target/coverage/missing.txt.
 
-  --yes           installs what is missing with sudo
 
 A line that is reached may still be wrong: `cargo xtask mutants` asks whether a test would notice.
 cargo-llvm-cov is installed into target/tools, and llvm-tools by rustup, where they are missing.
@@ -37,10 +36,9 @@ const CRATES: [(&str, &str); 5] = [
 /// The tests of sealed images that need no built firmware, in the test program `sealed`.
 pub const SEALED_TESTS: [&str; 4] = ["access::", "dictionary::", "model::", "pieces::"];
 
-pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
+pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    setup.prepare(&[Part::Emulator, Part::Coverage])?;
+    setup::prepare(&[Part::Emulator, Part::Coverage])?;
     let program = setup::tool("cargo-llvm-cov", VERSION, &[])?;
     evidence::begin("coverage")?;
     let llvm_cov = |words: &[&str]| {

@@ -138,6 +138,7 @@ fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
         let (name, value) = word.split_once('=').map_or((word, None), |(name, value)| (name, Some(value)));
         let known = help.split([' ', '[', '\n']).any(|known| known == name);
         match name {
+            "--yes" => {}
             _ if name.starts_with("--") && known => {
                 // In the help an option with a value has it in capitals, or has an example.
                 let line = help.lines().find(|line| line.split([' ', '[']).any(|known| known == name))?;

@@ -1,11 +1,11 @@
 //! `cargo xtask emulate`: runs an emulated board for other programs.
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [--yes] [OPTIONS]
+usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [OPTIONS]
 
 Sets the machine up, builds a bootloader and runs the emulated board with it in its flash.
 
@@ -13,7 +13,6 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
   --log[=WAY]     the bootloader that tells what it does, and what it tells. WAY: rtt (text for a debug
                   probe; the default), defmt (the same by defmt), uart (text out of the board's UART)
   --virtual-can   the bootloader that speaks CAN over the board's UART, which a pseudo-terminal leads to
-  --yes           installs what is missing with sudo
   OPTIONS         go to the emulator; `cargo xtask emulate -- --help` lists them. Among them:
                   --socketcand 127.0.0.1:29536    where other programs reach the bus
                   --app FILE                      an application in flash, as a debug probe puts it there
@@ -31,11 +30,10 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let log = log(&mut args)?;
     let virtual_can = args.flag("--virtual-can");
-    let setup = Setup::from(&mut args);
     let options = args.rest();
     let another = options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader="));
     let needed: &[Part] = if another { &[Part::Emulator] } else { &[Part::Firmware, Part::Emulator] };
-    setup.prepare(needed)?;
+    setup::prepare(needed)?;
 
     let mut emulator = process::cargo("run");
     emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board", board.board]);

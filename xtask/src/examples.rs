@@ -8,19 +8,17 @@ use shared_abi::layout::{stm32f407g_disc1, Layout};
 
 use crate::args::Args;
 use crate::build::report;
-use crate::setup::{self, Part, Setup};
+use crate::setup::{self, Part};
 use crate::{files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask examples [NAME...] [--yes]
+usage: cargo xtask examples [NAME...]
 
 Builds the programs in examples/ for the STM32F407G-DISC1, each by its own tools, and puts them into
 target/firmware/stm32f407g-disc1/example-NAME.elf. A NAME is a folder of examples/, or with -v2 the same
 program as version 2 (c-v2 and cpp-v2 by clang). Without a NAME it builds all of them, but not `template`:
 a new project, which `cargo generate` makes of no-stack. cargo-generate is built first, which takes some
 minutes once.
-
-  --yes         installs what is missing with sudo
 ";
 
 /// The board of all examples: their pages name it.
@@ -47,14 +45,13 @@ const TEMPLATE: &str = "template";
 /// What makes a project of a template, and its version.
 const GENERATE: (&str, &str) = ("cargo-generate", "0.23.7");
 
-pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
+pub fn run(args: Args) -> Outcome {
     let chosen = args.rest();
     let known: Vec<String> = names().chain([TEMPLATE.to_owned()]).collect();
     if let Some(name) = chosen.iter().find(|name| !known.contains(name)) {
         return Err(format!("there is no example \"{name}\"; there are: {}.", known.join(", ")));
     }
-    setup.prepare(&[Part::Examples, Part::Firmware])?;
+    setup::prepare(&[Part::Examples, Part::Firmware])?;
     if chosen.is_empty() {
         return all();
     }

@@ -14,7 +14,7 @@ use std::time::Instant;
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, files, process, workspace, Outcome};
 use bench::{Bench, Done};
 use coflash::Coflash;
@@ -22,7 +22,7 @@ use command::CommandLine;
 
 pub const HELP: &str = "\
 usage: cargo xtask hil --bus URL [--board BOARD] [--probe COMMAND] [--power-command COMMAND] [--node N]
-                       [--json FILE] [--yes]
+                       [--json FILE]
 
 Hardware in the loop: builds the images, flashes the bootloader into a real board through a debug probe and plays
 the main job and the update suite on its CAN bus. Programs that are in the board are overwritten.
@@ -37,7 +37,6 @@ the main job and the update suite on its CAN bus. Programs that are in the board
                   Without it the probe resets the board, and the power is not cut in mid-update
   --node N        the node-ID of the board, 1 to 127 (default: 1)
   --json FILE     writes the report to FILE
-  --yes           installs what is missing with sudo
 ";
 
 pub fn run(mut args: Args) -> Outcome {
@@ -52,9 +51,8 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let power = power.map(|line| CommandLine::new("--power-command", &line)).transpose()?;
     let report = args.value("--json")?;
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware])?;
+    setup::prepare(&[Part::Firmware])?;
 
     let started = Instant::now();
     let images = build::images(board, &build::MAIN)?;

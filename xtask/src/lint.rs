@@ -1,18 +1,17 @@
 //! `cargo xtask lint`: checks formatting and words, and runs clippy and rustdoc, with warnings denied.
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, files, process, product, words, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask lint [--board BOARD] [--yes]
+usage: cargo xtask lint [--board BOARD]
 
 Checks the formatting of every crate and the words of comments and pages, runs clippy over host
 crates (with their tests; the Python package, too) and over the firmware of a board, and makes the
 documentation of the host crates, all with warnings denied.
 
   --board BOARD   the board (default: stm32f407g-disc1)
-  --yes           installs what is missing with sudo
 ";
 
 /// What selects the host crates and their tests for clippy.
@@ -20,9 +19,8 @@ pub const HOST_CRATES: &[&str] = &["--all-targets", "--keep-going"];
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
 
     // All checks run, so that one run shows all problems.
     let mut problems = formatting()?;

@@ -85,6 +85,9 @@ macro_rules! jobs {
     };
 }
 
+/// The last line of each help.
+const YES: &str = "With --yes a job installs what is missing with sudo.\n";
+
 /// How many of the jobs are those that a newcomer needs.
 const FIRST: usize = 8;
 
@@ -146,9 +149,12 @@ fn main() -> ExitCode {
         Some(name) => match JOBS.iter().find(|job| job.name == name) {
             None => Err(format!("there is no job \"{name}\".\n\n{}", overview(JOBS))),
             Some(job) => {
-                let args = Args::new(words);
+                let mut args = Args::new(words);
+                if args.flag("--yes") {
+                    setup::may_use_sudo();
+                }
                 if args.asks_for_help() {
-                    print!("{}", job.help);
+                    print!("{}\n{YES}", job.help);
                     Ok(())
                 } else {
                     (job.run)(args)

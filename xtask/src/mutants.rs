@@ -6,11 +6,11 @@ use std::process::Command;
 use serde_json::json;
 
 use crate::args::Args;
-use crate::setup::{self, Part, Setup};
+use crate::setup::{self, Part};
 use crate::{coverage, evidence, files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [--yes] [OPTIONS]
+usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [OPTIONS]
 
 Changes the code of the device's crates in one place at a time with cargo-mutants, and runs the
 crate's tests: each change must make one fail. Fails if a change stays unnoticed that
@@ -19,7 +19,6 @@ crate's tests: each change must make one fail. Fails if a change stays unnoticed
   --package NAME  this crate alone: coboot-abi, coboot-canopen, coboot-core, coboot-app or coboot-seal
   --in-diff BASE  the changes alone in lines that differ from this commit
   --shard K/N     the K-th of N parts, from 0
-  --yes           installs what is missing with sudo
   OPTIONS         for cargo-mutants, as --file '**/store/*.rs' or --list
 
 It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed into target/tools.
@@ -43,7 +42,7 @@ pub fn run(mut args: Args) -> Outcome {
         return Err(format!("there is no crate \"{name}\"; there is: {}.", PACKAGES.join(", ")));
     }
     // The tests of sealed images are in the crate that builds the emulator.
-    Setup::from(&mut args).prepare(&[Part::Emulator])?;
+    setup::prepare(&[Part::Emulator])?;
     let program = setup::tool("cargo-mutants", VERSION, &[])?;
     let folder = workspace::target_dir().join("mutants");
     files::make(&folder)?;

@@ -5,11 +5,11 @@ use std::path::Path;
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, evidence, process, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask opinion [--json] [--yes]
+usage: cargo xtask opinion [--json]
 
 Runs the programs of sim/emulator/tests/it/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
 (mps2-an386), and compares their results word for word. A difference that is not explained in the
@@ -19,14 +19,12 @@ two flashes.
 
   --json          also writes the result of the programs to target/evidence/cpu.json: commit, counts,
                   differences
-  --yes           installs what is missing with sudo
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let json = args.flag("--json");
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::Emulator, Part::Qemu])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator, Part::Qemu])?;
     let cpu = cpu(json);
     let board = board();
     cpu.and(board)

@@ -7,18 +7,17 @@ use crate::args::Args;
 use crate::elf::Elf;
 use crate::footprint::Flash;
 use crate::product::Product;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, files, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask pairs [--spread] [--yes]
+usage: cargo xtask pairs [--spread]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
 values of any two choices stand together in one of them (a covering array), and fails when one does not
 build or does not fit its flash. It prints the choices and the size of each.
 
   --spread   each of them for one board, the next for the next; without, each for every board
-  --yes      installs what is missing with sudo
 ";
 
 /// The fields of a product that are varied, and their values, as the product's file writes them. The
@@ -70,10 +69,9 @@ const SWITCHES: &str = "NodeSource::Function(|| {
 type Row = [u8; FIELDS.len()];
 
 pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
     let spread = args.flag("--spread");
     args.none_left()?;
-    setup.prepare(&[Part::Firmware])?;
+    setup::prepare(&[Part::Firmware])?;
     let rows = covering();
     let mut largest = 0;
     let folder = workspace::target_dir().join("pairs");

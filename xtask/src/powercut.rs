@@ -7,11 +7,11 @@ use serde_json::json;
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask powercut [--full] [--every-way] [--json] [--reproduce POINT] [--board BOARD] [--yes]
+usage: cargo xtask powercut [--full] [--every-way] [--json] [--reproduce POINT] [--board BOARD]
 
 Cuts the power at flash operations of updates, stores and erasures, in every way, and once more in the
 recovery; then looks what the device does. Fails if it finds a device that cannot be reached, half a
@@ -26,17 +26,15 @@ On the model of the flash it cuts every operation; of the real firmware it cuts 
   --json             prints the counts as JSON, an object for each board
   --reproduce POINT  tells one point in words, as update:37:torn:12:after
   --board BOARD      this board alone (default: stm32f407g-disc1)
-  --yes              installs what is missing with sudo
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
-    let setup = Setup::from(&mut args);
     let (full, every_way, json) = (args.flag("--full"), args.flag("--every-way"), args.flag("--json"));
     let point = args.value("--reproduce")?;
     args.none_left()?;
-    setup.prepare(&[Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
     if let Some(point) = point {
         return process::run(&mut command(board, &["--reproduce", &point])?);
     }

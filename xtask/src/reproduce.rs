@@ -7,18 +7,17 @@ use serde_json::json;
 
 use crate::args::Args;
 use crate::elf::{Elf, Segment};
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{evidence, files, process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask reproduce [--board BOARD] [--yes]
+usage: cargo xtask reproduce [--board BOARD]
 
 Clones the last commit into two folders with names of different lengths, builds bootloader and
 application in both, and compares the bytes that go into the flash. Whoever has a device and the
 sources can so find out whether they belong together. Changes without a commit take no part.
 
   --board BOARD   the board (default: stm32f407g-disc1)
-  --yes           installs what is missing with sudo
 
 The result goes to target/evidence/reproduce.json.
 ";
@@ -30,9 +29,8 @@ const FOLDERS: [&str; 2] = ["a", "another-folder-with-a-longer-name"];
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware])?;
+    setup::prepare(&[Part::Firmware])?;
     evidence::begin("reproduce")?;
     let base = workspace::target_dir().join("reproduce");
     files::remove(&base)?;

@@ -6,6 +6,7 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::{env, fs};
 
 use crate::args::Args;
@@ -13,7 +14,7 @@ use crate::workspace::TARGET;
 use crate::{files, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask setup [--yes]
+usage: cargo xtask setup
 
 Brings the machine to where every other job runs: by rustup the Rust target thumbv7em-none-eabihf, rustfmt and
 clippy; by apt-get what builds the emulator's CPU (cmake, make, pkg-config, libclang), compilers for the chip
@@ -22,8 +23,6 @@ target/python with tests/python/requirements.txt.
 
 The other jobs do this themselves, each for what it needs. As root it installs what is missing; for
 anyone else it stops with the line to run, or, with --yes, runs that line.
-
-  --yes           installs missing packages with sudo
 ";
 
 /// A part of the product with needs on the machine.
@@ -56,16 +55,17 @@ pub enum Part {
     Windows,
 }
 
-/// The permissions of the set-up.
-pub struct Setup {
-    /// Whether packages may be installed with sudo.
-    yes: bool,
+/// Whether packages may be installed with sudo.
+static MAY_USE_SUDO: AtomicBool = AtomicBool::new(false);
+
+/// Allows it to install packages with sudo.
+pub fn may_use_sudo() {
+    MAY_USE_SUDO.store(true, Ordering::Relaxed);
 }
 
-pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
+pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    setup.prepare(&[
+    prepare(&[
         Part::Firmware,
         Part::C,
         Part::Examples,
@@ -79,83 +79,75 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-impl Setup {
-    /// Takes `--yes`.
-    pub fn from(args: &mut Args) -> Self {
-        Self { yes: args.flag("--yes") }
+/// Installs what these parts need and is missing. Where that may not be done, the message has the
+/// line to run.
+pub fn prepare(parts: &[Part]) -> Outcome {
+    install(parts)?;
+    if parts.contains(&Part::Emulator) {
+        renew_cmake(&workspace::target_dir());
     }
+    if parts.contains(&Part::Firmware) {
+        rust_target(TARGET)?;
+    }
+    if parts.contains(&Part::Lint) {
+        component("rustfmt", process::succeeds("rustfmt", &["--version"]))?;
+        component("clippy", process::succeeds("clippy-driver", &["--version"]))?;
+    }
+    if parts.contains(&Part::Coverage) {
+        let installed = process::output(Command::new("rustup").args(["component", "list", "--installed"]));
+        component("llvm-tools", installed.is_ok_and(|list| list.contains("llvm-tools")))?;
+    }
+    if parts.contains(&Part::Python) {
+        python_environment()?;
+    }
+    Ok(())
+}
 
-    /// Installs what these parts need and is missing. Where that may not be done, the message has the
-    /// line to run.
-    pub fn prepare(&self, parts: &[Part]) -> Outcome {
-        self.packages(parts)?;
-        if parts.contains(&Part::Emulator) {
-            renew_cmake(&workspace::target_dir());
-        }
-        if parts.contains(&Part::Firmware) {
-            rust_target(TARGET)?;
-        }
-        if parts.contains(&Part::Lint) {
-            component("rustfmt", process::succeeds("rustfmt", &["--version"]))?;
-            component("clippy", process::succeeds("clippy-driver", &["--version"]))?;
-        }
-        if parts.contains(&Part::Coverage) {
-            let installed =
-                process::output(Command::new("rustup").args(["component", "list", "--installed"]));
-            component("llvm-tools", installed.is_ok_and(|list| list.contains("llvm-tools")))?;
-        }
-        if parts.contains(&Part::Python) {
-            python_environment()?;
-        }
-        Ok(())
+/// Installs Debian's packages.
+fn install(parts: &[Part]) -> Outcome {
+    let missing = missing_packages(parts, is_there);
+    if missing.is_empty() {
+        return Ok(());
     }
-
-    /// Installs Debian's packages.
-    fn packages(&self, parts: &[Part]) -> Outcome {
-        let missing = missing_packages(parts, is_there);
-        if missing.is_empty() {
-            return Ok(());
-        }
-        let by_hand = format!(
-            "sudo apt-get update && sudo apt-get install -y --no-install-recommends {}",
-            missing.join(" ")
-        );
-        if !process::succeeds("apt-get", &["--version"]) {
-            return Err(format!(
-                "these are missing, by the names of Debian's packages: {}. There is no apt-get here to install \
-                 them with; do it with this system's package manager and try again.",
-                missing.join(", ")
-            ));
-        }
-        let root = process::output(Command::new("id").arg("-u")).is_ok_and(|id| id.trim() == "0");
-        if !root && !self.yes {
-            return Err(format!(
-                "some packages are missing. Run this line and try again:\n\n    {by_hand}\n\n\
-                 (or add --yes, and it is run for you.)"
-            ));
-        }
-        println!("Installing {} ...", missing.join(", "));
-        let apt_get = |words: &[&str]| {
-            let mut command = Command::new(if root { "env" } else { "sudo" });
-            command.args((!root).then_some("env")).args(["DEBIAN_FRONTEND=noninteractive", "apt-get"]);
-            process::run(command.args(["-qq", "-o", "DPkg::Lock::Timeout=300"]).args(words))
-        };
-        // A new machine has no package lists. If one of several sources cannot be reached, the
-        // install may still work; if not, it reports that.
-        let _ = apt_get(&["update"]);
-        let install = ["install", "-y", "--no-install-recommends"];
-        apt_get(&[&install[..], &missing[..]].concat())
-            .map_err(|problem| format!("{problem} By hand it is:\n\n    {by_hand}"))?;
-        let still = missing_packages(parts, is_there);
-        if still.is_empty() {
-            return Ok(());
-        }
-        Err(format!(
-            "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front of the \
-             system's in PATH?",
-            still.join(", ")
-        ))
+    let by_hand = format!(
+        "sudo apt-get update && sudo apt-get install -y --no-install-recommends {}",
+        missing.join(" ")
+    );
+    if !process::succeeds("apt-get", &["--version"]) {
+        return Err(format!(
+            "these are missing, by the names of Debian's packages: {}. There is no apt-get here to install \
+             them with; do it with this system's package manager and try again.",
+            missing.join(", ")
+        ));
     }
+    let root = process::output(Command::new("id").arg("-u")).is_ok_and(|id| id.trim() == "0");
+    if !root && !MAY_USE_SUDO.load(Ordering::Relaxed) {
+        return Err(format!(
+            "some packages are missing. Run this line and try again:\n\n    {by_hand}\n\n\
+             (or add --yes, and it is run for you.)"
+        ));
+    }
+    println!("Installing {} ...", missing.join(", "));
+    let apt_get = |words: &[&str]| {
+        let mut command = Command::new(if root { "env" } else { "sudo" });
+        command.args((!root).then_some("env")).args(["DEBIAN_FRONTEND=noninteractive", "apt-get"]);
+        process::run(command.args(["-qq", "-o", "DPkg::Lock::Timeout=300"]).args(words))
+    };
+    // A new machine has no package lists. If one of several sources cannot be reached, the
+    // install may still work; if not, it reports that.
+    let _ = apt_get(&["update"]);
+    let install = ["install", "-y", "--no-install-recommends"];
+    apt_get(&[&install[..], &missing[..]].concat())
+        .map_err(|problem| format!("{problem} By hand it is:\n\n    {by_hand}"))?;
+    let still = missing_packages(parts, is_there);
+    if still.is_empty() {
+        return Ok(());
+    }
+    Err(format!(
+        "{} installed well, and still nothing is found of it; is another cmake, clang or python3 in front of the \
+         system's in PATH?",
+        still.join(", ")
+    ))
 }
 
 /// Whether what a package of Debian and Ubuntu brings is there.

@@ -10,18 +10,17 @@ use shared_abi::layout::{Layout, BOARDS};
 use crate::args::Args;
 use crate::elf::Elf;
 use crate::footprint::{kib, read, Flash};
-use crate::setup::{Part, Setup};
+use crate::setup::{self, Part};
 use crate::{build, evidence, parts, ram_image, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask size [--board BOARD] [--image IMAGE] [--yes]
+usage: cargo xtask size [--board BOARD] [--image IMAGE]
 
 Builds the bootloader, prints its flash by section, by part, by variant and by board, and fails when
 it is over the budget on any board.
 
   --board BOARD   the board of the tables (default: stm32f407g-disc1)
   --image IMAGE   this bootloader alone, bootloader-sealed for one, by section and by part
-  --yes           installs what is missing with sudo
 ";
 
 /// The largest permitted sizes in bytes: of resident part, header and RAM image together in the
@@ -33,9 +32,8 @@ const RAM_IMAGE: u32 = 56 * 1024;
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let one = args.value("--image")?;
-    let setup = Setup::from(&mut args);
     args.none_left()?;
-    setup.prepare(&[Part::Firmware])?;
+    setup::prepare(&[Part::Firmware])?;
     let parts = tables(board, one.as_deref().unwrap_or("bootloader"))?;
     if one.is_some() {
         return Ok(());

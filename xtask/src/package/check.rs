@@ -125,7 +125,7 @@ finally:
 /// The crates build from the files for the registry, and `coflash` installs from its folder.
 pub fn crates(release: &Release, root: &Path) -> Outcome {
     // One of the crates is the emulator.
-    release.setup.prepare(&[setup::Part::Emulator])?;
+    setup::prepare(&[setup::Part::Emulator])?;
     process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     let mut install = process::bare_cargo();
     install.args(["install", "--locked", "--debug", "--quiet", "--no-track", "--path"]);

@@ -10,7 +10,7 @@ use crate::{files, process, setup, workspace, Outcome};
 const CARGO_DEB: &str = "3.8.0";
 
 pub fn make(release: &Release) -> Outcome {
-    release.setup.prepare(&[setup::Part::Deb])?;
+    setup::prepare(&[setup::Part::Deb])?;
     let cargo_deb = setup::tool("cargo-deb", CARGO_DEB, &[])?;
     // Beside the program, where the metadata names them.
     let parts = release.build.join(LINUX).join(build::PROFILE).join("deb");

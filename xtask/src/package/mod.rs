@@ -16,11 +16,10 @@ use sha2::{Digest, Sha256};
 
 use crate::args::Args;
 use crate::process::list;
-use crate::setup::{self, Setup};
-use crate::{files, process, sbom, toolchain, workspace, Outcome};
+use crate::{files, process, sbom, setup, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask package [--check] [--draft] [--yes] [PART ...]
+usage: cargo xtask package [--check] [--draft] [PART ...]
 
 Makes what is handed out, in target/dist. Without a PART it makes all of them:
 
@@ -39,7 +38,6 @@ SHA256SUMS has the sums of all files in target/dist.
             a quarter of an hour and more on two cores, so it is a job of its own and no part of .ci/run.
   --draft   a trial: also packs a tree with changes that are not committed (the source archive is without them),
             or a commit without the tag of its version, and by another Rust than a release has
-  --yes     installs missing packages with sudo
 ";
 
 /// Linux; the program does not need a C library of the system.
@@ -85,7 +83,6 @@ struct Release {
     /// The time of the commit, in seconds since 1970: all files in archives have this time.
     epoch: String,
     draft: bool,
-    setup: Setup,
 }
 
 impl Release {
@@ -119,7 +116,6 @@ impl Release {
 }
 
 pub fn run(mut args: Args) -> Outcome {
-    let setup = Setup::from(&mut args);
     let checked = args.flag("--check");
     let draft = args.flag("--draft");
     let parts = parts(&args.rest())?;
@@ -134,7 +130,6 @@ pub fn run(mut args: Args) -> Outcome {
         build: target.join("dist-build"),
         epoch: git(&["log", "-1", "--format=%ct"])?.trim().to_owned(),
         draft,
-        setup,
     };
     if parts.len() == PARTS.len() {
         files::remove(&release.dist)?;
@@ -189,13 +184,13 @@ fn releasable(status: &str, tags: &str) -> Outcome {
 }
 
 fn windows(release: &Release) -> Outcome {
-    release.setup.prepare(&[setup::Part::Windows])?;
+    setup::prepare(&[setup::Part::Windows])?;
     files::copy(&build::program(workspace::root(), &release.build, WINDOWS)?, &release.windows())?;
     notices_beside(release)
 }
 
 fn python(release: &Release) -> Outcome {
-    release.setup.prepare(&[setup::Part::Python])?;
+    setup::prepare(&[setup::Part::Python])?;
     build::wheel(release)?;
     notices_beside(release)
 }

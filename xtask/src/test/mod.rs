@@ -15,10 +15,9 @@ use self::plan::{Tier, IMAGES, OF_EACH_CHIP, SPLIT_ALONE};
 use self::programs::Program;
 use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
-use crate::setup::{self, Setup};
 use crate::{
-    attack, build, chips, evidence, examples, files, fuzz, opinion, powercut, process, reproduce, workspace,
-    Outcome,
+    attack, build, chips, evidence, examples, files, fuzz, opinion, powercut, process, reproduce, setup,
+    workspace, Outcome,
 };
 
 mod plan;
@@ -26,7 +25,7 @@ mod programs;
 mod runner;
 
 pub const HELP: &str = "\
-usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | --list | WORDS] [--yes]
+usage: cargo xtask test [--ci | --all [--part NAME] | --board BOARD | --list | WORDS]
 
 Sets the machine up, builds firmware and test programs and runs the tests of the product on its default
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
@@ -37,7 +36,6 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --part NAME     with --all: this part alone; --all lists the names at its beginning
   --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
-  --yes           installs what is missing with sudo
   WORDS           go to cargo test, for one kind of test:
                   `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
 
@@ -85,7 +83,6 @@ const ROOM: u64 = 5 << 20;
 pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
-    let setup = Setup::from(&mut args);
     if args.flag("--list") {
         print!("{}", plan::table());
         return args.none_left();
@@ -116,7 +113,7 @@ pub fn run(mut args: Args) -> Outcome {
 
     // Before anything takes time: what is missing on this machine.
     let tier = stages.iter().map(|stage| stage.tier).max().unwrap_or(Tier::Product);
-    setup.prepare(tier.needs())?;
+    setup::prepare(tier.needs())?;
     room()?;
     let _alone = alone()?;
     if !words.is_empty() {
