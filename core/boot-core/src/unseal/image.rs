@@ -12,7 +12,7 @@ use seal::ed25519::Verification;
 use seal::judge::{judge, Device, Needs};
 use seal::key_block::{self, KEKS, KEK_COUNT, KEY};
 use seal::lzma::Decoder;
-use seal::sha512::{hmac, prepare, Sha512};
+use seal::sha512::{hmac, Sha512};
 use seal::wire::{
     array, flag, head_size, Fault, Head, Recipient, DOMAIN, HASH, MAX_CHUNK, MAX_HEAD, WRAP_DOMAIN,
 };
@@ -214,12 +214,6 @@ impl Unsealer<'_> {
         self.0.key_block = layout.key_block().base;
         self.0.policy = Some(&policy.seal);
         self.0.takes_no_other = is_sealed(flash, parameters, layout);
-    }
-
-    /// Prepares constants while there is no other work; returns whether there is nothing left to
-    /// prepare.
-    pub(crate) fn prepare(&mut self) -> bool {
-        prepare()
     }
 
     /// Whether the device has keys and therefore accepts and starts only sealed programs.
