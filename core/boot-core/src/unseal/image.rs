@@ -388,8 +388,14 @@ impl Room {
         }
         let word = |at| seal::wire::word(&keys, at);
         let record = ProgramRecord::load(parameters, flash, self.program);
-        let [mut counter, mut epoch, installed, _] =
-            parameters.get(flash, Key::Counter(self.program)).unwrap_or([0; 4]);
+        let counters = |program| parameters.get(flash, Key::Counter(program)).unwrap_or([0; 4]);
+        let [mut counter, _, installed, _] = counters(self.program);
+        // The epoch is the device's: a key that is revoked for one program signs for none.
+        let programs = self.layout.map_or(0, |layout| layout.programs.len() as u8);
+        let epoch = (1..=programs).fold(word(key_block::EPOCH), |epoch, program| {
+            let [_, proved, ..] = counters(program);
+            epoch.max(proved)
+        });
         // A program that has proved itself has raised the counter, if the policy raises it at
         // confirmation.
         if record.is_some_and(|record| record.confirmed) {
@@ -399,7 +405,6 @@ impl Room {
         if self.granted & right::LOWER_COUNTER != 0 {
             counter = counter.min(self.argument);
         }
-        epoch = epoch.max(word(key_block::EPOCH));
         let head = Head(&self.head);
         self.needs = judge(
             head,
