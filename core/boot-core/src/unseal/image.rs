@@ -88,11 +88,13 @@ pub struct Room {
     pub(super) events: [Value; EVENTS],
     /// What must be stored when the flash is idle: the last event, the number of grants.
     pub(super) stores: (bool, bool),
+    /// A signature was good, of a complete image or of a request, and nobody was told yet.
+    pub(super) authentic: bool,
     pub(super) active: bool,
     pub(super) stage: Stage,
     pub(super) program: u8,
     /// The same image is already installed: the new one is checked and discarded.
-    same: bool,
+    pub(super) same: bool,
     /// The record of the installed image.
     record: Value,
     /// The new counter is not stored yet.
@@ -151,6 +153,7 @@ impl Room {
             event: 0,
             events: [[0; 4]; EVENTS],
             stores: (false, false),
+            authentic: false,
             active: false,
             stage: Stage::Head,
             program: 0,
@@ -590,8 +593,8 @@ impl Room {
 }
 
 /// The new counter of a program before its record is removed: the counter of a program that has
-/// proved itself. It is written even if it already has this value: after a power cut it may read
-/// this way now and differently later.
+/// proved itself. It is stored even if it already has this value: after a power cut it may read
+/// this way now and differently later. (The store writes nothing if it is certain.)
 pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
     let record = ProgramRecord::load(parameters, flash, program)?;
     let [counter, epoch, installed, _] = parameters.get(flash, Key::Counter(program))?;
