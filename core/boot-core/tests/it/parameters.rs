@@ -666,6 +666,8 @@ fn the_record_of_a_program_has_its_words() {
                 half_erased,
                 #[cfg(feature = "sealed")]
                 seal: None,
+                #[cfg(feature = "sealed")]
+                withdrawn: false,
             };
             assert_eq!(record.value(), [first, 0xCAFE_F00D, word, 77]);
             assert_eq!(ProgramRecord::from_value(record.value()), Some(record));
@@ -679,4 +681,30 @@ fn the_record_of_a_program_has_its_words() {
     for first in [0, 0x8000_0000] {
         assert_eq!(ProgramRecord::from_value([first, 1, flags(b"APP1"), 1]), None);
     }
+}
+
+/// A withdrawn program: bit 28 of the first word. Whatever a program stores by the callgate of this
+/// record, it is not released.
+#[cfg(feature = "sealed")]
+#[test]
+fn a_withdrawn_program_is_not_released_by_its_flags() {
+    use boot_core::store::record::Seal;
+
+    let record = ProgramRecord {
+        size: 0x1234,
+        crc: 1,
+        signed: false,
+        confirmed: true,
+        version: 7,
+        half_erased: false,
+        seal: Some(Seal::Locked),
+        withdrawn: true,
+    };
+    let confirmed = u32::from_le_bytes(*b"RUN0");
+    assert_eq!(record.value(), [0x5000_1234, 1, confirmed, 7]);
+    assert_eq!(ProgramRecord::from_value(record.value()), Some(record));
+    let told = ProgramRecord { signed: true, ..record };
+    assert_eq!(ProgramRecord::from_value(told.value()), Some(record), "the confirmation stays");
+    let released = ProgramRecord { signed: true, withdrawn: false, ..record };
+    assert!(ProgramRecord::from_value(released.value()).is_some_and(|record| record.signed));
 }
