@@ -13,3 +13,4 @@ mod pieces;
 mod powercut;
 mod provisioning;
 mod refusals;
+mod strangers;

@@ -407,6 +407,9 @@ fn signed_and_wrong() -> Vec<(String, u32, Vec<u8>)> {
         let file = claims(own, &|bytes| bytes[4..6].copy_from_slice(&len.to_le_bytes()));
         add(&format!("a certificate of {len} bytes"), SIGNATURE, file);
     }
+    for at in [64, 75, 87] {
+        add(&format!("reserved byte {at}"), SIGNATURE, claims(own, &|bytes| bytes[at] = 1));
+    }
     add("of the root 0", KEY, claims(own, &|bytes| bytes[60..64].fill(0)));
     let second = second_root.public().id().to_le_bytes();
     add("of the other root", SIGNATURE, claims(own, &|bytes| bytes[60..64].copy_from_slice(&second)));

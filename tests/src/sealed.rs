@@ -389,6 +389,8 @@ pub trait Node: Objects + LssDevice {
     fn take_boot_request(&mut self) -> Option<BootRequest>;
     /// [`Bootloader::confirm`].
     fn confirm(&mut self, program: u8);
+    /// [`Bootloader::is_finishing`].
+    fn is_finishing(&mut self) -> bool;
     /// [`Bootloader::set_time`].
     fn set_time(&mut self, now: Instant);
 }
@@ -404,6 +406,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, 
 
     fn confirm(&mut self, program: u8) {
         Bootloader::confirm(self, program);
+    }
+
+    fn is_finishing(&mut self) -> bool {
+        Bootloader::is_finishing(self)
     }
 
     fn set_time(&mut self, now: Instant) {

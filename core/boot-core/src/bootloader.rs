@@ -159,7 +159,11 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     download: Downloader<'b, P, PROGRAMS>,
     emcy: Emcy,
     second_server: SecondServer,
+    /// The password.
     lock: Lock,
+    /// The wait after wrong signatures. A password does not end it.
+    #[cfg(feature = "sealed")]
+    signatures: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
     stored_version: StoredVersion,
@@ -191,6 +195,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             emcy: Emcy::new(),
             second_server: SecondServer::NONE,
             lock: Lock::new(config.password),
+            #[cfg(feature = "sealed")]
+            signatures: Lock::new(b""),
             now: Instant::from_millis(0),
             stored_version: StoredVersion::new(),
         };
@@ -229,18 +235,19 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 
     /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
+        // No other success ends the wait: anybody may send a command that succeeds.
+        #[cfg(feature = "sealed")]
+        if self.download.unsealer_mut().take_authentic() {
+            self.signatures.succeed();
+        }
         match self.download.take_outcome() {
             None => {}
-            Some((_, Ok(()))) => {
-                #[cfg(feature = "sealed")]
-                self.lock.succeed();
-                self.emcy.clear(emcy::register::MANUFACTURER);
-            }
+            Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 // To check a signature takes the device a tenth of a second.
                 #[cfg(feature = "sealed")]
                 if error == FlashError::Signature {
-                    self.lock.fail(self.now);
+                    self.signatures.fail(self.now);
                 }
                 let code = match error {
                     FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
@@ -276,6 +283,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     pub fn is_finishing(&mut self) -> bool {
         // A reset would end the wait after a wrong password, and so speed up guessing.
         if self.lock.is_waiting(self.now) {
+            return true;
+        }
+        #[cfg(feature = "sealed")]
+        if self.signatures.remembers(self.now) {
             return true;
         }
         self.download.is_finishing()
@@ -344,7 +355,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             (ACCESS, request) => {
                 // One signature is checked at a time, and that of an image takes precedence.
                 let is_active = self.download.unsealer_mut().is_active();
-                if self.lock.is_waiting(self.now) || self.download.busy() || is_active {
+                if self.signatures.is_waiting(self.now) || self.download.busy() || is_active {
                     return Err(AbortCode::DEVICE_STATE);
                 }
                 self.download.unsealer_mut().ask(&self.flash, request)
@@ -366,7 +377,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
         #[cfg(feature = "sealed")]
-        if self.download.unsealer_mut().takes_no_other() && self.lock.is_waiting(self.now) {
+        if self.download.unsealer_mut().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }
         self.download.download_start(at.sub, size)

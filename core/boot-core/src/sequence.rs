@@ -39,6 +39,11 @@ impl ProgramWords {
         Ok(Some(Operation::Program { address: self.at(), word: word(self.written) }))
     }
 
+    /// The number of words that are programmed and were read back.
+    pub(crate) const fn written(&self) -> usize {
+        self.written
+    }
+
     const fn at(&self) -> u32 {
         self.address + 4 * self.written as u32
     }

@@ -6,8 +6,10 @@ use crate::time::Instant;
 /// How long the lock accepts no password after the first wrong one, in milliseconds. The time
 /// doubles with each further wrong password.
 pub const FIRST_DELAY_MS: u32 = 500;
-/// The number of wrong passwords after which the wait no longer grows; it is half a minute then.
+/// The number of wrong passwords after which the wait no longer grows.
 const MOST_FAILURES: u32 = 6;
+/// The longest wait, in milliseconds: half a minute.
+pub const LONGEST_DELAY_MS: u32 = FIRST_DELAY_MS << MOST_FAILURES;
 
 /// A lock with its password, and the state of the attempts.
 #[derive(Clone, Copy, Debug)]
@@ -15,15 +17,15 @@ pub struct Lock {
     password: &'static [u8],
     /// Wrong passwords since the last right one.
     failures: u32,
-    /// The lock accepts no password before this time.
-    closed_until: Option<Instant>,
+    /// The time of the last wrong one, for as long as the longest wait.
+    failed_at: Option<Instant>,
 }
 
 impl Lock {
     /// A lock with this password.
     #[must_use]
     pub const fn new(password: &'static [u8]) -> Self {
-        Self { password, failures: 0, closed_until: None }
+        Self { password, failures: 0, failed_at: None }
     }
 
     /// Wrong passwords since the last right one.
@@ -37,9 +39,19 @@ impl Lock {
     /// end the wait.
     #[must_use]
     pub fn is_waiting(&mut self, now: Instant) -> bool {
+        let delay = FIRST_DELAY_MS << self.failures.saturating_sub(1).min(MOST_FAILURES);
+        self.remembers(now) && self.failed_at.is_some_and(|at| !now.has_reached(at + delay))
+    }
+
+    /// Whether a restart now would forget a wrong attempt too early: the next wait would be the first
+    /// one again. It ends with the longest wait after the last wrong attempt, so that restarts allow
+    /// few attempts more: 18 in two minutes in place of 9. Call it as often as
+    /// [`is_waiting`](Self::is_waiting).
+    #[must_use]
+    pub fn remembers(&mut self, now: Instant) -> bool {
         // Removed when the time is over, because instants wrap.
-        self.closed_until = self.closed_until.filter(|until| !now.has_reached(*until));
-        self.closed_until.is_some()
+        self.failed_at = self.failed_at.filter(|at| !now.has_reached(*at + LONGEST_DELAY_MS));
+        self.failed_at.is_some()
     }
 
     /// Tries a password.
@@ -54,7 +66,7 @@ impl Lock {
         // All bytes are compared, so that the time does not depend on the first different byte.
         let differs = given.iter().zip(self.password).fold(0, |sum, (a, b)| sum | (a ^ b));
         if differs == 0 && given.len() == self.password.len() {
-            self.failures = 0;
+            self.succeed();
             return Ok(());
         }
         self.fail(now);
@@ -63,13 +75,15 @@ impl Lock {
 
     /// An attempt of another kind has failed: the next wait is longer.
     pub fn fail(&mut self, now: Instant) {
-        self.closed_until = Some(now + (FIRST_DELAY_MS << self.failures.min(MOST_FAILURES)));
+        self.failed_at = Some(now);
         self.failures = self.failures.saturating_add(1);
     }
 
-    /// An attempt of another kind was successful: the next wait is the first one again.
+    /// An attempt of another kind was successful: the wait ends, and the next one is the first one
+    /// again.
     pub fn succeed(&mut self) {
         self.failures = 0;
+        self.failed_at = None;
     }
 }
 
@@ -106,6 +120,23 @@ mod tests {
         assert_eq!(lock.failures(), 0);
         lock.fail(now);
         assert!(lock.is_waiting(now + 499) && !lock.is_waiting(now + 500));
+    }
+
+    /// A restart forgets the attempts, so it has to wait for the longest wait after the last one.
+    #[test]
+    fn a_wrong_one_is_remembered_for_half_a_minute() {
+        let mut lock = Lock::new(b"INIT");
+        let mut now = Instant::from_millis(0);
+        assert!(!lock.remembers(now));
+        for _ in 0..9 {
+            lock.fail(now);
+            assert!(lock.remembers(now + 31_999));
+            let mut later = lock;
+            assert!(!later.remembers(now + 32_000) && !later.is_waiting(now + 32_000));
+            now = now + 31_999;
+        }
+        lock.succeed();
+        assert!(!lock.remembers(now) && !lock.is_waiting(now));
     }
 
     /// Half a second, one, two … half a minute; during the wait even the right password is refused.

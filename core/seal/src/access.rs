@@ -5,7 +5,7 @@
 pub mod right {
     /// Erase a program at once (a second CLEAR) without installing another one.
     pub const ERASE: u32 = 1 << 0;
-    /// Withdraw a program's release for autostart (84h).
+    /// Withdraw a program's release for autostart (84h), and release such a program again (83h).
     pub const CLEAR_SIGNATURE: u32 = 1 << 1;
     /// Install one program with a security counter of at least the argument.
     pub const LOWER_COUNTER: u32 = 1 << 2;
@@ -35,13 +35,18 @@ pub const REQUEST: usize = SIGNED_REQUEST + 64;
 
 /// The number of events in the log: 2003h/1 to 2003h/8.
 pub const EVENTS: usize = 8;
+/// The number of these that may be refusals, which anybody can cause; a wrong signature
+/// ([`Fault::Signature`](crate::wire::Fault::Signature)) is recorded beyond it.
+pub const MOST_REFUSALS: usize = 3;
 /// An event is four words: its number (1 is the first in the device's life), the kind in the upper
 /// half and its detail in the lower half of a word, security counter and version of the image.
 pub mod event {
-    /// A sealed image was installed; the detail is the program's number.
+    /// A sealed image was installed; the detail is the program's number. The installed image once
+    /// more is not recorded.
     pub const INSTALLED: u32 = 1 << 16;
-    /// A sealed image was refused; the detail is the error code of 1F57h. A repetition of the same
-    /// refusal is not recorded.
+    /// A sealed image was refused; the detail is the error code of 1F57h. An error code that the log
+    /// contains is not recorded again, and other refusals are limited
+    /// ([`MOST_REFUSALS`](super::MOST_REFUSALS)).
     pub const REFUSED: u32 = 2 << 16;
     /// Rights were granted; the detail is the rights.
     pub const UNLOCKED: u32 = 3 << 16;

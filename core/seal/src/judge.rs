@@ -7,6 +7,7 @@
 use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
 use crate::wire::{
     flag, role, tag, word, Fault, Head, CERTIFICATE, ED25519, FIXED, FORMAT, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
+    RESERVED,
 };
 
 /// The device that has received the image.
@@ -110,7 +111,8 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
             && (certificate.role() == role::RELEASE || certificate.role() == role::TEST)
             && certificate.vendor_id() == device.vendor_id
             && (own == 0 || own == device.product_code)
-            && (certificate.lowest()..=certificate.highest()).contains(&counter);
+            && (certificate.lowest()..=certificate.highest()).contains(&counter)
+            && certificate.reserved() == [0; RESERVED];
         if !holds {
             return Err(Fault::Signature);
         }

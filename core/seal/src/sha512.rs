@@ -3,74 +3,43 @@
 //! The current block is also the message schedule: sixteen words, one of which is replaced in each
 //! round. A hash therefore needs 200 bytes of RAM for any message.
 
-use core::sync::atomic::{AtomicU32, Ordering};
-
-use crate::words::add_product;
-
-/// The initial state of SHA-512 (FIPS 180-4, 5.3.5) and the constants of the rounds (4.2.3), the
-/// lower half of each first: the first 64 bits of the fractional parts of the square roots of the
-/// first eight primes and of the cube roots of the first eighty. In the image they would take 704
-/// bytes, which cannot be compressed. They are therefore computed ([`prepare`]), which takes about
-/// 30 ms at 168 MHz.
-static CONSTANTS: [[AtomicU32; 2]; STATE + 80] = [const { [const { AtomicU32::new(0) }; 2] }; STATE + 80];
-
 /// Words of the state.
 const STATE: usize = 8;
 
-/// All constants, computed if necessary.
-fn constants() -> &'static [[AtomicU32; 2]; STATE + 80] {
-    while !prepare() {}
-    &CONSTANTS
-}
+/// The initial state of SHA-512 (FIPS 180-4, 5.3.5): the first 64 bits of the fractional parts of the
+/// square roots of the first eight primes.
+#[rustfmt::skip]
+const START: [u64; STATE] = [
+    0x6a09_e667_f3bc_c908, 0xbb67_ae85_84ca_a73b, 0x3c6e_f372_fe94_f82b, 0xa54f_f53a_5f1d_36f1,
+    0x510e_527f_ade6_82d1, 0x9b05_688c_2b3e_6c1f, 0x1f83_d9ab_fb41_bd6b, 0x5be0_cd19_137e_2179,
+];
 
-/// Computes the next constant, in about 0.4 ms at 168 MHz; returns whether all are there. A device
-/// calls it while it has no other work, so that no request waits for all of them.
-pub fn prepare() -> bool {
-    // The upper half of every constant is not zero. Two concurrent calls write the same value.
-    let missing = |halves: &[AtomicU32; 2]| halves[1].load(Ordering::Acquire) == 0;
-    let Some((n, constant)) = CONSTANTS.iter().enumerate().find(|(_, halves)| missing(halves)) else {
-        return true;
-    };
-    let square = n < STATE;
-    let is_prime = |number: &u32| (2..*number).all(|divisor| !number.is_multiple_of(divisor));
-    let prime = (2..).filter(is_prime).nth(if square { n } else { n - STATE });
-    let root = root(prime.unwrap_or(0), if square { 2 } else { 3 });
-    constant[0].store(root as u32, Ordering::Release);
-    constant[1].store((root >> 32) as u32, Ordering::Release);
-    false
-}
-
-/// The first 64 bits of the fractional part of a square or cube root below 8, bit by bit: each bit
-/// is tried, and cleared again if the power is not below the number. No root is an integer, so the
-/// power never equals the number.
-#[inline(never)]
-fn root(number: u32, exponent: usize) -> u64 {
-    // Times 2^64.
-    let mut root = [0; 3];
-    // Three bits are in front of the point.
-    for bit in (0..3 + 64).rev() {
-        root[bit / 32] ^= 1 << (bit % 32);
-        // Its powers, each multiplied by 2^64 once more.
-        let mut power = [1, 0, 0, 0, 0, 0, 0, 0];
-        for _ in 0..exponent {
-            let mut product = [0; 8 + 3];
-            for (at, factor) in root.iter().enumerate() {
-                add_product(&mut product[at..], *factor, &power);
-            }
-            power.copy_from_slice(&product[..8]);
-        }
-        if power[2 * exponent % 8] >= number {
-            root[bit / 32] ^= 1 << (bit % 32);
-        }
-    }
-    u64::from(root[1]) << 32 | u64::from(root[0])
-}
-
-#[inline(always)]
-fn constant(halves: &[AtomicU32; 2]) -> u64 {
-    let [low, high] = halves;
-    u64::from(high.load(Ordering::Relaxed)) << 32 | u64::from(low.load(Ordering::Relaxed))
-}
+/// The constants of the rounds (FIPS 180-4, 4.2.3): the same of the cube roots of the first eighty
+/// primes. A table and not computed at the start of the device, where the first hash would have to
+/// wait for them.
+#[rustfmt::skip]
+const ROUNDS: [u64; 80] = [
+    0x428a_2f98_d728_ae22, 0x7137_4491_23ef_65cd, 0xb5c0_fbcf_ec4d_3b2f, 0xe9b5_dba5_8189_dbbc,
+    0x3956_c25b_f348_b538, 0x59f1_11f1_b605_d019, 0x923f_82a4_af19_4f9b, 0xab1c_5ed5_da6d_8118,
+    0xd807_aa98_a303_0242, 0x1283_5b01_4570_6fbe, 0x2431_85be_4ee4_b28c, 0x550c_7dc3_d5ff_b4e2,
+    0x72be_5d74_f27b_896f, 0x80de_b1fe_3b16_96b1, 0x9bdc_06a7_25c7_1235, 0xc19b_f174_cf69_2694,
+    0xe49b_69c1_9ef1_4ad2, 0xefbe_4786_384f_25e3, 0x0fc1_9dc6_8b8c_d5b5, 0x240c_a1cc_77ac_9c65,
+    0x2de9_2c6f_592b_0275, 0x4a74_84aa_6ea6_e483, 0x5cb0_a9dc_bd41_fbd4, 0x76f9_88da_8311_53b5,
+    0x983e_5152_ee66_dfab, 0xa831_c66d_2db4_3210, 0xb003_27c8_98fb_213f, 0xbf59_7fc7_beef_0ee4,
+    0xc6e0_0bf3_3da8_8fc2, 0xd5a7_9147_930a_a725, 0x06ca_6351_e003_826f, 0x1429_2967_0a0e_6e70,
+    0x27b7_0a85_46d2_2ffc, 0x2e1b_2138_5c26_c926, 0x4d2c_6dfc_5ac4_2aed, 0x5338_0d13_9d95_b3df,
+    0x650a_7354_8baf_63de, 0x766a_0abb_3c77_b2a8, 0x81c2_c92e_47ed_aee6, 0x9272_2c85_1482_353b,
+    0xa2bf_e8a1_4cf1_0364, 0xa81a_664b_bc42_3001, 0xc24b_8b70_d0f8_9791, 0xc76c_51a3_0654_be30,
+    0xd192_e819_d6ef_5218, 0xd699_0624_5565_a910, 0xf40e_3585_5771_202a, 0x106a_a070_32bb_d1b8,
+    0x19a4_c116_b8d2_d0c8, 0x1e37_6c08_5141_ab53, 0x2748_774c_df8e_eb99, 0x34b0_bcb5_e19b_48a8,
+    0x391c_0cb3_c5c9_5a63, 0x4ed8_aa4a_e341_8acb, 0x5b9c_ca4f_7763_e373, 0x682e_6ff3_d6b2_b8a3,
+    0x748f_82ee_5def_b2fc, 0x78a5_636f_4317_2f60, 0x84c8_7814_a1f0_ab72, 0x8cc7_0208_1a64_39ec,
+    0x90be_fffa_2363_1e28, 0xa450_6ceb_de82_bde9, 0xbef9_a3f7_b2c6_7915, 0xc671_78f2_e372_532b,
+    0xca27_3ece_ea26_619c, 0xd186_b8c7_21c0_c207, 0xeada_7dd6_cde0_eb1e, 0xf57d_4f7f_ee6e_d178,
+    0x06f0_67aa_7217_6fba, 0x0a63_7dc5_a2c8_98a6, 0x113f_9804_bef9_0dae, 0x1b71_0b35_131c_471b,
+    0x28db_77f5_2304_7d84, 0x32ca_ab7b_40c7_2493, 0x3c9e_be0a_15c9_bebc, 0x431d_67c4_9c10_0d4c,
+    0x4cc5_d4be_cb3e_42b6, 0x597f_299c_fc65_7e2a, 0x5fcb_6fab_3ad6_faec, 0x6c44_198c_4a47_5817,
+];
 
 /// A hash that is being computed.
 #[derive(Clone, Debug)]
@@ -93,12 +62,8 @@ impl Sha512 {
 
     /// SHA-512 of an empty message.
     #[must_use]
-    pub fn new() -> Self {
-        let mut state = [0; STATE];
-        for (word, start) in state.iter_mut().zip(constants()) {
-            *word = constant(start);
-        }
-        Self { state, block: [0; 16], length: 0 }
+    pub const fn new() -> Self {
+        Self { state: START, block: [0; 16], length: 0 }
     }
 
     /// SHA-512/256 of an empty message. Its hash is the first 32 bytes of the result of
@@ -160,9 +125,9 @@ impl Sha512 {
         // values are written, until sixteen rounds have ended.
         let mut moving = [0; 16 + 8];
         moving[..8].copy_from_slice(&self.state);
-        for round in CONSTANTS[STATE..].chunks_exact(16) {
+        for round in ROUNDS.chunks_exact(16) {
             moving.copy_within(..8, 16);
-            for (t, halves) in round.iter().enumerate() {
+            for (t, constant) in round.iter().enumerate() {
                 let Some([next, a, b, c, d, e, f, g, h]) = moving[15 - t % 16..].first_chunk_mut() else {
                     break;
                 };
@@ -170,7 +135,7 @@ impl Sha512 {
                 let sum = h
                     .wrapping_add(turns(*e, 14, 18, e.rotate_right(41)))
                     .wrapping_add(*g ^ (*e & (*f ^ *g)))
-                    .wrapping_add(constant(halves))
+                    .wrapping_add(*constant)
                     .wrapping_add(w);
                 *d = d.wrapping_add(sum);
                 *next = sum

@@ -30,6 +30,8 @@ pub const MAX_MANIFEST: usize = 1024;
 pub const CERTIFICATE: usize = 152;
 /// Bytes of a certificate that the root's signature covers.
 pub const CERTIFIED: usize = 88;
+/// Bytes of a certificate that are 0, in front of the root's signature.
+pub const RESERVED: usize = 24;
 /// Bytes before a signature: key id, algorithm, length.
 pub const SIGNATURE_HEADER: usize = 8;
 /// Bytes of an Ed25519 signature (RFC 8032).
@@ -444,6 +446,13 @@ impl<'a> Certificate<'a> {
     #[must_use]
     pub fn root_id(self) -> u32 {
         word(self.0, 60)
+    }
+
+    /// The reserved bytes. They are 0, or the certificate is refused: a later format may restrict
+    /// there what the key signs, and a device that does not know the restriction must not ignore it.
+    #[must_use]
+    pub fn reserved(self) -> [u8; RESERVED] {
+        array(self.0, CERTIFIED - RESERVED)
     }
 
     /// The root's signature.

@@ -13,6 +13,7 @@ use emulator::bus::Outcome;
 use emulator::time::{Span, Time};
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection, SectionFlags};
+use seal::access::{right, DOMAIN, SIGNED_CHALLENGE};
 
 use super::{call_back, kinds, start, status};
 
@@ -115,6 +116,60 @@ fn no_answer_takes_longer_than_5_ms() {
             assert!(answers.len() > file.len() / 7, "{what}");
             assert!(slowest <= Span::from_millis(5), "{rate:?}, {what}: {} us", micros(slowest));
         }
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// 2002h (access): reading the challenge and writing a request, from the first request after the
+/// boot-up on, and during the check of the request's signature.
+#[test]
+fn access_is_answered_within_5_ms() {
+    let read = |bench: &mut Bench| {
+        let mut answer = bench.ask(REQUEST, &[0x40, 0x02, 0x20, 1, 0, 0, 0, 0], RESPONSE);
+        let mut value = Vec::new();
+        for number in 0.. {
+            let bytes = answer.expect("an answer");
+            assert_ne!(bytes[0], 0x80, "{bytes:02X?}");
+            if number > 0 {
+                value.extend(&bytes[1..]);
+            }
+            if number > 0 && bytes[0] & 1 == 1 {
+                break;
+            }
+            answer = bench.ask(REQUEST, &[0x60 | (number & 1) << 4, 0, 0, 0, 0, 0, 0, 0], RESPONSE);
+        }
+        value
+    };
+    for rate in [BitRate::K125, BitRate::K1000] {
+        let mut bench = open_board();
+        change_over(&mut bench, rate);
+        provision(&mut bench);
+        bench.power_on();
+        bench.await_boot_up(100);
+        let from = bench.time();
+        let challenge = read(&mut bench);
+        let root = coboot_tests::sealed_board::root();
+        let mut request = Vec::new();
+        for word in [right::STORE, 0, root.public().id()] {
+            request.extend(word.to_le_bytes());
+        }
+        let message = [&DOMAIN[..], &challenge[..SIGNED_CHALLENGE], &request].concat();
+        request.extend(root.sign(&message));
+        let begin = [0x21, 0x02, 0x20, 2, request.len() as u8, 0, 0, 0];
+        assert_eq!(bench.ask(REQUEST, &begin, RESPONSE).expect("an answer")[0], 0x60);
+        let last = request.chunks(7).count() - 1;
+        for (number, segment) in request.chunks(7).enumerate() {
+            let mut data = [0; 8];
+            data[0] = (number as u8 & 1) << 4 | (7 - segment.len() as u8) << 1 | u8::from(number == last);
+            data[1..=segment.len()].copy_from_slice(segment);
+            let answer = bench.ask(REQUEST, &data, RESPONSE).expect("an answer");
+            assert_eq!(answer[0], 0x20 | (number as u8 & 1) << 4);
+        }
+        let granted = |challenge: &[u8]| u32::from(challenge[SIGNED_CHALLENGE]) & right::STORE != 0;
+        assert!((0..1000).any(|_| granted(&read(&mut bench))), "the right is granted");
+        let slowest = answers(&bench, from).into_iter().max().expect("answers");
+        println!("{rate:?}: 2002h is answered after {} us at the latest", micros(slowest));
+        assert!(slowest <= Span::from_millis(5), "{rate:?}: {} us", micros(slowest));
         bench.assert_nothing_unmodelled();
     }
 }

@@ -469,6 +469,7 @@ impl Store {
                     version: 0,
                     half_erased: false,
                     seal: None,
+                    withdrawn: false,
                 };
                 Self::Instead(journal, Some(record.value()))
             }

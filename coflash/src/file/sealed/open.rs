@@ -6,7 +6,7 @@
 use seal::judge::judge;
 use seal::wire::{
     array, flag, head_size, role, tag, word, Certificate, Fault, Head, Recipient, CERTIFICATE, DOMAIN,
-    ED25519, FORMAT, HASH, MAGIC, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
+    ED25519, FORMAT, HASH, MAGIC, MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
 };
 
 use super::cipher::{chacha20, hash, wrap};
@@ -578,6 +578,9 @@ impl<'a> Sealed<'a> {
             () if u16::from(certificate.algorithm()) != ED25519 => "its key is for another algorithm",
             () if ![role::RELEASE, role::TEST].contains(&certificate.role()) => {
                 "its key does not sign programs"
+            }
+            () if certificate.reserved() != [0; RESERVED] => {
+                "its reserved bytes are not 0: it is of a later format"
             }
             () if certificate.vendor_id() != device.vendor_id => "it is for another vendor",
             () if ![0, device.product_code].contains(&certificate.product_code()) => {

@@ -5,7 +5,7 @@
 
 use seal::wire::{
     flag, tag, CERTIFICATE, CERTIFICATE_MAGIC, DOMAIN, ED25519, FIXED, FORMAT, HASH, MAGIC, MAX_CHUNK,
-    MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, SIGNATURE, SIGNATURE_HEADER,
+    MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, RESERVED, SIGNATURE, SIGNATURE_HEADER,
 };
 use seal::wire::{role, Certificate as Wire};
 
@@ -246,7 +246,8 @@ impl Sealer<'_> {
         let known = bytes.starts_with(&CERTIFICATE_MAGIC)
             && usize::from(certificate.len()) == CERTIFICATE
             && u16::from(certificate.algorithm()) == ED25519
-            && [role::RELEASE, role::TEST].contains(&certificate.role());
+            && [role::RELEASE, role::TEST].contains(&certificate.role())
+            && certificate.reserved() == [0; RESERVED];
         if !known {
             return Err(SealFault::NoCertificate);
         }

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use seal::wire::{flag, role, tag, Certificate};
+use seal::wire::{flag, role, tag, Certificate, RESERVED};
 use shared_abi::block_file::ProgramVersion;
 
 use super::key::PublicKey;
@@ -66,7 +66,11 @@ impl fmt::Display for CertificateWords<'_> {
             0 => write!(f, ", all products")?,
             code => write!(f, ", product code {code:08X}h")?,
         }
-        write!(f, ", security counters {lowest} to {highest}")
+        write!(f, ", security counters {lowest} to {highest}")?;
+        if certificate.reserved() != [0; RESERVED] {
+            write!(f, ", of a later format (its reserved bytes are not 0): this coflash does not use it")?;
+        }
+        Ok(())
     }
 }
 

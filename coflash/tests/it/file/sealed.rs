@@ -434,6 +434,8 @@ fn a_certificate_holds_for_what_it_says_and_only_if_the_root_has_signed_it() {
         (4, 151, "its size is impossible"),
         (6, 3, "its key does not sign programs"),
         (7, 2, "its key is for another algorithm"),
+        (64, 1, "its reserved bytes are not 0: it is of a later format"),
+        (87, 1, "its reserved bytes are not 0: it is of a later format"),
     ] {
         let mut bytes = certified().signed_by(&root());
         bytes[at] = byte;
@@ -475,6 +477,9 @@ fn what_no_device_would_take_is_not_sealed() {
     }
     assert_eq!(sealer().seal(&image, &key(9)).unwrap_err(), SealFault::OtherKey(key(9).public().id()));
     assert_eq!(sealed(Sealer { certificate: Some([0; 152]), ..sealer() }), SealFault::NoCertificate);
+    let mut later = certified().signed_by(&root());
+    later[70] = 1;
+    assert_eq!(sealed(Sealer { certificate: Some(later), ..sealer() }), SealFault::NoCertificate);
 }
 
 #[test]

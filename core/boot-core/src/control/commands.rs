@@ -60,6 +60,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             let needed = match command {
                 Clear if again || (self.policy.erase)(program) == Erase::AtOnce => right::ERASE,
                 ClrSignature => right::CLEAR_SIGNATURE,
+                // Otherwise anybody could undo what the right has done.
+                SetSignature if state.record.is_some_and(|record| record.withdrawn) => right::CLEAR_SIGNATURE,
                 _ => 0,
             };
             if needed != 0 && !self.programmer.unsealer().permits(needed) {
@@ -90,10 +92,17 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             (Start, Some(_)) if fresh => self.boot_request = Some(BootRequest::Fresh(program)),
             (Start, Some(record)) => self.boot_request = Some(start_request(program, record.signed)),
             (SetSignature | ClrSignature, Some(record)) => {
-                // Write the record even if it already has this value: after a power cut it may read
-                // this way now and differently later.
+                // Also if the record reads this way: after a power cut it may read differently later.
+                // The store writes nothing if the value is certain.
                 let signed = command == SetSignature;
-                let record = ProgramRecord { signed, ..record };
+                #[cfg(feature = "sealed")]
+                let withdrawn = !signed && self.programmer.unsealer().takes_no_other();
+                let record = ProgramRecord {
+                    signed,
+                    #[cfg(feature = "sealed")]
+                    withdrawn,
+                    ..record
+                };
                 self.programmer.record(&mut self.parameters, program, record, false);
             }
             (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),

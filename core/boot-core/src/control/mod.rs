@@ -314,6 +314,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                             half_erased,
                             #[cfg(feature = "sealed")]
                             seal: None,
+                            #[cfg(feature = "sealed")]
+                            withdrawn: false,
                         };
                         let record = self.programmer.unsealer().mark(record);
                         self.programmer.record(&mut self.parameters, program, record, false);

@@ -371,8 +371,7 @@ impl<'b> Programmer<'b> {
             }
             if self.job.is_none() {
                 return match self.choose(parameters, flash) {
-                    Ok(None) if self.unsealer.prepare() => (Step::Idle, None),
-                    Ok(None) => (Step::Again, None),
+                    Ok(None) => (Step::Idle, None),
                     Ok(job) => {
                         self.job = job;
                         (Step::Again, None)

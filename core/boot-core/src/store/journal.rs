@@ -1,14 +1,20 @@
 //! A journal over two flash regions that survives a power cut at every operation.
 //!
-//! A region holds slots of six words. Slot 0 is the header; every other slot is one record, written
-//! once. The value of a key is its latest valid record. When the region is full, the current
+//! A region holds slots of seven words. Slot 0 is the header; every other slot is one record,
+//! written once. The value of a key is its latest valid record. When the region is full, the current
 //! records are copied to the other region, and its header is written **last**: until then the old
 //! region is the valid one, and afterwards the new one, so a power cut always leaves one complete
 //! region. Each slot has a CRC, so an incomplete slot counts as absent.
 //!
-//! A power cut can leave bits between 0 and 1, which may read correctly now and wrongly later. A
-//! header that reads correctly is therefore written again before anything is added to its region:
-//! stored values must not be lost with their region.
+//! A power cut can leave bits between 0 and 1, which may read correctly now and wrongly later: that
+//! a slot reads correctly does not prove that it is complete. Its last word proves it. This **mark**
+//! is programmed after the words before it were read back, so they are certain if any bit of it is
+//! programmed.
+//!
+//! - A header without its mark is written again before anything is added to its region: stored
+//!   values must not be lost with their region.
+//! - **A value that is stored already is not written again**: a command that changes nothing must
+//!   not wear the flash.
 
 use shared_abi::geometry::Region;
 
@@ -17,7 +23,12 @@ use crate::crc;
 use crate::flash::{Flash, FlashFault, Next, Operation, ERASED};
 use crate::sequence::{EraseSectors, ProgramWords};
 
-const SLOT_WORDS: usize = 6;
+/// A tag, the four words of a value, a CRC, and the mark.
+const SLOT_WORDS: usize = 7;
+/// The place of the mark in a slot; in front of it are the words that a reader needs.
+const MARK_WORD: usize = 6;
+/// The mark.
+const MARK: u32 = 0;
 const SLOT_SIZE: u32 = SLOT_WORDS as u32 * 4;
 type Slot = [u32; SLOT_WORDS];
 
@@ -71,7 +82,7 @@ enum Header {
     Older,
     /// The header reads correctly, but a power cut may have left bits between 0 and 1.
     Found,
-    /// The header was written, or written again, since power-on.
+    /// The header is certain.
     Firm,
 }
 
@@ -115,7 +126,12 @@ impl Journal {
             if header != Header::Absent && found.wrapping_sub(sequence) as i32 <= 0 {
                 continue;
             }
-            header = if format == FORMAT { Header::Found } else { Header::Older };
+            let marked = flash.read_word(region.base + 4 * MARK_WORD as u32) != ERASED;
+            header = match format {
+                FORMAT if marked => Header::Firm,
+                FORMAT => Header::Found,
+                _ => Header::Older,
+            };
             sequence = found;
             if region.base == other.base {
                 core::mem::swap(&mut valid, &mut other);
@@ -141,7 +157,7 @@ impl Journal {
 
 impl Parameters for Journal {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        let [_, a, b, c, d, _] = self.latest(flash, key.0)?;
+        let [_, a, b, c, d, ..] = self.latest(flash, key.0)?;
         Some([a, b, c, d])
     }
 
@@ -176,6 +192,9 @@ impl Journal {
                 _ => self.storing.words.next(flash, SLOT_WORDS, |i| self.storing.slot[i]),
             };
             outcome = Ok(());
+            // Without its mark a slot is as good for a reader.
+            let is_sound = self.storing.step != Step::Erase && self.storing.words.written() == MARK_WORD;
+            let next = next.or_else(|fault| if is_sound { Ok(None) } else { Err(fault) });
             match (next, self.storing.step) {
                 (Ok(Some(_)), _) | (Ok(None), Step::Idle) => return next.map_err(StoreError::Flash),
                 (Ok(None), Step::Begin) => self.begin(flash)?,
@@ -216,6 +235,10 @@ impl Journal {
         if self.newer {
             return Err(StoreError::NewerFormat);
         }
+        if self.is_stored(flash) {
+            self.storing.step = Step::Idle;
+            return Ok(());
+        }
         match self.header {
             Header::Firm => return self.append(),
             Header::Found => {
@@ -230,6 +253,27 @@ impl Journal {
             Header::Absent | Header::Older => return self.change_over(),
         }
         Ok(())
+    }
+
+    /// Whether the new record is stored already, and certain. A slot without the mark behind the
+    /// latest record may be a record of the same key, which reads as invalid only now.
+    fn is_stored<F: Flash>(&self, flash: &F) -> bool {
+        if self.header != Header::Firm {
+            return false;
+        }
+        let first = first_slot(&self.valid);
+        let mut at = self.free;
+        while at > first {
+            at -= SLOT_SIZE;
+            let found = read_slot(flash, at);
+            if found[MARK_WORD] == ERASED {
+                return false;
+            }
+            if found[0] == self.storing.record[0] {
+                return found[..MARK_WORD] == self.storing.record[..MARK_WORD];
+            }
+        }
+        false
     }
 
     /// Copies the next current record; after the last one, writes the header of the other region.
@@ -296,15 +340,22 @@ impl Journal {
     }
 }
 
-/// The slot at an address, if it is a valid record of this tag. It is read once: bits left between
-/// 0 and 1 by a power cut may read differently the next time.
-fn sound_slot<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
+/// The words at an address.
+fn read_slot<F: Flash>(flash: &F, at: u32) -> Slot {
     let mut found = [0; SLOT_WORDS];
     for (word, address) in found.iter_mut().zip((at..).step_by(4)) {
         *word = flash.read_word(address);
     }
-    let [found_tag, a, b, c, d, _] = found;
-    (found_tag == tag && found == slot(tag, [a, b, c, d])).then_some(found)
+    found
+}
+
+/// The slot at an address, if it is a valid record of this tag. It is read once: bits left between
+/// 0 and 1 by a power cut may read differently the next time.
+fn sound_slot<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
+    let found = read_slot(flash, at);
+    let [found_tag, a, b, c, d, ..] = found;
+    let sound = slot(tag, [a, b, c, d]);
+    (found_tag == tag && found[..MARK_WORD] == sound[..MARK_WORD]).then_some(sound)
 }
 
 const fn first_slot(region: &Region) -> u32 {
@@ -329,7 +380,7 @@ fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
 
 fn slot(tag: u32, [a, b, c, d]: Value) -> Slot {
     let check = [tag, a, b, c, d].iter().fold(0, |crc, word| crc::resume(crc, &word.to_le_bytes()));
-    [tag, a, b, c, d, check]
+    [tag, a, b, c, d, check, MARK]
 }
 
 fn header_slot(sequence: u32) -> Slot {

@@ -56,14 +56,17 @@ pub enum StoreError {
 /// A place for parameters: the [`Journal`](super::Journal) in flash, or a part of the board (an EEPROM), which may
 /// ignore the flash.
 ///
-/// An implementation must guarantee two properties: after a power cut at any time,
-/// [`get`](Self::get) returns for every key the value before the store or the new one; and every
-/// store ends, with an error if the memory is full or worn out.
+/// An implementation must guarantee three properties: after a power cut at any time,
+/// [`get`](Self::get) returns for every key the value before the store or the new one; every store
+/// ends, with an error if the memory is full or worn out; and to store a value that is stored
+/// already writes nothing. Callers rely on the last one: they store whenever a value must be
+/// certain, also if it reads so already.
 pub trait Parameters {
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 
-    /// Starts to store one value; [`next`](Self::next) carries it out.
+    /// Starts to store one value; [`next`](Self::next) carries it out. After a success the value is
+    /// certain, also if a power cut had left it between 0 and 1.
     fn store(&mut self, key: Key, value: Value);
 
     /// The next operation of the store. `outcome` is the result of the previous one (`Ok` at

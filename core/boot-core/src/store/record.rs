@@ -24,6 +24,11 @@ pub struct ProgramRecord {
     /// The kind of sealed image; `None` for a program that was not sealed.
     #[cfg(feature = "sealed")]
     pub seal: Option<Seal>,
+    /// A client with the right to do so has withdrawn the release of the sealed program (84h). It is
+    /// not released then, whatever `signed` is when the record is stored: nobody without this right
+    /// releases it again, no master and no program.
+    #[cfg(feature = "sealed")]
+    pub withdrawn: bool,
 }
 
 /// What a sealed program may do to the flash.
@@ -50,9 +55,12 @@ const HALF_ERASED: u32 = 1 << 31;
 const SEALED: u32 = 1 << 30;
 #[cfg(feature = "sealed")]
 const WRITES_FLASH: u32 = 1 << 29;
+/// The flag of [`withdrawn`](ProgramRecord::withdrawn), in the same word.
+#[cfg(feature = "sealed")]
+const WITHDRAWN: u32 = 1 << 28;
 /// The mask of the size in the first word.
 #[cfg(feature = "sealed")]
-const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH);
+const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH | WITHDRAWN);
 #[cfg(not(feature = "sealed"))]
 const SIZE: u32 = !HALF_ERASED;
 
@@ -100,6 +108,10 @@ impl ProgramRecord {
             return None;
         }
         let signed = flags == SIGNED || flags == SIGNED_CONFIRMED;
+        #[cfg(feature = "sealed")]
+        let withdrawn = first & WITHDRAWN != 0;
+        #[cfg(feature = "sealed")]
+        let signed = signed && !withdrawn;
         let confirmed = flags == CONFIRMED || flags == SIGNED_CONFIRMED;
         Some(Self {
             size,
@@ -114,6 +126,8 @@ impl ProgramRecord {
                 0 | WRITES_FLASH => None,
                 _ => Some(Seal::WritesFlash),
             },
+            #[cfg(feature = "sealed")]
+            withdrawn,
         })
     }
 
@@ -133,7 +147,7 @@ impl ProgramRecord {
             None => 0,
             Some(Seal::Locked) => SEALED,
             Some(Seal::WritesFlash) => SEALED | WRITES_FLASH,
-        };
+        } | if self.withdrawn { WITHDRAWN } else { 0 };
         [self.size | Self::none(self.half_erased, Partial::NONE)[0] | seal, self.crc, flags, self.version]
     }
 }

@@ -38,9 +38,6 @@ impl Unsealer<'_> {
         _: &'static Policy,
     ) {
     }
-    pub(crate) fn prepare(&mut self) -> bool {
-        true
-    }
     pub(crate) fn takes_no_other(&self) -> bool {
         false
     }

@@ -14,6 +14,8 @@ use crate::store::{Key, Value};
 
 /// The number of events in the log.
 const LAST: usize = seal::access::EVENTS;
+/// The number of them that may be refusals, without that of a wrong signature.
+const MOST_REFUSALS: usize = seal::access::MOST_REFUSALS;
 
 // The constants that `seal`, `canopen` and `shared-abi` each define must agree.
 const _: () = {
@@ -88,14 +90,26 @@ impl Unsealer<'_> {
         self.0.stage == Stage::Access
     }
 
+    /// Whether a signature was found good since the last call: that of a complete image, or that of
+    /// a request for rights.
+    pub(crate) fn take_authentic(&mut self) -> bool {
+        core::mem::take(&mut self.0.authentic)
+    }
+
     /// Records the result of the installation of a sealed image.
     pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
         if self.0.active {
             let program = u32::from(self.0.program);
-            self.0.record(match outcome {
-                Ok(()) => event::INSTALLED | program,
-                Err(error) => event::REFUSED | u32::from(error.code()),
-            });
+            match outcome {
+                Ok(()) => {
+                    self.0.authentic = true;
+                    // Anybody may send the installed image again: this changes nothing.
+                    if !self.0.same {
+                        self.0.record(event::INSTALLED | program);
+                    }
+                }
+                Err(error) => self.0.record(event::REFUSED | u32::from(error.code())),
+            }
         }
         self.rest();
     }
@@ -129,17 +143,26 @@ impl Room {
         self.nonce = [0; 32];
         self.grants = self.grants.wrapping_add(1);
         self.stores.1 = true;
+        self.authentic = true;
         self.stage = Stage::Head;
         self.record(event::UNLOCKED | rights & 0xFFFF);
     }
 
-    /// Records an event.
+    /// Records an event, unless it is a refusal that must not be recorded. Anybody causes a refusal:
+    /// he must neither wear out the flash nor push the other events out of the log. So a refusal
+    /// that the log contains is not recorded again, and no further one if there are
+    /// [`MOST_REFUSALS`], except a wrong signature, which is more likely to be an attack.
     fn record(&mut self, what: u32) {
         let head = Head(&self.head);
-        let last = self.events[self.event as usize % LAST];
-        // Repeated refusals must not wear out the flash.
-        if what >> 16 == event::REFUSED >> 16 && last[1] == what {
-            return;
+        let is_refusal = |what: u32| what >> 16 == event::REFUSED >> 16;
+        if is_refusal(what) {
+            let is_attack = what == event::REFUSED | u32::from(FlashError::Signature.code());
+            let refusals = self.events.iter().filter(|[_, what, ..]| is_refusal(*what));
+            if refusals.clone().any(|[_, known, ..]| *known == what)
+                || refusals.count() >= MOST_REFUSALS && !is_attack
+            {
+                return;
+            }
         }
         self.event += 1;
         self.events[self.event as usize % LAST] = [self.event, what, head.counter(), head.version()];

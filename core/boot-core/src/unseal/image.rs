@@ -12,7 +12,7 @@ use seal::ed25519::Verification;
 use seal::judge::{judge, Device, Needs};
 use seal::key_block::{self, KEKS, KEK_COUNT, KEY};
 use seal::lzma::Decoder;
-use seal::sha512::{hmac, prepare, Sha512};
+use seal::sha512::{hmac, Sha512};
 use seal::wire::{
     array, flag, head_size, Fault, Head, Recipient, DOMAIN, HASH, MAX_CHUNK, MAX_HEAD, WRAP_DOMAIN,
 };
@@ -88,11 +88,13 @@ pub struct Room {
     pub(super) events: [Value; EVENTS],
     /// What must be stored when the flash is idle: the last event, the number of grants.
     pub(super) stores: (bool, bool),
+    /// A signature was good, of a complete image or of a request, and nobody was told yet.
+    pub(super) authentic: bool,
     pub(super) active: bool,
     pub(super) stage: Stage,
     pub(super) program: u8,
     /// The same image is already installed: the new one is checked and discarded.
-    same: bool,
+    pub(super) same: bool,
     /// The record of the installed image.
     record: Value,
     /// The new counter is not stored yet.
@@ -151,6 +153,7 @@ impl Room {
             event: 0,
             events: [[0; 4]; EVENTS],
             stores: (false, false),
+            authentic: false,
             active: false,
             stage: Stage::Head,
             program: 0,
@@ -214,12 +217,6 @@ impl Unsealer<'_> {
         self.0.key_block = layout.key_block().base;
         self.0.policy = Some(&policy.seal);
         self.0.takes_no_other = is_sealed(flash, parameters, layout);
-    }
-
-    /// Prepares constants while there is no other work; returns whether there is nothing left to
-    /// prepare.
-    pub(crate) fn prepare(&mut self) -> bool {
-        prepare()
     }
 
     /// Whether the device has keys and therefore accepts and starts only sealed programs.
@@ -394,8 +391,14 @@ impl Room {
         }
         let word = |at| seal::wire::word(&keys, at);
         let record = ProgramRecord::load(parameters, flash, self.program);
-        let [mut counter, mut epoch, installed, _] =
-            parameters.get(flash, Key::counter(self.program)).unwrap_or([0; 4]);
+        let counters = |program| parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
+        let [mut counter, _, installed, _] = counters(self.program);
+        // The epoch is the device's: a key that is revoked for one program signs for none.
+        let programs = self.layout.map_or(0, |layout| layout.programs.len() as u8);
+        let epoch = (1..=programs).fold(word(key_block::EPOCH), |epoch, program| {
+            let [_, proved, ..] = counters(program);
+            epoch.max(proved)
+        });
         // A program that has proved itself has raised the counter, if the policy raises it at
         // confirmation.
         if record.is_some_and(|record| record.confirmed) {
@@ -405,7 +408,6 @@ impl Room {
         if self.granted & right::LOWER_COUNTER != 0 {
             counter = counter.min(self.argument);
         }
-        epoch = epoch.max(word(key_block::EPOCH));
         let head = Head(&self.head);
         self.needs = judge(
             head,
@@ -591,8 +593,8 @@ impl Room {
 }
 
 /// The new counter of a program before its record is removed: the counter of a program that has
-/// proved itself. It is written even if it already has this value: after a power cut it may read
-/// this way now and differently later.
+/// proved itself. It is stored even if it already has this value: after a power cut it may read
+/// this way now and differently later. (The store writes nothing if it is certain.)
 pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
     let record = ProgramRecord::load(parameters, flash, program)?;
     let [counter, epoch, installed, _] = parameters.get(flash, Key::counter(program))?;

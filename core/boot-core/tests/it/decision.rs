@@ -43,6 +43,8 @@ fn check_record(
     let record = ProgramRecord {
         #[cfg(feature = "sealed")]
         seal: None,
+        #[cfg(feature = "sealed")]
+        withdrawn: false,
         size: 64,
         crc: boot_core::crc32(&bytes),
         signed,
@@ -128,6 +130,8 @@ fn a_program_ends_inside_its_region() {
         let record = ProgramRecord {
             #[cfg(feature = "sealed")]
             seal: None,
+            #[cfg(feature = "sealed")]
+            withdrawn: false,
             size,
             crc: boot_core::crc32(&bytes),
             signed: true,

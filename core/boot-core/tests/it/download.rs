@@ -410,16 +410,6 @@ fn a_transfer_cut_off_in_the_middle_leaves_no_trace() {
 fn faults_of_the_flash_are_told_and_clear_begins_anew() {
     let image = program(192, 0x99);
     let good = block_file(&image, 96);
-    // The first block removes the record and erases its sector; its last operation writes data.
-    let of_the_block = {
-        let mut flash = full();
-        let mut bench = Bench::new(&mut flash);
-        assert_eq!((bench.command(CLEAR), bench.command(CLEAR), bench.command(CLEAR)), (0, 0, 0));
-        bench.good(&good[0]);
-        let before = bench.node.flash().operations;
-        bench.good(&good[1]);
-        bench.node.flash().operations - before
-    };
     for (fault, status) in
         [(FlashFault::Failed, 0x0A), (FlashFault::Verify, 0x0A), (FlashFault::Protected, 0x0E)]
     {
@@ -428,14 +418,23 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
         let mut bench = Bench::new(&mut flash);
         assert_eq!((bench.command(CLEAR), bench.command(CLEAR)), (0, 0));
         let last = bench.node.flash().touched.iter().rposition(|region| region.size > 4).unwrap();
+        let fail_to_clear = |bench: &mut Bench<'_>| {
+            bench.node.flash().fail = Some((last as u32 + 1, fault));
+            assert_eq!(bench.command(CLEAR), 0);
+            assert_eq!(bench.command(CLEAR), status);
+            assert_eq!(bench.command(CLEAR), 0);
+            bench.good(&good[0]);
+            bench.node.flash().operations
+        };
+        // The first block erases its sector; its last operation writes data.
         let mut flash = full();
         let mut bench = Bench::new(&mut flash);
-        bench.node.flash().fail = Some((last as u32 + 1, fault));
-        assert_eq!(bench.command(CLEAR), 0);
-        assert_eq!(bench.command(CLEAR), status);
-        assert_eq!(bench.command(CLEAR), 0);
-        bench.good(&good[0]);
-        let operations = bench.node.flash().operations;
+        let before = fail_to_clear(&mut bench);
+        bench.good(&good[1]);
+        let of_the_block = bench.node.flash().operations - before;
+        let mut flash = full();
+        let mut bench = Bench::new(&mut flash);
+        let operations = fail_to_clear(&mut bench);
         bench.node.flash().fail = Some((operations + of_the_block, fault));
         assert_eq!(bench.block(&good[1]), (Ok(()), status));
         // Half a block is in flash: only CLEAR helps, and until then the cause stays visible.

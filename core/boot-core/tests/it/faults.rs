@@ -302,10 +302,11 @@ fn a_download_that_begins_ends_one_of_another_program() {
     }
 }
 
-/// A slot of the journal (docs/adr/0004): five words and their CRC.
+/// A slot of the journal (docs/adr/0004): five words, their CRC, and the mark.
 fn slot(five: [u32; 5]) -> Vec<u8> {
     let mut bytes = words(&five);
     bytes.extend(crc32(&bytes).to_le_bytes());
+    bytes.extend([0; 4]);
     bytes
 }
 
@@ -323,7 +324,7 @@ fn a_journal_of_a_newer_format_refuses_what_has_to_be_stored_and_is_left_alone()
     for (newer, other) in cases {
         let mut flash = ModelFlash::new(&CHIP);
         flash.poke(regions[newer].base, &header(7, NEWER));
-        flash.poke(regions[newer].base + 24, &slot([0x0001_0001, 1, 2, 3, 4]));
+        flash.poke(regions[newer].base + 28, &slot([0x0001_0001, 1, 2, 3, 4]));
         if let Some(other) = &other {
             flash.poke(regions[1 - newer].base, other);
         }

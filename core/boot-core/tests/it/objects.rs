@@ -253,19 +253,78 @@ fn an_acknowledged_order_is_finishing_until_it_is_stored() {
     rig.settle();
     assert!(!rig.node.is_finishing(), "half a program is none");
     rig.node.download_end(Address::new(0x1F50, 1)).unwrap();
-    let mut steps = 0;
+    let (mut steps, mut readable) = (0, 0);
     while rig.node.is_finishing() {
-        assert!(rig.stored().records[0].is_none(), "step {steps}");
+        readable += u32::from(rig.stored().records[0].is_some());
         assert!(!rig.node.is_idle_after_step());
         steps += 1;
     }
     assert!(steps > 10 && rig.stored().records[0].is_some());
+    // The mark, a word, follows the record.
+    assert!(readable <= 5, "{readable} steps");
     rig.settle();
     rig.command(1, SET_SIGNATURE).unwrap();
     assert!(rig.node.is_finishing());
     rig.settle();
     assert!(!rig.node.is_finishing());
     assert!(rig.stored().records[0].unwrap().2);
+}
+
+/// What changes nothing writes nothing, at once and after any number of starts: 83h of a released
+/// program, 84h of one that is not, CLEAR of no program, LSS with the stored values, a password again.
+#[test]
+fn what_changes_nothing_writes_nothing() {
+    for setup in [&STANDARD_1, &LIFT_1] {
+        let node = NodeParameters { id: NodeId::new(9), bit_rate: BitRate::K250 };
+        let store = |rig: &mut Rig| {
+            assert_eq!(rig.node.store(node.id, Some(node.bit_rate)), Poll::Pending);
+            rig.settle();
+            assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
+        };
+        let mut rig = Rig::new(setup, 4096);
+        store(&mut rig);
+        rig.install(1, &raw(setup, 1, 600));
+        for (command, released) in [(SET_SIGNATURE, true), (CLR_SIGNATURE, false)] {
+            rig.unlock(1).unwrap();
+            rig.command(1, command).unwrap();
+            rig.settle();
+            rig.reset();
+            rig.chip.model().touched.clear();
+            for round in 0..30 {
+                rig.unlock(1).unwrap();
+                assert_eq!(rig.command(1, command), Ok(()));
+                rig.settle();
+                store(&mut rig);
+                assert_eq!(rig.status(1), 0);
+                if round % 3 == 0 {
+                    rig.reset();
+                }
+                let what = format!("{}, {command:02X}h, round {round}", setup.name);
+                assert_eq!(rig.chip.model().touched, [], "{what}");
+            }
+            assert_eq!(rig.stored().records[0].map(|record| record.2), Some(released));
+            assert_eq!(rig.stored().node, node);
+        }
+    }
+}
+
+/// The password of ESAcademy makes the program invalid, once.
+#[test]
+fn a_password_that_finds_no_program_writes_nothing() {
+    let mut rig = Rig::new(&ESACADEMY_1, 4096);
+    rig.install(1, &raw(&ESACADEMY_1, 1, 600));
+    rig.unlock(1).unwrap();
+    rig.settle();
+    assert_eq!(rig.stored().records[0], None);
+    rig.chip.model().touched.clear();
+    for round in 0..30 {
+        if round % 3 == 0 {
+            rig.reset();
+        }
+        rig.unlock(1).unwrap();
+        rig.settle();
+        assert_eq!(rig.chip.model().touched, [], "round {round}");
+    }
 }
 
 // --- layer setting services

@@ -295,9 +295,9 @@ fn the_progress_of_a_large_program_is_stored_sixteen_times() {
     }
     let in_journal = |at: &&Region| LAYOUT.parameters.iter().any(|own| own.contains(at.base, at.size));
     let words = flash.touched.iter().filter(in_journal).filter(|at| at.size == 4).count();
-    // Six words each: the journal's header, and a record with the first data and after each sixteenth
+    // Seven words each: the journal's header, and a record with the first data and behind each sixteenth
     // part but the last, which the program fills only in part.
-    assert_eq!(words, (1 + 16) * 6);
+    assert_eq!(words, (1 + 16) * 7);
 }
 
 /// CLEAR gives up what was there; a command of another kind does not.

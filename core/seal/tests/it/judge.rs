@@ -54,6 +54,7 @@ struct Certificate {
     lowest: u32,
     highest: u32,
     root: u32,
+    reserved: [u8; 24],
 }
 
 /// What makes an accepted image one that is refused.
@@ -96,6 +97,7 @@ fn certified() -> Case {
         lowest: COUNTER,
         highest: COUNTER,
         root: ROOTS[1],
+        reserved: [0; 24],
     };
     Case { certificate: Some(certificate), signers: vec![OTHER], ..direct() }
 }
@@ -120,6 +122,7 @@ impl Case {
             let numbers = [own.epoch, own.vendor, own.product, own.lowest, own.highest];
             numbers.iter().enumerate().for_each(|(n, number)| put(&mut certificate, 8 + 4 * n, *number));
             put(&mut certificate, 60, own.root);
+            certificate[64..88].copy_from_slice(&own.reserved);
             bytes.extend(certificate);
         }
         self.signers.iter().for_each(|signer| bytes.extend(signature(*signer, 1, &[0; 64])));
@@ -307,6 +310,10 @@ fn what_a_certificate_allows() {
     with_certificate(|own| (own.lowest, own.highest) = (0, u32::MAX), accepted(52));
     with_certificate(|own| (own.lowest, own.highest) = (COUNTER + 1, u32::MAX), wrong);
     with_certificate(|own| (own.lowest, own.highest) = (0, COUNTER - 1), wrong);
+    // A restriction of a later format.
+    for at in 0..24 {
+        with_certificate(|own| own.reserved[at] = 0x80, wrong);
+    }
 }
 
 #[test]

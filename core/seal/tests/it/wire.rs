@@ -71,6 +71,7 @@ fn each_field_of_a_certificate_stands_at_its_offset() {
     assert_eq!(certificate.highest(), number(&bytes, 24));
     assert_eq!(certificate.key(), bytes[28..60]);
     assert_eq!(certificate.root_id(), number(&bytes, 60));
+    assert_eq!(certificate.reserved(), bytes[64..88]);
     assert_eq!(certificate.signature(), bytes[88..]);
     // It is one only if it is whole.
     assert!(Head(&file[..176 + 151]).certificate().is_none());
