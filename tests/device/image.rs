@@ -12,7 +12,7 @@ use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::machine::{ResetCause, Stop};
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
-use object::{Endianness, Object, ObjectSection};
+use object::{Endianness, Object, ObjectSection, ObjectSymbol};
 use shared_abi::geometry::Region;
 use shared_abi::layout::toml::Toml;
 use shared_abi::ram_image::SERVICES_VERSION;

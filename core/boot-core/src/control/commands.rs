@@ -95,14 +95,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 // Also if the record reads this way: after a power cut it may read differently later.
                 // The store writes nothing if the value is certain.
                 let signed = command == SetSignature;
-                #[cfg(feature = "sealed")]
                 let withdrawn = !signed && self.programmer.unsealer().takes_no_other();
-                let record = ProgramRecord {
-                    signed,
-                    #[cfg(feature = "sealed")]
-                    withdrawn,
-                    ..record
-                };
+                let record = ProgramRecord { signed, withdrawn, ..record };
                 self.programmer.record(&mut self.parameters, program, record, false);
             }
             (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),

@@ -312,9 +312,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                             confirmed,
                             version,
                             half_erased,
-                            #[cfg(feature = "sealed")]
                             seal: None,
-                            #[cfg(feature = "sealed")]
                             withdrawn: false,
                         };
                         let record = self.programmer.unsealer().mark(record);

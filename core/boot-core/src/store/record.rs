@@ -22,17 +22,14 @@ pub struct ProgramRecord {
     /// erased: a sector that reads as erased may be only partly erased.
     pub half_erased: bool,
     /// The kind of sealed image; `None` for a program that was not sealed.
-    #[cfg(feature = "sealed")]
     pub seal: Option<Seal>,
     /// A client with the right to do so has withdrawn the release of the sealed program (84h). It is
     /// not released then, whatever `signed` is when the record is stored: nobody without this right
     /// releases it again, no master and no program.
-    #[cfg(feature = "sealed")]
     pub withdrawn: bool,
 }
 
 /// What a sealed program may do to the flash.
-#[cfg(feature = "sealed")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Seal {
     /// Nothing: the flash is locked until the next reset before the program starts.
@@ -51,18 +48,12 @@ const SIGNED_CONFIRMED: u32 = u32::from_le_bytes(*b"RUN1");
 /// above the size.
 const HALF_ERASED: u32 = 1 << 31;
 /// The flags of the two kinds of [`Seal`], in the same word.
-#[cfg(feature = "sealed")]
 const SEALED: u32 = 1 << 30;
-#[cfg(feature = "sealed")]
 const WRITES_FLASH: u32 = 1 << 29;
 /// The flag of [`withdrawn`](ProgramRecord::withdrawn), in the same word.
-#[cfg(feature = "sealed")]
 const WITHDRAWN: u32 = 1 << 28;
 /// The mask of the size in the first word.
-#[cfg(feature = "sealed")]
 const SIZE: u32 = !(HALF_ERASED | SEALED | WRITES_FLASH | WITHDRAWN);
-#[cfg(not(feature = "sealed"))]
-const SIZE: u32 = !HALF_ERASED;
 
 impl ProgramRecord {
     /// The stored form of "no program", with the download that is going on.
@@ -88,10 +79,7 @@ impl ProgramRecord {
     /// Whether it was installed as a sealed image.
     #[must_use]
     pub const fn is_sealed(&self) -> bool {
-        #[cfg(feature = "sealed")]
-        return self.seal.is_some();
-        #[cfg(not(feature = "sealed"))]
-        false
+        self.seal.is_some()
     }
 
     /// Loads the record from the store; `None` if there is no program.
@@ -107,11 +95,8 @@ impl ProgramRecord {
         if size == 0 {
             return None;
         }
-        let signed = flags == SIGNED || flags == SIGNED_CONFIRMED;
-        #[cfg(feature = "sealed")]
         let withdrawn = first & WITHDRAWN != 0;
-        #[cfg(feature = "sealed")]
-        let signed = signed && !withdrawn;
+        let signed = (flags == SIGNED || flags == SIGNED_CONFIRMED) && !withdrawn;
         let confirmed = flags == CONFIRMED || flags == SIGNED_CONFIRMED;
         Some(Self {
             size,
@@ -120,13 +105,11 @@ impl ProgramRecord {
             confirmed,
             version,
             half_erased,
-            #[cfg(feature = "sealed")]
             seal: match first & (SEALED | WRITES_FLASH) {
                 SEALED => Some(Seal::Locked),
                 0 | WRITES_FLASH => None,
                 _ => Some(Seal::WritesFlash),
             },
-            #[cfg(feature = "sealed")]
             withdrawn,
         })
     }
@@ -140,9 +123,6 @@ impl ProgramRecord {
             (false, true) => CONFIRMED,
             (true, true) => SIGNED_CONFIRMED,
         };
-        #[cfg(not(feature = "sealed"))]
-        let seal = 0;
-        #[cfg(feature = "sealed")]
         let seal = match self.seal {
             None => 0,
             Some(Seal::Locked) => SEALED,

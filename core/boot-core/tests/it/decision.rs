@@ -41,9 +41,7 @@ fn check_record(
     flash.poke(0x0802_0000, &bytes);
     let mut journal = Journal::open(&flash, LAYOUT.parameters);
     let record = ProgramRecord {
-        #[cfg(feature = "sealed")]
         seal: None,
-        #[cfg(feature = "sealed")]
         withdrawn: false,
         size: 64,
         crc: boot_core::crc32(&bytes),
@@ -128,9 +126,7 @@ fn a_program_ends_inside_its_region() {
         let mut bytes = vec![0; size as usize];
         flash.read(region.base, &mut bytes);
         let record = ProgramRecord {
-            #[cfg(feature = "sealed")]
             seal: None,
-            #[cfg(feature = "sealed")]
             withdrawn: false,
             size,
             crc: boot_core::crc32(&bytes),

@@ -684,9 +684,7 @@ fn the_record_of_a_program_has_its_words() {
                 confirmed,
                 version: 77,
                 half_erased,
-                #[cfg(feature = "sealed")]
                 seal: None,
-                #[cfg(feature = "sealed")]
                 withdrawn: false,
             };
             assert_eq!(record.value(), [first, 0xCAFE_F00D, word, 77]);
