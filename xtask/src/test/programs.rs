@@ -25,7 +25,9 @@ pub fn build(arguments: &[String]) -> Outcome<Vec<Program>> {
     let mut cargo = process::cargo("test");
     cargo.args(["--no-run", "--message-format=json-render-diagnostics"]).args(arguments);
     cargo.current_dir(workspace::root()).stderr(std::process::Stdio::inherit());
-    let messages = process::output(&mut cargo)?;
+    // On its standard output are messages for programs; the errors it has shown.
+    let messages = process::output(&mut cargo)
+        .map_err(|_| "the test programs do not build; what cargo printed above says why.".to_owned())?;
     Ok(messages.lines().filter_map(of_message).collect())
 }
 
