@@ -195,11 +195,9 @@ fn and_while_the_journal_changes_over() {
     for stores in 0..22 {
         let before = with(&STANDARD_2, Some(&old));
         before.run(|host| {
-            for _ in 0..stores {
-                host.commanded(1, 0x83);
-            }
             host.commanded(1, 0x83);
         });
+        before.fill_journal(stores);
         before.take_touched();
         let through = before.copy();
         through.run(|host| host.install(1, &new.file));

@@ -11,7 +11,7 @@ use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
 use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances};
-use boot_core::flash::Flash;
+use boot_core::flash::{run, Flash};
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
@@ -484,6 +484,19 @@ impl Device {
 
     fn parameters(&self) -> Journal {
         Journal::open(&self.chip, self.setup.layout.parameters)
+    }
+
+    /// Stores so many values, as the boot stage does when it counts resets, so that the journal fills.
+    ///
+    /// # Panics
+    /// If the flash does not take one.
+    pub fn fill_journal(&self, stores: u32) {
+        let mut flash = self.chip.clone();
+        let mut parameters = self.parameters();
+        for count in (0..stores).rev() {
+            parameters.store(Key::CRASH_COUNT, [count, 0, 0, 0]);
+            run(&mut flash, |flash, outcome| parameters.next(flash, outcome)).expect("it is stored");
+        }
     }
 
     /// The boot stage's check of a program.
