@@ -234,7 +234,7 @@ fn a_program_without_a_label_is_taken_and_says_nothing_of_itself() {
 fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     let layout = "layout.x";
     let at_the_beginning = |name: &str| {
-        Project::new(name).edit(layout, "0x08010000, LENGTH = 0xf0000", "0x08000000, LENGTH = 0x100000")
+        Project::new(name).edit(layout, "0x08020000, LENGTH = 0xe0000", "0x08000000, LENGTH = 0x100000")
     };
     let refused = at_the_beginning("address").build(&[]).expect_err("it links");
     assert!(refused.contains("ERROR(coboot): the program lies over the bootloader's callgate"), "{refused}");
@@ -246,7 +246,7 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
         let (good, told) = judged(words, &elf);
         assert!(
             !good
-                && told.contains("lies outside 0x08010000..=0x080fffff: link the program for this region")
+                && told.contains("lies outside 0x08020000..=0x080fffff: link the program for this region")
                 && told.contains("0x60000015"),
             "{told}"
         );

@@ -330,7 +330,7 @@ Examples:
         "\
 Examples:
   coflash debug read 0x20000000 64 --node 5
-  coflash debug break 0x08010204 --node 5",
+  coflash debug break 0x08020204 --node 5",
     ),
     (
         "conform",

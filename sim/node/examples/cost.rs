@@ -20,7 +20,7 @@ use coflash::file::read::{read, Format};
 use coflash::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
-const SIZES: [u32; 2] = [256, 900];
+const SIZES: [u32; 2] = [256, 896];
 const TRANSFERS: [(Transfers, &str); 2] = [(Transfers::Blocks, "blocks"), (Transfers::Segments, "segments")];
 
 /// The bus, with counters of its frames.

@@ -7,7 +7,7 @@ use coboot_tests::fleet::{self, Way};
 use coboot_tests::throughput::{load, measure, measure_form, Form, Load, Measurement, OfForm};
 
 const RATES: [BitRate; 4] = [BitRate::K125, BitRate::K250, BitRate::K500, BitRate::K1000];
-const SIZES: [u32; 3] = [64, 256, 900];
+const SIZES: [u32; 3] = [64, 256, 896];
 /// The default of `coflash`, which the downloads above use.
 const BLOCK_SIZES: [usize; 2] = [1024, 4096];
 

@@ -116,7 +116,7 @@ node = [sys.argv[1], '--listen', '127.0.0.1:0', '--node', '5', '--flash', 'insta
 node = subprocess.Popen(node, stdout=subprocess.PIPE, text=True)
 try:
     bus = node.stdout.readline().removeprefix('bus: ').strip()
-    report = coflash.flash(bus, 5, 'program.bin', board='stm32f407g-disc1', address=0x08010000, verify=True)
+    report = coflash.flash(bus, 5, 'program.bin', board='stm32f407g-disc1', address=0x08020000, verify=True)
     print(report['size'])
 finally:
     node.kill()
@@ -165,9 +165,9 @@ fn works(root: &Path, program: &str) -> Outcome {
     })
 }
 
-/// A program for 0801_0000h: the initial stack pointer, the reset vector, and almost no code.
+/// A program for 0802_0000h: the initial stack pointer, the reset vector, and almost no code.
 fn sample() -> Vec<u8> {
-    let mut image = [0x2001_0000_u32, 0x0801_0201].map(u32::to_le_bytes).concat();
+    let mut image = [0x2001_0000_u32, 0x0802_0201].map(u32::to_le_bytes).concat();
     image.resize(1024, 0xBF);
     image
 }
