@@ -89,7 +89,7 @@ class Bench:
 
     def image(self, name, size=8 * 1024, seed=1, vendor=VENDOR, product=PRODUCT):
         """A block file with a program of `size` bytes, made by the host tool from a raw image."""
-        words = [0x2001_0000, 0x0801_0201] + [0] * 2
+        words = [0x2001_0000, 0x0802_0201] + [0] * 2
         body = bytes((seed * 7 + at * 31 + (at >> 8)) & 0xFF for at in range(size - 16))
         raw, blocks = self.folder / f"{name}.bin", self.folder / f"{name}.blk"
         raw.write_bytes(struct.pack("<4I", *words) + body)

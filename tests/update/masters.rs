@@ -82,7 +82,7 @@ fn lelys_master_updates_a_running_device() {
 /// inside, Thumb bit set.
 fn program(first: u8) -> Vec<u8> {
     let mut bytes = vec![first; 20 * 1024];
-    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08]);
+    bytes[..8].copy_from_slice(&[0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x02, 0x08]);
     bytes
 }
 

@@ -227,7 +227,7 @@ fn images_go_through_a_gateway() {
     fake.maker = Some(Box::new(Standard(image.clone())));
     let (bus, _, _) = behind(fake);
     let file = data("program.elf");
-    let board = ["--board", "stm32f407g-disc1", "--dialect", "raw"];
+    let board = ["--board", "nucleo-f446re", "--dialect", "raw"];
     let done = coflash(&[&["--bus", &bus, "flash", "-N", "5", &file][..], &board].concat());
     assert_eq!(done.exit, 0, "{}\n{}", done.err, done.out);
     assert!(*image.lock().unwrap() == fs::read(data("program.bin")).unwrap());

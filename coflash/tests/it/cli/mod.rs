@@ -23,7 +23,7 @@ use crate::tool::{coflash, data, folder, run, serve, snapshot};
 fn convert_writes_the_block_file_of_the_manual() {
     let folder = folder("convert");
     let out = folder.path("out.blk");
-    let board = ["--board", "stm32f407g-disc1"];
+    let board = ["--board", "nucleo-f446re"];
     let identity = ["--block-size", "0x110", "--vid", "0", "--pid", "1234"];
     let release = ["--ver", "0x00640A01", "--date", "1420070400"];
     for (arguments, expected) in [
@@ -124,7 +124,7 @@ fn inspect_tells_what_a_file_holds() {
         done.out
     };
     snapshot("inspect-release", &shown("release-110.blk", &[]));
-    snapshot("inspect-crc16", &shown("crc16-400.blk", &["--board", "stm32f407g-disc1"]));
+    snapshot("inspect-crc16", &shown("crc16-400.blk", &["--board", "nucleo-f446re"]));
     snapshot("inspect-hex", &shown("program.hex", &[]));
     let json: serde_json::Value = serde_json::from_str(&shown("release-110.blk", &["--json"])).unwrap();
     assert_eq!(json["format"], "block file");
@@ -146,7 +146,7 @@ fn inspect_tells_what_a_file_holds() {
         fs::read_to_string(data("program.hex")).unwrap().replacen(":020000040801F1", ":020000040800F2", 1);
     let far = folder.file("far.hex", far.as_bytes());
     assert_eq!(coflash(&["inspect", &far]).exit, 0);
-    let done = coflash(&["inspect", &far, "--board", "stm32f407g-disc1"]);
+    let done = coflash(&["inspect", &far, "--board", "nucleo-f446re"]);
     assert!(done.exit == 3 && done.err.contains("lies outside"), "{}", done.err);
 }
 
@@ -201,8 +201,8 @@ fn what_can_be_no_program_is_refused_without_a_bus() {
             "bootloader.bin: begins at the start of the flash",
         ),
         (&bootloader, &["--dialect", "raw"], "bootloader.bin: begins at the start of the flash"),
-        (&bootloader, &["--board", "stm32f407g-disc1"], "its reset vector is 08000189h, outside 0x08010000"),
-        (&zeros, &["--board", "stm32f407g-disc1"], "zeros.bin: is not a program: all its bytes are 00h"),
+        (&bootloader, &["--board", "nucleo-f446re"], "its reset vector is 08000189h, outside 0x08010000"),
+        (&zeros, &["--board", "nucleo-f446re"], "zeros.bin: is not a program: all its bytes are 00h"),
         (&zeros, &["--dialect", "lift", "--unlock", "x"], "zeros.bin: is not a program"),
     ] {
         let done = flash(file, options);
@@ -231,7 +231,7 @@ fn the_label_is_shown_and_goes_into_block_0() {
     image[0x1E0..0x200]
         .copy_from_slice(&label.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>());
     let file = folder.file("app.bin", &image);
-    let raw = ["-I", "binary", "--board", "stm32f407g-disc1"];
+    let raw = ["-I", "binary", "--board", "nucleo-f446re"];
 
     let done = coflash(&[&["inspect", &file][..], &raw].concat());
     assert!(
@@ -346,7 +346,7 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
         (
             "far.hex",
             far.as_bytes(),
-            "far.hex, line 2: the data at 0x08000000..=0x08000007 lies outside 0x08010000..=0x080fffff"
+            "far.hex, line 2: the data at 0x08000000..=0x08000007 lies outside 0x08010000..=0x0807ffff"
                 .to_string(),
         ),
         ("cut.blk", &blocks[..500], "cut.blk, offset 0x18: a block is cut off".to_string()),
@@ -354,7 +354,7 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
     ] {
         let file = folder.file(name, bytes);
         let out = folder.path("out.blk");
-        let board = ["--board", "stm32f407g-disc1"];
+        let board = ["--board", "nucleo-f446re"];
         for command in [&["convert", &file, &out][..], &["--bus", &bus, "flash", &file]] {
             let done = coflash(&[command, &board].concat());
             assert_eq!(done.exit, 3, "{name}: {}", done.err);
@@ -416,16 +416,8 @@ fn flash_and_info_over_a_socket() {
     fake.erase_time = Duration::from_millis(50);
     fake.restart_time = Duration::from_millis(20);
     let (bus, server) = serve(fake);
-    let done = coflash(&[
-        "--bus",
-        &bus,
-        "flash",
-        "--node",
-        "5",
-        "--board",
-        "stm32f407g-disc1",
-        &data("program.elf"),
-    ]);
+    let done =
+        coflash(&["--bus", &bus, "flash", "--node", "5", "--board", "nucleo-f446re", &data("program.elf")]);
     assert_eq!(done.exit, 0, "{}", done.err);
     let fake = server.join().unwrap();
     assert_eq!(fake.blocks.concat(), fs::read(data("plain-400.blk")).unwrap());

@@ -75,7 +75,7 @@ impl Room {
     fn seal(&self, name: &str, more: &[&str]) -> Done {
         let (app, out) = (self.path("app.hex"), self.path(name));
         let (key, cert) = (self.path("release.pem"), self.path("release.cert"));
-        let words = ["seal", &app, "-o", &out, "--board", "stm32f407g-disc1", "--key", &key, "--cert", &cert];
+        let words = ["seal", &app, "-o", &out, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert];
         coflash(&[&words[..], more].concat())
     }
 
@@ -185,7 +185,7 @@ fn the_converter_encrypts_with_a_value() {
     let room = Room::new("convert");
     let (value, app) = ("000102030405060708090a0b0c0d0e0f", room.path("app.hex"));
     let (sign, cert) = (room.path("release.pem"), room.path("release.cert"));
-    let words = ["convert", &app, "--board", "stm32f407g-disc1", "--key", value];
+    let words = ["convert", &app, "--board", "nucleo-f446re", "--key", value];
     for (more, missing) in [
         (&[][..], "--sign and --counter is missing"),
         (&["--counter", "7"], ", and --sign is missing"),
@@ -476,8 +476,7 @@ fn what_cannot_be_sealed_is_refused_with_what_to_do() {
     // No program, and no label.
     let junk = room.0.file("junk.bin", &[0x5A; 1000]);
     let key = room.path("release.pem");
-    let words =
-        ["seal", &junk, "-I", "binary", "--board", "stm32f407g-disc1", "--key", &key, "--counter", "1"];
+    let words = ["seal", &junk, "-I", "binary", "--board", "nucleo-f446re", "--key", &key, "--counter", "1"];
     assert!(coflash(&words).err.contains("is not a program"));
     let done = coflash(&[&words[..], &["--data"]].concat());
     assert!(
@@ -500,8 +499,7 @@ fn a_module_signs_in_two_steps() {
     let room = Room::new("module");
     let (app, out) = (room.path("app.hex"), room.path("app.cbs"));
     let (key, cert, tbs) = (room.path("release.pub"), room.path("release.cert"), room.path("app.tbs"));
-    let words =
-        ["seal", &app, "--board", "stm32f407g-disc1", "--key", &key, "--cert", &cert, "--counter", "1"];
+    let words = ["seal", &app, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert, "--counter", "1"];
     let done = room.good(&[&words[..], &["--tbs", &tbs]].concat());
     assert!(done.out.contains("its signature is missing"), "{}", done.out);
     let done = room.verify("app.cbs", &[]);
@@ -525,7 +523,7 @@ fn a_module_signs_in_two_steps() {
     let attach = ["seal", &out, "--key", &key, "--attach", &signature];
     let done = coflash(&[&attach[..], &["--blocks"]].concat());
     assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
-    room.good(&[&attach[..], &["--blocks", "--board", "stm32f407g-disc1"]].concat());
+    room.good(&[&attach[..], &["--blocks", "--board", "nucleo-f446re"]].concat());
     room.good(&attach);
     assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
     assert!(unwrapped(&split(&room.bytes("app.blk"))).1 == room.bytes("app.cbs"));

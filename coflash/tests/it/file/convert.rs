@@ -5,7 +5,7 @@ use coflash::file::block_file::{BlockFile, Checksum, LastBlock};
 use coflash::file::convert::{blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region};
 use coflash::file::read::{self, Firmware, Format};
 use coflash::file::{AddressRange, Image};
-use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+use shared_abi::layout::nucleo_f446re::LAYOUT;
 
 fn image(bytes: &[u8]) -> Image {
     match read::read(bytes, None, None).unwrap() {

@@ -20,7 +20,7 @@ pub const FLASH: &[&str] = &["flash", "program.bin", "-I", "binary", "--board", 
 
 /// The part of a program that a bootloader checks: initial stack pointer in RAM, reset vector
 /// inside, Thumb bit set.
-pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x01, 0x08];
+pub const VECTORS: [u8; 8] = [0x00, 0x00, 0x01, 0x20, 0x01, 0x02, 0x02, 0x08];
 
 /// A folder for one test, deleted at the end.
 pub struct Folder(kit::folder::Folder);
