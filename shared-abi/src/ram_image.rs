@@ -178,7 +178,7 @@ mod tests {
             (Header { size: 60, ..SOUND }, Damage::Header),
             (Header { size: 0x3FFE, ..SOUND }, Damage::Header),
             (Header { size: 0x4004, ..SOUND }, Damage::Header),
-            (Header { size: u32::MAX & !3, ..SOUND }, Damage::Header),
+            (Header { size: !3, ..SOUND }, Damage::Header),
             (Header { ram_base: 0x2000_0200, ..SOUND }, Damage::Header),
             (Header { ram_base: 0x0801_0040, ..SOUND }, Damage::Header),
             (Header { ram_end: 0x2001_FFC4, ..SOUND }, Damage::Header),
