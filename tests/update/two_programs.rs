@@ -126,7 +126,7 @@ fn a_block_for_the_other_program_is_refused() {
     let refused = flash(&mut bench.session(), &second, &options.force(true), &mut |_| {}).unwrap_err();
     let status = bench.ask(0x601, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0], 0x581).unwrap();
     assert_eq!(status[4], 0x0C, "ADDRESS: {refused}");
-    let (start, end) = (0x1_0000, LAYOUT.chip.flash.size as usize);
+    let (start, end) = (0x2_0000, LAYOUT.chip.flash.size as usize);
     assert!(bench.machine().flash()[start..end].iter().all(|byte| *byte == 0xFF));
 }
 

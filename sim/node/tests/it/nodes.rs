@@ -74,7 +74,7 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     nodes.await_line("serial 1, node 7: would start program 1");
     // CiA 302-3: it runs, and 1F56h has the same value as in the bootloader.
     assert_eq!(coflash.json(&["read", "1F51/1", "-N", "7"])["number"], 1);
-    assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["hex"], "818FFBA6");
+    assert_eq!(coflash.json(&["read", "1F56/1", "-N", "7"])["hex"], "22946669");
     // The program's version is reported, running or stopped, in the format of the manual's figure
     // 13.
     let scan = || coflash.done(&["scan", "-N", "7"]);
