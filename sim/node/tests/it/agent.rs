@@ -171,7 +171,7 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
         let erased = said.matches("erase the old program").count();
         assert_eq!(erased, starts, "{kept} {byte:X}: {said}");
         assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
-        assert!(folder.read("1.flash")[0x1_0100] == byte);
+        assert!(folder.read("1.flash")[0x2_0100] == byte);
     }
 }
 
