@@ -198,7 +198,7 @@ fn refusals_leave_room_for_the_other_events() {
             host.install(1, &sealed(&STANDARD_1, 1, seed, counter));
         }
     });
-    let own = device.run(|host| log(host));
+    let own = device.run(log);
     assert_eq!(own.len(), 5);
     for _ in 0..3 {
         device.run(|host| {
@@ -209,7 +209,7 @@ fn refusals_leave_room_for_the_other_events() {
     }
     let is_refusal = |event: &[u32; 4]| event[1] & 0xFFFF_0000 == event::REFUSED;
     let (refusals, others): (Vec<_>, Vec<_>) =
-        device.run(|host| log(host)).into_iter().partition(|event| is_refusal(event));
+        device.run(log).into_iter().partition(|event| is_refusal(event));
     let codes: Vec<u32> = refusals.iter().map(|event| event[1] & 0xFFFF).collect();
     assert_eq!(codes, [status::SIGNATURE, 0x80, 0x0C, status::FORMAT]);
     // The log has eight places: the oldest of five makes room for the fourth refusal.
