@@ -284,7 +284,7 @@ fn the_log_tells_the_last_events_the_latest_first() {
         assert_eq!(logged(host, 4), [1, event::INSTALLED | 1, 5, 11]);
         assert_eq!(logged(host, 5), [0; 4]);
     });
-    // Each installation is told, but not the same image again; and the log is there behind a reset.
+    // Each installation is told, but not the same image again; and the log is there after a reset.
     let before = device.run(|host| {
         let before = log(host);
         assert_eq!(before[0][..2], [4, event::UNLOCKED | right::ERASE | right::STORE]);
