@@ -15,7 +15,7 @@
 use core::fmt;
 
 use crate::geometry::{Geometry, Region, CORE_VECTORS_SIZE};
-use crate::{callgate, handoff, label, ram_image, warm_start};
+use crate::{callgate, handoff, label, warm_start};
 
 pub mod toml;
 
@@ -27,6 +27,10 @@ pub const DEFAULT: &Layout = &stm32f407g_disc1::LAYOUT;
 
 /// The size of [`Layout::key_block`] in bytes.
 pub const KEY_BLOCK_SIZE: u32 = 256;
+
+/// The least number of bytes of RAM after the bootloader's variables that remain for its stack. The
+/// boot stage, which copies the RAM image, uses the same RAM.
+pub const LEAST_STACK: u32 = 4096;
 
 /// The offset of a word in the bootloader's vector table that is not a vector (PM0214 section
 /// 2.3.4: reserved). It contains [`KNOWS_SEALED_IMAGES`] in a bootloader that uses a key block.
@@ -373,7 +377,7 @@ impl fmt::Display for LinkerScript<'_> {
             ("__vector_table_alignment", layout.chip.vector_table_alignment()),
             ("__vector_table_size", layout.chip.vector_table_size()),
             ("__core_vectors_size", CORE_VECTORS_SIZE),
-            ("__least_stack", ram_image::LEAST_STACK),
+            ("__least_stack", LEAST_STACK),
             ("__label", flash.base + label::OFFSET),
             ("__label_end", flash.base + label::OFFSET + label::SIZE as u32),
             ("__callgate_table", layout.callgate()),

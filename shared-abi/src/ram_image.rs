@@ -6,7 +6,9 @@
 //! has the services it needs.
 
 use crate::geometry::{Region, CORE_VECTORS_SIZE};
+use crate::layout::LEAST_STACK;
 use crate::vectors::VectorTable;
+use crate::warm_start::Damage;
 
 /// Identifies a RAM image, format 2 ("CBI2" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
@@ -17,10 +19,6 @@ pub const SERVICES_VERSION: u32 = 1;
 
 /// Optional abilities of the resident part, a bit each. None is defined yet.
 pub const FEATURES: u32 = 0;
-
-/// The least number of bytes of RAM after the bootloader's variables that remain for its stack. The
-/// boot stage, which copies the image, uses the same RAM.
-pub const LEAST_STACK: u32 = 4096;
 
 /// The header before the image: 64 bytes, little-endian. `cargo build` writes everything but the
 /// CRC, which `cargo xtask build` writes.
@@ -58,37 +56,6 @@ pub struct Header {
     pub counter: u32,
     /// 0.
     pub reserved: [u32; 2],
-}
-
-/// Why the RAM image cannot run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
-pub enum Damage {
-    /// The header is missing, or contains a size or an address that cannot be.
-    Header = 1,
-    /// The image needs services or abilities that this resident part has not.
-    Services = 2,
-    /// The CRC is wrong.
-    Crc = 3,
-    /// The image is for another board.
-    Board = 4,
-    /// Its stack pointer or its reset vector points out of its RAM.
-    Vectors = 5,
-}
-
-impl Damage {
-    /// The damage with this number.
-    #[must_use]
-    pub const fn from_number(number: u8) -> Option<Self> {
-        Some(match number {
-            1 => Self::Header,
-            2 => Self::Services,
-            3 => Self::Crc,
-            4 => Self::Board,
-            5 => Self::Vectors,
-            _ => return None,
-        })
-    }
 }
 
 impl Header {
@@ -216,14 +183,6 @@ mod tests {
         ] {
             assert_eq!(entry(sp, reset), Err(Damage::Vectors), "{sp:08X} {reset:08X}");
         }
-    }
-
-    #[test]
-    fn every_damage_has_a_number() {
-        for number in 1..=5 {
-            assert_eq!(Damage::from_number(number).map(|damage| damage as u8), Some(number));
-        }
-        assert_eq!((Damage::from_number(0), Damage::from_number(6)), (None, None));
     }
 
     #[test]

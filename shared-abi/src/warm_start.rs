@@ -6,10 +6,40 @@
 //! are read once: [`Cell::take`] consumes them.
 
 use crate::check_word;
-use crate::ram_image::Damage;
 
 /// Identifies a warm-start cell, layout version 1 ("CBW1" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBW1");
+
+/// Why the RAM image cannot run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Damage {
+    /// The header is missing, or contains a size or an address that cannot be.
+    Header = 1,
+    /// The image needs services or abilities that this resident part has not.
+    Services = 2,
+    /// The CRC is wrong.
+    Crc = 3,
+    /// The image is for another board.
+    Board = 4,
+    /// Its stack pointer or its reset vector points out of its RAM.
+    Vectors = 5,
+}
+
+impl Damage {
+    /// The damage with this number.
+    #[must_use]
+    pub const fn from_number(number: u8) -> Option<Self> {
+        Some(match number {
+            1 => Self::Header,
+            2 => Self::Services,
+            3 => Self::Crc,
+            4 => Self::Board,
+            5 => Self::Vectors,
+            _ => return None,
+        })
+    }
+}
 
 /// A request for the next start of the bootloader.
 ///
@@ -223,6 +253,14 @@ impl Cell {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn every_damage_has_a_number() {
+        for number in 1..=5 {
+            assert_eq!(Damage::from_number(number).map(|damage| damage as u8), Some(number));
+        }
+        assert_eq!((Damage::from_number(0), Damage::from_number(6)), (None, None));
+    }
 
     #[test]
     fn every_request_survives_the_cell_once() {

@@ -5,8 +5,9 @@ use core::slice;
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
-use shared_abi::ram_image::{Damage, Header};
+use shared_abi::ram_image::Header;
 use shared_abi::vectors::VectorTable;
+use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
 
@@ -24,7 +25,7 @@ extern "C" {
 /// The damaged part; the RAM may then hold the image.
 ///
 /// # Safety
-/// Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::ram_image::LEAST_STACK)
+/// Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::layout::LEAST_STACK)
 /// bytes.
 pub unsafe fn load(flash: &ResidentFlash) -> Result<VectorTable, Damage> {
     // SAFETY: the linker script places it in flash, aligned; any bits are a valid `Header`, and the
