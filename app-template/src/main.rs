@@ -62,7 +62,7 @@ mod app {
     /// Received frames that may wait for the protocol task.
     const RX_QUEUE: usize = 16;
     /// How often the protocol looks at its deadlines, in ms.
-    const TICK_MS: u32 = 5;
+    const TICK_MS: u32 = 2;
     /// The bit rate that the program uses when no bootloader has started it.
     const DEFAULT_BIT_RATE: BitRate = match BitRate::from_bits_per_second(BIT_RATE) {
         Some(rate) => rate,
@@ -197,6 +197,7 @@ mod app {
     /// Lets time pass for the protocol, and shows life.
     #[task(local = [led], priority = 1)]
     async fn tick(cx: tick::Context) {
+        let mut next = Mono::now();
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
@@ -204,7 +205,8 @@ mod app {
                 cx.local.led.toggle();
             }
             ticks = ticks.wrapping_add(1);
-            Mono::delay(TICK_MS.millis()).await;
+            next += TICK_MS.millis();
+            Mono::delay_until(next).await;
         }
     }
 }

@@ -60,15 +60,24 @@ fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
         &mut |_| {},
     )
     .unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    let answered = bench.time();
-    let call_back = bench.await_boot_up(1000) - answered;
-    println!(
-        "boot-up of the bootloader: {} us after power-on, {} us after the answer to 80h",
-        power_on.0 / 1_000_000,
-        call_back.0 / 1_000_000
-    );
-    assert!(power_on <= Span::from_micros(4500), "{} us", power_on.0 / 1_000_000);
-    // The application takes 11 ms of it (SYS TEC manual L-1112d_10, 4.5: at least 10).
-    assert!(call_back <= Span::from_millis(18), "{} us", call_back.0 / 1_000_000);
+    println!("boot-up of the bootloader: {} us after power-on", micros(power_on));
+    assert!(power_on <= Span::from_micros(4500), "{} us", micros(power_on));
+    // The application looks at its deadlines by a clock of its own: the request meets it in any phase.
+    for phase in 0..4 {
+        bench.run_ms(phase);
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        let answered = bench.time();
+        let call_back = bench.await_boot_up(1000) - answered;
+        println!("boot-up of the bootloader: {} us after the answer to 80h", micros(call_back));
+        // The application takes 11 ms of it (SYS TEC manual L-1112d_10, 4.5: at least 10).
+        assert!(call_back <= Span::from_millis(18), "{} us", micros(call_back));
+        assert!(call_back >= Span::from_millis(10), "{} us", micros(call_back));
+        bench.run_ms(20);
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_boot_up(1000);
+    }
+}
+
+fn micros(span: Span) -> u64 {
+    span.0 / 1_000_000
 }
