@@ -7,7 +7,7 @@ use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters, StoreError, Value};
 use bsp::LAYOUT;
 use shared_abi::geometry::{Region, Sector};
-use shared_abi::services::{Services, Step, StoreState, ERASE, OFFSET};
+use shared_abi::services::{OperationResult, Services, Step, StoreState, ERASE, OFFSET};
 
 use crate::flash_controller::FlashController;
 
@@ -105,15 +105,15 @@ impl Parameters for Store {
     }
 
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
-        let outcome = match outcome {
-            Ok(()) => 0,
-            Err(FlashFault::Protected) => 1,
-            Err(FlashFault::Failed) => 2,
-            Err(FlashFault::Verify) => 3,
+        let result = match outcome {
+            Ok(()) => OperationResult::Done,
+            Err(FlashFault::Protected) => OperationResult::Protected,
+            Err(FlashFault::Failed) => OperationResult::Failed,
+            Err(FlashFault::Verify) => OperationResult::NotVerified,
         };
         let mut operation = [0; 4];
         // SAFETY: the state comes from `open`, and the words are writable.
-        let step = unsafe { (services().next)(&mut *self.0, outcome, &mut operation) };
+        let step = unsafe { (services().next)(&mut *self.0, result as u32, &mut operation) };
         match (Step::from_number(step), operation) {
             (Step::Start, [ERASE, place @ ..]) => Next::Start(Operation::Erase(sector(place))),
             (Step::Start, [_, address, word, _]) => Next::Start(Operation::Program { address, word }),

@@ -30,8 +30,8 @@ pub struct Services {
     /// Begins to store a value under a key. A key that the resident part does not know is as good as
     /// any other.
     pub store: unsafe extern "C" fn(*mut StoreState, u32, *const [u32; 4]),
-    /// Continues to store the value. The second argument is the result of the previous operation: 0
-    /// for success, 1 protected, 2 failed, 3 not verified. Returns a number of a [`Step`].
+    /// Continues to store the value. The second argument is the result of the previous operation, a
+    /// number of [`OperationResult`]. Returns a number of a [`Step`].
     pub next: unsafe extern "C" fn(*mut StoreState, u32, *mut FlashOperation) -> u32,
     /// CRC-32 of a region of the flash (address, size); it continues the CRC in the first argument.
     pub crc32: extern "C" fn(u32, u32, u32) -> u32,
@@ -50,6 +50,33 @@ pub type FlashOperation = [u32; 4];
 pub const ERASE: u32 = 1;
 /// The first word of a [`FlashOperation`] that programs a word.
 pub const PROGRAM: u32 = 2;
+
+/// The result of an operation of the flash.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u32)]
+pub enum OperationResult {
+    /// It is done.
+    Done = 0,
+    /// The place is write-protected by option bytes.
+    Protected = 1,
+    /// The operation was refused or failed.
+    Failed = 2,
+    /// The word read back differs from the programmed one.
+    NotVerified = 3,
+}
+
+impl OperationResult {
+    /// The result with this number; any other number is [`Failed`](Self::Failed).
+    #[must_use]
+    pub const fn from_number(number: u32) -> Self {
+        match number {
+            0 => Self::Done,
+            1 => Self::Protected,
+            3 => Self::NotVerified,
+            _ => Self::Failed,
+        }
+    }
+}
 
 /// The next step of the store.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,6 +132,15 @@ const _: () = {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_result_that_nobody_knows_is_a_failure() {
+        use OperationResult::{Done, Failed, NotVerified, Protected};
+        for result in [Done, Protected, Failed, NotVerified] {
+            assert_eq!(OperationResult::from_number(result as u32), result);
+        }
+        assert_eq!([4, u32::MAX].map(OperationResult::from_number), [Failed; 2]);
+    }
 
     #[test]
     fn a_step_that_nobody_knows_is_a_failure() {

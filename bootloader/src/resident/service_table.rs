@@ -4,7 +4,7 @@ use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters as _, Value};
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::SERVICES_VERSION;
-use shared_abi::services::{FlashOperation, Services, Step, StoreState, ERASE, PROGRAM};
+use shared_abi::services::{FlashOperation, OperationResult, Services, Step, StoreState, ERASE, PROGRAM};
 
 use crate::flash::ResidentFlash;
 use crate::product::{self, Parameters};
@@ -61,12 +61,12 @@ unsafe extern "C" fn store(state: *mut StoreState, key: u32, value: *const Value
 
 /// # Safety
 /// `state` must come from [`open`]; `operation` must be writable.
-unsafe extern "C" fn next(state: *mut StoreState, outcome: u32, operation: *mut FlashOperation) -> u32 {
-    let outcome = match outcome {
-        0 => Ok(()),
-        1 => Err(FlashFault::Protected),
-        3 => Err(FlashFault::Verify),
-        _ => Err(FlashFault::Failed),
+unsafe extern "C" fn next(state: *mut StoreState, result: u32, operation: *mut FlashOperation) -> u32 {
+    let outcome = match OperationResult::from_number(result) {
+        OperationResult::Done => Ok(()),
+        OperationResult::Protected => Err(FlashFault::Protected),
+        OperationResult::Failed => Err(FlashFault::Failed),
+        OperationResult::NotVerified => Err(FlashFault::Verify),
     };
     // SAFETY: the caller guarantees both.
     let step = unsafe {
