@@ -61,8 +61,10 @@ pub struct Header {
 impl Header {
     /// Its size in bytes.
     pub const SIZE: u32 = size_of::<Self>() as u32;
+    /// The offset of the CRC.
+    pub const CRC: u32 = core::mem::offset_of!(Self, crc) as u32;
     /// The offset of the first byte that the CRC covers.
-    pub const CRC_FROM: u32 = 8;
+    pub const CRC_FROM: u32 = Self::CRC + 4;
 
     /// Checks a header: `flash` bytes follow it in the region of the RAM image, `ram` is the RAM of
     /// the images, and `board` the identity of this board.

@@ -11,8 +11,6 @@ use crate::Outcome;
 pub const HEADER: &str = ".ram_image";
 /// The section of the image, at its addresses in RAM.
 pub const IMAGE: &str = ".data";
-/// The offset of the CRC in the header, and its size.
-const CRC_WORD: std::ops::Range<usize> = 4..8;
 
 /// Writes the CRC into the ELF file of a bootloader. No other byte changes.
 ///
@@ -42,8 +40,8 @@ pub fn seal(mut file: Vec<u8>) -> Outcome<Vec<u8>> {
     digest.update(&contents(header)[Header::CRC_FROM as usize..]);
     digest.update(contents(image));
     let crc = digest.finalize();
-    let at = header.offset as usize;
-    file[at..][CRC_WORD].copy_from_slice(&crc.to_le_bytes());
+    let at = (header.offset + Header::CRC) as usize;
+    file[at..][..4].copy_from_slice(&crc.to_le_bytes());
     Ok(file)
 }
 

@@ -2,7 +2,7 @@
 
 use seal::key_block::SIZE;
 use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
-use shared_abi::ram_image::MAGIC;
+use shared_abi::ram_image::{Header, MAGIC};
 
 use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
@@ -48,9 +48,6 @@ pub enum ProvisionFault {
     Occupied(AddressRange),
 }
 
-/// The offset of the CRC in the header of the RAM image.
-const CRC_OFFSET: u32 = 4;
-
 /// Adds a key block to a bootloader image.
 ///
 /// # Errors
@@ -78,7 +75,7 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     }
     let no_crc = [Some([0; 4]), None];
     if bootloader.bytes(home.first) != Some(MAGIC.to_le_bytes())
-        || no_crc.contains(&bootloader.bytes(home.first + CRC_OFFSET))
+        || no_crc.contains(&bootloader.bytes(home.first + Header::CRC))
     {
         return Err(ProvisionFault::NoRamImage(home.first));
     }
