@@ -16,11 +16,13 @@ use crate::args::Args;
 use crate::{files, process, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask evidence
+usage: cargo xtask evidence [--release]
 
 Writes target/evidence/evidence.md: one page of what the jobs have measured of the commit that is
 checked out. It runs nothing itself. A part of which there is no result of this commit says so and
 names the command; results of other commits and of changed sources do not count.
+
+  --release   writes docs/evidence.md, too: the figures of a release, with date and commit
 ";
 
 /// A part of the page.
@@ -59,7 +61,8 @@ const NOT_VERIFIED: &str = "Nothing here ran on silicon. The emulated chip follo
     brown-out levels, the wear of the flash and the erase times of a real device are not verified. `cargo xtask hil` \
     runs the same tests on a board.";
 
-pub fn run(args: Args) -> Outcome {
+pub fn run(mut args: Args) -> Outcome {
+    let is_release = args.flag("--release");
     args.none_left()?;
     let (commit, clean) = sources();
     let mut records = Vec::new();
@@ -75,7 +78,11 @@ pub fn run(args: Args) -> Outcome {
     for (part, known) in PARTS.iter().zip(&results) {
         println!("  {:<9} {}", part.name, known.verdict);
     }
-    write(&folder().join("evidence.md"), &page(&commit, &results))
+    let page = page(&commit, &results);
+    if is_release {
+        write(&workspace::root().join("docs/evidence.md"), &page)?;
+    }
+    write(&folder().join("evidence.md"), &page)
 }
 
 fn write(file: &Path, text: &str) -> Outcome {
