@@ -125,10 +125,10 @@ impl Variant {
         VARIANTS.iter().filter(|variant| variant.least_programs <= board.programs.len()).filter(fits)
     }
 
-    /// Whether only the split map has room for it: bootloaders with sealed images, logs, the debugger.
+    /// Whether only the split map has room for it, or for the bootloader that it needs.
     fn needs_split(&self) -> bool {
-        self.is_bootloader() && !self.features.is_empty() && self.features != "virtual-can"
-            || self.features == "debugger"
+        const FEATURES: [&str; 6] = ["debugger", "log-defmt", "log-rtt", "log-uart", "sealed", "virtual-can"];
+        FEATURES.contains(&self.features)
     }
 
     /// The product of the image.
