@@ -10,4 +10,3 @@ mod peers;
 mod python_package;
 mod second_board;
 mod ui;
-mod zencan;

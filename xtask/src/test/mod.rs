@@ -210,25 +210,38 @@ fn room() -> Outcome {
 const NOT_ON_HOST: [&str; 6] =
     ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
 
-/// The test programs that need no firmware.
+/// Selects all packages that are built for this machine but some. What cargo builds at one time has the
+/// features of all selected packages: calls that select the same build the crates of others once.
+fn all_but(others: &[&str]) -> Vec<String> {
+    let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]).chain(others);
+    let without = without.flat_map(|package| ["--exclude", package]).map(str::to_owned);
+    ["--workspace".to_owned()].into_iter().chain(without).collect()
+}
+
+/// The test programs that need no firmware, and the programs that tests start: the host tool and the
+/// node, which cargo builds for their tests.
 fn host_programs() -> Outcome<Vec<Program>> {
     // coboot-tests has sealed images, without which a bootloader has more: together, all would be
     // tested with them. The jobs of the repository are tested in .ci/run.
-    let others = NOT_ON_HOST.iter().chain(&["coboot-tests", "xtask"]);
-    let without = others.flat_map(|package| ["--exclude", package]).map(str::to_owned);
-    programs::build(&["--workspace".to_owned()].into_iter().chain(without).collect::<Vec<_>>())
+    programs::build(&all_but(&["coboot-tests"]))
 }
 
-/// The test programs that run the firmware of a board; and the crates with sealed images.
+/// The test programs that run the firmware of a board.
 fn board_programs(board: &Layout) -> Outcome<Vec<Program>> {
-    let sealed = ["--package=coboot-core", "--package=coboot-canopen"].map(str::to_owned);
-    programs::build(&[&build::tests_args(board)[..], &sealed].concat())
+    let tests = ["device", "update", "sealed", "foreign", "port"].map(|name| format!("--test={name}"));
+    programs::build(&[&build::board_args(board)[..], &all_but(&[]), &tests].concat())
 }
 
-/// Builds the programs that tests start: the host tool and the node.
+/// The core of the bootloader with sealed images.
+fn sealed_programs() -> Outcome<Vec<Program>> {
+    programs::build(&["--package=coboot-core", "--features=coboot-core/sealed"].map(str::to_owned))
+}
+
+/// Builds the programs that tests start, for tests that are chosen by words.
 fn programs_of_ours() -> Outcome {
-    let packages = ["--package", "coflash", "--package", "coboot-node"];
-    process::run(process::cargo("build").current_dir(workspace::root()).args(packages))
+    let mut cargo = process::cargo("build");
+    cargo.current_dir(workspace::root()).args(all_but(&["coboot-tests"]));
+    process::run(cargo.args(["--bin=coflash", "--bin=coboot-node"]))
 }
 
 /// Builds the images of a tier, and of those before it.
@@ -278,12 +291,11 @@ fn product(summary: &mut Summary) -> Outcome {
         let images = scope.spawn(|| build_images(Tier::Product));
         let hosts = host_programs()?;
         let with_board = board_programs(DEFAULT)?;
+        let sealed = sealed_programs()?;
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
         add(&mut jobs, summary, &hosts, None, DEFAULT, chosen)?;
-        let (own, sealed): (Vec<_>, Vec<_>) =
-            with_board.into_iter().partition(|program| program.package == "coboot-tests");
-        add(&mut jobs, summary, &own, None, DEFAULT, chosen)?;
+        add(&mut jobs, summary, &with_board, None, DEFAULT, chosen)?;
         add(&mut jobs, summary, &sealed, Some("sealed"), DEFAULT, chosen)
     })?;
     runner::run(jobs, summary);
@@ -293,8 +305,8 @@ fn product(summary: &mut Summary) -> Outcome {
 /// Tests of the default board that run from a tier on.
 fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
     let mut jobs = Vec::new();
-    let programs =
-        [host_programs()?, board_programs(DEFAULT)?, programs::build(&["--package=xtask".to_owned()])?];
+    let more = programs::build(&["--package=xtask", "--package=coboot-zencan"].map(str::to_owned))?;
+    let programs = [host_programs()?, board_programs(DEFAULT)?, more];
     let chosen = |program: &str, test: &str| Tier::of(program, test) == tier;
     add(&mut jobs, summary, &programs.concat(), None, DEFAULT, chosen)?;
     Ok(jobs)
@@ -344,8 +356,7 @@ fn on_board(
     if tier == Tier::All {
         build::boards(&[(board, &[])])?;
     }
-    let mut programs = board_programs(board)?;
-    programs.retain(|program| program.package == "coboot-tests");
+    let programs = board_programs(board)?;
     let mut jobs = Vec::new();
     let is_of = |program: &str, test: &str, row: &(&str, &str)| program == row.0 && test.starts_with(row.1);
     let has = |program: &str, test: &str| {

@@ -58,9 +58,9 @@ pub const LATER: &[Later] = &[
     later("foreign", "peers::", Tier::Ci, OTHERS),
     later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
     later("foreign", "ui::", Tier::Ci, "Chromium"),
-    later("foreign", "zencan::", Tier::Ci, OTHERS),
     later("port", "matrix::", Tier::Ci, TWO),
     later("port", "porting::", Tier::All, "builds a copy of the repository"),
+    later("coboot-zencan/zencan", "", Tier::Ci, OTHERS),
     later("xtask", "", Tier::Ci, "the repository and its pages, not the product"),
     later("xtask/hil", "", Tier::All, "builds and flashes for 4 minutes"),
 ];

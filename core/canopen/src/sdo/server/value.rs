@@ -2,4 +2,4 @@
 
 /// The longest variable or string, in bytes. A longer value must be a domain. (A signature with the
 /// signed data, 2002h, has 76 bytes.)
-pub const VALUE_MAX: usize = if cfg!(feature = "sealed") { 80 } else { 64 };
+pub const VALUE_MAX: usize = 80;
