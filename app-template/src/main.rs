@@ -197,7 +197,6 @@ mod app {
     /// Lets time pass for the protocol, and shows life.
     #[task(local = [led], priority = 1)]
     async fn tick(cx: tick::Context) {
-        let mut next = Mono::now();
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
@@ -205,8 +204,8 @@ mod app {
                 cx.local.led.toggle();
             }
             ticks = ticks.wrapping_add(1);
-            next += TICK_MS.millis();
-            Mono::delay_until(next).await;
+            // `delay` would wait for one tick of the clock more.
+            Mono::delay_until(Mono::now() + TICK_MS.millis()).await;
         }
     }
 }

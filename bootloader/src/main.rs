@@ -52,7 +52,7 @@ mod app {
     use boot_core::control::Step;
     use boot_core::decision::StayReason;
     use boot_core::store::NodeParameters;
-    use boot_core::unseal::Room;
+    use boot_core::unseal::{Room, Unsealer};
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
@@ -151,7 +151,7 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: Room = Room::new(), store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
         CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
@@ -194,7 +194,7 @@ mod app {
             parameters,
             flash,
             cx.local.blocks,
-            cx.local.room.unsealer(),
+            cx.local.room.first_mut().map_or(Unsealer::NONE, Room::unsealer),
         );
         bootloader.confirm(report.returned);
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);

@@ -12,6 +12,7 @@ use boot_core::control::{Erase, Policy, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::decision;
 use boot_core::flash::Flash;
+use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
@@ -259,18 +260,22 @@ impl Product {
             resume: self.resume,
             crc: self.crc,
             crc_step: self.crc_step,
-            #[cfg(feature = "sealed")]
-            seal: boot_core::policy::SealPolicy {
-                vendor_id: IDENTITY.vendor_id,
-                product_code: IDENTITY.product_code,
-                revision: IDENTITY.revision,
-                data: self.profile.download.data,
-                unique_id: bsp::unique_id,
-                cycles: bsp::cycles,
-                counter: self.security_counter,
-                counter_with_confirmation: self.counter_with_confirmation,
-            },
+            seal: if SEALED { self.seal() } else { SealPolicy::NONE },
             ..self.profile.download
+        }
+    }
+
+    /// The values with which sealed images are checked.
+    const fn seal(&self) -> SealPolicy {
+        SealPolicy {
+            vendor_id: IDENTITY.vendor_id,
+            product_code: IDENTITY.product_code,
+            revision: IDENTITY.revision,
+            data: self.profile.download.data,
+            unique_id: bsp::unique_id,
+            cycles: bsp::cycles,
+            counter: self.security_counter,
+            counter_with_confirmation: self.counter_with_confirmation,
         }
     }
 

@@ -474,8 +474,8 @@ impl Device {
         let mut room = Box::<Room>::default();
         let boot = Boot::new(&self.setup.config, node);
         let node: Box<dyn Node + '_> = match self.setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, &mut room)),
-            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, &mut room)),
+            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, room.unsealer())),
+            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, room.unsealer())),
         };
         let result = talk(&mut Host { device: self, node, now: 0 });
         self.chip.model().power_on();

@@ -20,13 +20,11 @@ use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
-#[cfg(feature = "sealed")]
 use {canopen::program::ACCESS, seal::access::right};
 
 use crate::control::{Downloader, Policy, Step};
 use crate::decision::StayReason;
 use crate::flash::Flash;
-use crate::resume;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
 use crate::unseal::Unsealer;
@@ -52,8 +50,8 @@ impl Extras {
         password: PasswordObject::None,
         read_back: false,
         sealed: false,
-        second_server: resume::HAS_ROOM,
-        resume: resume::HAS_ROOM,
+        second_server: true,
+        resume: true,
     };
 }
 
@@ -162,7 +160,6 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     /// The password.
     lock: Lock,
     /// The wait after wrong signatures. A password does not end it.
-    #[cfg(feature = "sealed")]
     signatures: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
@@ -195,7 +192,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             emcy: Emcy::new(),
             second_server: SecondServer::NONE,
             lock: Lock::new(config.password),
-            #[cfg(feature = "sealed")]
             signatures: Lock::new(b""),
             now: Instant::from_millis(0),
             stored_version: StoredVersion::new(),
@@ -236,7 +232,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
         // No other success ends the wait: anybody may send a command that succeeds.
-        #[cfg(feature = "sealed")]
         if self.download.unsealer_mut().take_authentic() {
             self.signatures.succeed();
         }
@@ -245,7 +240,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 // To check a signature takes the device a tenth of a second.
-                #[cfg(feature = "sealed")]
                 if error == FlashError::Signature {
                     self.signatures.fail(self.now);
                 }
@@ -285,7 +279,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         if self.lock.is_waiting(self.now) {
             return true;
         }
-        #[cfg(feature = "sealed")]
         if self.signatures.remembers(self.now) {
             return true;
         }
@@ -312,7 +305,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
 
 impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
     fn has_second_server() -> bool {
-        resume::HAS_ROOM
+        true
     }
 
     fn entries(&self) -> &'static [Entry] {
@@ -328,16 +321,15 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 return put(buf, version);
             }
         }
-        #[cfg(feature = "sealed")]
         if let Some(read) = self.download.unsealer_mut().read(at, buf) {
             return read;
         }
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
-            PROGRAM_PARTIAL if resume::HAS_ROOM => return put(buf, &self.download.partial(at.sub)),
+            PROGRAM_PARTIAL => return put(buf, &self.download.partial(at.sub)),
             PROGRAM_ID => self.download.identification(at.sub),
-            SECOND_SERVER if resume::HAS_ROOM && self.config.second_server => self.second_server.read(at.sub),
+            SECOND_SERVER if self.config.second_server => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -351,7 +343,6 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             return written;
         }
         match (at.index, data) {
-            #[cfg(feature = "sealed")]
             (ACCESS, request) => {
                 // One signature is checked at a time, and that of an image takes precedence.
                 let is_active = self.download.unsealer_mut().is_active();
@@ -360,7 +351,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 }
                 self.download.unsealer_mut().ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) if resume::HAS_ROOM && self.config.second_server => {
+            (SECOND_SERVER, &[a, b, c, d]) if self.config.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
@@ -376,7 +367,6 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        #[cfg(feature = "sealed")]
         if self.download.unsealer_mut().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }
@@ -414,7 +404,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn second_server(&self) -> Channel {
-        if resume::HAS_ROOM && self.config.second_server {
+        if self.config.second_server {
             self.second_server.channel()
         } else {
             Channel::NONE
@@ -432,7 +422,6 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
-        #[cfg(feature = "sealed")]
         if !self.download.unsealer_mut().permits(right::STORE) {
             return Poll::Ready(Err(StoreError::Failed));
         }
@@ -462,9 +451,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<
     fn node_id_changed(&mut self, id: Option<NodeId>) {
         self.id = id;
         // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
-        if resume::HAS_ROOM {
-            self.second_server = SecondServer::NONE;
-        }
+        self.second_server = SecondServer::NONE;
         if id.is_some() && self.config.boot_up_emergency {
             self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
         }

@@ -3,31 +3,25 @@
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-#[cfg(feature = "sealed")]
-use crate::store::Key;
-use crate::store::Parameters;
+use crate::store::{Key, Parameters};
+use crate::unseal::LINKED;
 
 /// Whether the place of the key block (`seal::key_block`) is not empty, unless the holder of a root
 /// key has opened the device permanently. A damaged key block does not open the device: no image
-/// passes the checks then.
-#[cfg(feature = "sealed")]
+/// passes the checks then. A bootloader without sealed images ignores keys.
 pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Layout) -> bool {
+    if !LINKED {
+        return false;
+    }
     let [_, opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);
     opened == 0 && !flash.is_blank(layout.key_block())
 }
 
 /// Whether the key block is valid.
-#[cfg(feature = "sealed")]
 pub fn is_sound<F: Flash>(flash: &F, key_block: u32) -> bool {
     use seal::key_block::{CHECK, MAGIC};
     use shared_abi::geometry::Region;
 
     flash.read_word(key_block) == u32::from_le_bytes(MAGIC)
         && flash.crc32(0, Region::new(key_block, CHECK as u32)) == flash.read_word(key_block + CHECK as u32)
-}
-
-/// A bootloader without sealed images ignores keys.
-#[cfg(not(feature = "sealed"))]
-pub fn is_sealed<F: Flash>(_: &F, _: &impl Parameters, _: &Layout) -> bool {
-    false
 }

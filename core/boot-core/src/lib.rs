@@ -5,7 +5,7 @@
 //! | [`decision`] | bootloader or program, after every reset | records, no flash |
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
-//! | [`unseal`] | sealed images: authentic, deciphered, unpacked (feature `sealed`) | the format, no object |
+//! | [`unseal`] | sealed images: authentic, deciphered, unpacked | the format, no object |
 //! | `programmer` | erase, write, read back, verify; with sealed images, unpack | pieces and flash, no object |
 //! | `sequence` | sectors to erase and words to program, one operation at a time | |
 //! | [`store`] | everything non-volatile | the journal |

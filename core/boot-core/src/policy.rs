@@ -69,12 +69,10 @@ pub struct Policy {
     /// work of the same priority must wait.
     pub crc_step: u32,
     /// The values with which a sealed image is checked.
-    #[cfg(feature = "sealed")]
     pub seal: SealPolicy,
 }
 
 /// The values with which a sealed image is checked, besides the keys in the device.
-#[cfg(feature = "sealed")]
 #[derive(Clone, Copy, Debug)]
 pub struct SealPolicy {
     /// Vendor-ID of the device (1018h/1).
@@ -97,7 +95,6 @@ pub struct SealPolicy {
     pub counter_with_confirmation: bool,
 }
 
-#[cfg(feature = "sealed")]
 impl SealPolicy {
     /// Values that match no device.
     pub const NONE: Self = Self {
@@ -130,7 +127,6 @@ impl Policy {
         resume: true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
-        #[cfg(feature = "sealed")]
         seal: SealPolicy::NONE,
     };
 }

@@ -95,7 +95,6 @@ impl VerifiedProgram {
     }
 
     /// Whether the flash must be locked until the next reset before the program starts.
-    #[cfg(feature = "sealed")]
     #[must_use]
     pub fn locks_flash(&self) -> bool {
         self.record.seal == Some(crate::store::record::Seal::Locked)

@@ -77,7 +77,6 @@ impl<'b> Queue<'b> {
 
     /// Adds bytes of a sealed image, which are not a piece ([`take`](Self::take)). Adds all bytes
     /// or none; returns whether there was room.
-    #[cfg(feature = "sealed")]
     pub(crate) fn push_bytes(&mut self, data: &[u8]) -> bool {
         if data.len() > self.free() {
             return false;
@@ -91,7 +90,6 @@ impl<'b> Queue<'b> {
     }
 
     /// Removes bytes of a sealed image, as many as there are and fit; returns their number.
-    #[cfg(feature = "sealed")]
     pub(crate) fn take(&mut self, bytes: &mut [u8]) -> usize {
         let len = bytes.len().min(self.queued);
         for (i, byte) in bytes.iter_mut().take(len).enumerate() {
@@ -119,7 +117,6 @@ impl<'b> Queue<'b> {
     }
 
     /// The first four bytes of the open piece, if it has that many.
-    #[cfg(feature = "sealed")]
     pub(crate) fn open_word(&self) -> u32 {
         self.word(self.queued + PIECE_HEADER)
     }
@@ -136,7 +133,6 @@ impl<'b> Queue<'b> {
 
     /// The open bytes are good and belong to a sealed image: adds them to the queue, not as a
     /// piece.
-    #[cfg(feature = "sealed")]
     pub(crate) fn commit_bytes(&mut self) {
         for _ in 0..self.open_size() {
             let at = self.place(self.queued);

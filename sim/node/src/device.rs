@@ -17,7 +17,7 @@ use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReaso
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
-use boot_core::unseal::Room;
+use boot_core::unseal::Unsealer;
 use coboot_app::{Defaults, Next, Start};
 use shared_abi::warm_start::{BootRequest, Owed};
 
@@ -226,16 +226,15 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             BootDecision::Stay(_) | BootDecision::Hold { .. } => {
                 let reason =
                     if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
-                let (reason_code, unsealer) = (reason.code(), Box::leak(Box::<Room>::default()).unsealer());
                 let device = Bootloader::new(
                     config,
                     serial_number,
                     node,
-                    reason_code,
+                    reason.code(),
                     journal,
                     flash,
                     buffer,
-                    unsealer,
+                    Unsealer::NONE,
                 );
                 let address = device.lss_address();
                 let node = NodeParameters { id: device.node_id(), ..node };

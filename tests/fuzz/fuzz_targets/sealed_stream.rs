@@ -169,7 +169,7 @@ type Sealed<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, 1>;
 
 fn device<'b, 'f>(flash: &'f mut ModelFlash, buffer: &'b mut [u8], room: &'b mut Room) -> Sealed<'b, 'f> {
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(&CONFIG, node).on(flash, buffer, room)
+    Boot::new(&CONFIG, node).on(flash, buffer, room.unsealer())
 }
 
 fn settle(device: &mut Sealed<'_, '_>) {

@@ -98,7 +98,7 @@ type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(config, node).on(flash, buffer, Box::leak(Box::default()))
+    Boot::new(config, node).on(flash, buffer, boot_core::unseal::Unsealer::NONE)
 }
 
 fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_>) {

@@ -271,7 +271,7 @@ impl Device {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
         let (mut buffer, mut room) = ([0; 256], Room::new());
-        let node = Boot::new(config, node).with(parameters, flash, &mut buffer, &mut room);
+        let node = Boot::new(config, node).with(parameters, flash, &mut buffer, room.unsealer());
         talk(&mut Host { node })
     }
 }

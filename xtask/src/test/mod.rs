@@ -210,37 +210,31 @@ fn room() -> Outcome {
 const NOT_ON_HOST: [&str; 6] =
     ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
 
-/// Selects all packages that are built for this machine but some. What cargo builds at one time has the
-/// features of all selected packages: calls that select the same build the crates of others once.
-fn all_but(others: &[&str]) -> Vec<String> {
-    let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]).chain(others);
+/// Selects the packages that are built for this machine. What cargo builds at one time has the features
+/// of all selected packages: calls that select the same build the crates of others once.
+fn on_host() -> Vec<String> {
+    let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]);
     let without = without.flat_map(|package| ["--exclude", package]).map(str::to_owned);
     ["--workspace".to_owned()].into_iter().chain(without).collect()
 }
 
-/// The test programs that need no firmware, and the programs that tests start: the host tool and the
-/// node, which cargo builds for their tests.
-fn host_programs() -> Outcome<Vec<Program>> {
-    // coboot-tests has sealed images, without which a bootloader has more: together, all would be
-    // tested with them. The jobs of the repository are tested in .ci/run.
-    programs::build(&all_but(&["coboot-tests"]))
+/// The test programs, those with firmware for the default board; and the programs that tests start, the
+/// host tool and the node, which cargo builds for their tests. The jobs of the repository are tested in
+/// .ci/run.
+fn test_programs() -> Outcome<Vec<Program>> {
+    programs::build(&[&build::board_args(DEFAULT)[..], &on_host()].concat())
 }
 
 /// The test programs that run the firmware of a board.
 fn board_programs(board: &Layout) -> Outcome<Vec<Program>> {
     let tests = ["device", "update", "sealed", "foreign", "port"].map(|name| format!("--test={name}"));
-    programs::build(&[&build::board_args(board)[..], &all_but(&[]), &tests].concat())
-}
-
-/// The core of the bootloader with sealed images.
-fn sealed_programs() -> Outcome<Vec<Program>> {
-    programs::build(&["--package=coboot-core", "--features=coboot-core/sealed"].map(str::to_owned))
+    programs::build(&[&build::board_args(board)[..], &on_host(), &tests].concat())
 }
 
 /// Builds the programs that tests start, for tests that are chosen by words.
 fn programs_of_ours() -> Outcome {
     let mut cargo = process::cargo("build");
-    cargo.current_dir(workspace::root()).args(all_but(&["coboot-tests"]));
+    cargo.current_dir(workspace::root()).args(on_host());
     process::run(cargo.args(["--bin=coflash", "--bin=coboot-node"]))
 }
 
@@ -271,12 +265,11 @@ fn add(
     summary: &mut Summary,
     programs: &[Program],
     place: Option<&str>,
-    board: &Layout,
+    variables: Variables,
     chosen: impl Fn(&str, &str) -> bool,
 ) -> Outcome {
     for program in programs {
-        let (more, skipped) =
-            runner::jobs(program, place, &variables(board), |test| chosen(&program.name, test))?;
+        let (more, skipped) = runner::jobs(program, place, &variables, |test| chosen(&program.name, test))?;
         summary.skipped += if more.is_empty() { 0 } else { skipped };
         jobs.extend(more);
     }
@@ -289,14 +282,14 @@ fn product(summary: &mut Summary) -> Outcome {
     std::thread::scope(|scope| {
         // The link of an image uses one core, and so does much of what cargo builds beside it.
         let images = scope.spawn(|| build_images(Tier::Product));
-        let hosts = host_programs()?;
-        let with_board = board_programs(DEFAULT)?;
-        let sealed = sealed_programs()?;
+        let programs = test_programs()?;
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
-        add(&mut jobs, summary, &hosts, None, DEFAULT, chosen)?;
-        add(&mut jobs, summary, &with_board, None, DEFAULT, chosen)?;
-        add(&mut jobs, summary, &sealed, Some("sealed"), DEFAULT, chosen)
+        add(&mut jobs, summary, &programs, None, variables(DEFAULT), chosen)?;
+        // Once more, for a device that takes sealed images and has no keys yet.
+        let core: Vec<_> = programs.into_iter().filter(|program| program.name == "coboot-core/it").collect();
+        let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
+        add(&mut jobs, summary, &core, Some("sealed"), takes_sealed, chosen)
     })?;
     runner::run(jobs, summary);
     Ok(())
@@ -306,9 +299,9 @@ fn product(summary: &mut Summary) -> Outcome {
 fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
     let mut jobs = Vec::new();
     let more = programs::build(&["--package=xtask", "--package=coboot-zencan"].map(str::to_owned))?;
-    let programs = [host_programs()?, board_programs(DEFAULT)?, more];
+    let programs = [test_programs()?, more];
     let chosen = |program: &str, test: &str| Tier::of(program, test) == tier;
-    add(&mut jobs, summary, &programs.concat(), None, DEFAULT, chosen)?;
+    add(&mut jobs, summary, &programs.concat(), None, variables(DEFAULT), chosen)?;
     Ok(jobs)
 }
 
@@ -363,7 +356,7 @@ fn on_board(
         board.home.is_some() || !SPLIT_ALONE.iter().any(|row| is_of(program, test, row))
     };
     let chosen = |program: &str, test: &str| has(program, test) && chosen(program, test);
-    add(&mut jobs, summary, &programs, Some(board.board), board, chosen)?;
+    add(&mut jobs, summary, &programs, Some(board.board), variables(board), chosen)?;
     runner::run(jobs, summary);
     Ok(())
 }

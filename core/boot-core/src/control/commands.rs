@@ -3,7 +3,6 @@
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
-#[cfg(feature = "sealed")]
 use seal::access::right;
 use shared_abi::warm_start::BootRequest;
 
@@ -54,19 +53,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
-        #[cfg(feature = "sealed")]
-        {
-            let again = matches!(state.session, Session::Cleared { just: true });
-            let needed = match command {
-                Clear if again || (self.policy.erase)(program) == Erase::AtOnce => right::ERASE,
-                ClrSignature => right::CLEAR_SIGNATURE,
-                // Otherwise anybody could undo what the right has done.
-                SetSignature if state.record.is_some_and(|record| record.withdrawn) => right::CLEAR_SIGNATURE,
-                _ => 0,
-            };
-            if needed != 0 && !self.programmer.unsealer().permits(needed) {
-                return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
-            }
+        let again = matches!(state.session, Session::Cleared { just: true });
+        let erases = again || (self.policy.erase)(program) == Erase::AtOnce;
+        let withdrawn = state.record.is_some_and(|record| record.withdrawn);
+        if !self.programmer.unsealer().permits(right_of(command, erases, withdrawn)) {
+            return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
         if changes && (state.locked || !(self.policy.allowed)()) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
@@ -77,12 +68,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         match (command, record) {
             (Clear, _) => {
                 let region = state.region;
-                let again = matches!(state.session, Session::Cleared { just: true });
                 // Before the transfer is aborted, because the abort marks an open session as
                 // failed.
                 state.session = Session::Cleared { just: true };
                 // The erase of a sector for the old download must end first.
-                let at_once = (again || (self.policy.erase)(program) == Erase::AtOnce) && !busy;
+                let at_once = erases && !busy;
                 self.download_cancel();
                 self.programmer.abort();
                 if at_once {
@@ -118,7 +108,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// the old program becomes invalid now; otherwise only when a new one replaces it. A previous
     /// download, of this program or another one, is aborted.
     ///
-    ///
     /// # Errors
     /// The device is busy with other work.
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
@@ -136,7 +125,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
-        #[cfg(feature = "sealed")]
         let at_once = at_once && self.programmer.unsealer().permits(right::ERASE);
         if at_once {
             self.programmer.void(program);
@@ -151,5 +139,16 @@ fn start_request(program: u8, signed: bool) -> BootRequest {
         BootRequest::Start(program)
     } else {
         BootRequest::Trial(program)
+    }
+}
+
+/// The right that a command needs in a sealed device; 0 for none.
+fn right_of(command: ProgramControl, erases: bool, withdrawn: bool) -> u32 {
+    match command {
+        ProgramControl::Clear if erases => right::ERASE,
+        ProgramControl::ClrSignature => right::CLEAR_SIGNATURE,
+        // Otherwise anybody could undo what the right has done.
+        ProgramControl::SetSignature if withdrawn => right::CLEAR_SIGNATURE,
+        _ => 0,
     }
 }

@@ -18,7 +18,6 @@ use core::task::Poll;
 
 use canopen::program::{region_value, FlashError, FlashStatus, ProgramState};
 use canopen::AbortCode;
-#[cfg(feature = "sealed")]
 use seal::access::right;
 use shared_abi::geometry::Region;
 use shared_abi::label;
@@ -32,8 +31,8 @@ use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::Session;
-use crate::store::{NodeParameters, Parameters, ProgramRecord};
-use crate::unseal::Unsealer;
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
+use crate::unseal::{Images, Unsealer};
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
@@ -101,14 +100,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let record = load(&parameters, flash, number, &unsealer);
+            let (record, partial) = load(&parameters, flash, number, &unsealer);
             Program {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
                 identification: record.map_or(0, |record| record.crc),
                 error: None,
                 session: Session::Idle,
-                partial: ProgramRecord::load_partial(&parameters, flash, number),
+                partial,
                 version: 0,
                 streamed: false,
                 start_when_verified: false,
@@ -135,7 +134,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 
     /// The state of sealed images.
-    #[cfg(feature = "sealed")]
     pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
         self.programmer.unsealer_mut()
     }
@@ -243,7 +241,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if !self.policy.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
-        #[cfg(feature = "sealed")]
         if !self.programmer.unsealer().permits(right::READ_BACK) {
             return Err(AbortCode::DEVICE_STATE);
         }
@@ -274,8 +271,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
             Some(Event::Stored { program, ends }) => {
-                let record = load(&self.parameters, flash, program, self.programmer.unsealer());
-                let partial = ProgramRecord::load_partial(&self.parameters, flash, program);
+                let (record, partial) = load(&self.parameters, flash, program, self.programmer.unsealer());
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
                     if record.is_none() {
@@ -325,8 +321,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 self.fault = match error {
                     _ if erasing => AbortCode::GENERAL,
                     // The errors for which a sealed image is refused.
-                    #[cfg(feature = "sealed")]
-                    error if !matches!(error, FlashError::Write | FlashError::NvData) => AbortCode::STORE,
+                    error
+                        if self.programmer.unsealer().is_present()
+                            && !matches!(error, FlashError::Write | FlashError::NvData) =>
+                    {
+                        AbortCode::STORE
+                    }
                     _ => AbortCode::HARDWARE,
                 };
                 self.end(program, Err(error));
@@ -364,8 +364,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             region,
             session: state.session,
             installed: false,
-            #[cfg(feature = "sealed")]
-            sealed_only: false,
+            images: Images::Plain,
+            partial: Partial::NONE,
         };
         // The version of a control block takes precedence.
         let told = state.version;
@@ -405,15 +405,18 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 }
 
-/// The record of a program, if the device may start it.
+/// The record of a program, if the device may start it; and its download that was cut off. Both are of
+/// one reading: after a power cut the next one may differ.
 fn load<F: Flash>(
     parameters: &impl Parameters,
     flash: &F,
     number: u8,
     unsealer: &Unsealer<'_>,
-) -> Option<ProgramRecord> {
-    let record = ProgramRecord::load(parameters, flash, number)?;
-    (record.is_sealed() || !unsealer.takes_no_other()).then_some(record)
+) -> (Option<ProgramRecord>, Partial) {
+    let value = parameters.get(flash, Key::program(number)).unwrap_or([0; 4]);
+    let record = ProgramRecord::from_value(value);
+    let record = record.filter(|record| record.is_sealed() || !unsealer.takes_no_other());
+    (record, ProgramRecord::partial_of(value))
 }
 
 /// The program with this number, if it exists.

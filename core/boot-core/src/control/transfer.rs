@@ -106,8 +106,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             region: state.region,
             session: state.session,
             installed: state.record.is_some(),
-            #[cfg(feature = "sealed")]
-            sealed_only: self.programmer.unsealer().takes_no_other(),
+            images: self.programmer.unsealer().images(),
+            partial: state.partial,
         };
         let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
         let outcome = match data {
@@ -156,23 +156,24 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 }
             } else {
                 let mut partial = begin.partial;
-                if goes_on && matches!(state.session, Session::Idle) {
+                if goes_on && matches!(state.session, Session::Idle) && !progress.sealed {
                     partial = state.partial;
                     next = ANY;
                 }
-                self.programmer.queue_mut().last = LastBlock::none(partial.start(state.region.base));
+                self.programmer.queue_mut().last = LastBlock::none(partial.start());
                 let erases = next == ANY || state.session.erases(self.policy);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
-                state.partial = partial;
-                #[cfg(feature = "sealed")]
                 if progress.sealed {
+                    // What was found authentic is not known any more after a cut.
+                    self.programmer.disown();
                     self.programmer.unseal();
                 }
+                state.partial = partial;
             }
             state.session = Session::Open { next };
         }
         if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = self.programmer.queue().last.next(*next);
+            *next = self.programmer.queue().last.next();
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);

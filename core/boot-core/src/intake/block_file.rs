@@ -7,7 +7,6 @@
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
-#[cfg(feature = "sealed")]
 use seal::wire::MAGIC;
 use shared_abi::block_file::{
     Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, MAX_BLOCK_SIZE, NUMBER_CONTROL,
@@ -101,6 +100,14 @@ impl Format for BlockFile {
                 to.queue.discard();
                 return Ok(());
             }
+            if to.judge.images.only_sealed() && header.flash_address != to.queue.last.end() {
+                // The bytes of a sealed image are processed in order, and each once.
+                if header.flash_address + header.size > to.queue.last.end() {
+                    return Err(Refusal::untimely(FlashError::Sequence));
+                }
+                to.queue.discard();
+                return Ok(());
+            }
             to.queue.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
         let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
@@ -117,19 +124,20 @@ impl Format for BlockFile {
                 let id = if size == 0 { 0 } else { self.crc };
                 let partial = Partial::begin(id, to.judge.region.base);
                 to.progress.begins = Some(Begin { size, version, partial });
-                #[cfg(feature = "sealed")]
-                if to.judge.sealed_only {
+                if to.judge.images.only_sealed() {
+                    // The sequence begins again over what was processed, if it is that of the same file.
+                    if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
+                        return Err(Refusal::untimely(FlashError::Sequence));
+                    }
                     to.progress.begins = Some(Begin { size: 0, version: 0, partial });
                     to.progress.sealed = true;
                 }
             }
-            #[cfg(feature = "sealed")]
-            NUMBER_LAST if to.judge.sealed_only => {
+            NUMBER_LAST if to.judge.images.only_sealed() => {
                 // The manifest of the sealed image describes the program.
                 to.progress.complete = Some(Expected { size: 0, crc: None });
             }
-            #[cfg(feature = "sealed")]
-            _ if to.judge.sealed_only => {
+            _ if to.judge.images.only_sealed() => {
                 if header.number == 1 && to.queue.open_word() != u32::from_le_bytes(MAGIC) {
                     return Err(Refusal::unfit(FlashError::NoAccess));
                 }
@@ -208,12 +216,7 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
         return Err(TOO_LONG);
     }
     match (header.number, to.judge.session) {
-        // The sequence begins again over the existing pieces. (The pieces of a sealed image were
-        // processed in another way.)
-        #[cfg(feature = "sealed")]
-        (NUMBER_CONTROL, Session::Open { .. }) if to.judge.sealed_only => {
-            return Err(Refusal::untimely(FlashError::Sequence));
-        }
+        // The sequence begins again over the existing pieces.
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
         (NUMBER_CONTROL, _) => return to.judge.may_begin(),
         (NUMBER_LAST, Session::Open { next }) if next != 1 => return Ok(()),

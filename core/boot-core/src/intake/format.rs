@@ -57,7 +57,6 @@ pub(crate) struct Progress {
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
     /// The download is a sealed image.
-    #[cfg(feature = "sealed")]
     pub sealed: bool,
 }
 

@@ -9,7 +9,9 @@ use shared_abi::vectors::VectorTable;
 
 use crate::policy::{Policy, Verdict};
 use crate::refusal::Refusal;
+use crate::resume::Partial;
 use crate::session::Session;
+use crate::unseal::Images;
 
 /// Checks the data for one program.
 #[derive(Clone, Copy)]
@@ -26,9 +28,10 @@ pub(crate) struct Judge<'a> {
     pub session: Session,
     /// Whether a program is installed.
     pub installed: bool,
-    /// Whether the device accepts only sealed images.
-    #[cfg(feature = "sealed")]
-    pub sealed_only: bool,
+    /// The images that the device takes.
+    pub images: Images,
+    /// The download that can go on, or is going on.
+    pub partial: Partial,
 }
 
 impl Judge<'_> {

@@ -4,7 +4,7 @@
 //! |---|---|
 //! | [`block_file`] | the number of a block |
 //! | [`ihex`] | `:` |
-//! | `sealed` | `CBS1` (feature `sealed`) |
+//! | [`sealed`] | `CBS1`, in a device that takes sealed images |
 //! | [`raw`] | an initial stack pointer; any bytes if the program is data |
 //!
 //! A format gets its bytes, the rules ([`Judge`]) and the queue for the pieces. It has no access to
@@ -16,7 +16,6 @@ mod format;
 mod ihex;
 mod judge;
 mod raw;
-#[cfg(feature = "sealed")]
 mod sealed;
 mod stream;
 
@@ -28,13 +27,6 @@ use crate::refusal::Refusal;
 pub(crate) use format::{Destination, Format, Progress, Recognition};
 pub(crate) use judge::Judge;
 
-#[cfg(not(feature = "sealed"))]
-formats! {
-    BlockFile(block_file::BlockFile),
-    IntelHex(ihex::IntelHex),
-    Raw(raw::Raw),
-}
-#[cfg(feature = "sealed")]
 formats! {
     Sealed(sealed::Sealed),
     BlockFile(block_file::BlockFile),
@@ -75,8 +67,7 @@ impl Intake {
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
             let Some(mut known) = Known::recognise(&first[..len], &to.judge)? else { return Ok(()) };
-            #[cfg(feature = "sealed")]
-            if to.judge.sealed_only && !matches!(known, Known::Sealed(_) | Known::BlockFile(_)) {
+            if to.judge.images.only_sealed() && !matches!(known, Known::Sealed(_) | Known::BlockFile(_)) {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;

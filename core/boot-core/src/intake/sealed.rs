@@ -17,7 +17,10 @@ pub(super) struct Sealed;
 impl Format for Sealed {
     const IS_STREAM: bool = true;
 
-    fn recognise(first: &[u8], _judge: &Judge<'_>) -> Recognition<Self> {
+    fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {
+        if !judge.images.has_sealed() {
+            return Recognition::No;
+        }
         match (MAGIC.starts_with(first), first.len() == MAGIC.len()) {
             (true, true) => Recognition::Yes(Self),
             (true, false) => Recognition::More,

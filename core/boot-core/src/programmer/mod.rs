@@ -24,7 +24,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Queue;
-use crate::resume::{self, Partial};
+use crate::resume::Partial;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
 use crate::unseal::Unsealer;
 use write::WritePiece;
@@ -91,7 +91,6 @@ enum Job {
     /// The piece at the front of the queue is being written.
     Write(WritePiece),
     /// The sealed image is being processed.
-    #[cfg(feature = "sealed")]
     Unseal,
     /// The flash is compared with the sent program.
     Verify { expected: Expected, crc: FlashCrc },
@@ -109,10 +108,8 @@ enum Change {
     /// Node-ID and bit rate.
     Node,
     /// The security counter of a sealed image.
-    #[cfg(feature = "sealed")]
     Counter,
     /// An event, or the number of grants; no host waits for it.
-    #[cfg(feature = "sealed")]
     Note,
 }
 
@@ -126,7 +123,6 @@ pub(crate) struct Programmer<'b> {
     /// Bit n: the record of program n must be removed before anything is erased or written.
     voids: u32,
     /// Whether the counter proved by the next of these programs is already stored.
-    #[cfg(feature = "sealed")]
     kept: bool,
     job: Option<Job>,
     /// The present operation of the flash. Without a job its result is ignored.
@@ -149,7 +145,6 @@ impl<'b> Programmer<'b> {
             crc_step,
             target: None,
             voids: 0,
-            #[cfg(feature = "sealed")]
             kept: false,
             job: None,
             running: None,
@@ -177,7 +172,7 @@ impl<'b> Programmer<'b> {
     /// start.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
-            (partial.start(region.base), region.base + size.min(region.size))
+            (partial.start(), region.base + size.min(region.size))
         } else {
             (region.end(), region.end())
         };
@@ -209,7 +204,6 @@ impl<'b> Programmer<'b> {
     }
 
     /// The [opened](Self::open) program arrives as a sealed image.
-    #[cfg(feature = "sealed")]
     pub(crate) fn unseal(&mut self) {
         if let Some(Target { program, region, .. }) = self.target {
             self.unsealer.begin(program, region);
@@ -222,7 +216,6 @@ impl<'b> Programmer<'b> {
     }
 
     /// See [`unsealer`](Self::unsealer).
-    #[cfg(feature = "sealed")]
     pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
         &mut self.unsealer
     }
@@ -303,7 +296,6 @@ impl<'b> Programmer<'b> {
     /// Whether there is work that a command must wait for.
     pub(crate) fn has_work(&self) -> bool {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm, _)));
-        #[cfg(feature = "sealed")]
         let confirming = confirming || matches!(self.job, Some(Job::Store(Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
@@ -412,7 +404,6 @@ impl<'b> Programmer<'b> {
             }
             (_, Err(fault)) => Err(fault),
             (Some(Job::Erase { sector, .. }), _) => Ok(sector.take().map(Operation::Erase)),
-            #[cfg(feature = "sealed")]
             (Some(Job::Unseal), _) => {
                 return Next::Done(self.unsealer.step(flash, parameters, &mut self.queue));
             }
@@ -444,17 +435,12 @@ impl<'b> Programmer<'b> {
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
-            #[cfg(feature = "sealed")]
             (Job::Store(Change::Counter | Change::Note, _) | Job::Unseal, Ok(())) => None,
             (Job::Store(change, program), result) => {
                 if change == Change::Void {
                     self.voids &= !bit(program);
-                    #[cfg(feature = "sealed")]
-                    {
-                        self.kept = false;
-                    }
+                    self.kept = false;
                 }
-                #[cfg(feature = "sealed")]
                 if change == Change::Record && self.unsealer.is_installed() {
                     self.unsealer.end(result);
                 }
@@ -480,9 +466,7 @@ impl<'b> Programmer<'b> {
                 if self.unsealer.is_active() {
                     self.unsealer.written();
                 } else {
-                    if resume::HAS_ROOM {
-                        self.note();
-                    }
+                    self.note();
                     self.queue.pop();
                 }
                 None
@@ -503,12 +487,9 @@ impl<'b> Programmer<'b> {
     }
 
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
-        #[cfg(feature = "sealed")]
         self.unsealer.end(Err(error));
-        #[cfg(feature = "sealed")]
+        // The signature of a request for rights belongs to no program.
         let program = self.program().unwrap_or(0);
-        #[cfg(not(feature = "sealed"))]
-        let program = self.program()?;
         self.abort();
         Some(Event::Failed { program, error, erasing })
     }
@@ -519,15 +500,12 @@ impl<'b> Programmer<'b> {
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
-        #[cfg(feature = "sealed")]
-        {
-            if let Some((key, value)) = self.unsealer.take_store() {
-                parameters.store(key, value);
-                return Ok(Some(Job::Store(Change::Note, 0)));
-            }
-            if self.unsealer.is_asked() {
-                return Ok(Some(Job::Unseal));
-            }
+        if let Some((key, value)) = self.unsealer.take_store() {
+            parameters.store(key, value);
+            return Ok(Some(Job::Store(Change::Note, 0)));
+        }
+        if self.unsealer.is_asked() {
+            return Ok(Some(Job::Unseal));
         }
         let piece = if self.unsealer.is_active() { self.unsealer.piece() } else { self.queue.first() };
         if let Some(target) = &mut self.target {
@@ -552,8 +530,7 @@ impl<'b> Programmer<'b> {
         if self.voids != 0 {
             let program = self.voids.trailing_zeros() as u8;
             // The counter that a program has proved must survive its record.
-            #[cfg(feature = "sealed")]
-            if !core::mem::replace(&mut self.kept, true) {
+            if self.unsealer.is_present() && !core::mem::replace(&mut self.kept, true) {
                 if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
                     parameters.store(Key::counter(program), counter);
                     return Ok(Some(Job::Store(Change::Counter, program)));
@@ -588,7 +565,6 @@ impl<'b> Programmer<'b> {
                 WritePiece::new(flash, piece, target.partial.is_resumed()).ok_or(FlashError::NotCleared)?;
             return Ok(Some(Job::Write(write)));
         }
-        #[cfg(feature = "sealed")]
         if self.unsealer.is_active() {
             let ended = target.expected.is_some();
             match (self.unsealer.is_installed(), self.queue.is_empty()) {

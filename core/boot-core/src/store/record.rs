@@ -63,11 +63,13 @@ impl ProgramRecord {
         [if half_erased { HALF_ERASED } else { 0 }, id, end, 0]
     }
 
-    /// The download of a program that was cut off.
-    pub fn load_partial<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Partial {
-        match parameters.get(flash, Key::program(number)) {
-            Some([first, id, end, _]) if first & SIZE == 0 => Partial::of_words([id, end]),
-            _ => Partial::NONE,
+    /// The download of a program that was cut off, from the stored form.
+    #[must_use]
+    pub const fn partial_of([first, id, end, _]: Value) -> Partial {
+        if first & SIZE == 0 {
+            Partial::of_words([id, end])
+        } else {
+            Partial::NONE
         }
     }
 

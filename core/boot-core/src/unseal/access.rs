@@ -28,14 +28,14 @@ const _: () = {
 };
 
 impl Unsealer<'_> {
-    /// Whether an action is permitted that needs a right in a sealed device.
+    /// Whether an action is permitted that needs a right in a sealed device, or none (0).
     pub(crate) fn permits(&self, right: u32) -> bool {
-        !self.0.takes_no_other || self.0.granted & right != 0
+        self.room().is_none_or(|room| !room.takes_no_other || right == 0 || room.granted & right != 0)
     }
 
     /// Reads 2002h or 2003h; `None` for other objects.
     pub(crate) fn read(&mut self, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
-        let room = &mut *self.0;
+        let room = self.room_mut()?;
         match at.index {
             ACCESS => Some(put(buf, &room.challenge())),
             EVENTS => {
@@ -56,7 +56,7 @@ impl Unsealer<'_> {
     /// # Errors
     /// An invalid request, or a key that is not a root of the device.
     pub(crate) fn ask<F: Flash>(&mut self, flash: &F, request: &[u8]) -> Result<(), AbortCode> {
-        let room = &mut *self.0;
+        let Some(room) = self.room_mut() else { return Err(AbortCode::NO_OBJECT) };
         if request.len() != REQUEST {
             return Err(AbortCode::LENGTH);
         }
@@ -77,7 +77,7 @@ impl Unsealer<'_> {
 
     /// Returns the next value to store, once.
     pub(crate) fn take_store(&mut self) -> Option<(Key, Value)> {
-        let room = &mut *self.0;
+        let room = self.room_mut()?;
         if core::mem::take(&mut room.stores.1) {
             return Some((Key::GRANTS, [room.grants, room.opened, 0, 0]));
         }
@@ -87,31 +87,32 @@ impl Unsealer<'_> {
 
     /// Whether the signature of a request for rights is being checked.
     pub(crate) fn is_asked(&self) -> bool {
-        self.0.stage == Stage::Access
+        self.room().is_some_and(|room| room.stage == Stage::Access)
     }
 
     /// Whether a signature was found good since the last call: that of a complete image, or that of
     /// a request for rights.
     pub(crate) fn take_authentic(&mut self) -> bool {
-        core::mem::take(&mut self.0.authentic)
+        self.room_mut().is_some_and(|room| core::mem::take(&mut room.authentic))
     }
 
     /// Records the result of the installation of a sealed image.
     pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
-        if self.0.active {
-            let program = u32::from(self.0.program);
+        let Some(room) = self.room_mut() else { return };
+        if room.active {
+            let program = u32::from(room.program);
             match outcome {
                 Ok(()) => {
-                    self.0.authentic = true;
+                    room.authentic = true;
                     // Anybody may send the installed image again: this changes nothing.
-                    if !self.0.same {
-                        self.0.record(event::INSTALLED | program);
+                    if !room.same {
+                        room.record(event::INSTALLED | program);
                     }
                 }
-                Err(error) => self.0.record(event::REFUSED | u32::from(error.code())),
+                Err(error) => room.record(event::REFUSED | u32::from(error.code())),
             }
         }
-        self.rest();
+        room.rest();
     }
 }
 

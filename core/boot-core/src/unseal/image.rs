@@ -19,6 +19,7 @@ use seal::wire::{
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
+use super::{Images, LINKED};
 use crate::flash::{fold, Flash};
 use crate::keys::{is_sealed, is_sound};
 use crate::policy::{Policy, SealPolicy};
@@ -62,8 +63,8 @@ pub(super) enum Stage {
     Installed,
 }
 
-/// The processing of a sealed image.
-pub struct Unsealer<'b>(pub(super) &'b mut Room);
+/// The processing of a sealed image, in a device that takes them.
+pub struct Unsealer<'b>(Option<&'b mut Room>);
 
 /// Its state. The state is large, and therefore not a part of the bootloader's structure.
 pub struct Room {
@@ -183,20 +184,54 @@ impl Room {
 
     /// The interface to this state.
     pub fn unsealer(&mut self) -> Unsealer<'_> {
-        Unsealer(self)
+        Unsealer(Some(self))
+    }
+
+    /// Ends the processing of an image.
+    pub(super) fn rest(&mut self) {
+        self.active = false;
+        self.stage = Stage::Head;
     }
 }
 
 impl Unsealer<'_> {
+    /// For a device that takes no sealed images.
+    pub const NONE: Self = Self(None);
+
+    /// The state, in a device that takes sealed images.
+    pub(super) fn room(&self) -> Option<&Room> {
+        self.0.as_deref().filter(|_| LINKED)
+    }
+
+    /// See [`room`](Self::room).
+    pub(super) fn room_mut(&mut self) -> Option<&mut Room> {
+        self.0.as_deref_mut().filter(|_| LINKED)
+    }
+
+    /// Whether the device takes sealed images.
+    pub(crate) fn is_present(&self) -> bool {
+        self.room().is_some()
+    }
+
+    /// The images that the device takes.
+    pub(crate) fn images(&self) -> Images {
+        match self.room() {
+            None => Images::Plain,
+            Some(room) if room.takes_no_other => Images::Sealed,
+            Some(_) => Images::Both,
+        }
+    }
+
     /// Whether the present download is a sealed image.
     pub(crate) fn is_active(&self) -> bool {
-        self.0.active
+        self.room().is_some_and(|room| room.active)
     }
 
     /// Ends the processing of a sealed image.
     pub(crate) fn rest(&mut self) {
-        self.0.active = false;
-        self.0.stage = Stage::Head;
+        if let Some(room) = self.room_mut() {
+            room.rest();
+        }
     }
 
     /// Sets the properties of the device.
@@ -207,91 +242,96 @@ impl Unsealer<'_> {
         layout: &'static Layout,
         policy: &'static Policy,
     ) {
-        let room = &mut self.0;
+        let Some(room) = self.room_mut() else { return };
         for (place, event) in (0..).zip(&mut room.events) {
             *event = parameters.get(flash, Key::event(place)).unwrap_or([0; 4]);
             room.event = room.event.max(event[0]);
         }
         [room.grants, room.opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);
-        self.0.layout = Some(layout);
-        self.0.key_block = layout.key_block().base;
-        self.0.policy = Some(&policy.seal);
-        self.0.takes_no_other = is_sealed(flash, parameters, layout);
+        room.layout = Some(layout);
+        room.key_block = layout.key_block().base;
+        room.policy = Some(&policy.seal);
+        room.takes_no_other = is_sealed(flash, parameters, layout);
     }
 
     /// Whether the device has keys and therefore accepts and starts only sealed programs.
     pub(crate) fn takes_no_other(&self) -> bool {
-        self.0.takes_no_other
+        self.room().is_some_and(|room| room.takes_no_other)
     }
 
     /// Starts an image for this program.
     pub(crate) fn begin(&mut self, program: u8, region: Region) {
-        self.0.active = true;
-        self.0.stage = Stage::Head;
-        self.0.program = program;
-        self.0.region = region;
-        self.0.have = 0;
-        self.0.want = 8;
-        self.0.out.1 = 0;
-        self.0.raises = true;
-        self.0.same = false;
+        let Some(room) = self.room_mut() else { return };
+        room.active = true;
+        room.stage = Stage::Head;
+        room.program = program;
+        room.region = region;
+        room.have = 0;
+        room.want = 8;
+        room.out.1 = 0;
+        room.raises = true;
+        room.same = false;
     }
 
     /// Whether there is nothing to do before more bytes arrive.
     pub(crate) fn waits(&self) -> bool {
-        matches!(self.0.stage, Stage::Head | Stage::Chunk | Stage::Installed)
+        self.room().is_none_or(|room| matches!(room.stage, Stage::Head | Stage::Chunk | Stage::Installed))
     }
 
     /// Whether the flash contains the image.
     pub(crate) fn is_installed(&self) -> bool {
-        self.0.stage == Stage::Installed
+        self.room().is_some_and(|room| room.stage == Stage::Installed)
     }
 
     /// Whether it was already installed before.
     pub(crate) fn is_same(&self) -> bool {
-        self.0.same
+        self.room().is_some_and(|room| room.same)
     }
 
     /// Its record as it was read at that time: after a power cut it may read differently the next
     /// time.
     pub(crate) fn same_record(&self) -> Value {
-        self.0.record
+        self.room().map_or([0; 4], |room| room.record)
     }
 
     /// The next bytes for the flash.
     pub(crate) fn piece(&self) -> Option<Piece> {
-        let size = self.0.out.1 as u32;
-        (size > 0).then(|| Piece { address: self.0.region.base + self.0.done, size })
+        let room = self.room()?;
+        let size = room.out.1 as u32;
+        (size > 0).then(|| Piece { address: room.region.base + room.done, size })
     }
 
     /// A byte of these bytes.
     pub(crate) fn data(&self, offset: usize) -> u8 {
-        self.0.bytes.get(self.0.out.0 + offset).copied().unwrap_or(0)
+        self.room().and_then(|room| room.bytes.get(room.out.0 + offset).copied()).unwrap_or(0)
     }
 
     /// These bytes are in flash.
     pub(crate) fn written(&mut self) {
-        self.0.done += self.0.out.1 as u32;
-        self.0.out.1 = 0;
+        let Some(room) = self.room_mut() else { return };
+        room.done += room.out.1 as u32;
+        room.out.1 = 0;
     }
 
     /// The expected properties of the program.
     pub(crate) fn expected(&self) -> Expected {
-        let head = Head(&self.0.head);
-        Expected { size: head.size(), crc: Some(head.crc()) }
+        let head = self.room().map(|room| Head(&room.head));
+        head.map_or(Expected { size: 0, crc: None }, |head| Expected {
+            size: head.size(),
+            crc: Some(head.crc()),
+        })
     }
 
     /// Returns the new counter, once.
     pub(crate) fn take_counter(&mut self) -> Option<Value> {
-        core::mem::take(&mut self.0.raises).then_some(self.0.counter)
+        let room = self.room_mut()?;
+        core::mem::take(&mut room.raises).then_some(room.counter)
     }
 
     /// Marks the record of a program that was installed as a sealed image.
     pub(crate) fn mark(&self, record: ProgramRecord) -> ProgramRecord {
-        if !self.0.active {
-            return record;
-        }
-        let head = Head(&self.0.head);
+        let Some(room) = self.room().filter(|room| room.active) else { return record };
+        let head = Head(&room.head);
         let writes = head.flags() & flag::WRITES_FLASH != 0;
         let seal = if writes { Seal::WritesFlash } else { Seal::Locked };
         ProgramRecord { version: head.version(), seal: Some(seal), ..record }
@@ -304,8 +344,8 @@ impl Unsealer<'_> {
         parameters: &impl Parameters,
         queue: &mut Queue<'_>,
     ) -> Result<(), FlashError> {
-        self.0
-            .advance(flash, parameters, queue)
+        let Some(room) = self.room_mut() else { return Ok(()) };
+        room.advance(flash, parameters, queue)
             .map_err(|fault| FlashError::from_code(fault as u8).unwrap_or(FlashError::Unspecified))
     }
 }

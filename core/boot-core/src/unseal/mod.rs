@@ -1,17 +1,37 @@
 //! Sealed images between the queue and the flash: an image is verified, deciphered and unpacked here.
-//! Without the feature `sealed`, there is no code for sealed images, and every question is answered
-//! with no. Other modules depend on the feature, too: where they ask what only a sealed image has.
+//!
+//! A device that takes them has an [`Unsealer`] with a [`Room`]; in any other device, every question to
+//! the [`Unsealer`] is answered with no. Other modules ask it, and never how the bootloader was built.
 
-#[cfg(not(feature = "sealed"))]
-mod absent;
-#[cfg(feature = "sealed")]
 mod access;
-#[cfg(feature = "sealed")]
 mod image;
 
-#[cfg(not(feature = "sealed"))]
-pub use absent::{Room, Unsealer};
-#[cfg(feature = "sealed")]
 pub(crate) use image::proved;
-#[cfg(feature = "sealed")]
 pub use image::{Room, Unsealer};
+
+/// The images that a device takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Images {
+    /// Plain ones: it knows no sealed ones.
+    Plain,
+    /// Both: it has no keys yet.
+    Both,
+    /// Sealed ones alone.
+    Sealed,
+}
+
+impl Images {
+    /// Whether sealed images are among them.
+    pub(crate) fn has_sealed(self) -> bool {
+        LINKED && self != Self::Plain
+    }
+
+    /// Whether plain images are refused.
+    pub(crate) fn only_sealed(self) -> bool {
+        LINKED && self == Self::Sealed
+    }
+}
+
+/// Whether the code for sealed images is linked. This is the only place that depends on it: the
+/// compiler leaves out what follows a question that is always answered with no.
+pub(crate) const LINKED: bool = cfg!(feature = "sealed");

@@ -5,11 +5,11 @@ use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
 use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
-use boot_core::unseal::{Room, Unsealer};
 use canopen::od::{Address, Objects};
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
 use kit::bench::*;
+use kit::boot::leaked;
 use kit::model::{ModelFlash, CHIP};
 use shared_abi::block_file::Control;
 use shared_abi::geometry::Region;
@@ -712,7 +712,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
         }
     }
 
-    let unsealer = || -> Unsealer<'static> { Box::leak(Box::<Room>::default()).unsealer() };
+    let unsealer = || leaked(0).1;
     let image = program(200, 0x5E);
     let mut flash = ModelFlash::new(&CHIP);
     let mut eeprom = Eeprom::default();

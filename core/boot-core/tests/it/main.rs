@@ -1,5 +1,6 @@
-//! The tests of the bootloader without hardware. They run with the feature `sealed` and without it;
-//! sealed images themselves are tested in `tests/`.
+//! The tests of the bootloader without hardware, of a device without keys. They run twice: for one that
+//! takes sealed images, and for one that does not (`kit::boot`). Sealed images themselves are tested in
+//! `tests/`.
 
 mod attacker;
 mod clear;
@@ -10,6 +11,5 @@ mod label;
 mod masters;
 mod objects;
 mod parameters;
-#[cfg(not(feature = "sealed"))]
 mod resume;
 mod streams;

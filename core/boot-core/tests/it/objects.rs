@@ -438,9 +438,9 @@ fn a_device_tells_why_it_stayed() {
     let messages = |reason: u8, boot_up_emergency| {
         let mut flash = ModelFlash::new(&CHIP);
         let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
-        let (buffer, room) = leaked(256);
+        let (buffer, unsealer) = leaked(256);
         let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), reason };
-        let mut node = boot.on::<_, 1>(&mut flash, buffer, room);
+        let mut node = boot.on::<_, 1>(&mut flash, buffer, unsealer);
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
         let mut bytes = [0; 4];
@@ -468,7 +468,6 @@ fn a_device_tells_why_it_stayed() {
 
 /// 1201h: written by a master, back to nothing with the next reset of the communication (CiA 301
 /// clause 7.3.2.2.1).
-#[cfg(not(feature = "sealed"))]
 #[test]
 fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_reset() {
     use boot_core::bootloader::Bootloader;

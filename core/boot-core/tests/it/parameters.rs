@@ -244,11 +244,8 @@ fn the_first_values_stand_behind_a_header_in_the_first_region() {
 fn the_tags_are_those_of_devices_in_the_field() {
     let tags = [Key::program(1), Key::program(254), Key::CRASH_COUNT, Key::NODE].map(|key| key.0);
     assert_eq!(tags, [0x0001_0001, 0x0001_00FE, 0x0002_0000, 0x0003_0000]);
-    #[cfg(feature = "sealed")]
-    {
-        let tags = [Key::counter(1), Key::counter(254), Key::event(7), Key::GRANTS].map(|key| key.0);
-        assert_eq!(tags, [0x0004_0001, 0x0004_00FE, 0x0005_0007, 0x0006_0000]);
-    }
+    let tags = [Key::counter(1), Key::counter(254), Key::event(7), Key::GRANTS].map(|key| key.0);
+    assert_eq!(tags, [0x0004_0001, 0x0004_00FE, 0x0005_0007, 0x0006_0000]);
 }
 
 /// A newer RAM image stores under keys that this resident part does not know: they survive each
@@ -703,7 +700,6 @@ fn the_record_of_a_program_has_its_words() {
 
 /// A withdrawn program: bit 28 of the first word. Whatever a program stores by the callgate of this
 /// record, it is not released.
-#[cfg(feature = "sealed")]
 #[test]
 fn a_withdrawn_program_is_not_released_by_its_flags() {
     use boot_core::store::record::Seal;

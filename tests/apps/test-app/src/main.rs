@@ -211,7 +211,6 @@ mod app {
     /// Lets time pass for the protocol, and shows life.
     #[task(local = [led], priority = 1)]
     async fn tick(cx: tick::Context) {
-        let mut next = Mono::now();
         let mut ticks = 0_u32;
         loop {
             rtic::pend(pac::Interrupt::CAN1_TX);
@@ -220,8 +219,8 @@ mod app {
                 debugger::example();
             }
             ticks = ticks.wrapping_add(1);
-            next += TICK_MS.millis();
-            Mono::delay_until(next).await;
+            // `delay` would wait for one tick of the clock more.
+            Mono::delay_until(Mono::now() + TICK_MS.millis()).await;
         }
     }
 }

@@ -1,6 +1,9 @@
-//! The real types.
+//! What a device keeps of a download of block files, so that it can go on after a cut, and so that
+//! a block may come twice.
 
-use super::number::ANY;
+/// The number of a block that is not known: the sequence goes on with any block that begins at most
+/// where the existing data end.
+pub(crate) const ANY: u32 = 0;
 
 /// How often the progress of a download is stored, at most.
 const NOTES: u32 = 16;
@@ -57,8 +60,8 @@ impl Partial {
         self.resumed
     }
 
-    /// The address of its first data that are not in flash; `base` for a new one.
-    pub(crate) const fn start(self, _base: u32) -> u32 {
+    /// The address of its first data that are not in flash.
+    pub(crate) const fn start(self) -> u32 {
         self.end
     }
 
@@ -116,8 +119,8 @@ impl LastBlock {
         *self = Self { crc, number, end };
     }
 
-    /// The number of the block after it; `next` was expected.
-    pub(crate) const fn next(&self, _next: u32) -> u32 {
+    /// The number of the block after it.
+    pub(crate) const fn next(&self) -> u32 {
         self.number.wrapping_add(1)
     }
 }
