@@ -142,9 +142,8 @@ impl Product {
         lss_announce: false,
         lss_store: true,
         block_upload: true,
-        // There is no room for them beside sealed images.
-        second_server: !SEALED,
-        resume: !SEALED,
+        second_server: true,
+        resume: true,
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,

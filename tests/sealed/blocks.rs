@@ -1,16 +1,21 @@
 //! A sealed image in a block file, block by block, for masters that only support block files: the
 //! blocks that the sealed device accepts and refuses, and that the old program stays.
 
+use std::sync::Arc;
+
 use canopen::program::ProgramControl;
-use canopen::Address;
+use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, release, sealer, status, write, COUNTER, KEKS};
+use coboot_tests::fleet::Fleet;
+use coboot_tests::sealed_board::{board, keys, release, sealer, status, write, COUNTER, KEKS};
 use coflash::device::{Doing, Transfers};
 use coflash::file::convert::blocks_of_sealed;
 use coflash::file::sealed::{SealedFile, Sealer};
-use coflash::update::{flash_sealed, FlashOptions};
+use coflash::update::event::{Note, Phase};
+use coflash::update::{flash_sealed, Event, FlashOptions};
 use coflash::Error;
+use shared_abi::block_file::Header;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
@@ -126,7 +131,11 @@ fn what_is_not_authentic_costs_nothing() {
         ("a flipped bit, and the block's CRC tells", |all| all[1][50] ^= 1, status::CRC),
         ("no sealed image", |all| all[1] = with_data(&all[1], |data| data[0] ^= 1), status::NO_ACCESS),
         ("a block is left out", |all| drop(all.remove(2)), status::SEQUENCE),
-        ("block 0 again in the middle", |all| all.insert(2, all[0].clone()), status::SEQUENCE),
+        (
+            "block 0 of another version in the middle",
+            |all| all.insert(2, with_data(&all[0], |data| data[12] ^= 1)),
+            status::SEQUENCE,
+        ),
         ("the end comes too early", |all| drop(all.drain(2..all.len() - 1)), status::FORMAT),
     ];
     for (what, spoil, expected) in cases {
@@ -190,4 +199,107 @@ fn blocks_among_other_work() {
         assert_runs(&mut bench, version, "begun anew");
     }
     bench.assert_nothing_unmodelled();
+}
+
+/// What the device reports of a begun download (2006h): the CRC of block 0, and the address.
+fn begun(bench: &mut Bench) -> (u32, u32) {
+    let value = bench.session().read(Address::new(0x2006, 1)).expect("2006h is answered");
+    let word = |at: usize| u32::from_le_bytes(value[at..at + 4].try_into().unwrap());
+    (word(0), word(4))
+}
+
+/// The bus is lost, or the host: the device keeps what it has processed, and takes each byte once.
+#[test]
+fn a_client_that_comes_back_goes_on_with_the_next_block() {
+    const SIZE: usize = 512;
+    let mut bench = board_with_a_program();
+    let all = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
+    let blocks = self::blocks(&seal(&all, firmware::APP_V2), SIZE);
+    let others = self::blocks(&seal(&all, firmware::APP_V1), SIZE);
+    let control_crc = u32::from_le_bytes(*blocks[0].last_chunk().unwrap());
+    assert_eq!(begun(&mut bench), (0, 0));
+    clear(&mut bench);
+    for (at, block) in blocks.iter().enumerate() {
+        if at % 7 == 6 {
+            let before = Header::parse(blocks[at - 1].first_chunk().unwrap());
+            let end = before.flash_address + before.size;
+            assert_eq!(begun(&mut bench), (control_crc, end), "before block {at}");
+            assert_eq!(send(&mut bench, &others[0]), status::SEQUENCE, "the blocks of another file");
+            assert_eq!(send(&mut bench, &blocks[0]), status::OK, "the same file again");
+            assert_eq!(begun(&mut bench), (control_crc, end));
+            // The client is not sure where it was.
+            assert_eq!(send(&mut bench, &blocks[at - 3]), status::OK, "it is there");
+            assert_eq!(send(&mut bench, &blocks[at - 1]), status::OK, "it is there, too");
+            if at + 2 < blocks.len() {
+                assert_eq!(send(&mut bench, &blocks[at + 1]), status::SEQUENCE, "one is missing before it");
+            }
+        }
+        assert_eq!(send(&mut bench, block), status::OK, "block {at} of {}", blocks.len());
+    }
+    assert_eq!(begun(&mut bench), (0, 0));
+    assert_runs(&mut bench, "2.0.0", "with each byte once");
+    // What was found authentic is known no more after a power cut.
+    clear(&mut bench);
+    for block in &others[..14] {
+        assert_eq!(send(&mut bench, block), status::OK);
+    }
+    assert_ne!(begun(&mut bench), (0, 0));
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert_eq!(begun(&mut bench).0, 0);
+    assert_eq!(send_all(&mut bench, &others), status::OK);
+    assert_runs(&mut bench, "1.0.0", "begun anew");
+    bench.assert_nothing_unmodelled();
+}
+
+/// By the host tool: a second call sends what the first one has left.
+#[test]
+fn coflash_goes_on_with_a_sealed_image_in_blocks() {
+    let mut bench = board_with_a_program();
+    let file = seal(&sealer(COUNTER), firmware::APP_V2);
+    let blocks = self::blocks(&file, 512);
+    clear(&mut bench);
+    for block in &blocks[..20] {
+        assert_eq!(send(&mut bench, block), status::OK);
+    }
+    let file = SealedFile::parse(file).unwrap();
+    let options = FlashOptions::default().blocks(Some(512));
+    let mut went_on_with = None;
+    flash_sealed(&mut bench.session(), &file, &options, &mut |event| {
+        if let Event::Phase(Phase::GoingOn { done, .. }) = event {
+            went_on_with = Some(done);
+        }
+    })
+    .unwrap();
+    assert_eq!(went_on_with, Some(19 * (512 - 16)));
+    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
+}
+
+/// Eight devices on one bus get an image in one download for all.
+#[test]
+fn eight_sealed_devices_get_an_image_together() {
+    let mut fleet = Fleet::of_image(firmware::BOOTLOADER_SEALED, 8, BitRate::K1000);
+    let boards = fleet.bench.boards();
+    for board in boards {
+        let machine = fleet.bench.world.machine_mut(board);
+        machine.load_bin(firmware::board().key_block().base, &keys()).unwrap();
+        machine.reset_pin();
+    }
+    fleet.bench.run_ms(50);
+    for (image, version) in [(firmware::APP_V1, "1.0.0"), (firmware::APP_V2, "2.0.0")] {
+        let file = Arc::new(SealedFile::parse(seal(&sealer(COUNTER), image)).unwrap());
+        let update = fleet.update_sealed(8, &file);
+        assert_eq!(update.done(), 8, "{:?}", update.results);
+        for number in 0..8 {
+            let together = |(of, event): &(usize, Event)| {
+                *of == number && matches!(event, Event::Note(Note::Together { devices: 8 }))
+            };
+            assert!(update.events.iter().any(together), "device {number}");
+            let node = number as u8 + 1;
+            assert_eq!(fleet.bench.session_with(node).read_text(VERSION).unwrap(), version, "node {node}");
+        }
+    }
+    fleet.bench.assert_nothing_unmodelled();
 }

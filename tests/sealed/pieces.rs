@@ -65,7 +65,11 @@ fn a_wrong_block_costs_nothing() {
             status::NO_ACCESS,
         ),
         ("a block is left out", |all| drop(all.remove(2)), status::SEQUENCE),
-        ("block 0 in the middle", |all| all.insert(2, all[0].clone()), status::SEQUENCE),
+        (
+            "block 0 of another program in the middle",
+            |all| all.insert(2, changed(&all[0], |data| data[0] ^= 1)),
+            status::SEQUENCE,
+        ),
         ("the end too early", |all| drop(all.drain(2..all.len() - 1)), status::FORMAT),
         ("nothing but the end", |all| drop(all.drain(1..all.len() - 1)), status::SEQUENCE),
     ];

@@ -108,6 +108,15 @@ impl Bench {
     /// As [`with`](Self::with), and for zero boards.
     #[must_use]
     pub fn of_boards(count: u32) -> Self {
+        Self::of_boards_with(firmware::BOOTLOADER, count)
+    }
+
+    /// The same with this bootloader.
+    ///
+    /// # Panics
+    /// As [`of_boards`](Self::of_boards).
+    #[must_use]
+    pub fn of_boards_with(bootloader: &str, count: u32) -> Self {
         let options = |n| {
             let Options { unique_id: [position, lot, more], .. } = Options::default();
             Options {
@@ -116,7 +125,7 @@ impl Bench {
                 ..Options::default()
             }
         };
-        Self::of(firmware::BOOTLOADER, (0..count).map(options).collect())
+        Self::of(bootloader, (0..count).map(options).collect())
     }
 
     fn of(bootloader: &str, chips: Vec<Options>) -> Self {

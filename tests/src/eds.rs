@@ -22,19 +22,13 @@ const TIME: &str = "12:00AM";
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
 /// The tables of the bootloader: standard and Paulus, ESAcademy, lift.
-static STANDARD: [Entry; len(full(Extras::STANDARD))] = entries(PROGRAMS, full(Extras::STANDARD)).entries();
-static ESACADEMY: [Entry; len(full(Profile::ESACADEMY.extras))] =
-    entries(PROGRAMS, full(Profile::ESACADEMY.extras)).entries();
-static LIFT: [Entry; len(full(Profile::LIFT.extras))] =
-    entries(PROGRAMS, full(Profile::LIFT.extras)).entries();
+static STANDARD: [Entry; len(Extras::STANDARD)] = entries(PROGRAMS, Extras::STANDARD).entries();
+static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
+    entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
+static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
 
-/// The objects of a bootloader that has no sealed images, and so has room for these two.
-const fn full(extras: Extras) -> Extras {
-    Extras { second_server: true, resume: true, ..extras }
-}
-
-/// The same with sealed images.
-const SEALED: Extras = Extras { sealed: true, second_server: false, resume: false, ..Extras::STANDARD };
+/// The objects of a bootloader for sealed images.
+const SEALED: Extras = Extras { sealed: true, ..Extras::STANDARD };
 static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
 
 const fn len(extras: Extras) -> usize {

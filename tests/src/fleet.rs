@@ -7,11 +7,13 @@ use canopen::{BitRate, NodeId};
 use coflash::bus::{Adapter, AdapterError};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::DEFAULT_BLOCK_SIZE;
+use coflash::file::sealed::SealedFile;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::update::{Event, FlashOptions, Report, GROUP_BLOCKS};
+use coflash::update::{Event, FlashOptions, Program, Report, GROUP_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;
+use crate::firmware;
 use crate::throughput::{blocks, program};
 
 /// Boards with the node-IDs 1, 2 and so on.
@@ -69,7 +71,16 @@ impl Fleet {
     /// If a board refuses its node-ID, or the firmware was not built.
     #[must_use]
     pub fn new(boards: u8, rate: BitRate) -> Self {
-        let mut bench = Bench::of_boards(boards.into());
+        Self::of_image(firmware::BOOTLOADER, boards, rate)
+    }
+
+    /// The same with this bootloader.
+    ///
+    /// # Panics
+    /// As [`new`](Self::new).
+    #[must_use]
+    pub fn of_image(bootloader: &str, boards: u8, rate: BitRate) -> Self {
+        let mut bench = Bench::of_boards_with(bootloader, boards.into());
         for (board, node) in bench.boards().into_iter().zip(1..) {
             bench.commission(board, node, rate);
         }
@@ -104,13 +115,24 @@ impl Fleet {
         options: &ManyOptions,
         happens: Happens<'_>,
     ) -> Update {
-        self.update_as(devices, file, &FlashOptions::default(), options, happens)
+        let program = Program::Blocks(file.clone());
+        self.update_as(devices, &program, &FlashOptions::default(), options, happens)
+    }
+
+    /// The same with a sealed image, and everything else by default.
+    ///
+    /// # Panics
+    /// As [`update`](Self::update).
+    pub fn update_sealed(&mut self, devices: u8, file: &Arc<SealedFile>) -> Update {
+        let program = Program::Sealed(file.clone());
+        let (each, options) = (FlashOptions::default(), ManyOptions::default());
+        self.update_as(devices, &program, &each, &options, &mut |_| {})
     }
 
     fn update_as(
         &mut self,
         devices: u8,
-        file: &Arc<BlockFile>,
+        file: &Program,
         each: &FlashOptions,
         options: &ManyOptions,
         happens: Happens<'_>,
@@ -190,7 +212,7 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
         }
         let options = ManyOptions::default().together(way == Way::Together);
         let each = FlashOptions::default().group_blocks(Some(block_size));
-        let update = fleet.update_as(boards, &file, &each, &options, &mut |_| {});
+        let update = fleet.update_as(boards, &Program::Blocks(file.clone()), &each, &options, &mut |_| {});
         assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
         let (took, one) = (update.took, *one.get_or_insert(update.took));
         row(Measurement { boards, way, block_size, lost_one_in, took, one });

@@ -131,16 +131,15 @@ struct End {
     is_for_another: bool,
 }
 
-/// The COB-IDs for the jobs that can be done together: those that send blocks and have a COB-ID for
-/// answers, if there are several.
+/// The COB-IDs for the jobs that can be done together: those that have a COB-ID for answers, if there
+/// are several.
 fn channels(jobs: &[Job]) -> Vec<Option<Channel>> {
-    let by_blocks = |job: &&Job| matches!(job.file, Program::Blocks(_));
-    if jobs.iter().filter(by_blocks).count() < 2 {
+    if jobs.len() < 2 {
         return vec![None; jobs.len()];
     }
     let of = |job: &Job| {
         let response = GROUP_ANSWERS + u16::from(job.node.get());
-        if !by_blocks(&job) || response >= GROUP {
+        if response >= GROUP {
             return None;
         }
         Some(Channel { request: CobId::new(GROUP)?, response: CobId::new(response)? })

@@ -13,7 +13,7 @@ use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
-use crate::file::convert::blocks_of_sealed;
+use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
@@ -45,8 +45,8 @@ impl Procedure for Block {
 
     /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
     /// With `start` off, the program is neither tried nor released. A sealed image is sent in one
-    /// download unless the user asked for blocks, and it needs no release: its signature serves as
-    /// the release.
+    /// download, unless the user asked for blocks or the device gets it together with others; and it
+    /// needs no release: its signature serves as the release.
     fn download(
         &self,
         session: &mut Session<'_>,
@@ -54,32 +54,39 @@ impl Procedure for Block {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let file = match (file, options.blocks) {
-            (Content::Blocks(file), _) => file,
-            (Content::Sealed(sealed), None) => {
-                return cia302::download(session, sealed.bytes(), file.program_crc(), options, update);
-            }
-            (Content::Sealed(sealed), Some(block_size)) => {
-                let blocks = cut(session, sealed, block_size, options.program)?;
-                let (repeats, took) = send(session, &blocks, None, &mut false, options, update)?;
-                update.state = DeviceState::Written;
-                let crc = file.program_crc();
-                steps::verify(session, options.program, crc, &mut |event| update.tell(event))?;
-                return Ok(Downloaded { repeats, took, released: None });
-            }
-        };
-        let number = options.program;
+        let (number, crc) = (options.program, file.program_crc());
         let mut in_group = session.join_group()?;
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
         }
+        let (cut, is_sealed);
+        let file = match file {
+            Content::Blocks(file) => {
+                is_sealed = false;
+                file
+            }
+            Content::Sealed(sealed) => {
+                let size = match options.blocks {
+                    None if in_group => DEFAULT_BLOCK_SIZE,
+                    None => return cia302::download(session, sealed.bytes(), crc, options, update),
+                    Some(size) => size,
+                };
+                is_sealed = true;
+                cut = cut_up(session, sealed, size, number)?;
+                &cut
+            }
+        };
         let larger = options.group_blocks.filter(|_| in_group).map(|size| file.joined(size));
         let file = larger.as_ref().unwrap_or(file);
-        let sent = send_verified(session, file, &mut in_group, options, update);
+        let sent = send_verified(session, file, crc, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
         }
         let (repeats, took) = sent?;
+        if is_sealed {
+            update.state = DeviceState::Written;
+            return Ok(Downloaded { repeats, took, released: None });
+        }
         update.state = DeviceState::Unreleased;
         if !options.start {
             update.tell(Phase::NotReleased.into());
@@ -95,7 +102,7 @@ impl Procedure for Block {
 }
 
 /// The blocks that carry a sealed image to the program's region of this device.
-fn cut(
+fn cut_up(
     session: &mut Session<'_>,
     sealed: &SealedFile,
     block_size: usize,
@@ -126,11 +133,12 @@ impl PartialDownload {
     }
 }
 
-/// Steps 4 to 9, and the comparison of the CRC. Goes on with a download that was cut off; if the
+/// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off; if the
 /// device's part of it proves to be wrong, everything is sent.
 fn send_verified(
     session: &mut Session<'_>,
     file: &BlockFile,
+    crc: u32,
     in_group: &mut bool,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
@@ -140,7 +148,7 @@ fn send_verified(
     let partial = partial.filter(|partial| partial.is_of(file));
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, options, update)?;
-        steps::verify(session, number, file.program_crc(), &mut |event| update.tell(event))?;
+        steps::verify(session, number, crc, &mut |event| update.tell(event))?;
         Ok(sent)
     };
     match all(partial, update) {
