@@ -26,12 +26,12 @@ const BOOT_CORE: &[Rule] = &[
     ("policy", "crc"),
     ("session", "policy refusal"),
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
-    ("intake", "policy program queue refusal resume session"),
+    ("intake", "keys policy program queue refusal resume session"),
     // It works from the queue to the flash: no session, no object.
     ("unseal", "flash keys policy program queue store"),
     // It works on pieces and addresses: no format, no object.
     ("programmer", "crc flash program queue resume sequence store unseal"),
-    ("control", "flash intake policy program programmer refusal resume session store unseal"),
+    ("control", "flash intake keys policy program programmer refusal resume session store unseal"),
     ("stored_version", "flash programmer"),
     ("bootloader", "control decision flash resume store stored_version unseal"),
     ("profile", "bootloader policy"),

@@ -11,7 +11,6 @@ use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
-#[cfg(feature = "sealed")]
 use boot_core::store::record::Seal;
 use boot_core::store::{Key, NodeParameters, ProgramRecord, Value};
 use bsp::{pac, LAYOUT};
@@ -19,14 +18,12 @@ use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
 };
 use shared_abi::geometry::Region;
-#[cfg(feature = "sealed")]
 use shared_abi::handoff::Handoff;
-#[cfg(feature = "sealed")]
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
-use crate::product::{self, NO_NODE_ID};
+use crate::product::{self, NO_NODE_ID, SEALED};
 use crate::storing::{crash_count, store};
 
 /// The entry of all services: it checks the argument structure, takes the flash once, calls the
@@ -93,8 +90,10 @@ fn keep(
 }
 
 /// Whether the boot stage locked the flash before it started the running program.
-#[cfg(feature = "sealed")]
 fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
+    if !SEALED {
+        return false;
+    }
     // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
     let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
     let record = ProgramRecord::load(parameters, flash, program);
@@ -103,7 +102,6 @@ fn is_locked(parameters: &product::Parameters, flash: &ResidentFlash) -> bool {
 
 /// Stores the values that an application requested before its reset. A refused request changes
 /// nothing; the application sees that when it reads the values.
-#[cfg(feature = "sealed")]
 pub fn store_after_reset(flash: &mut ResidentFlash, request: Option<BootRequest>) {
     // The program for which the flash was locked does not run any more.
     // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
@@ -122,11 +120,6 @@ pub fn store_after_reset(flash: &mut ResidentFlash, request: Option<BootRequest>
     };
     unlock();
     let _ = program(selector, flash, &mut ProgramArgs { number: number.into(), ..ProgramArgs::default() });
-}
-
-#[cfg(not(feature = "sealed"))]
-fn is_locked(_: &product::Parameters, _: &ResidentFlash) -> bool {
-    false
 }
 
 fn crc32(flash: &ResidentFlash, args: &mut Crc32Args) -> Result<(), Status> {

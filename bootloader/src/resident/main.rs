@@ -24,7 +24,6 @@ mod callgate;
 mod flash;
 #[path = "../flash_controller.rs"]
 mod flash_controller;
-#[cfg(feature = "sealed")]
 mod flash_lock;
 #[path = "../memory.rs"]
 mod memory;
@@ -61,7 +60,7 @@ global_asm!(
     ".word {fault}",
     ".endr",
     faults = const MARK_OFFSET / 4 - 2,
-    is_sealed = const cfg!(feature = "sealed") as u32,
+    is_sealed = const product::SEALED as u32,
     mark = const KNOWS_SEALED_IMAGES,
     others = const CORE_VECTORS - MARK_OFFSET / 4 - 1,
     fault = sym fault,

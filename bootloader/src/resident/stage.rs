@@ -18,7 +18,7 @@ use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
-use crate::product::{self, NO_NODE_ID, PRODUCT};
+use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
 use crate::{ram_image, storing};
 
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
@@ -42,8 +42,7 @@ pub unsafe extern "C" fn stage() -> ! {
 
     // Without a reset cause an application has jumped here, and the flash may be locked. A reset
     // unlocks it; the request stays in the cell.
-    #[cfg(feature = "sealed")]
-    if reset_cause == ResetCause::Unknown {
+    if SEALED && reset_cause == ResetCause::Unknown {
         SCB::sys_reset();
     }
 
@@ -56,8 +55,9 @@ pub unsafe extern "C" fn stage() -> ! {
     // SAFETY: as above.
     let mut flash = unsafe { ResidentFlash::steal(true) };
     ResidentFlash::switch_crc_unit_on(&rcc);
-    #[cfg(feature = "sealed")]
-    crate::callgate::store_after_reset(&mut flash, request);
+    if SEALED {
+        crate::callgate::store_after_reset(&mut flash, request);
+    }
     let mut parameters = product::parameters(&flash);
     let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
     // SAFETY: as above; nothing is programmed from here on.
@@ -89,8 +89,7 @@ pub unsafe extern "C" fn stage() -> ! {
                 bootloader_version: product::VERSION,
                 serial_number: bsp::serial_number(),
             });
-            #[cfg(feature = "sealed")]
-            if program.locks_flash() {
+            if SEALED && program.locks_flash() {
                 // SAFETY: only this code runs, and it writes the flash no more.
                 unsafe { crate::flash_lock::lock_flash() };
             }

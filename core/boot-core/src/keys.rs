@@ -1,10 +1,37 @@
-//! Whether the device has keys and therefore accepts and starts only sealed programs.
+//! Whether the device takes sealed images, and whether it has keys and therefore accepts and starts no
+//! others.
 
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
 use crate::store::{Key, Parameters};
-use crate::unseal::LINKED;
+
+/// Whether the code for sealed images is linked. This is the only place that depends on it: the
+/// compiler leaves out what follows a question that is always answered with no.
+pub(crate) const LINKED: bool = cfg!(feature = "sealed");
+
+/// The images that a device takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Images {
+    /// Plain ones: it knows no sealed ones.
+    Plain,
+    /// Both: it has no keys yet.
+    Both,
+    /// Sealed ones alone.
+    Sealed,
+}
+
+impl Images {
+    /// Whether sealed images are among them.
+    pub(crate) fn has_sealed(self) -> bool {
+        LINKED && self != Self::Plain
+    }
+
+    /// Whether plain images are refused.
+    pub(crate) fn only_sealed(self) -> bool {
+        LINKED && self == Self::Sealed
+    }
+}
 
 /// Whether the place of the key block (`seal::key_block`) is not empty, unless the holder of a root
 /// key has opened the device permanently. A damaged key block does not open the device: no image

@@ -16,7 +16,7 @@
 //! | [`bootloader`] | the object dictionary over it | objects |
 //! | `stored_version` | 100Ah: the version text, searched in a stored program | |
 //! | [`program`] | the proof that a program may be started | |
-//! | `keys` | whether the device has keys, and so takes only sealed programs | |
+//! | `keys` | whether the device takes sealed images, and whether it has keys and takes no others | |
 //! | [`crc`] | the CRCs of block file, program and journal | |
 //! | [`policy`], [`profile`] | what a product may choose | |
 //! | [`flash`] | the seam to the flash | |

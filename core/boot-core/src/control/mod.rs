@@ -26,13 +26,14 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
 use crate::intake::{Intake, Judge};
+use crate::keys::Images;
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
-use crate::unseal::{Images, Unsealer};
+use crate::unseal::Unsealer;
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;

@@ -7,11 +7,11 @@ use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::vectors::VectorTable;
 
+use crate::keys::Images;
 use crate::policy::{Policy, Verdict};
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::Session;
-use crate::unseal::Images;
 
 /// Checks the data for one program.
 #[derive(Clone, Copy)]

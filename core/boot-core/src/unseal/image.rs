@@ -19,9 +19,8 @@ use seal::wire::{
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
-use super::{Images, LINKED};
 use crate::flash::{fold, Flash};
-use crate::keys::{is_sealed, is_sound};
+use crate::keys::{is_sealed, is_sound, Images, LINKED};
 use crate::policy::{Policy, SealPolicy};
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
