@@ -7,8 +7,13 @@ use crate::{files, links, workspace};
 /// Folders without our files, and pages about the past, which use old names.
 const FOREIGN: [&str; 4] = ["target", ".git", "node_modules", "adr"];
 /// Files that are not in the repository: those of a user, of a package, and what a job makes.
-const ELSEWHERE: [&str; 4] =
-    ["coflash/coflash.toml", ".vscode/launch.json", "udev/70-coflash.rules", "build/app.elf"];
+const ELSEWHERE: [&str; 5] = [
+    "docs/evidence.md",
+    "coflash/coflash.toml",
+    ".vscode/launch.json",
+    "udev/70-coflash.rules",
+    "build/app.elf",
+];
 
 /// The word as a path, if it is one: with a slash and a small letter, and without a blank. What
 /// `cargo` and CMake build is none.
