@@ -6,9 +6,25 @@ use shared_abi::layout::Layout;
 use crate::flash::Flash;
 use crate::store::{Key, Parameters};
 
-/// Whether the code for sealed images is linked. This is the only place that depends on it: the
-/// compiler leaves out what follows a question that is always answered with no.
-pub(crate) const LINKED: bool = cfg!(feature = "sealed");
+/// A proof that the code for sealed images is linked. Without the feature `sealed` this type has no value:
+/// then the compiler leaves out all code that needs one. No other line depends on the feature.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Linked {
+    /// It is.
+    #[cfg(feature = "sealed")]
+    Yes,
+}
+
+impl Linked {
+    /// The proof, if there is one.
+    pub(crate) const PROOF: Option<Self> = {
+        #[cfg(feature = "sealed")]
+        let proof = Some(Self::Yes);
+        #[cfg(not(feature = "sealed"))]
+        let proof = None;
+        proof
+    };
+}
 
 /// The images that a device takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -16,20 +32,26 @@ pub(crate) enum Images {
     /// Plain ones: it knows no sealed ones.
     Plain,
     /// Both: it has no keys yet.
-    Both,
+    Both(Linked),
     /// Sealed ones alone.
-    Sealed,
+    Sealed(Linked),
 }
 
 impl Images {
-    /// Whether sealed images are among them.
-    pub(crate) fn has_sealed(self) -> bool {
-        LINKED && self != Self::Plain
+    /// The proof, if sealed images are among them.
+    pub(crate) fn sealed(self) -> Option<Linked> {
+        match self {
+            Self::Plain => None,
+            Self::Both(linked) | Self::Sealed(linked) => Some(linked),
+        }
     }
 
-    /// Whether plain images are refused.
-    pub(crate) fn only_sealed(self) -> bool {
-        LINKED && self == Self::Sealed
+    /// The proof, if plain images are refused.
+    pub(crate) fn only_sealed(self) -> Option<Linked> {
+        match self {
+            Self::Sealed(linked) => Some(linked),
+            Self::Plain | Self::Both(_) => None,
+        }
     }
 }
 
@@ -37,7 +59,7 @@ impl Images {
 /// key has opened the device permanently. A damaged key block does not open the device: no image
 /// passes the checks then. A bootloader without sealed images ignores keys.
 pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Layout) -> bool {
-    if !LINKED {
+    if Linked::PROOF.is_none() {
         return false;
     }
     let [_, opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);

@@ -156,14 +156,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 }
             } else {
                 let mut partial = begin.partial;
-                if goes_on && matches!(state.session, Session::Idle) && !progress.sealed {
+                if goes_on && matches!(state.session, Session::Idle) && progress.sealed.is_none() {
                     partial = state.partial;
                     next = ANY;
                 }
                 self.programmer.queue_mut().last = LastBlock::none(partial.start());
                 let erases = next == ANY || state.session.erases(self.policy);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
-                if progress.sealed {
+                if progress.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
                     self.programmer.disown();
                     self.programmer.unseal();

@@ -100,7 +100,7 @@ impl Format for BlockFile {
                 to.queue.discard();
                 return Ok(());
             }
-            if to.judge.images.only_sealed() && header.flash_address != to.queue.last.end() {
+            if to.judge.images.only_sealed().is_some() && header.flash_address != to.queue.last.end() {
                 // The bytes of a sealed image are processed in order, and each once.
                 if header.flash_address + header.size > to.queue.last.end() {
                     return Err(Refusal::untimely(FlashError::Sequence));
@@ -124,20 +124,20 @@ impl Format for BlockFile {
                 let id = if size == 0 { 0 } else { self.crc };
                 let partial = Partial::begin(id, to.judge.region.base);
                 to.progress.begins = Some(Begin { size, version, partial });
-                if to.judge.images.only_sealed() {
+                if let Some(linked) = to.judge.images.only_sealed() {
                     // The sequence begins again over what was processed, if it is that of the same file.
                     if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
                         return Err(Refusal::untimely(FlashError::Sequence));
                     }
                     to.progress.begins = Some(Begin { size: 0, version: 0, partial });
-                    to.progress.sealed = true;
+                    to.progress.sealed = Some(linked);
                 }
             }
-            NUMBER_LAST if to.judge.images.only_sealed() => {
+            NUMBER_LAST if to.judge.images.only_sealed().is_some() => {
                 // The manifest of the sealed image describes the program.
                 to.progress.complete = Some(Expected { size: 0, crc: None });
             }
-            _ if to.judge.images.only_sealed() => {
+            _ if to.judge.images.only_sealed().is_some() => {
                 if header.number == 1 && to.queue.open_word() != u32::from_le_bytes(MAGIC) {
                     return Err(Refusal::unfit(FlashError::NoAccess));
                 }

@@ -1,6 +1,7 @@
 //! What each format implements, and what it gets and reports.
 
 use crate::intake::judge::Judge;
+use crate::keys::Linked;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
@@ -57,7 +58,7 @@ pub(crate) struct Progress {
     /// The program is complete.
     pub complete: Option<crate::program::Expected>,
     /// The download is a sealed image.
-    pub sealed: bool,
+    pub sealed: Option<Linked>,
 }
 
 /// What is known about a program when its download begins.

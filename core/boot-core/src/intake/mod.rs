@@ -67,7 +67,9 @@ impl Intake {
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
             let Some(mut known) = Known::recognise(&first[..len], &to.judge)? else { return Ok(()) };
-            if to.judge.images.only_sealed() && !matches!(known, Known::Sealed(_) | Known::BlockFile(_)) {
+            if to.judge.images.only_sealed().is_some()
+                && !matches!(known, Known::Sealed(_) | Known::BlockFile(_))
+            {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;

@@ -7,22 +7,21 @@ use seal::wire::MAGIC;
 
 use super::format::{Begin, Destination, Format, Recognition};
 use super::judge::Judge;
+use crate::keys::Linked;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 
-pub(super) struct Sealed;
+pub(super) struct Sealed(Linked);
 
 impl Format for Sealed {
     const IS_STREAM: bool = true;
 
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {
-        if !judge.images.has_sealed() {
-            return Recognition::No;
-        }
+        let Some(linked) = judge.images.sealed() else { return Recognition::No };
         match (MAGIC.starts_with(first), first.len() == MAGIC.len()) {
-            (true, true) => Recognition::Yes(Self),
+            (true, true) => Recognition::Yes(Self(linked)),
             (true, false) => Recognition::More,
             _ => Recognition::No,
         }
@@ -40,7 +39,7 @@ impl Format for Sealed {
         if !to.judge.has_begun() {
             to.progress.begins =
                 Some(Begin { size: 0, version: 0, partial: Partial::begin(0, to.judge.region.base) });
-            to.progress.sealed = true;
+            to.progress.sealed = Some(self.0);
         }
         Ok(())
     }

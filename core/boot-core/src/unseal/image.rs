@@ -20,7 +20,7 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::flash::{fold, Flash};
-use crate::keys::{is_sealed, is_sound, Images, LINKED};
+use crate::keys::{is_sealed, is_sound, Images, Linked};
 use crate::policy::{Policy, SealPolicy};
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
@@ -199,12 +199,12 @@ impl Unsealer<'_> {
 
     /// The state, in a device that takes sealed images.
     pub(super) fn room(&self) -> Option<&Room> {
-        self.0.as_deref().filter(|_| LINKED)
+        Linked::PROOF.and(self.0.as_deref())
     }
 
     /// See [`room`](Self::room).
     pub(super) fn room_mut(&mut self) -> Option<&mut Room> {
-        self.0.as_deref_mut().filter(|_| LINKED)
+        Linked::PROOF.and(self.0.as_deref_mut())
     }
 
     /// Whether the device takes sealed images.
@@ -214,10 +214,10 @@ impl Unsealer<'_> {
 
     /// The images that the device takes.
     pub(crate) fn images(&self) -> Images {
-        match self.room() {
-            None => Images::Plain,
-            Some(room) if room.takes_no_other => Images::Sealed,
-            Some(_) => Images::Both,
+        match (self.room(), Linked::PROOF) {
+            (Some(room), Some(linked)) if room.takes_no_other => Images::Sealed(linked),
+            (Some(_), Some(linked)) => Images::Both(linked),
+            _ => Images::Plain,
         }
     }
 
