@@ -52,7 +52,7 @@ const RULES: &[(&str, &str)] = &[
         "coboot-tests",
         "app-template boot-core bsp canopen coboot-app coboot-node coflash emulator seal shared-abi kit",
     ),
-    ("coboot-zencan", "coboot-tests coflash emulator"),
+    ("coboot-zencan", "bsp canopen coboot-tests coflash emulator"),
     ("xtask", "shared-abi kit"),
 ];
 

@@ -298,7 +298,8 @@ fn product(summary: &mut Summary) -> Outcome {
 /// Tests of the default board that run from a tier on.
 fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
     let mut jobs = Vec::new();
-    let more = programs::build(&["--package=xtask", "--package=coboot-zencan"].map(str::to_owned))?;
+    let more = ["--package=xtask", "--package=coboot-zencan"].map(str::to_owned);
+    let more = programs::build(&[&build::board_args(DEFAULT)[..], &more].concat())?;
     let programs = [test_programs()?, more];
     let chosen = |program: &str, test: &str| Tier::of(program, test) == tier;
     add(&mut jobs, summary, &programs.concat(), None, variables(DEFAULT), chosen)?;
