@@ -27,7 +27,7 @@ It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed 
 /// The version that the job installs.
 const VERSION: &str = "27.1.0";
 const PACKAGES: [&str; 5] = ["coboot-abi", "coboot-canopen", "coboot-core", "coboot-app", "coboot-seal"];
-/// The changes in the files of coboot-core that only the feature `sealed` builds.
+/// The changes in the files of coboot-core that only sealed images use.
 const SEALED: &str = r"/(unseal|intake/sealed)\b";
 /// The options for them. Their tests are in another crate, too, where cargo-mutants does not look for
 /// them before the first change.
