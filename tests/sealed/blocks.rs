@@ -56,6 +56,13 @@ fn send_all(bench: &mut Bench, blocks: &[Vec<u8>]) -> u32 {
     blocks.iter().map(|block| send(bench, block)).find(|word| *word != status::OK).unwrap_or(status::OK)
 }
 
+fn cut_power(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(1000);
+}
+
 fn assert_runs(bench: &mut Bench, version: &str, what: &str) {
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
@@ -188,10 +195,7 @@ fn blocks_among_other_work() {
             assert_eq!(send(&mut bench, block), status::OK);
         }
         if power {
-            bench.power_off();
-            bench.run_ms(100);
-            bench.power_on();
-            bench.await_boot_up(1000);
+            cut_power(&mut bench);
             bench.run_ms(500);
             assert!(bench.is_bootloader(NODE), "half a program does not start");
         }
@@ -244,10 +248,7 @@ fn a_client_that_comes_back_goes_on_with_the_next_block() {
         assert_eq!(send(&mut bench, block), status::OK);
     }
     assert_ne!(begun(&mut bench), (0, 0));
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
-    bench.await_boot_up(1000);
+    cut_power(&mut bench);
     assert_eq!(begun(&mut bench).0, 0);
     assert_eq!(send_all(&mut bench, &others), status::OK);
     assert_runs(&mut bench, "1.0.0", "begun anew");

@@ -20,7 +20,7 @@ use super::stream::judge_start;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::resume::Partial;
+use crate::resume::{Partial, ANY};
 use crate::session::Session;
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
@@ -100,9 +100,10 @@ impl Format for BlockFile {
                 to.queue.discard();
                 return Ok(());
             }
-            if to.judge.images.only_sealed().is_some() && header.flash_address != to.queue.last.end() {
+            let end = to.queue.last.end();
+            if to.judge.images.only_sealed().is_some() && next == ANY && header.flash_address != end {
                 // The bytes of a sealed image are processed in order, and each once.
-                if header.flash_address + header.size > to.queue.last.end() {
+                if header.flash_address + header.size > end {
                     return Err(Refusal::untimely(FlashError::Sequence));
                 }
                 to.queue.discard();

@@ -295,8 +295,7 @@ impl<'b> Programmer<'b> {
 
     /// Whether there is work that a command must wait for.
     pub(crate) fn has_work(&self) -> bool {
-        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm, _)));
-        let confirming = confirming || matches!(self.job, Some(Job::Store(Change::Note, _)));
+        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || !self.queue.is_empty()
