@@ -3,7 +3,7 @@
 //! mdBook renders a copy of the pages in which every file has its path of the repository. So a link
 //! is the same in the site, in the repository, and on a server that shows Markdown.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -44,7 +44,6 @@ pub fn run(args: Args) -> Outcome {
     build.arg("build").arg("--dest-dir").arg(&book).arg(&copy);
     let said = process::messages(&mut build)?;
     refuse("mdBook", &warnings(&said))?;
-    refuse("the site", &broken(&book)?)?;
     println!("{}", workspace::shown(&book.join("index.html")));
     Ok(())
 }
@@ -93,43 +92,6 @@ fn warnings(said: &str) -> Vec<String> {
     said.lines().filter(|line| !is_good(line)).map(str::to_owned).collect()
 }
 
-/// The broken references of the site: to a missing file, or to a missing place of a page.
-fn broken(book: &Path) -> Outcome<Vec<String>> {
-    // Each reference is looked up among the paths of the pages.
-    let book = book.canonicalize().unwrap_or_else(|_| book.to_owned());
-    let mut pages = BTreeMap::new();
-    for page in files::below(&book, &[])?.into_iter().filter(|file| files::is(file, "html")) {
-        let html = files::text(&page)?;
-        pages.insert(page, html);
-    }
-    let mut faults = BTreeSet::new();
-    for (page, html) in &pages {
-        for target in attributes(html, "href").chain(attributes(html, "src")) {
-            if target.contains(':') || target.starts_with("//") {
-                continue;
-            }
-            let (file, place) = target.split_once('#').unwrap_or((target, ""));
-            let file = if file.is_empty() { page.clone() } else { page.with_file_name(file) };
-            let Ok(file) = file.canonicalize() else {
-                faults.insert(format!("{}: {target} is not there", workspace::shown(page)));
-                continue;
-            };
-            let there = |html: &String| attributes(html, "id").any(|id| id == place);
-            if !place.is_empty() && !pages.get(&file).is_some_and(there) {
-                faults.insert(format!("{}: {target} has no such place", workspace::shown(page)));
-            }
-        }
-    }
-    Ok(faults.into_iter().collect())
-}
-
-/// The values of an attribute, as the page's text has them.
-fn attributes<'h>(html: &'h str, name: &str) -> impl Iterator<Item = &'h str> {
-    let opening = format!(" {name}=\"");
-    let behind = html.match_indices(&opening).map(|(at, opening)| at + opening.len()).collect::<Vec<_>>();
-    behind.into_iter().filter_map(|at| html[at..].split('"').next())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -154,19 +116,5 @@ mod tests {
         let said = " INFO Book building has started\n WARN unclosed HTML tag `<n>` found in `docs/a.md`\n\n";
         assert_eq!(warnings(said), [" WARN unclosed HTML tag `<n>` found in `docs/a.md`"]);
         assert!(warnings(" INFO Running the html backend\n").is_empty());
-    }
-
-    #[test]
-    fn a_reference_that_leads_nowhere_is_found_in_the_site() {
-        let site = kit::folder::Folder::below(std::env::temp_dir(), "coboot-site");
-        let index = r##"<a href="docs/a.html#there">a</a><a href="https://example.invalid/x">b</a>"##;
-        let page = site.join("docs/a.html");
-        files::write(&site.join("index.html"), index).unwrap();
-        files::write(&page, r##"<h1 id="there"><img src="../index.html"></h1>"##).unwrap();
-        assert_eq!(broken(&site), Ok(Vec::new()));
-        files::write(&page, r##"<h1 id="here"><img src="b.png"><a href="#gone">c</a></h1>"##).unwrap();
-        let faults = broken(&site).unwrap();
-        let of = |words: &str| faults.iter().filter(|fault| fault.contains(words)).count();
-        assert_eq!((faults.len(), of("a.html#there has"), of("b.png is not"), of("#gone has")), (3, 1, 1, 1));
     }
 }

@@ -18,7 +18,6 @@ crate's own tests, those of the core with sealed images, and the tests of sealed
 of the flash. What the built firmware does in the emulator is not counted. The result goes to
 target/evidence/coverage.json, and the lines that no test reaches to target/coverage/missing.txt.
 
-
 A line that is reached may still be wrong: `cargo xtask mutants` asks whether a test would notice.
 cargo-llvm-cov is installed into target/tools, and llvm-tools by rustup, where they are missing.
 ";
@@ -49,8 +48,8 @@ pub fn run(args: Args) -> Outcome {
     process::run(&mut llvm_cov(&["clean", "--workspace"]))?;
     let packages = CRATES.iter().flat_map(|(package, _)| ["--package", package]);
     process::run(llvm_cov(&["--no-report", "--quiet"]).args(packages))?;
-    let core = ["--no-report", "--quiet", "--package", "coboot-core", "--features", "sealed"];
-    process::run(&mut llvm_cov(&core))?;
+    let core = ["--no-report", "--quiet", "--package", "coboot-core"];
+    process::run(llvm_cov(&core).env("COBOOT_TAKES_SEALED", "1"))?;
     let sealed = ["--no-report", "--quiet", "--package", "coboot-tests", "--test", "sealed", "--"];
     process::run(llvm_cov(&sealed).args(SEALED_TESTS))?;
 

@@ -51,17 +51,6 @@ const COMMANDS: [(&str, u32); 9] = [
     ("signature", 512),
     ("streams", 1024),
 ];
-/// The target that needs the feature for sealed images.
-const SEALED: &str = "sealed_stream";
-/// The features of a target.
-fn features(target: &str) -> &'static str {
-    if target == SEALED {
-        "sealed"
-    } else {
-        ""
-    }
-}
-
 /// The longest input of a target whose bytes are commands.
 fn longest_commands(target: &str) -> Option<u32> {
     COMMANDS.iter().find(|(name, _)| *name == target).map(|(_, longest)| *longest)
@@ -71,14 +60,9 @@ fn longest_commands(target: &str) -> Option<u32> {
 fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
     let programs = target_dir().join("replay");
     // Building takes longer than running: without optimisation, and without what a debugger needs.
-    let build = || {
-        let mut build = process::cargo_on(folder, "build");
-        build.arg("--quiet").env("CARGO_TARGET_DIR", &programs).env("CARGO_PROFILE_DEV_DEBUG", "0");
-        build
-    };
-    process::run(build().arg("--bins"))?;
-    // Only that one: the others would be replaced by what they are with the feature.
-    process::run(build().args(["--features", features(SEALED), "--bin", SEALED]))?;
+    let mut build = process::cargo_on(folder, "build");
+    build.args(["--quiet", "--bins"]).env("CARGO_TARGET_DIR", &programs);
+    process::run(build.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     for target in targets {
         let mut program = Command::new(programs.join("debug").join(target));
         // They are unpacked anew: a name may have gone.
@@ -215,7 +199,7 @@ impl Tools {
             command.arg("--no-trace-compares");
             programs.push("without-compares");
         }
-        command.args(["--features", features(target), target]).current_dir(workspace::root());
+        command.arg(target).current_dir(workspace::root());
         command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
         command
     }
@@ -312,9 +296,7 @@ mod tests {
         assert!(targets.iter().any(|target| target == "lss"), "{targets:?}");
         for target in targets {
             let lines = format!("path = \"fuzz_targets/{target}.rs\"");
-            let declared = manifest.split("[[bin]]").find(|bin| bin.contains(&lines));
-            let declared = declared.unwrap_or_else(|| panic!("{target} is not in Cargo.toml"));
-            assert_eq!(declared.contains("required-features"), !features(&target).is_empty(), "{target}");
+            assert!(manifest.contains(&lines), "{target} is not in Cargo.toml");
         }
         for (name, _) in COMMANDS {
             assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");

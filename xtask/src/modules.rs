@@ -61,9 +61,16 @@ pub fn without_comments(text: &str) -> String {
 
 /// A source without comments, strings and tests.
 pub fn code(text: &str) -> String {
-    let text = text.split("#[cfg(test)]\nmod ").next().unwrap_or_default();
     let mut code = String::new();
-    for line in text.lines().filter(|line| !line.trim_start().starts_with("//")) {
+    let mut lines = text.lines().filter(|line| !line.trim_start().starts_with("//"));
+    while let Some(line) = lines.next() {
+        if line == "#[cfg(test)]" {
+            match lines.next() {
+                // The last item of a file; a module of tests in a file of its own is only declared.
+                Some(tests) if tests.starts_with("mod ") && tests.ends_with('{') => break,
+                _ => continue,
+            }
+        }
         // Text between quotation marks is not a path.
         code.extend(line.split('"').step_by(2));
         code.push('\n');
@@ -240,5 +247,7 @@ mod tests {
     fn comments_texts_and_tests_use_nothing() {
         let text = "//! crate::d\n// crate::d\nfn f() { \"crate::d\"; }\n#[cfg(test)]\nmod tests { use crate::d::X; }";
         assert_eq!(uses("a/b.rs", text), [""; 0]);
+        let text = "#[cfg(test)]\nmod tests;\nuse crate::d::X;\n#[cfg(test)]\nuse crate::e::Y;";
+        assert_eq!(uses("a/b.rs", text), ["d"]);
     }
 }

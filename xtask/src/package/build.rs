@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
-use super::{notices, Release, LINUX};
+use super::notices;
+use super::release::{Release, LINUX};
 use crate::{files, process, setup, workspace, Outcome};
 
 /// Cargo's profile of the released programs.

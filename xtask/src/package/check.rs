@@ -10,7 +10,8 @@ use object::read::elf::{ElfFile64, ProgramHeader as _};
 use object::read::pe::PeFile64;
 use object::{Architecture, LittleEndian, Object as _};
 
-use super::{build, package_crates, Release, LINUX, SUMS, VERSION};
+use super::build;
+use super::release::{package_crates, Release, LINUX, SUMS, VERSION};
 use crate::{files, process, setup, workspace, Outcome};
 
 /// Checks the sums, with the program that users have for it.

@@ -3,7 +3,8 @@
 
 use std::process::Command;
 
-use super::{build, Release, LINUX, VERSION};
+use super::build;
+use super::release::{Release, LINUX, VERSION};
 use crate::{files, process, setup, workspace, Outcome};
 
 /// The version of cargo-deb that the job installs.

@@ -5,17 +5,18 @@ mod build;
 mod check;
 mod deb;
 mod notices;
+mod release;
 #[cfg(test)]
 mod workflow;
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::Command;
 
 use sha2::{Digest, Sha256};
 
+use self::release::{package_crates, Release, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
-use crate::process::list;
 use crate::{files, process, sbom, setup, toolchain, workspace, Outcome};
 
 pub const HELP: &str = "\
@@ -39,12 +40,6 @@ SHA256SUMS has the sums of all files in target/dist.
   --draft   a trial: also packs a tree with changes that are not committed (the source archive is without them),
             or a commit without the tag of its version, and by another Rust than a release has
 ";
-
-/// Linux; the program does not need a C library of the system.
-const LINUX: &str = "x86_64-unknown-linux-musl";
-const WINDOWS: &str = "x86_64-pc-windows-gnu";
-/// The version; all members of the workspace have the same one.
-const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// A part of what is handed out.
 struct Part {
@@ -73,47 +68,6 @@ const PARTS: [Part; 7] = [
     part("sbom", bills, |_, _| Ok(())),
     part("crates", crates, check::crates),
 ];
-
-/// The folders of a release, and the time of its files.
-struct Release {
-    /// The folder of the release files.
-    dist: PathBuf,
-    /// Cargo's folder for the release, and intermediate files.
-    build: PathBuf,
-    /// The time of the commit, in seconds since 1970: all files in archives have this time.
-    epoch: String,
-    draft: bool,
-}
-
-impl Release {
-    fn file(&self, suffix: &str) -> PathBuf {
-        self.dist.join(format!("coflash-{VERSION}{suffix}"))
-    }
-
-    fn source(&self) -> PathBuf {
-        self.dist.join(format!("coboot-{VERSION}.tar.gz"))
-    }
-
-    fn linux(&self) -> PathBuf {
-        self.file("-x86_64-linux.tar.gz")
-    }
-
-    fn deb(&self) -> PathBuf {
-        self.dist.join(format!("coflash_{VERSION}_amd64.deb"))
-    }
-
-    fn windows(&self) -> PathBuf {
-        self.file("-x86_64-windows.exe")
-    }
-
-    /// An empty folder with this name among the intermediate files.
-    fn empty(&self, name: &str) -> Outcome<PathBuf> {
-        let folder = self.build.join(name);
-        files::remove(&folder)?;
-        files::make(&folder)?;
-        Ok(folder)
-    }
-}
 
 pub fn run(mut args: Args) -> Outcome {
     let checked = args.flag("--check");
@@ -243,21 +197,6 @@ fn crates(release: &Release) -> Outcome {
     process::run(package_crates(release)?.arg("--no-verify"))
 }
 
-/// `cargo package` of all crates that may be published. One call does all, since they depend on
-/// each other and none is in the registry yet.
-fn package_crates(release: &Release) -> Outcome<Command> {
-    let mut command = process::cargo("package");
-    command.args(["--locked", "--target-dir"]).arg(&release.build);
-    // The packages without `publish = false`.
-    let metadata = process::metadata()?;
-    let published = list(&metadata, "packages").filter(|package| package["publish"].is_null());
-    command.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
-    if release.draft {
-        command.arg("--allow-dirty");
-    }
-    Ok(command)
-}
-
 /// Writes SHA256SUMS in the form for `sha256sum --check`.
 fn sums(dist: &Path) -> Outcome {
     let mut text = String::new();
@@ -270,8 +209,6 @@ fn sums(dist: &Path) -> Outcome {
     }
     files::write(&dist.join(SUMS), text)
 }
-
-const SUMS: &str = "SHA256SUMS";
 
 fn git(words: &[&str]) -> Outcome<String> {
     process::git(words).map_err(|problem| {

@@ -1,0 +1,72 @@
+//! What a release is made of: its folders, its files and its crates.
+
+use std::path::PathBuf;
+use std::process::Command;
+
+use crate::process::list;
+use crate::{files, process, Outcome};
+
+/// Linux; the program does not need a C library of the system.
+pub const LINUX: &str = "x86_64-unknown-linux-musl";
+pub const WINDOWS: &str = "x86_64-pc-windows-gnu";
+/// The version; all members of the workspace have the same one.
+pub const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The file with the sums of all others.
+pub const SUMS: &str = "SHA256SUMS";
+
+/// The folders of a release, and the time of its files.
+pub struct Release {
+    /// The folder of the release files.
+    pub dist: PathBuf,
+    /// Cargo's folder for the release, and intermediate files.
+    pub build: PathBuf,
+    /// The time of the commit, in seconds since 1970: all files in archives have this time.
+    pub epoch: String,
+    pub draft: bool,
+}
+
+impl Release {
+    pub fn file(&self, suffix: &str) -> PathBuf {
+        self.dist.join(format!("coflash-{VERSION}{suffix}"))
+    }
+
+    pub fn source(&self) -> PathBuf {
+        self.dist.join(format!("coboot-{VERSION}.tar.gz"))
+    }
+
+    pub fn linux(&self) -> PathBuf {
+        self.file("-x86_64-linux.tar.gz")
+    }
+
+    pub fn deb(&self) -> PathBuf {
+        self.dist.join(format!("coflash_{VERSION}_amd64.deb"))
+    }
+
+    pub fn windows(&self) -> PathBuf {
+        self.file("-x86_64-windows.exe")
+    }
+
+    /// An empty folder with this name among the intermediate files.
+    pub fn empty(&self, name: &str) -> Outcome<PathBuf> {
+        let folder = self.build.join(name);
+        files::remove(&folder)?;
+        files::make(&folder)?;
+        Ok(folder)
+    }
+}
+
+/// `cargo package` of all crates that may be published. One call does all, since they depend on
+/// each other and none is in the registry yet.
+pub fn package_crates(release: &Release) -> Outcome<Command> {
+    let mut command = process::cargo("package");
+    command.args(["--locked", "--target-dir"]).arg(&release.build);
+    // The packages without `publish = false`.
+    let metadata = process::metadata()?;
+    let published = list(&metadata, "packages").filter(|package| package["publish"].is_null());
+    command.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
+    if release.draft {
+        command.arg("--allow-dirty");
+    }
+    Ok(command)
+}
