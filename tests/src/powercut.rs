@@ -18,5 +18,5 @@ mod points;
 mod scenario;
 
 pub use device::{Bug, DECISION};
-pub use points::{reproduce, run, shows, Point, Report, Shown};
+pub use points::{reproduce, run, shows, Cuts, Point, Report, Shown};
 pub use scenario::{Scenario, SCENARIOS};

@@ -1,18 +1,16 @@
 //! Proof by power cut, and the proof of the proof.
 
-use coboot_tests::powercut::{reproduce, run, shows, Bug, Point, Scenario, Shown, SCENARIOS};
+use coboot_tests::powercut::{reproduce, run, shows, Bug, Cuts, Point, Scenario, Shown, SCENARIOS};
 
 fn scenario(name: &str) -> &'static Scenario {
     SCENARIOS.iter().find(|scenario| scenario.name == name).expect("a scenario of this name")
 }
 
-/// Level 1: `boot-core` on the flash model; every operation, every way, and every operation of the
-/// recovery.
-#[test]
-fn no_cut_bricks_the_device_or_starts_half_a_program() {
+/// Level 1, `boot-core` on the flash model: these cuts in each scenario. Returns the number of points.
+fn prove(cuts: Cuts) -> u64 {
     let mut points = 0;
     for scenario in SCENARIOS {
-        let report = run(scenario, false).expect("it works without a cut");
+        let report = run(scenario, cuts).expect("it works without a cut");
         println!(
             "{}: {} operations, {} points, {:?}",
             scenario.name, report.operations, report.points, report.outcomes
@@ -21,6 +19,19 @@ fn no_cut_bricks_the_device_or_starts_half_a_program() {
         assert_eq!(report.violations, 0, "{}:\n{}", scenario.name, told.join("\n"));
         points += report.points;
     }
+    points
+}
+
+#[test]
+fn no_cut_of_the_sample_bricks_the_device_or_starts_half_a_program() {
+    let points = prove(Cuts::Sample(20));
+    assert!(points > 4_000, "{points}");
+}
+
+/// Every operation, every way, and every operation of the recovery.
+#[test]
+fn no_cut_bricks_the_device_or_starts_half_a_program() {
+    let points = prove(Cuts::EveryOperation);
     assert!(points > 20_000, "{points}");
 }
 
@@ -51,7 +62,7 @@ fn a_cut_shows_every_seeded_bug_where_it_should() {
 #[test]
 fn a_program_for_another_product_costs_nothing() {
     let scenario = scenario("wrong-product");
-    assert_eq!(run(scenario, false).expect("it works without a cut").operations, 0);
+    assert_eq!(run(scenario, Cuts::EveryOperation).expect("it works without a cut").operations, 0);
     let shown = shows(scenario, Bug::EraseBeforeCheck);
     assert!(matches!(shown, Shown::Uncut(_)), "{shown:?}");
 }

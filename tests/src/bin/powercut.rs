@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use std::str::FromStr;
 
 use coboot_tests::powercut::board::{self, Effort};
-use coboot_tests::powercut::{reproduce, run, Point, Report, SCENARIOS};
+use coboot_tests::powercut::{reproduce, run, Cuts, Point, Report, SCENARIOS};
 
 /// A point of one of the levels.
 enum AnyPoint {
@@ -108,8 +108,9 @@ fn main() -> ExitCode {
         if !wish.json {
             println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
         }
+        let cuts = if wish.every_way { Cuts::EveryWay } else { Cuts::EveryOperation };
         for scenario in SCENARIOS {
-            match run(scenario, wish.every_way) {
+            match run(scenario, cuts) {
                 Ok(report) => sum.add(1, scenario.name, &report, wish.json),
                 Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
             }

@@ -11,6 +11,7 @@ use super::device::{Bug, Device, Outcome};
 use super::point::{self, At};
 use super::scenario::{Allowed, Scenario, Tell, SCENARIOS};
 use kit::model::{until_power_cut, Cut};
+use kit::random::Random;
 
 /// The number of violations that a report describes.
 pub(super) const TOLD: usize = 10;
@@ -26,6 +27,27 @@ const KINDS: [(&str, Cut); 6] = [
     ("unstable", Cut::Unstable(10)),
     ("all-but-one-bit", Cut::Unstable(9)),
 ];
+
+/// How much of a scenario is cut.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Cuts {
+    /// One operation in four, drawn by this seed, in every way; and every operation of the recovery,
+    /// in one way that changes from operation to operation.
+    Sample(u64),
+    /// The same for every operation.
+    EveryOperation,
+    /// Every operation of both in every way.
+    EveryWay,
+}
+
+impl Cuts {
+    fn has(self, operation: u32) -> bool {
+        match self {
+            Self::Sample(seed) => Random(seed ^ u64::from(operation)).chance(25),
+            Self::EveryOperation | Self::EveryWay => true,
+        }
+    }
+}
 
 /// A point of the proof: a scenario, a cut, and possibly another one in the recovery. Written as
 /// `update:37:torn` or `update:37:torn:12:after`; operations are counted from the power-on.
@@ -199,8 +221,11 @@ fn completes(scenario: &Scenario, device: &Device, from: &Allowed) -> Result<(Ou
 }
 
 /// All points whose first cut is at this operation.
-fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind: bool) -> Report {
+fn at_operation(scenario: &Scenario, device: &Device, operation: u32, cuts: Cuts) -> Report {
     let mut report = Report::default();
+    if !cuts.has(operation) {
+        return report;
+    }
     let Ok(start) = exactly(device) else { return report };
     for kind in 0..KINDS.len() {
         let first = At { operation, kind };
@@ -216,7 +241,7 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
         let Ok((_, operations)) = recovery else { continue };
         for operation in 1..=operations {
             let turn = (first.operation + operation) as usize % KINDS.len();
-            for kind in (0..KINDS.len()).filter(|kind| every_kind || *kind == turn) {
+            for kind in (0..KINDS.len()).filter(|kind| cuts == Cuts::EveryWay || *kind == turn) {
                 let second = At { operation, kind };
                 let mut device = device.clone();
                 let run =
@@ -231,14 +256,12 @@ fn at_operation(scenario: &Scenario, device: &Device, operation: u32, every_kind
     report
 }
 
-/// Cuts the power at every operation of a scenario, in every way, and at every operation of the
-/// recovery; there in one way that changes from operation to operation, or in every way with
-/// `every_kind`.
+/// Cuts the power at operations of a scenario, and of the recovery.
 ///
 /// # Errors
 /// If the scenario fails without a cut.
-pub fn run(scenario: &Scenario, every_kind: bool) -> Result<Report, String> {
-    run_until(scenario, None, every_kind, u64::MAX)
+pub fn run(scenario: &Scenario, cuts: Cuts) -> Result<Report, String> {
+    run_until(scenario, None, cuts, u64::MAX)
 }
 
 /// How a bug shows in a scenario.
@@ -255,7 +278,7 @@ pub enum Shown {
 /// How a bug shows in this scenario. Stops at the first violation.
 #[must_use]
 pub fn shows(scenario: &Scenario, bug: Bug) -> Shown {
-    match run_until(scenario, Some(bug), false, 1) {
+    match run_until(scenario, Some(bug), Cuts::EveryOperation, 1) {
         Err(what) => Shown::Uncut(what),
         Ok(report) => match report.told.into_iter().next() {
             Some((point, what)) => Shown::ByCut(point, what),
@@ -264,12 +287,7 @@ pub fn shows(scenario: &Scenario, bug: Bug) -> Shown {
     }
 }
 
-fn run_until(
-    scenario: &Scenario,
-    bug: Option<Bug>,
-    every_kind: bool,
-    violations: u64,
-) -> Result<Report, String> {
+fn run_until(scenario: &Scenario, bug: Option<Bug>, cuts: Cuts, violations: u64) -> Result<Report, String> {
     let device = scenario.device(bug);
     let start = exactly(&device)?;
     let mut through = device.clone();
@@ -295,7 +313,7 @@ fn run_until(
                     break;
                 }
                 let report =
-                    catch_unwind(AssertUnwindSafe(|| at_operation(scenario, &device, operation, every_kind)))
+                    catch_unwind(AssertUnwindSafe(|| at_operation(scenario, &device, operation, cuts)))
                         .unwrap_or_else(|_| {
                             let first = At { operation, kind: 0 };
                             let point = Point { scenario: scenario.name, first, second: None };

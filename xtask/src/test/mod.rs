@@ -225,9 +225,11 @@ fn test_programs() -> Outcome<Vec<Program>> {
     programs::build(&[&build::board_args(DEFAULT)[..], &on_host()].concat())
 }
 
-/// The test programs that run the firmware of a board.
-fn board_programs(board: &Layout) -> Outcome<Vec<Program>> {
-    let tests = ["device", "update", "sealed", "foreign", "port"].map(|name| format!("--test={name}"));
+/// The test programs that run the firmware of a board, up to a tier.
+fn board_programs(board: &Layout, tier: Tier) -> Outcome<Vec<Program>> {
+    let all = ["device", "update", "sealed", "foreign", "port"].into_iter();
+    let tests = all.filter(|name| tier == Tier::All || OF_EACH_CHIP.iter().any(|(of, _)| of == name));
+    let tests: Vec<_> = tests.map(|name| format!("--test={name}")).collect();
     programs::build(&[&build::board_args(board)[..], &on_host(), &tests].concat())
 }
 
@@ -350,7 +352,7 @@ fn on_board(
     if tier == Tier::All {
         build::boards(&[(board, &[])])?;
     }
-    let programs = board_programs(board)?;
+    let programs = board_programs(board, tier)?;
     let mut jobs = Vec::new();
     let is_of = |program: &str, test: &str, row: &(&str, &str)| program == row.0 && test.starts_with(row.1);
     let has = |program: &str, test: &str| {
