@@ -90,13 +90,12 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
         log_event(setup.serial_number, event);
         devices.push((setup.serial_number, device));
     }
-    let mut more = true;
+    // The first pass is the boot-up: a request that is there already is answered after it.
+    let mut frame = None;
     loop {
-        // The nodes are slaves: the frames of one node do not concern the others.
-        let frame = bus.receive(if more { Duration::ZERO } else { TICK })?;
         // Wraps after 49 days, as on the chip.
         let now = Instant::from_millis(bus.now().as_millis() as u32);
-        more = frame.is_some();
+        let mut more = frame.is_some();
         for (serial, device) in &mut devices {
             if let Some(frame) = &frame {
                 device.handle(frame, now);
@@ -112,6 +111,8 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
                 .map_err(|error| format!("the file of serial number {serial} cannot be written: {error}"))?;
             sent?;
         }
+        // The nodes are slaves: the frames of one node do not concern the others.
+        frame = bus.receive(if more { Duration::ZERO } else { TICK })?;
     }
 }
 
