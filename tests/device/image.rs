@@ -378,6 +378,26 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
     assert!(parameters(&bench) == before);
 }
 
+/// A product in which no program starts by itself: with the image it stays in the bootloader, and
+/// without it the program is better than nothing.
+#[test]
+fn without_autostart_the_program_runs_beside_a_damaged_image() {
+    let least = Parts::of(firmware::BOOTLOADER_LEAST);
+    let mut bench = board_with_a_program();
+    load(&mut bench, &least);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(bench.is_bootloader(NODE));
+    bench.power_off();
+    let mut damaged = least;
+    damaged.image[0] ^= 1;
+    load(&mut bench, &damaged);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(!bench.is_bootloader(NODE));
+    assert_eq!(cell(&bench), Some((DAMAGED, BY_HEADER)));
+}
+
 /// Without a program nothing can run: the chip resets again and again, which is visible at its NRST
 /// pin, and the cell contains the reason.
 #[test]

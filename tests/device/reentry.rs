@@ -183,6 +183,12 @@ fn node_id_and_bit_rate_are_shared() {
         store_by_lss(&mut bench, 9, Some(BitRate::K250));
         bench.set_host_bit_rate(250_000);
         bench.await_program_of(9, 1000);
+        if bootloader == firmware::BOOTLOADER_LEAST {
+            // No program starts by itself.
+            assert!(bench.is_bootloader(9));
+            bench.session_with(9).command(1, ProgramControl::Start).unwrap();
+            bench.await_boot_up_of(9, 1000);
+        }
         assert!(!bench.is_bootloader(9));
         bench.session_with(9).command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up_of(9, 1000);

@@ -24,12 +24,14 @@ use crate::{ram_image, storing};
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
 /// the warm-start cell in this time.
 const RESET_PERIOD_MS: u32 = 100;
+/// Programs of the layout.
+const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
 
 /// Decides between a program and the bootloader, and starts it: a program in flash, or the RAM image
 /// with a report ([`BootReport`]) of what is left for it.
 ///
-/// A damaged RAM image does not run. The warm-start cell records the damage, and the program with
-/// autostart starts. If there is none, the chip resets again and again.
+/// A damaged RAM image does not run. The warm-start cell records the damage, and a program starts:
+/// the one with autostart, or the next that may. If there is none, the chip resets again and again.
 ///
 /// # Safety
 /// Nothing else may run yet.
@@ -65,12 +67,18 @@ pub unsafe extern "C" fn stage() -> ! {
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    // If the RAM image is damaged, the program with autostart is resumed at once: a rescue window
-    // would need the RAM image, and so would the entry strap.
+    // If the RAM image is damaged, there is no bootloader to stay in: neither for the entry strap nor
+    // for a rescue window. Then the program with autostart is resumed at once, or the next that may
+    // start.
     let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
-    for is_damaged in [false, true] {
+    for turn in 0..=PROGRAMS {
+        let is_damaged = turn > 0;
         if is_damaged {
-            circumstances.request = PRODUCT.autostart.map(BootRequest::Resume);
+            let number = (PRODUCT.autostart.unwrap_or(1) + turn - 2) % PROGRAMS + 1;
+            if PRODUCT.profile.download.data == Some(number) {
+                continue;
+            }
+            circumstances.request = Some(BootRequest::Resume(number));
             circumstances.strap = false;
         }
         let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
@@ -102,6 +110,9 @@ pub unsafe extern "C" fn stage() -> ! {
                 handoff.write(LAYOUT.handoff.base as *mut Handoff);
                 program.vectors().jump()
             }
+        }
+        if is_damaged {
+            continue;
         }
         // SAFETY: only the stack uses the RAM.
         match unsafe { ram_image::load(&flash) } {
