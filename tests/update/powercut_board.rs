@@ -1,13 +1,13 @@
 //! Proof by power cut, level 2: the built firmware on the emulated chip.
 
 use coboot_tests::firmware;
-use coboot_tests::powercut::board::{operations, prove, run, Effort, Point, SCENARIOS};
+use coboot_tests::powercut::board::{operations, prove, run, scenarios, Effort, Point};
 use emulator::machine::Operation;
 
 #[test]
 fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
     let mut states = 0;
-    for scenario in SCENARIOS {
+    for scenario in scenarios() {
         let report = run(scenario, Effort::SAMPLE).expect("it works without a cut");
         println!("{}: {report:?}", scenario.name);
         let told: Vec<_> = report.told.iter().map(|(point, what)| format!("{point}: {what}")).collect();
@@ -25,7 +25,7 @@ fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
 /// The operations of an update in another order, as a bootloader with a bug would have them.
 #[test]
 fn a_cut_shows_an_order_of_operations_that_is_wrong() {
-    let scenario = SCENARIOS.iter().find(|scenario| scenario.name == "update").unwrap();
+    let scenario = scenarios().find(|scenario| scenario.name == "update").unwrap();
     let story = scenario.story().unwrap();
     let sound = operations(&story).unwrap();
     let parameters = firmware::board().parameters;

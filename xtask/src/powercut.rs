@@ -79,7 +79,8 @@ const IMAGES: [&str; 4] = ["bootloader", "bootloader-sealed", "app-v1", "app-v2"
 
 /// The program that cuts the power on a board, after its images were built.
 fn command(board: &Layout, arguments: &[&str]) -> Outcome<Command> {
-    build::images(board, &IMAGES)?;
+    let has = |name: &&str| build::Variant::of(board).any(|variant| variant.name == *name);
+    build::images(board, &IMAGES.into_iter().filter(has).collect::<Vec<_>>())?;
     let mut powercut = build::tests_program(board, "powercut");
     powercut.args(arguments);
     Ok(powercut)

@@ -122,7 +122,7 @@ fn main() -> ExitCode {
             coboot_tests::firmware::board().board
         );
     }
-    for scenario in board::SCENARIOS {
+    for scenario in board::scenarios() {
         // Every operation once; the other scenarios share most of them.
         let effort = match (wish.full && scenario.name == "update", wish.full || wish.twentieth) {
             (true, _) => Effort::FULL,

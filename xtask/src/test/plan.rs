@@ -110,11 +110,15 @@ pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("update", "conform::"),
 ];
 
-/// Tests of images that only a board with the split map has: sealed, with a log, with the debugger.
+/// Tests of images that only a board with the split map has: sealed, with a log, with the debugger,
+/// with CAN over UART.
 pub const SPLIT_ALONE: &[(&str, &str)] = &[
     ("device", "debugger::"),
     ("device", "image::a_ram_image_runs_on_the_resident_part_of_another_bootloader"),
     ("device", "log::"),
+    ("device", "virtual_can::"),
+    ("update", "attacker::"),
+    ("port", "matrix::"),
     ("foreign", "gdb_door::"),
     ("sealed", ""),
 ];

@@ -27,7 +27,8 @@ use crate::bench::Bench;
 use crate::firmware;
 use look::{look, observe};
 use story::BOOT_MS;
-pub use story::{Outcome, Scenario, Seen, Story, SCENARIOS};
+use story::SCENARIOS;
+pub use story::{scenarios, Outcome, Scenario, Seen, Story};
 
 mod look;
 pub mod story;
@@ -270,7 +271,7 @@ impl Proof<'_> {
 /// # Errors
 /// If the scenario fails without a cut.
 pub fn run(scenario: &Scenario, effort: Effort) -> Result<Report<Point>, String> {
-    let effort = if scenario.is_slow { effort.slow() } else { effort };
+    let effort = if scenario.is_sealed { effort.slow() } else { effort };
     let story = scenario.story()?;
     Ok(prove(scenario.name, &story, &operations(&story)?, effort))
 }

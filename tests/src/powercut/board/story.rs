@@ -101,8 +101,9 @@ pub struct Scenario {
     pub name: &'static str,
     /// What happens, in words.
     pub about: &'static str,
-    /// Whether a look takes ten times as long: a sealed device computes with its keys at each start.
-    pub is_slow: bool,
+    /// Whether the device is sealed. A look then takes ten times as long: such a device computes with
+    /// its keys at each start.
+    pub is_sealed: bool,
     prepare: fn() -> Result<Story, String>,
 }
 
@@ -116,61 +117,67 @@ impl Scenario {
     }
 }
 
+/// The scenarios of the tested board.
+pub fn scenarios() -> impl Iterator<Item = &'static Scenario> {
+    let has_sealed = firmware::board().home.is_some();
+    SCENARIOS.iter().filter(move |scenario| has_sealed || !scenario.is_sealed)
+}
+
 /// All of them.
-pub const SCENARIOS: &[Scenario] = &[
+pub(super) const SCENARIOS: &[Scenario] = &[
     Scenario {
         name: "update",
         about: "version 2 in blocks, while version 1 runs",
-        is_slow: false,
+        is_sealed: false,
         prepare: || update(|bench| write(bench, &options())),
     },
     Scenario {
         name: "raw",
         about: "the same in one download of a binary image",
-        is_slow: false,
+        is_sealed: false,
         prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Raw)))),
     },
     Scenario {
         name: "hex",
         about: "the same in one download of Intel HEX",
-        is_slow: false,
+        is_sealed: false,
         prepare: || update(|bench| write(bench, &options().dialect(Some(Dialect::Hex)))),
     },
     Scenario {
         name: "group",
         about: "the same in blocks of 4 KiB, as a group of devices gets them",
-        is_slow: false,
+        is_sealed: false,
         prepare: || update(|bench| write_file(bench, &firmware::large_blocks(firmware::APP_V2), &options())),
     },
     Scenario {
         name: "resume",
         about: "the same in blocks, after half of them have arrived",
-        is_slow: false,
+        is_sealed: false,
         prepare: resume,
     },
     Scenario {
         name: "confirm",
         about: "version 2 runs and was never confirmed; it is called back, and started again",
-        is_slow: false,
+        is_sealed: false,
         prepare: confirm,
     },
     Scenario {
         name: "store",
         about: "another node-ID is stored by layer setting services, while version 1 runs",
-        is_slow: false,
+        is_sealed: false,
         prepare: store,
     },
     Scenario {
         name: "sealed",
         about: "version 2 as a sealed image with a higher security counter, while version 1 runs",
-        is_slow: true,
+        is_sealed: true,
         prepare: || sealed(false),
     },
-    Scenario { name: "compressed", about: "the same, compressed", is_slow: true, prepare: || sealed(true) },
+    Scenario { name: "compressed", about: "the same, compressed", is_sealed: true, prepare: || sealed(true) },
     Scenario {
         name: "counter",
         about: "version 2 once more, with a certificate of a higher epoch, while it runs",
-        is_slow: true,
+        is_sealed: true,
         prepare: counter,
     },
 ];
