@@ -69,8 +69,12 @@ pub const LATER: &[Later] = &[
 
 /// Test modules that take longest, the slowest first: they begin first, so that no core waits for
 /// one of them at the end.
-pub const SLOW: &str = "powercut fleet powercut_board streams application ui device conform resume refusals \
-                        program_control attacker throughput clients";
+pub const SLOW: &str =
+    "powercut fleet powercut_board streams application ui device conform cli resume blocks \
+                        commands nodes refusals clients client model program_control attacker throughput";
+
+/// Test programs that mostly wait: their tests start programs that talk to each other in real time.
+pub const WAITING: [&str; 2] = ["coboot-node/it", "coflash/it"];
 
 /// The images of a board that the tests of a tier need.
 pub struct Images {

@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{json, Value};
 
-use super::plan::SLOW;
+use super::plan::{SLOW, WAITING};
 use super::programs::Program;
 use crate::{process, Outcome};
 
@@ -116,16 +116,19 @@ pub fn count(name: &str, ended: Outcome, summary: &mut Summary) {
     summary.counts.insert(name.to_owned(), (usize::from(!failed), usize::from(failed), 0.0));
 }
 
-/// Runs jobs, as many side by side as there are cores; the slow ones begin first.
+/// Runs jobs, as many side by side as there are cores, and one more of those that mostly wait; the
+/// slow ones begin first.
 pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
     let rank = |job: &Job| {
         let module = job.tests.first().and_then(|test| test.split("::").next());
         SLOW.split(' ').position(|slow| Some(slow) == module).unwrap_or(usize::MAX)
     };
     jobs.sort_by_key(|job| std::cmp::Reverse(rank(job)));
-    let (queue, shared) = (Mutex::new(jobs), Mutex::new(summary));
-    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop();
-    let work = || {
+    let (waiting, computing): (Vec<_>, Vec<_>) =
+        jobs.into_iter().partition(|job| WAITING.contains(&job.program.name.as_str()));
+    let (waiting, computing, shared) = (Mutex::new(waiting), Mutex::new(computing), Mutex::new(summary));
+    let work = |queue: &Mutex<Vec<Job>>| {
+        let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop();
         while let Some(job) = next() {
             let ran = job.run();
             job.report(&ran);
@@ -133,8 +136,9 @@ pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
         }
     };
     thread::scope(|scope| {
+        scope.spawn(|| work(&waiting));
         for _ in 0..thread::available_parallelism().map_or(2, usize::from) {
-            scope.spawn(work);
+            scope.spawn(|| work(&computing));
         }
     });
 }
