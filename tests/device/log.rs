@@ -10,8 +10,9 @@ use emulator::peripheral::Peripheral;
 use object::{Object, ObjectSection, ObjectSymbol};
 
 /// The images with a log, and the reader of each.
-fn ways() -> [(&'static str, Listener); 3] {
+fn ways() -> [(&'static str, Listener); 4] {
     [
+        (firmware::BOOTLOADER_SEALED_LOG_RTT, Listener::probe()),
         (firmware::BOOTLOADER_LOG_RTT, Listener::probe()),
         (firmware::BOOTLOADER_LOG_DEFMT, Listener::probe_of(firmware::BOOTLOADER_LOG_DEFMT)),
         (firmware::BOOTLOADER_LOG_UART, Listener::terminal()),
@@ -150,6 +151,7 @@ fn a_release_has_nothing_of_it() {
         (symbol, frames, words)
     };
     assert_eq!(has(firmware::BOOTLOADER_LOG_RTT), (true, false, true));
+    assert_eq!(has(firmware::BOOTLOADER_SEALED_LOG_RTT), (true, false, true));
     assert_eq!(has(firmware::BOOTLOADER_LOG_UART), (false, false, true));
     assert_eq!(has(firmware::BOOTLOADER_LOG_DEFMT), (true, true, true));
     for image in [firmware::BOOTLOADER, firmware::BOOTLOADER_PAULUS, firmware::BOOTLOADER_LEAST] {

@@ -10,10 +10,12 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::listener::Listener;
 use coboot_tests::sealed_board::{
-    board, key, open_board, release, root, sealer, status, write, COUNTER, KEKS,
+    board, board_of, key, keys, open_board, release, root, sealer, status, write, COUNTER, KEKS,
 };
 use coflash::device::access::{ask, challenge, events};
+use coflash::device::debugger::Debugger;
 use coflash::device::{Doing, Transfers};
 use coflash::file::sealed::{Kek, Sealer, SigningKey};
 use seal::access::{event, right};
@@ -107,6 +109,30 @@ fn sealed_programs_are_taken_and_started() {
         }
     }
     bench.assert_nothing_unmodelled();
+}
+
+/// With a log and with the debugger interface, which a developer needs in a sealed device as in any
+/// other: an update is logged; the keys can be read, as in each image with the debugger.
+#[test]
+fn a_sealed_device_can_be_looked_into_during_development() {
+    let file = seal(&sealer(COUNTER), firmware::APP_V1);
+    let mut listener = Listener::probe();
+    let mut bench = board_of(firmware::BOOTLOADER_SEALED_LOG_RTT);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    let lines = listener.told(&mut bench);
+    assert!(lines.iter().any(|line| line == "1F51h; program and command 00000103"), "{lines:?}");
+    start(&mut bench, firmware::APP_V1, "1.0.0");
+
+    let mut bench = board_of(firmware::BOOTLOADER_SEALED_DEBUGGER);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+    let place = firmware::board().key_block().base;
+    let read = Debugger::new(&mut bench.session()).read(place, 256, &mut |_| {}).unwrap();
+    assert_eq!(read, keys());
+    start(&mut bench, firmware::APP_V1, "1.0.0");
 }
 
 /// An invalid image is refused with the code of the reason, and has no other effect: the flash of

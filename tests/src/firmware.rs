@@ -36,6 +36,10 @@ pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
 /// The bootloader that accepts sealed images, and only these after it has keys.
 pub const BOOTLOADER_SEALED: &str = "bootloader-sealed.elf";
+/// The same with a text log for a debug probe, and with the debugger interface.
+pub const BOOTLOADER_SEALED_LOG_RTT: &str = "bootloader-sealed-log-rtt.elf";
+/// See [`BOOTLOADER_SEALED_LOG_RTT`].
+pub const BOOTLOADER_SEALED_DEBUGGER: &str = "bootloader-sealed-debugger.elf";
 /// The bootloader with the debugger interface, which no product has.
 pub const BOOTLOADER_DEBUGGER: &str = "bootloader-debugger.elf";
 /// The bootloader with CAN over the board's UART.

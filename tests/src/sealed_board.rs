@@ -105,7 +105,16 @@ pub fn sealer_of_epoch(counter: u32, epoch: u32) -> Sealer<'static> {
 /// If the firmware was not built.
 #[must_use]
 pub fn board() -> Bench {
-    let mut bench = open_board();
+    board_of(firmware::BOOTLOADER_SEALED)
+}
+
+/// The same with another bootloader that takes sealed images.
+///
+/// # Panics
+/// If the firmware was not built.
+#[must_use]
+pub fn board_of(bootloader: &str) -> Bench {
+    let mut bench = Bench::of_image(bootloader);
     provision(&mut bench);
     bench
 }

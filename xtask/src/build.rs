@@ -73,8 +73,10 @@ pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader-virtual-can", "virtual-can"),
     // It accepts programs only from the holder of a key.
     bootloader("bootloader-sealed", "sealed"),
+    bootloader("bootloader-sealed-log-rtt", "sealed,log-rtt"),
     // With the debugger interface, only for the tests: never ship it.
     bootloader("bootloader-debugger", "debugger"),
+    bootloader("bootloader-sealed-debugger", "sealed,debugger"),
     application("app-debugger", "test-app", "debugger"),
     // The unchanged template, in two versions.
     application("app-v1", "app-template", ""),
@@ -128,7 +130,7 @@ impl Variant {
     /// Whether only the split map has room for it, or for the bootloader that it needs.
     fn needs_split(&self) -> bool {
         const FEATURES: [&str; 6] = ["debugger", "log-defmt", "log-rtt", "log-uart", "sealed", "virtual-can"];
-        FEATURES.contains(&self.features)
+        self.features.split(',').any(|feature| FEATURES.contains(&feature))
     }
 
     /// The product of the image.

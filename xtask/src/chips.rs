@@ -31,13 +31,8 @@ pub fn run(args: Args) -> Outcome {
     let chips: Vec<_> = chips.iter().map(|chip| chip.chip).collect();
     println!("{}", chips.join(", "));
     let mut test = process::cargo("test");
-    test.args(build::tests_args(DEFAULT)).args([
-        "--test=port",
-        "--",
-        "porting::",
-        "--ignored",
-        "--nocapture",
-    ]);
+    test.args(build::tests_args(DEFAULT));
+    test.args("--test=port -- porting:: --ignored --nocapture".split(' '));
     process::run(test.env("COBOOT_CHIPS", chips.join(",")))
 }
 

@@ -8,21 +8,24 @@ use crate::elf::Elf;
 use crate::footprint::Flash;
 use crate::product::Product;
 use crate::setup::{self, Part};
+use crate::size::{budgets, within};
 use crate::{build, files, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask pairs [--spread]
+usage: cargo xtask pairs [--spread | --board BOARD]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
-values of any two choices stand together in one of them (a covering array), and fails when one does not
-build or does not fit its flash. It prints the choices and the size of each.
+values of any two choices are together in one of them (a covering array), sealed images included, and
+fails when one does not build or is over the budget of its flash. It prints the choices and the size
+of each.
 
-  --spread   each of them for one board, the next for the next; without, each for every board
+  --spread        each of them for one board, the next for the next; without, each for every board
+  --board BOARD   all of them for this board
 ";
 
-/// The fields of a product that are varied, and their values, as the product's file writes them. The
-/// first value is the default.
-const FIELDS: [(&str, &[&str]); 34] = [
+/// The fields of a product that are varied, and their values, as the product's file writes them; and
+/// the feature [`SEALED`]. The first value is the default.
+const FIELDS: [(&str, &[&str]); 35] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Some(1)", "None"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -57,7 +60,11 @@ const FIELDS: [(&str, &[&str]); 34] = [
     ("counter_with_confirmation", &["false", "true"]),
     ("second_server", &["true", "false"]),
     ("resume", &["true", "false"]),
+    (SEALED, &["false", "true"]),
 ];
+
+/// Sealed images: a feature, and no field of a product. Boards with the compact map do not have it.
+const SEALED: &str = "sealed";
 
 /// Seven switches for the node-ID, four for the bit rate.
 const SWITCHES: &str = "NodeSource::Function(|| {
@@ -70,6 +77,8 @@ type Row = [u8; FIELDS.len()];
 
 pub fn run(mut args: Args) -> Outcome {
     let spread = args.flag("--spread");
+    let only = (!spread && args.has("--board")).then(|| workspace::board(&mut args)).transpose()?;
+    let all = only.as_ref().map_or(BOARDS, std::slice::from_ref);
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
     let rows = covering();
@@ -80,8 +89,10 @@ pub fn run(mut args: Args) -> Outcome {
         let path = folder.join(format!("pairs-{:02}.rs", number + 1));
         files::write(&path, file(row))?;
         let product = Product::of_file(&path)?;
-        let one = [BOARDS[number % BOARDS.len()]];
-        for board in if spread { &one[..] } else { BOARDS } {
+        let fits = |board: &&Layout| board.home.is_some() || !is_sealed(row);
+        let boards: Vec<&Layout> = all.iter().copied().filter(fits).collect();
+        let of_row = if spread { &boards[number % boards.len()..][..1] } else { &boards[..] };
+        for board in of_row {
             let used = size(board, row, &product)?;
             largest = largest.max(used);
             println!("    {:<24} {used:>6} bytes", board.board);
@@ -102,18 +113,27 @@ use super::*;
 pub const PRODUCT: Product = Product {
 ",
     );
-    for ((name, values), value) in FIELDS.iter().zip(row).filter(|(_, value)| **value > 0) {
+    let others = FIELDS.iter().zip(row).filter(|((name, _), value)| **value > 0 && *name != SEALED);
+    for ((name, values), value) in others {
         file += &format!("    {name}: {},\n", values[usize::from(*value)]);
     }
     file + "    ..Product::DEFAULT\n};\n"
 }
 
-/// The size in a board's flash of the bootloader of this product, in bytes; an error if it does not
-/// fit.
+/// Whether a bootloader takes sealed images.
+fn is_sealed(row: &Row) -> bool {
+    FIELDS.iter().zip(row).any(|((name, _), value)| *name == SEALED && *value > 0)
+}
+
+/// The size in a board's flash of the bootloader of this product, in bytes; an error if it is over the
+/// budget.
 fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let told = |problem: String| format!("{}, {}: {problem}", board.board, words(row));
-    let elf = build::to_look_at(board, "", product).map_err(told)?;
+    let elf = build::to_look_at(board, if is_sealed(row) { SEALED } else { "" }, product).map_err(told)?;
     let flash = Flash::of(&Elf::parse(&elf)?, &build::bootloader_flash(board)).map_err(told)?;
+    for ((_, bytes), budget) in flash.used.iter().zip(budgets(board)) {
+        within(*bytes, budget).map_err(told)?;
+    }
     Ok(flash.used.iter().map(|(_, bytes)| bytes).sum())
 }
 
@@ -124,10 +144,14 @@ fn words(row: &Row) -> String {
 }
 
 /// Whether a product may have these choices (`Product::checked`): a rescue window delays a program
-/// that starts by itself, so it needs such a program. `None` is a field without a choice yet.
+/// that starts by itself, so it needs such a program; a sealed image carries a CRC-32. `None` is a field
+/// without a choice yet.
 fn allowed(row: &[Option<u8>; FIELDS.len()]) -> bool {
-    let (autostart_off, window, window_confirmed) = (row[1] == Some(1), row[2] == Some(0), row[3] == Some(1));
-    !(autostart_off && (window || window_confirmed))
+    let is = |name: &str, value: u8| {
+        FIELDS.iter().zip(row).any(|((field, _), chosen)| *field == name && *chosen == Some(value))
+    };
+    let window = is("rescue_window_ms", 0) || is("rescue_window_confirmed_ms", 1);
+    !(is("autostart", 1) && window) && !(is(SEALED, 1) && is("crc", 1))
 }
 
 /// Rows in which any two compatible values are together at least once. Each row takes a pair that
@@ -185,13 +209,13 @@ fn pairs() -> Vec<(Choice, Choice)> {
 mod tests {
     use super::*;
 
-    /// Counted by hand: 32 fields with two values, one with three, one with four.
+    /// Counted by hand: 33 fields with two values, one with three, one with four.
     #[test]
     fn every_pair_stands_in_a_row_and_no_row_contradicts_itself() {
         let rows = covering();
-        // 4 for each pair of the 32, 6 and 8 with the larger ones, 12 between these; two are not
+        // 4 for each pair of the 33, 6 and 8 with the larger ones, 12 between these; three are not
         // permitted.
-        assert_eq!(pairs().len(), 32 * 31 / 2 * 4 + 32 * 6 + 32 * 8 + 12 - 2);
+        assert_eq!(pairs().len(), 33 * 32 / 2 * 4 + 33 * 6 + 33 * 8 + 12 - 3);
         for ((a, value_a), (b, value_b)) in pairs() {
             assert!(rows.iter().any(|row| row[a] == value_a && row[b] == value_b), "{a} {b}");
         }
@@ -212,7 +236,8 @@ mod tests {
             .lines()
             .filter_map(|line| Some(line.strip_prefix("    pub ")?.split_once(':')?.0))
             .collect();
-        let mut varied: Vec<_> = FIELDS.iter().map(|(name, _)| *name).collect();
+        let mut varied: Vec<_> =
+            FIELDS.iter().map(|(name, _)| *name).filter(|name| *name != SEALED).collect();
         fields.sort_unstable();
         varied.sort_unstable();
         assert_eq!(varied, fields);

@@ -60,10 +60,8 @@ pub fn run(mut args: Args) -> Outcome {
     }
     let sum = |name: &str| boards.iter().filter_map(|board| board[name].as_u64()).sum::<u64>();
     let (states, failed) = (sum("states"), sum("violations"));
-    evidence::record(
-        "powercut",
-        json!({"full": full, "states": states, "failed": failed, "boards": boards}),
-    )?;
+    let facts = json!({"full": full, "states": states, "failed": failed, "boards": boards});
+    evidence::record("powercut", facts)?;
     problems.into_iter().next().map_or(Ok(()), Err)
 }
 

@@ -74,7 +74,7 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// The budgets of a bootloader's regions ([`build::bootloader_flash`]).
-fn budgets(board: &Layout) -> &'static [u32] {
+pub fn budgets(board: &Layout) -> &'static [u32] {
     match board.home {
         Some(_) => &[RESIDENT, RAM_IMAGE],
         None => &[COMPACT],
@@ -85,7 +85,7 @@ fn budgets(board: &Layout) -> &'static [u32] {
 ///
 /// # Errors
 /// When an image uses more than the budget.
-fn within(used: u32, budget: &u32) -> Outcome {
+pub fn within(used: u32, budget: &u32) -> Outcome {
     match used.checked_sub(*budget) {
         None | Some(0) => Ok(()),
         Some(over) => Err(format!(
