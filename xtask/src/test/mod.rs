@@ -113,8 +113,8 @@ pub fn run(mut args: Args) -> Outcome {
 
     // Before anything takes time: what is missing on this machine.
     let tier = stages.iter().map(|stage| stage.tier).max().unwrap_or(Tier::Product);
-    setup::prepare(tier.needs())?;
     room()?;
+    setup::prepare(tier.needs())?;
     let _alone = alone()?;
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
