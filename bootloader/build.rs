@@ -124,9 +124,5 @@ fn resident(package: &Path, out: &Path, layout: &Layout, product: &str) {
     assert!(status.success(), "the resident part of the bootloader does not build");
     let built = target.join(&triple).join("firmware").join("resident");
     let bytes = fs::read(&built).expect("the resident part was built");
-    // Its Reset is the second vector (PM0214 section 2.3.4).
-    let reset = bytes.get(4..8).and_then(|word| word.try_into().ok()).map(u32::from_le_bytes);
-    let reset = reset.expect("the resident part begins with its vectors");
-    println!("cargo:rustc-link-arg-bin=bootloader=--defsym=__resident_reset={reset:#x}");
     fs::write(out.join("resident.bin"), bytes).expect("OUT_DIR is writable");
 }

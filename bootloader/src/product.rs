@@ -18,10 +18,12 @@ use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
+use shared_abi::services::Facts;
 use shared_abi::warm_start::Cell;
 
-// The file of this product, as the module `chosen` (build.rs).
+// The file of this product, as the module `chosen`, and the identity of the board (build.rs).
 include!(concat!(env!("OUT_DIR"), "/product.rs"));
+include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 
 /// Whether the bootloader takes sealed images.
 pub const SEALED: bool = cfg!(feature = "sealed");
@@ -118,6 +120,10 @@ pub struct Product {
     /// Whether the security counter is raised when a program is confirmed, instead of when it is
     /// installed (feature `sealed`).
     pub counter_with_confirmation: bool,
+    /// The bytes of the resident part that was released with the product's devices, usually by
+    /// `include_bytes!`; the RAM image is then built for it. `None` for a fresh one. The choices that the
+    /// resident part decides by must be the same ([`FACTS`]).
+    pub resident: Option<&'static [u8]>,
 }
 
 impl Product {
@@ -157,6 +163,7 @@ impl Product {
         answer_to_reset_ms: 20,
         security_counter: 0,
         counter_with_confirmation: false,
+        resident: None,
     };
 
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
@@ -309,6 +316,23 @@ pub enum NodeSource {
 
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
+
+/// The choices that the resident part decides by.
+pub const FACTS: Facts = Facts {
+    size: Facts::SIZE,
+    board: BOARD_IDENTITY,
+    sealed: SEALED as u32,
+    autostart: match PRODUCT.autostart {
+        Some(number) => number as u32,
+        None => 0,
+    },
+    crc_bits: match PRODUCT.crc {
+        CrcKind::Crc32 => 32,
+        CrcKind::Crc16 => 16,
+    },
+    node_ids: *PRODUCT.node_ids.start() as u32 | (*PRODUCT.node_ids.end() as u32) << 8,
+    bit_rates: (2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()),
+};
 
 /// Version of the bootloader: major in the upper half, minor in the lower.
 pub const VERSION: u32 = 0x0000_0001;

@@ -5,10 +5,30 @@ use core::arch::global_asm;
 use bsp::{IDENTITY, LAYOUT};
 use shared_abi::boot_report::{BootReport, Words};
 use shared_abi::ram_image::{self, Header};
+use shared_abi::services::{self, Facts};
 
-include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
+use crate::product::{BOARD_IDENTITY, FACTS, PRODUCT};
 
-const BYTES: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin"));
+/// The bytes of the resident part: of the released one that the product names, or a fresh one.
+const BYTES: &[u8] = match PRODUCT.resident {
+    Some(released) => released,
+    None => include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin")),
+};
+
+// A released resident part decides by choices of its own: the image must not contradict them.
+const _: () = {
+    let table = LAYOUT.callgate() + services::OFFSET;
+    let Some((version, facts)) = Facts::of_resident(BYTES, LAYOUT.bootloader.base, table) else {
+        panic!("product: `resident` is no resident part")
+    };
+    assert!(facts.board == FACTS.board, "product: `resident` is for another board");
+    assert!(version >= ram_image::SERVICES_VERSION, "product: `resident` is older than the image needs");
+    assert!(facts.sealed == FACTS.sealed, "product: `resident` differs in the feature `sealed`");
+    assert!(facts.autostart == FACTS.autostart, "product: `resident` has another autostart");
+    assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
+    assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
+    assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other bit_rates");
+};
 
 #[repr(C, align(4))]
 struct Resident([u8; BYTES.len()]);
@@ -18,7 +38,18 @@ struct Resident([u8; BYTES.len()]);
 #[used]
 #[no_mangle]
 #[link_section = ".resident"]
-static RESIDENT: Resident = Resident(*include_bytes!(concat!(env!("OUT_DIR"), "/resident.bin")));
+static RESIDENT: Resident = {
+    let mut bytes = [0; BYTES.len()];
+    bytes.copy_from_slice(BYTES);
+    Resident(bytes)
+};
+
+// Its Reset is the second vector (PM0214 section 2.3.4), and the entry of the ELF file.
+global_asm!(
+    ".global __resident_reset",
+    ".set __resident_reset, {reset}",
+    reset = const u32::from_le_bytes([BYTES[4], BYTES[5], BYTES[6], BYTES[7]]),
+);
 
 // The header of the RAM image. The build writes the second word, the CRC, after the link. It is in
 // assembly, because the linker knows the image's size.

@@ -40,6 +40,67 @@ pub struct Services {
     /// Finds the sector that contains an address: its number, its address, its size. Returns 1 if
     /// there is one, otherwise 0.
     pub sector_at: unsafe extern "C" fn(u32, *mut [u32; 3]) -> u32,
+    /// What the resident part decides by.
+    pub facts: &'static Facts,
+}
+
+/// Choices of the product that the resident part decides by, and that a RAM image has to share. The
+/// record only grows.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Facts {
+    /// Bytes of this record.
+    pub size: u32,
+    /// The board, as in [`Header::board`](crate::ram_image::Header::board).
+    pub board: u32,
+    /// 1 if the device takes sealed images, otherwise 0.
+    pub sealed: u32,
+    /// The program that starts by itself; 0 for none.
+    pub autostart: u32,
+    /// Bits of the CRC of programs: 32 or 16.
+    pub crc_bits: u32,
+    /// The lowest node-ID with which a program starts, and in bits 8 to 15 the highest one.
+    pub node_ids: u32,
+    /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1.
+    pub bit_rates: u32,
+}
+
+impl Facts {
+    /// Its size in bytes.
+    pub const SIZE: u32 = size_of::<Self>() as u32;
+
+    /// Reads the facts from the bytes of a resident part for the chip: `base` is its address, `table`
+    /// that of its services. Returns them with the version of the services; `None` if this is no
+    /// resident part.
+    #[must_use]
+    pub const fn of_resident(bytes: &[u8], base: u32, table: u32) -> Option<(u32, Self)> {
+        /// The offset of the pointer to the facts: two words and seven pointers of four bytes.
+        const FACTS: u32 = 9 * 4;
+        let Some(version) = word(bytes, table.wrapping_sub(base)) else { return None };
+        let Some(at) = word(bytes, table.wrapping_sub(base).wrapping_add(FACTS)) else { return None };
+        let mut words = [0; Self::SIZE as usize / 4];
+        let mut number = 0;
+        while number < words.len() {
+            let offset = at.wrapping_sub(base).wrapping_add(number as u32 * 4);
+            let Some(word) = word(bytes, offset) else { return None };
+            words[number] = word;
+            number += 1;
+        }
+        let [size, board, sealed, autostart, crc_bits, node_ids, bit_rates] = words;
+        if size < Self::SIZE {
+            return None;
+        }
+        Some((version, Self { size, board, sealed, autostart, crc_bits, node_ids, bit_rates }))
+    }
+}
+
+/// The word at an offset, if it is inside.
+const fn word(bytes: &[u8], offset: u32) -> Option<u32> {
+    let Some((_, rest)) = bytes.split_at_checked(offset as usize) else { return None };
+    match rest.first_chunk() {
+        Some(word) => Some(u32::from_le_bytes(*word)),
+        None => None,
+    }
 }
 
 /// An operation of the flash in four words: [`ERASE`], and number, address and size of a sector; or
@@ -126,6 +187,8 @@ const _: () = {
     assert!(offset_of!(Services, crc32) == 8 + 4 * POINTER);
     assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
     assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
+    assert!(offset_of!(Services, facts) == 8 + 7 * POINTER);
+    assert!(offset_of!(Facts, bit_rates) == 24);
     assert!(size_of::<StoreState>() == 128);
 };
 
@@ -140,6 +203,39 @@ mod tests {
             assert_eq!(OperationResult::from_number(result as u32), result);
         }
         assert_eq!([4, u32::MAX].map(OperationResult::from_number), [Failed; 2]);
+    }
+
+    #[test]
+    fn facts_are_read_from_the_bytes_of_a_resident_part() {
+        let facts = Facts {
+            size: 32,
+            board: 0x1234_5678,
+            sealed: 1,
+            autostart: 2,
+            crc_bits: 16,
+            node_ids: 0x7F01,
+            bit_rates: 0x1FF,
+        };
+        // Its services are at 20h, version 3, and the facts at 60h; the record is longer than known.
+        let mut bytes = [0; 0x80];
+        let words = [(0x20, 3), (0x44, 0x0800_0060)].into_iter().chain(
+            [32, 0x1234_5678, 1, 2, 16, 0x7F01, 0x1FF, 9]
+                .into_iter()
+                .zip((0x60..).step_by(4))
+                .map(|(w, a)| (a, w)),
+        );
+        for (at, word) in words {
+            bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
+        }
+        let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
+        assert_eq!(read(&bytes), Some((3, facts)));
+        for (at, word) in [(0x44, 0x0800_0068_u32), (0x44, 0x0000_0060), (0x44, !0), (0x60, 24)] {
+            let mut wrong = bytes;
+            wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());
+            assert_eq!(read(&wrong), None, "{word:#x} at {at:#x}");
+        }
+        assert_eq!(read(&bytes[..0x40]), None);
+        assert_eq!(read(&[]), None);
     }
 
     #[test]

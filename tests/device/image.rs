@@ -16,6 +16,7 @@ use object::{Endianness, Object, ObjectSection, ObjectSymbol};
 use shared_abi::geometry::Region;
 use shared_abi::layout::toml::Toml;
 use shared_abi::ram_image::SERVICES_VERSION;
+use shared_abi::services::{Facts, OFFSET};
 
 /// The size of the header in bytes (shared_abi::ram_image, typed again).
 const HEADER: usize = 64;
@@ -118,6 +119,27 @@ fn the_header_says_what_was_linked() {
             Some(home) => assert_eq!(parts.home, home.base),
             None => assert_eq!(parts.home, board.bootloader.base + parts.resident.len() as u32),
         }
+    }
+}
+
+/// The resident part says what it decides by: what the products of the tests choose.
+#[test]
+fn the_resident_part_has_its_facts() {
+    let board = firmware::board();
+    let identity = crc32(Toml(board).to_string().as_bytes());
+    let facts = |image: &str| {
+        let resident = Parts::of(image).resident;
+        let (version, facts) =
+            Facts::of_resident(&resident, board.bootloader.base, board.callgate() + OFFSET).unwrap();
+        assert_eq!((version, facts.size, facts.board), (1, 28, identity), "{image}");
+        [facts.sealed, facts.autostart, facts.crc_bits, facts.node_ids, facts.bit_rates]
+    };
+    assert_eq!(facts(firmware::BOOTLOADER), [0, 1, 32, 0x7F01, 0x1FF]);
+    assert_eq!(facts(firmware::BOOTLOADER_LEAST), [0, 0, 32, 0x7F01, 0x1FF]);
+    assert_eq!(facts(firmware::BOOTLOADER_CRC_16), [0, 1, 16, 0x7F01, 0x1FF]);
+    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), [0, 1, 32, 0x6402, 0x7C]);
+    if board.home.is_some() {
+        assert_eq!(facts(firmware::BOOTLOADER_SEALED), [1, 1, 32, 0x7F01, 0x1FF]);
     }
 }
 

@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use kit::folder::Alone;
+use object::{Object, ObjectSection};
 use shared_abi::layout;
 
 const TARGET: &str = "thumbv7em-none-eabihf";
@@ -148,6 +149,48 @@ fn a_board_is_made_as_the_guide_says() {
     let told = copy.xtask(&["demo", "--board", "my-board"]);
     assert!(told.contains("An emulated my-board"), "{told}");
     assert!(told.contains("a node of my own"), "the device does not say its name:\n{told}");
+}
+
+/// A later RAM image for devices in the field: it is built for the resident part that they have.
+#[test]
+fn a_bootloader_is_built_for_a_released_resident_part() {
+    let copy = Copy::new();
+    let resident = |product: &str| {
+        let name = if product == "default" { String::new() } else { format!("-{product}") };
+        let elf = copy.target.join(format!("firmware/stm32f407g-disc1/bootloader{name}.elf"));
+        let elf = fs::read(elf).expect("it was built");
+        let file = object::File::parse(&*elf).expect("an ELF file");
+        file.section_by_name(".resident").expect("a section").data().expect("its bytes").to_vec()
+    };
+    copy.xtask(&["build", "bootloader"]);
+    let released = resident("default");
+    let products = copy.root.join("bootloader/products");
+    fs::write(products.join("released.bin"), &released).expect("it can be written");
+    // What a fresh one would contain has changed since.
+    copy.edit("bootloader/src/resident/stage.rs", "RESET_PERIOD_MS: u32 = 100", "RESET_PERIOD_MS: u32 = 50");
+    let product = |choices: &str| {
+        let text = format!(
+            "use super::*;\n\npub const PRODUCT: Product = Product {{ {choices}, ..Product::DEFAULT }};\n"
+        );
+        fs::write(products.join("later.rs"), text).expect("it can be written");
+        copy.cargo(&["run", "-q", "-p", "xtask", "--", "build", "bootloader", "--product", "later"])
+    };
+    let include = "resident: Some(include_bytes!(\"released.bin\"))";
+    let built = product(include);
+    assert!(built.status.success(), "{}", text(&built));
+    assert!(resident("later") == released);
+    for (choices, says) in [
+        ("resident: Some(&[0; 64])".to_owned(), "product: `resident` is no resident part"),
+        (format!("{include}, crc: CrcKind::Crc16"), "product: `resident` has another crc"),
+        (format!("{include}, bit_rates: 0..=7"), "product: `resident` has other bit_rates"),
+        (format!("{include}, node_ids: 1..=126"), "product: `resident` has other node_ids"),
+    ] {
+        let refused = product(&choices);
+        assert!(!refused.status.success() && text(&refused).contains(says), "{says}: {}", text(&refused));
+    }
+    let built = product("heartbeat_ms: 2000");
+    assert!(built.status.success(), "{}", text(&built));
+    assert!(resident("later") != released, "a fresh one has changed");
 }
 
 /// A board for each chip in `COBOOT_CHIPS`, from `new-board` to the update on the emulated board.

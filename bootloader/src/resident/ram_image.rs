@@ -10,8 +10,7 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
-
-include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
+use crate::product::BOARD_IDENTITY;
 
 extern "C" {
     /// The image's header: the linker script of the resident part has its address.

@@ -19,6 +19,7 @@ pub const SERVICES: Services = Services {
     crc32,
     is_blank,
     sector_at,
+    facts: &product::FACTS,
 };
 
 const _: () = assert!(
