@@ -49,6 +49,11 @@ impl FlashController {
         self.is_busy() || self.registers.cr().read().lock().bit_is_clear()
     }
 
+    /// Whether the option bytes start the watchdog at each reset (WDG_SW, section 3.6.2).
+    pub fn starts_watchdog(&self) -> bool {
+        self.registers.optcr().read().wdg_sw().bit_is_clear()
+    }
+
     /// Copies bytes; addresses outside the flash read as FFh.
     pub fn read(&self, address: u32, buffer: &mut [u8]) {
         for (byte, address) in buffer.iter_mut().zip(address..) {

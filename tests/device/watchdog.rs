@@ -115,3 +115,36 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
         }
     }
 }
+
+/// The option byte WDG_SW starts the watchdog with each reset, with 512 ms at 32 kHz (RM0090 table
+/// 107); at 47 kHz the erase of a sector of 16 KiB may take longer. The boot stage gives it its longest
+/// time, 4096 periods of LSI / 256, from which on the program has to feed it.
+#[test]
+fn a_watchdog_of_the_option_bytes_does_not_end_a_store_of_the_boot_stage() {
+    let mut bench = Bench::new();
+    bench.machine().set_hardware_watchdog(true);
+    bench.power_on();
+    bench.await_boot_up(100);
+    let file = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    bench.events();
+    // The bootloader feeds it.
+    bench.run_ms(5000);
+    assert_eq!(bench.events(), []);
+    bench.power_off();
+    bench.run_ms(10);
+    let on = bench.time();
+    bench.power_on();
+    bench.await_program(1000);
+    assert!(!bench.is_bootloader(NODE));
+    bench.events();
+    // This program does not.
+    bench.run_ms(34_000);
+    let events = bench.events();
+    let [(at, Stop::Reset(ResetCause::IndependentWatchdog))] = events[..] else { panic!("{events:?}") };
+    let ms = (at - on).0 / 1_000_000_000;
+    assert!((32_768..33_200).contains(&ms), "reset after {ms} ms");
+    bench.assert_nothing_unmodelled();
+}

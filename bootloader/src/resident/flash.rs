@@ -31,6 +31,11 @@ impl ResidentFlash {
         rcc.ahb1enr().modify(|_, w| w.crcen().enabled());
     }
 
+    /// See [`FlashController::starts_watchdog`].
+    pub fn starts_watchdog(&self) -> bool {
+        self.controller.starts_watchdog()
+    }
+
     /// Leaves both in their reset state.
     pub fn release(self, rcc: &pac::RCC) {
         if self.has_crc_unit {

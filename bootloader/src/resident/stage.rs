@@ -39,7 +39,8 @@ pub unsafe extern "C" fn stage() -> ! {
     // SAFETY: nothing else runs yet.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
-    let reset_cause = ResetCause::from_rcc_csr(rcc.csr().read().bits());
+    let status = rcc.csr().read();
+    let reset_cause = ResetCause::from_rcc_csr(status.bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
     // Without a reset cause an application has jumped here, and the flash may be locked. A reset
@@ -56,6 +57,11 @@ pub unsafe extern "C" fn stage() -> ! {
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { ResidentFlash::steal(true) };
+    // A watchdog that the option bytes start, or that ran when an application jumped here, would end
+    // the erase of a sector. (Without its clock, the LSI, it does not run.)
+    if flash.starts_watchdog() || reset_cause == ResetCause::Unknown && status.lsirdy().bit_is_set() {
+        bsp::watchdog::prolong(&iwdg);
+    }
     ResidentFlash::switch_crc_unit_on(&rcc);
     if SEALED {
         crate::callgate::store_after_reset(&mut flash, request);

@@ -493,6 +493,11 @@ impl Machine {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
     }
 
+    /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.
+    pub fn set_hardware_watchdog(&mut self, on: bool) {
+        self.cpu.chip_mut().flash.preset_hardware_watchdog(on);
+    }
+
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
     /// anything else level 1. The model shows it in its registers and does nothing about it.
     pub fn set_read_protection(&mut self, rdp: u8) {

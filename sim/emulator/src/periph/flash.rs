@@ -257,6 +257,11 @@ impl Flash {
         self.options.preset_read_protection(rdp);
     }
 
+    /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.
+    pub fn preset_hardware_watchdog(&mut self, on: bool) {
+        self.options.preset_hardware_watchdog(on);
+    }
+
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
         if let Some(running) = self.running.take() {

@@ -150,6 +150,11 @@ impl OptionBytes {
         self.preset(0xFF00, u32::from(rdp) << 8);
     }
 
+    /// Sets WDG_SW as a debug probe does: the watchdog starts with each reset.
+    pub fn preset_hardware_watchdog(&mut self, on: bool) {
+        self.preset(1 << 5, u32::from(!on) << 5);
+    }
+
     fn preset(&mut self, mask: u32, value: u32) {
         for options in [&mut self.programmed, &mut self.register] {
             *options = *options & !mask | value;
