@@ -20,11 +20,11 @@ const BOOT_CORE: &[Rule] = &[
     ("program", "crc flash keys store"),
     ("decision", "program"),
     ("keys", "flash store"),
-    ("queue", "resume"),
+    ("queue", "session"),
     ("refusal", ""),
     ("resume", ""),
-    ("policy", "crc"),
-    ("session", "policy refusal"),
+    ("policy", "crc keys refusal resume session"),
+    ("session", ""),
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
     ("intake", "keys policy program queue refusal resume session"),
     // It works from the queue to the flash: no session, no object.

@@ -10,15 +10,15 @@
 //! | `sequence` | sectors to erase and words to program, one operation at a time | |
 //! | [`store`] | everything non-volatile | the journal |
 //! | [`control`] | 1F51h, 1F57h: the rules that tie the three together | all of them |
-//! | `session` | the state of a program's download | |
-//! | `resume` | what goes on after a cut, and blocks that come twice | block files |
+//! | `session` | the state of a program's download, and blocks that come twice | block files |
+//! | `resume` | what goes on after a cut | block files |
 //! | `refusal` | a refusal: the status in 1F57h, and the abort for the client | |
 //! | [`bootloader`] | the object dictionary over it | objects |
 //! | `stored_version` | 100Ah: the version text, searched in a stored program | |
 //! | [`program`] | the proof that a program may be started | |
 //! | `keys` | whether the device takes sealed images, and whether it has keys and takes no others | |
 //! | [`crc`] | the CRCs of block file, program and journal | |
-//! | [`policy`], [`profile`] | what a product may choose | |
+//! | [`policy`], [`profile`] | what a product may choose, and the rules for data that follow from it | |
 //! | [`flash`] | the seam to the flash | |
 #![no_std]
 #![forbid(unsafe_code)]

@@ -5,7 +5,7 @@
 //! ([`Queue::commit`]) or is dropped ([`Queue::discard`]). In the ring each piece is its address,
 //! its size and its bytes.
 
-use crate::resume::LastBlock;
+use crate::session::LastBlock;
 
 /// The bytes before each piece's data.
 pub(crate) const PIECE_HEADER: usize = 8;

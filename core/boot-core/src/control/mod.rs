@@ -25,8 +25,9 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
-use crate::intake::{Intake, Judge};
+use crate::intake::Intake;
 use crate::keys::Images;
+use crate::policy::Judge;
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;

@@ -5,10 +5,11 @@ use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
 use super::{find, Downloader, Transfer};
-use crate::intake::{Destination, Intake, Judge, Progress};
+use crate::intake::{Destination, Intake, Progress};
+use crate::policy::Judge;
 use crate::refusal::Refusal;
-use crate::resume::{LastBlock, Partial, ANY};
-use crate::session::Session;
+use crate::resume::Partial;
+use crate::session::{LastBlock, Session, ANY};
 use crate::store::Parameters;
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
@@ -161,7 +162,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     next = ANY;
                 }
                 self.programmer.queue_mut().last = LastBlock::none(partial.start());
-                let erases = next == ANY || state.session.erases(self.policy);
+                let erases = next == ANY || self.policy.erases(state.session);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
                 if progress.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
@@ -173,7 +174,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.session = Session::Open { next };
         }
         if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = self.programmer.queue().last.next();
+            *next = self.programmer.queue_mut().last.next();
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);

@@ -15,13 +15,13 @@ use shared_abi::block_file::{
 use shared_abi::geometry::Region;
 
 use super::format::{Begin, Destination, Format, Recognition, SMALLEST_PROGRAM};
-use super::judge::Judge;
 use super::stream::judge_start;
+use crate::policy::Judge;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-use crate::resume::{Partial, ANY};
-use crate::session::Session;
+use crate::resume::Partial;
+use crate::session::{Session, ANY};
 
 const TOO_LONG: Refusal = Refusal(FlashError::Format, AbortCode::LENGTH_TOO_HIGH);
 

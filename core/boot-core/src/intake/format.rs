@@ -1,7 +1,7 @@
 //! What each format implements, and what it gets and reports.
 
-use crate::intake::judge::Judge;
 use crate::keys::Linked;
+use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;

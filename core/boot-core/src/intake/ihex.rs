@@ -8,8 +8,8 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 
 use super::format::{Destination, Format, Recognition};
-use super::judge::Judge;
 use super::stream::Stream;
+use crate::policy::Judge;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
 

@@ -14,7 +14,6 @@
 mod block_file;
 mod format;
 mod ihex;
-mod judge;
 mod raw;
 mod sealed;
 mod stream;
@@ -22,10 +21,10 @@ mod stream;
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
+use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 pub(crate) use format::{Destination, Format, Progress, Recognition};
-pub(crate) use judge::Judge;
 
 formats! {
     Sealed(sealed::Sealed),

@@ -5,8 +5,8 @@ use canopen::AbortCode;
 use shared_abi::vectors::VectorTable;
 
 use super::format::{Destination, Format, Recognition};
-use super::judge::Judge;
 use super::stream::Stream;
+use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 

@@ -6,8 +6,8 @@ use canopen::AbortCode;
 use seal::wire::MAGIC;
 
 use super::format::{Begin, Destination, Format, Recognition};
-use super::judge::Judge;
 use crate::keys::Linked;
+use crate::policy::Judge;
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;

@@ -7,7 +7,7 @@ use shared_abi::geometry::Region;
 use shared_abi::label;
 
 use super::format::{Begin, Destination, SMALLEST_PROGRAM};
-use super::judge::Judge;
+use crate::policy::Judge;
 use crate::program::Expected;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;

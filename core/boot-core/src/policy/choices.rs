@@ -4,6 +4,7 @@ use canopen::program::FlashError;
 use shared_abi::block_file::Control;
 
 use crate::crc::CrcKind;
+use crate::session::Session;
 
 /// The time of the erase for CLEAR.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -129,4 +130,11 @@ impl Policy {
         crc_step: 1024,
         seal: SealPolicy::NONE,
     };
+
+    /// Whether a download that begins in this state first erases the flash. Otherwise each piece
+    /// must find its place erased.
+    pub(crate) fn erases(&self, session: Session) -> bool {
+        matches!(session, Session::Cleared { .. })
+            || self.replaces && !matches!(session, Session::Open { .. })
+    }
 }

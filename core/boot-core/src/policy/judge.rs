@@ -7,8 +7,8 @@ use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
 use shared_abi::vectors::VectorTable;
 
+use super::choices::{Policy, Verdict};
 use crate::keys::Images;
-use crate::policy::{Policy, Verdict};
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::Session;
@@ -47,7 +47,14 @@ impl Judge<'_> {
 
     /// Whether a download may begin.
     pub(crate) fn may_begin(&self) -> Result<(), Refusal> {
-        self.session.may_begin(self.policy, self.installed)
+        let replaces = self.policy.replaces;
+        match self.session {
+            Session::Idle if self.installed && !replaces => Err(Refusal::untimely(FlashError::NotCleared)),
+            Session::Failed if !replaces => Err(Refusal::untimely(FlashError::Sequence)),
+            Session::Open { .. } => Err(Refusal::untimely(FlashError::Sequence)),
+            _ if (self.policy.allowed)() => Ok(()),
+            _ => Err(Refusal::untimely(FlashError::NoAccess)),
+        }
     }
 
     /// The refusal of first bytes in no known format.

@@ -1,0 +1,7 @@
+//! The product's choices about downloads, and the rules that follow from them.
+
+mod choices;
+mod judge;
+
+pub use choices::{Erase, Policy, SealPolicy, Verdict};
+pub(crate) use judge::Judge;
