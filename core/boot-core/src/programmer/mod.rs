@@ -23,7 +23,7 @@ use shared_abi::geometry::{Region, Sector};
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
-use crate::queue::Queue;
+use crate::queue::{Piece, Queue};
 use crate::resume::Partial;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
 use crate::unseal::Unsealer;
@@ -493,77 +493,96 @@ impl<'b> Programmer<'b> {
         Some(Event::Failed { program, error, erasing })
     }
 
-    /// Chooses the next work for an idle flash.
+    /// Chooses the next work for an idle flash: the first of these that there is.
     fn choose<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
-        if let Some((key, value)) = self.unsealer.take_store() {
-            parameters.store(key, value);
-            return Ok(Some(Job::Store(Change::Note, 0)));
-        }
-        if self.unsealer.is_asked() {
-            return Ok(Some(Job::Unseal));
+        if let Some(job) = self.store_note(parameters).or_else(|| self.check_request()) {
+            return Ok(Some(job));
         }
         let piece = if self.unsealer.is_active() { self.unsealer.piece() } else { self.queue.first() };
-        if let Some(target) = &mut self.target {
-            // The size of a sealed image is not known before an authentic piece.
-            if piece.is_some() || target.clearing || (target.expected.is_some() && !self.unsealer.is_active())
-            {
-                if let Some(ahead) = target.untouched.take() {
-                    target.ahead = target.ahead.max(ahead);
-                    let program = target.program;
-                    if target.partial.is_resumed() {
-                        // The data end within a sector that was erased for them; or at the start of
-                        // one that may be half erased.
-                        let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
-                        if sector.region.base != target.erased {
-                            target.erased = sector.region.end();
-                        }
-                    }
-                    self.void(program);
-                }
-            }
-        }
-        if self.voids != 0 {
-            let program = self.voids.trailing_zeros() as u8;
-            // The counter that a program has proved must survive its record.
-            if self.unsealer.is_present() && !core::mem::replace(&mut self.kept, true) {
-                if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
-                    parameters.store(Key::counter(program), counter);
-                    return Ok(Some(Job::Store(Change::Counter, program)));
-                }
-            }
-            let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
-            let mut partial = Partial::NONE;
-            if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
-                // From the second time on, the stored value is that of the present work.
-                target.half_erased &= core::mem::replace(&mut half_erased, true);
-                partial = target.partial;
-            }
-            let value = ProgramRecord::none(half_erased, partial);
-            return Ok(Some(store(parameters, Change::Void, program, value)));
+        self.give_up_old(flash, piece)?;
+        if let Some(job) = self.remove_record(parameters, flash) {
+            return Ok(Some(job));
         }
         let Some(target) = &mut self.target else { return Ok(None) };
-        let needed = piece.map_or(target.ahead, |piece| piece.address + piece.size);
-        if target.erased < needed {
+        if let Some(job) = target.erase(flash, piece)? {
+            return Ok(Some(job));
+        }
+        if let Some(job) = target.end_clear(parameters) {
+            return Ok(Some(job));
+        }
+        match piece {
+            Some(piece) => target.write(flash, piece).map(Some),
+            None => self.complete_program(parameters),
+        }
+    }
+
+    /// Stores what no host waits for.
+    fn store_note(&mut self, parameters: &mut impl Parameters) -> Option<Job> {
+        let (key, value) = self.unsealer.take_store()?;
+        parameters.store(key, value);
+        Some(Job::Store(Change::Note, 0))
+    }
+
+    /// Checks the signature of a request for rights.
+    fn check_request(&self) -> Option<Job> {
+        self.unsealer.is_asked().then_some(Job::Unseal)
+    }
+
+    /// With the first piece, or for CLEAR, the old program is given up: its record must be removed
+    /// first.
+    fn give_up_old<F: Flash>(&mut self, flash: &F, piece: Option<Piece>) -> Result<(), FlashError> {
+        let Some(target) = &mut self.target else { return Ok(()) };
+        // The size of a sealed image is not known before an authentic piece.
+        let is_known = target.expected.is_some() && !self.unsealer.is_active();
+        if piece.is_none() && !target.clearing && !is_known {
+            return Ok(());
+        }
+        let Some(ahead) = target.untouched.take() else { return Ok(()) };
+        target.ahead = target.ahead.max(ahead);
+        if target.partial.is_resumed() {
+            // The data end within a sector that was erased for them; or at the start of one that
+            // may be half erased.
             let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
-            let piece = Region::new(target.erased, BLANK_STEP);
-            if target.clearing && !target.half_erased && flash.is_blank(piece) {
-                return Ok(Some(Job::Erase { sector: None, until: piece.end() }));
+            if sector.region.base != target.erased {
+                target.erased = sector.region.end();
             }
-            return Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }));
         }
-        if core::mem::take(&mut target.clearing) {
-            let value = ProgramRecord::none(false, Partial::NONE);
-            return Ok(Some(store(parameters, Change::Record, target.program, value)));
+        let program = target.program;
+        self.void(program);
+        Ok(())
+    }
+
+    /// Removes the record of a program, or writes the progress of its download into it.
+    fn remove_record<F: Flash>(&mut self, parameters: &mut impl Parameters, flash: &F) -> Option<Job> {
+        if self.voids == 0 {
+            return None;
         }
-        if let Some(piece) = piece {
-            let write =
-                WritePiece::new(flash, piece, target.partial.is_resumed()).ok_or(FlashError::NotCleared)?;
-            return Ok(Some(Job::Write(write)));
+        let program = self.voids.trailing_zeros() as u8;
+        // The counter that a program has proved must survive its record.
+        if self.unsealer.is_present() && !core::mem::replace(&mut self.kept, true) {
+            if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
+                parameters.store(Key::counter(program), counter);
+                return Some(Job::Store(Change::Counter, program));
+            }
         }
+        let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
+        let mut partial = Partial::NONE;
+        if let Some(target) = self.target.as_mut().filter(|target| target.program == program) {
+            // From the second time on, the stored value is that of the present work.
+            target.half_erased &= core::mem::replace(&mut half_erased, true);
+            partial = target.partial;
+        }
+        let value = ProgramRecord::none(half_erased, partial);
+        Some(store(parameters, Change::Void, program, value))
+    }
+
+    /// All received data are written: ends the program if it was sent completely.
+    fn complete_program(&mut self, parameters: &mut impl Parameters) -> Result<Option<Job>, FlashError> {
+        let Some(target) = &mut self.target else { return Ok(None) };
         if self.unsealer.is_active() {
             let ended = target.expected.is_some();
             match (self.unsealer.is_installed(), self.queue.is_empty()) {
@@ -591,6 +610,34 @@ impl<'b> Programmer<'b> {
             let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
             Job::Verify { expected, crc }
         }))
+    }
+}
+
+impl Target {
+    /// Erases the flash for the piece, or ahead of it.
+    fn erase<F: Flash>(&self, flash: &F, piece: Option<Piece>) -> Result<Option<Job>, FlashError> {
+        let needed = piece.map_or(self.ahead, |piece| piece.address + piece.size);
+        if self.erased >= needed {
+            return Ok(None);
+        }
+        let sector = flash.sector_at(self.erased).ok_or(FlashError::Address)?;
+        let place = Region::new(self.erased, BLANK_STEP);
+        if self.clearing && !self.half_erased && flash.is_blank(place) {
+            return Ok(Some(Job::Erase { sector: None, until: place.end() }));
+        }
+        Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }))
+    }
+
+    /// All of it is erased for a command: stores that no erase is unfinished.
+    fn end_clear(&mut self, parameters: &mut impl Parameters) -> Option<Job> {
+        let value = ProgramRecord::none(false, Partial::NONE);
+        core::mem::take(&mut self.clearing).then(|| store(parameters, Change::Record, self.program, value))
+    }
+
+    /// Writes the piece.
+    fn write<F: Flash>(&self, flash: &F, piece: Piece) -> Result<Job, FlashError> {
+        let again = self.partial.is_resumed();
+        WritePiece::new(flash, piece, again).map(Job::Write).ok_or(FlashError::NotCleared)
     }
 }
 
