@@ -29,9 +29,10 @@ const BOOT_CORE: &[Rule] = &[
     ("intake", "keys policy program queue refusal resume session"),
     // It works from the queue to the flash: no session, no object.
     ("unseal", "flash keys policy program queue store"),
+    ("source", "flash program queue store unseal"),
     // It works on pieces and addresses: no format, no object.
-    ("programmer", "crc flash program queue resume sequence store unseal"),
-    ("control", "flash intake keys policy program programmer refusal resume session store unseal"),
+    ("programmer", "crc flash program queue resume sequence source store"),
+    ("control", "flash intake keys policy program programmer refusal resume session source store unseal"),
     ("stored_version", "flash programmer"),
     ("bootloader", "control decision flash resume store stored_version unseal"),
     ("profile", "bootloader policy"),

@@ -6,7 +6,8 @@
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
 //! | [`unseal`] | sealed images: authentic, deciphered, unpacked | the format, no object |
-//! | `programmer` | erase, write, read back, verify; with sealed images, unpack | pieces and flash, no object |
+//! | `source` | where the programmer's data come from: the queue, or a sealed image in it | both |
+//! | `programmer` | erase, write, read back, verify | pieces and flash, no format, no object |
 //! | `sequence` | sectors to erase and words to program, one operation at a time | |
 //! | [`store`] | everything non-volatile | the journal |
 //! | [`control`] | 1F51h, 1F57h: the rules that tie the three together | all of them |
@@ -39,6 +40,7 @@ mod refusal;
 mod resume;
 mod sequence;
 mod session;
+mod source;
 pub mod store;
 mod stored_version;
 pub mod unseal;

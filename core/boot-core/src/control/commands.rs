@@ -45,7 +45,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let busy = match command {
             // Also not during the download of a sealed image, which changes the record itself.
             SetSignature | ClrSignature => {
-                self.programmer.is_busy() || self.programmer.unsealer().is_active()
+                self.programmer.is_busy() || self.programmer.source().unsealer.is_active()
             }
             _ => self.programmer.has_work(),
         };
@@ -56,7 +56,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let again = matches!(state.session, Session::Cleared { just: true });
         let erases = again || (self.policy.erase)(program) == Erase::AtOnce;
         let withdrawn = state.record.is_some_and(|record| record.withdrawn);
-        if !self.programmer.unsealer().permits(right_of(command, erases, withdrawn)) {
+        if !self.programmer.source().unsealer.permits(right_of(command, erases, withdrawn)) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
         if changes && (state.locked || !(self.policy.allowed)()) {
@@ -85,7 +85,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 // Also if the record reads this way: after a power cut it may read differently later.
                 // The store writes nothing if the value is certain.
                 let signed = command == SetSignature;
-                let withdrawn = !signed && self.programmer.unsealer().takes_no_other();
+                let withdrawn = !signed && self.programmer.source().unsealer.takes_no_other();
                 let record = ProgramRecord { signed, withdrawn, ..record };
                 self.programmer.record(&mut self.parameters, program, record, false);
             }
@@ -125,7 +125,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
-        let at_once = at_once && self.programmer.unsealer().permits(right::ERASE);
+        let at_once = at_once && self.programmer.source().unsealer.permits(right::ERASE);
         if at_once {
             self.programmer.void(program);
         }

@@ -33,6 +33,7 @@ use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::Session;
+use crate::source::Source;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Unsealer;
 
@@ -121,7 +122,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             policy,
             parameters,
             programs,
-            programmer: Programmer::new(buffer, policy.crc, policy.crc_step, unsealer),
+            programmer: Programmer::new(Source::new(buffer, unsealer), policy.crc, policy.crc_step),
             transfer: None,
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
@@ -137,7 +138,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// The state of sealed images.
     pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
-        self.programmer.unsealer_mut()
+        &mut self.programmer.source_mut().unsealer
     }
 
     /// 1F57h. It is busy while a command of this program is carried out, or while no further block
@@ -177,7 +178,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let [id, stored] = state.partial.words();
         let (id, end) = match state.session {
             Session::Idle => (id, stored),
-            Session::Open { .. } => (id, self.programmer.queue().last.end()),
+            Session::Open { .. } => (id, self.programmer.source().queue.last.end()),
             _ => (0, 0),
         };
         region_value(id, end)
@@ -243,7 +244,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if !self.policy.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
-        if !self.programmer.unsealer().permits(right::READ_BACK) {
+        if !self.programmer.source().unsealer.permits(right::READ_BACK) {
             return Err(AbortCode::DEVICE_STATE);
         }
         // The flash cannot be read while it works.
@@ -273,7 +274,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
             Some(Event::Stored { program, ends }) => {
-                let (record, partial) = load(&self.parameters, flash, program, self.programmer.unsealer());
+                let (record, partial) =
+                    load(&self.parameters, flash, program, &self.programmer.source().unsealer);
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
                     if record.is_none() {
@@ -283,7 +285,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     if !open {
                         state.partial = partial;
                     }
-                    if ends && open && self.programmer.unsealer().is_same() {
+                    if ends && open && self.programmer.source().unsealer.is_same() {
                         state.session = Session::Idle;
                     }
                 }
@@ -298,7 +300,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
                 match self.check_stored(flash, program, &expected, crc) {
                     Ok(version) => {
-                        let whole = expected.crc.is_none() || self.programmer.unsealer().is_active();
+                        let whole = expected.crc.is_none() || self.programmer.source().unsealer.is_active();
                         let signed = whole && self.policy.valid_without_signature;
                         let size = expected.size;
                         let half_erased = self.programmer.is_half_erased();
@@ -313,7 +315,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                             seal: None,
                             withdrawn: false,
                         };
-                        let record = self.programmer.unsealer().mark(record);
+                        let record = self.programmer.source().unsealer.mark(record);
                         self.programmer.record(&mut self.parameters, program, record, false);
                     }
                     Err(error) => self.end(program, Err(error)),
@@ -324,7 +326,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     _ if erasing => AbortCode::GENERAL,
                     // The errors for which a sealed image is refused.
                     error
-                        if self.programmer.unsealer().is_present()
+                        if self.programmer.source().unsealer.is_present()
                             && !matches!(error, FlashError::Write | FlashError::NvData) =>
                     {
                         AbortCode::STORE
@@ -380,7 +382,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program);
         if outcome.is_err() && current {
             self.transfer = None;
-            self.programmer.queue_mut().clear();
+            self.programmer.source_mut().queue.clear();
         }
         self.outcome = Some((program, outcome));
         let Some(state) = find(&mut self.programs, program) else { return };
@@ -398,7 +400,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// Whether the queue has room for another transfer.
     fn has_room(&self) -> bool {
-        self.programmer.has_room()
+        self.programmer.source().has_room()
     }
 
     /// The program with this number, if it exists.

@@ -56,7 +56,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// `held`, the answer to the client is already delayed, and the client may use a reserve.
     #[must_use]
     pub fn space(&self, held: bool) -> usize {
-        let room = |transfer: &Transfer| transfer.intake.room(self.programmer.queue(), held);
+        let room = |transfer: &Transfer| transfer.intake.room(&self.programmer.source().queue, held);
         self.transfer.as_ref().map_or(usize::MAX, room)
     }
 
@@ -85,7 +85,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// incomplete program.
     pub fn download_cancel(&mut self) {
         let Some(Transfer { program, intake }) = self.transfer.take() else { return };
-        self.programmer.queue_mut().discard();
+        self.programmer.source_mut().queue.discard();
         let Some(state) = find(&mut self.programs, program) else { return };
         if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
@@ -107,10 +107,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             region: state.region,
             session: state.session,
             installed: state.record.is_some(),
-            images: self.programmer.unsealer().images(),
+            images: self.programmer.source().unsealer.images(),
             partial: state.partial,
         };
-        let mut to = Destination { judge, queue: self.programmer.queue_mut(), progress: Progress::default() };
+        let mut to = Destination {
+            judge,
+            queue: &mut self.programmer.source_mut().queue,
+            progress: Progress::default(),
+        };
         let outcome = match data {
             Some(bytes) => intake.data(bytes, &mut to),
             None => intake.end(&mut to),
@@ -126,7 +130,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             Err(refusal) => {
                 if progress.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
                     // Its pieces belong to a download that does not start.
-                    self.programmer.queue_mut().clear();
+                    self.programmer.source_mut().queue.clear();
                 }
                 if refusal.0 == FlashError::Crc || streaming {
                     self.outcome = Some((program, Err(refusal.0)));
@@ -161,7 +165,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     partial = state.partial;
                     next = ANY;
                 }
-                self.programmer.queue_mut().last = LastBlock::none(partial.start());
+                self.programmer.source_mut().queue.last = LastBlock::none(partial.start());
                 let erases = next == ANY || self.policy.erases(state.session);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
                 if progress.sealed.is_some() {
@@ -174,7 +178,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.session = Session::Open { next };
         }
         if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
-            *next = self.programmer.queue_mut().last.next();
+            *next = self.programmer.source_mut().queue.last.next();
         }
         if let Some(expected) = progress.complete {
             self.programmer.complete(expected);

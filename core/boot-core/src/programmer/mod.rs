@@ -1,11 +1,10 @@
 //! The flash half of a download: carries out the accepted work, one operation or one bounded
 //! computation at a time.
 //!
-//! Pieces wait in a queue. The programmer erases sectors before the pieces need them, writes each
+//! Pieces wait in the source. The programmer erases sectors before the pieces need them, writes each
 //! piece and reads it back, and computes the CRC of the program at the end. It also writes what the
-//! store needs. It knows pieces, addresses and program numbers, but no objects or commands. Of the
-//! formats it knows one thing: the data of a sealed image come from the [`Unsealer`] and not from the
-//! queue.
+//! store needs. It knows pieces, addresses and program numbers, but no formats, objects or commands:
+//! all its data come from one [`Source`].
 //!
 //! **Data are not changed while a record for them is valid**: [`Programmer::open`] and
 //! [`Programmer::void`] only note that a record must be removed, and until it is removed, nothing
@@ -17,16 +16,15 @@ mod write;
 use core::task::Poll;
 
 use canopen::program::FlashError;
-use shared_abi::block_file::MAX_BLOCK_SIZE;
 use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
-use crate::queue::{Piece, Queue};
+use crate::queue::Piece;
 use crate::resume::Partial;
+use crate::source::{Demand, Source};
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
-use crate::unseal::Unsealer;
 use write::WritePiece;
 
 /// The result of a step.
@@ -77,8 +75,6 @@ struct Target {
     half_erased: bool,
     /// What is stored of its progress.
     partial: Partial,
-    /// The program to verify when the queue is empty.
-    expected: Option<Expected>,
 }
 
 /// The present work.
@@ -88,10 +84,10 @@ enum Job {
     /// A sector until its erase was started, and its end; or no sector, and the address up to which
     /// the flash was found to be erased.
     Erase { sector: Option<Sector>, until: u32 },
-    /// The piece at the front of the queue is being written.
+    /// The next piece of the source is being written.
     Write(WritePiece),
-    /// The sealed image is being processed.
-    Unseal,
+    /// The source processes received bytes.
+    Process,
     /// The flash is compared with the sent program.
     Verify { expected: Expected, crc: FlashCrc },
 }
@@ -115,8 +111,7 @@ enum Change {
 
 /// The flash half. It starts operations and polls them, but never waits for them.
 pub(crate) struct Programmer<'b> {
-    queue: Queue<'b>,
-    unsealer: Unsealer<'b>,
+    source: Source<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
     target: Option<Target>,
@@ -130,39 +125,23 @@ pub(crate) struct Programmer<'b> {
 }
 
 impl<'b> Programmer<'b> {
-    /// The larger the `buffer`, the further the flash may lag behind the bus. One step of a CRC
-    /// covers `crc_step` bytes.
-    pub(crate) fn new(
-        buffer: &'b mut [u8],
-        crc_kind: CrcKind,
-        crc_step: u32,
-        unsealer: Unsealer<'b>,
-    ) -> Self {
-        Self {
-            queue: Queue::new(buffer),
-            unsealer,
-            crc_kind,
-            crc_step,
-            target: None,
-            voids: 0,
-            kept: false,
-            job: None,
-            running: None,
-        }
+    /// One step of a CRC covers `crc_step` bytes.
+    pub(crate) fn new(source: Source<'b>, crc_kind: CrcKind, crc_step: u32) -> Self {
+        Self { source, crc_kind, crc_step, target: None, voids: 0, kept: false, job: None, running: None }
     }
 
     pub(crate) fn into_buffer(self) -> &'b mut [u8] {
-        self.queue.into_buffer()
+        self.source.queue.into_buffer()
     }
 
-    /// The queue of pieces.
-    pub(crate) fn queue(&self) -> &Queue<'b> {
-        &self.queue
+    /// The source of its data.
+    pub(crate) fn source(&self) -> &Source<'b> {
+        &self.source
     }
 
-    /// See [`queue`](Self::queue).
-    pub(crate) fn queue_mut(&mut self) -> &mut Queue<'b> {
-        &mut self.queue
+    /// See [`source`](Self::source).
+    pub(crate) fn source_mut(&mut self) -> &mut Source<'b> {
+        &mut self.source
     }
 
     /// Prepares for pieces of this program, and of no other. The first piece removes its record.
@@ -176,20 +155,11 @@ impl<'b> Programmer<'b> {
         } else {
             (region.end(), region.end())
         };
-        let (untouched, clearing, half_erased, expected) = (Some(ahead), false, true, None);
+        let (untouched, clearing, half_erased) = (Some(ahead), false, true);
         let ahead = erased;
-        self.unsealer.rest();
-        self.target = Some(Target {
-            program,
-            region,
-            erased,
-            ahead,
-            untouched,
-            clearing,
-            half_erased,
-            partial,
-            expected,
-        });
+        self.source.rest();
+        self.target =
+            Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, partial });
     }
 
     /// The pieces of the [opened](Self::open) program are of another file from here on: after a
@@ -206,18 +176,8 @@ impl<'b> Programmer<'b> {
     /// The [opened](Self::open) program arrives as a sealed image.
     pub(crate) fn unseal(&mut self) {
         if let Some(Target { program, region, .. }) = self.target {
-            self.unsealer.begin(program, region);
+            self.source.unsealer.begin(program, region);
         }
-    }
-
-    /// The sealed image, if the program came as one.
-    pub(crate) fn unsealer(&self) -> &Unsealer<'b> {
-        &self.unsealer
-    }
-
-    /// See [`unsealer`](Self::unsealer).
-    pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
-        &mut self.unsealer
     }
 
     /// Removes the record of a program, then erases all its sectors that are not erased.
@@ -237,7 +197,7 @@ impl<'b> Programmer<'b> {
     /// The program was sent completely.
     pub(crate) fn complete(&mut self, expected: Expected) {
         if let Some(target) = &mut self.target {
-            target.expected = Some(expected);
+            self.source.complete(expected);
             // Bytes without a piece belong to the program, too, and must read FFh.
             target.ahead = target.ahead.max(target.region.base + expected.size);
         }
@@ -265,8 +225,7 @@ impl<'b> Programmer<'b> {
 
     /// Discards the received data. A value that is being stored is still completed.
     pub(crate) fn abort(&mut self) {
-        self.queue.clear();
-        self.unsealer.rest();
+        self.source.clear();
         self.target = None;
         if !self.is_storing() {
             self.job = None;
@@ -298,11 +257,8 @@ impl<'b> Programmer<'b> {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
-            || !self.queue.is_empty()
-            || !self.unsealer.waits()
-            || self.target.as_ref().is_some_and(|target| {
-                target.clearing || target.expected.is_some() || target.erased < target.ahead
-            })
+            || self.source.has_work()
+            || self.target.as_ref().is_some_and(|target| target.clearing || target.erased < target.ahead)
     }
 
     /// Whether it works on a command or on the end of a program, so that no further block of that
@@ -314,7 +270,8 @@ impl<'b> Programmer<'b> {
             Some(Job::Verify { .. }) => current,
             _ => false,
         };
-        let waiting = |target: &Target| target.clearing || target.expected.is_some() || !self.has_room();
+        let waiting =
+            |target: &Target| target.clearing || self.source.is_complete() || !self.source.has_room();
         ending || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
     }
 
@@ -324,9 +281,7 @@ impl<'b> Programmer<'b> {
         match self.job {
             Some(Job::Store(Change::Record, of)) => Some(of),
             Some(Job::Verify { .. }) => self.program(),
-            _ => self
-                .program()
-                .filter(|_| self.target.as_ref().is_some_and(|target| target.expected.is_some())),
+            _ => self.program().filter(|_| self.source.is_complete()),
         }
     }
 
@@ -339,12 +294,6 @@ impl<'b> Programmer<'b> {
     /// Whether node-ID and bit rate are being stored.
     pub(crate) fn is_storing_node(&self) -> bool {
         matches!(self.job, Some(Job::Store(Change::Node, _)))
-    }
-
-    /// Whether the queue has room for a block of the largest size. (A smaller queue takes one block
-    /// at a time.)
-    pub(crate) fn has_room(&self) -> bool {
-        self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
     }
 
     /// Continues the work with one step.
@@ -403,16 +352,10 @@ impl<'b> Programmer<'b> {
             }
             (_, Err(fault)) => Err(fault),
             (Some(Job::Erase { sector, .. }), _) => Ok(sector.take().map(Operation::Erase)),
-            (Some(Job::Unseal), _) => {
-                return Next::Done(self.unsealer.step(flash, parameters, &mut self.queue));
-            }
+            (Some(Job::Process), _) => return Next::Done(self.source.step(flash, parameters)),
             (Some(Job::Write(write)), _) => {
-                let (queue, unsealer) = (&self.queue, &self.unsealer);
-                if unsealer.is_active() {
-                    write.next(flash, move |at| unsealer.data(at))
-                } else {
-                    write.next(flash, move |at| queue.data(at))
-                }
+                let source = &self.source;
+                write.next(flash, move |at| source.byte(at))
             }
             (Some(Job::Verify { crc, .. }), _) => {
                 return match crc.step(flash, self.crc_kind, self.crc_step) {
@@ -434,14 +377,14 @@ impl<'b> Programmer<'b> {
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
-            (Job::Store(Change::Counter | Change::Note, _) | Job::Unseal, Ok(())) => None,
+            (Job::Store(Change::Counter | Change::Note, _) | Job::Process, Ok(())) => None,
             (Job::Store(change, program), result) => {
                 if change == Change::Void {
                     self.voids &= !bit(program);
                     self.kept = false;
                 }
-                if change == Change::Record && self.unsealer.is_installed() {
-                    self.unsealer.end(result);
+                if change == Change::Record {
+                    self.source.stored(result);
                 }
                 match result {
                     Ok(()) => Some(Event::Stored { program, ends: change == Change::Record }),
@@ -462,12 +405,8 @@ impl<'b> Programmer<'b> {
                 None
             }
             (Job::Write(_), Ok(())) => {
-                if self.unsealer.is_active() {
-                    self.unsealer.written();
-                } else {
-                    self.note();
-                    self.queue.pop();
-                }
+                self.note();
+                self.source.written();
                 None
             }
             (Job::Verify { expected, crc }, Ok(())) => {
@@ -478,7 +417,7 @@ impl<'b> Programmer<'b> {
 
     /// Notes the progress of a download that could go on, sixteen times in the program.
     fn note(&mut self) {
-        let (Some(target), Some(piece)) = (&mut self.target, self.queue.first()) else { return };
+        let (Some(target), Some(piece)) = (&mut self.target, self.source.piece()) else { return };
         if target.partial.note(piece.address + piece.size, target.ahead - target.region.base) {
             let program = target.program;
             self.void(program);
@@ -486,7 +425,7 @@ impl<'b> Programmer<'b> {
     }
 
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
-        self.unsealer.end(Err(error));
+        self.source.fail(error);
         // The signature of a request for rights belongs to no program.
         let program = self.program().unwrap_or(0);
         self.abort();
@@ -502,7 +441,7 @@ impl<'b> Programmer<'b> {
         if let Some(job) = self.store_note(parameters).or_else(|| self.check_request()) {
             return Ok(Some(job));
         }
-        let piece = if self.unsealer.is_active() { self.unsealer.piece() } else { self.queue.first() };
+        let piece = self.source.piece();
         self.give_up_old(flash, piece)?;
         if let Some(job) = self.remove_record(parameters, flash) {
             return Ok(Some(job));
@@ -522,23 +461,21 @@ impl<'b> Programmer<'b> {
 
     /// Stores what no host waits for.
     fn store_note(&mut self, parameters: &mut impl Parameters) -> Option<Job> {
-        let (key, value) = self.unsealer.take_store()?;
+        let (key, value) = self.source.unsealer.take_store()?;
         parameters.store(key, value);
         Some(Job::Store(Change::Note, 0))
     }
 
     /// Checks the signature of a request for rights.
     fn check_request(&self) -> Option<Job> {
-        self.unsealer.is_asked().then_some(Job::Unseal)
+        self.source.unsealer.is_asked().then_some(Job::Process)
     }
 
     /// With the first piece, or for CLEAR, the old program is given up: its record must be removed
     /// first.
     fn give_up_old<F: Flash>(&mut self, flash: &F, piece: Option<Piece>) -> Result<(), FlashError> {
         let Some(target) = &mut self.target else { return Ok(()) };
-        // The size of a sealed image is not known before an authentic piece.
-        let is_known = target.expected.is_some() && !self.unsealer.is_active();
-        if piece.is_none() && !target.clearing && !is_known {
+        if piece.is_none() && !target.clearing && !self.source.is_sized() {
             return Ok(());
         }
         let Some(ahead) = target.untouched.take() else { return Ok(()) };
@@ -563,10 +500,9 @@ impl<'b> Programmer<'b> {
         }
         let program = self.voids.trailing_zeros() as u8;
         // The counter that a program has proved must survive its record.
-        if self.unsealer.is_present() && !core::mem::replace(&mut self.kept, true) {
-            if let Some(counter) = crate::unseal::proved(flash, parameters, program) {
-                parameters.store(Key::counter(program), counter);
-                return Some(Job::Store(Change::Counter, program));
+        if let Some(counter) = self.source.proved(flash, parameters, program) {
+            if !core::mem::replace(&mut self.kept, true) {
+                return Some(store_counter(parameters, program, counter));
             }
         }
         let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
@@ -580,36 +516,20 @@ impl<'b> Programmer<'b> {
         Some(store(parameters, Change::Void, program, value))
     }
 
-    /// All received data are written: ends the program if it was sent completely.
+    /// All pieces are written: continues as the source demands.
     fn complete_program(&mut self, parameters: &mut impl Parameters) -> Result<Option<Job>, FlashError> {
         let Some(target) = &mut self.target else { return Ok(None) };
-        if self.unsealer.is_active() {
-            let ended = target.expected.is_some();
-            match (self.unsealer.is_installed(), self.queue.is_empty()) {
-                (false, true) if self.unsealer.waits() => {
-                    return if ended { Err(FlashError::Format) } else { Ok(None) };
-                }
-                (false, _) => return Ok(Some(Job::Unseal)),
-                (true, false) => return Err(FlashError::Format),
-                (true, true) if !ended => return Ok(None),
-                (true, true) => target.expected = Some(self.unsealer.expected()),
+        let program = target.program;
+        Ok(match self.source.next()? {
+            Demand::Wait => None,
+            Demand::Process => Some(Job::Process),
+            Demand::Counter(counter) => Some(store_counter(parameters, program, counter)),
+            Demand::Keep(record) => Some(store(parameters, Change::Record, program, record)),
+            Demand::Verify(expected) => {
+                let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
+                Some(Job::Verify { expected, crc })
             }
-            let program = target.program;
-            // Also for the same image: its certificate may have a higher epoch.
-            if let Some(counter) = self.unsealer.take_counter() {
-                parameters.store(Key::counter(program), counter);
-                return Ok(Some(Job::Store(Change::Counter, program)));
-            }
-            if self.unsealer.is_same() {
-                target.expected = None;
-                let value = self.unsealer.same_record();
-                return Ok(Some(store(parameters, Change::Record, program, value)));
-            }
-        }
-        Ok(target.expected.take().map(|expected| {
-            let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
-            Job::Verify { expected, crc }
-        }))
+        })
     }
 }
 
@@ -650,4 +570,10 @@ fn bit(program: u8) -> u32 {
 fn store(parameters: &mut impl Parameters, change: Change, program: u8, value: Value) -> Job {
     parameters.store(Key::program(program), value);
     Job::Store(change, program)
+}
+
+/// Starts to store the security counter of a program.
+fn store_counter(parameters: &mut impl Parameters, program: u8, counter: Value) -> Job {
+    parameters.store(Key::counter(program), counter);
+    Job::Store(Change::Counter, program)
 }

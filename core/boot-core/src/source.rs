@@ -1,0 +1,171 @@
+//! Where the data for the flash come from: the pieces in the queue, or a sealed image, whose bytes
+//! are in the queue and whose pieces come out of the [`Unsealer`].
+//!
+//! The programmer asks this module, and never which of the two it is.
+
+use canopen::program::FlashError;
+use shared_abi::block_file::MAX_BLOCK_SIZE;
+
+use crate::flash::Flash;
+use crate::program::Expected;
+use crate::queue::{Piece, Queue};
+use crate::store::{Parameters, Value};
+use crate::unseal::{proved, Unsealer};
+
+/// The source of the program that is being downloaded.
+pub(crate) struct Source<'b> {
+    /// The received data that are not in flash yet.
+    pub queue: Queue<'b>,
+    /// The sealed image, if the program came as one.
+    pub unsealer: Unsealer<'b>,
+    /// `Some` from the end of the program's data until the program is to be verified.
+    ended: Option<Expected>,
+}
+
+/// What there is to do when no piece is ready.
+pub(crate) enum Demand {
+    /// Nothing before more data arrive.
+    Wait,
+    /// The received bytes must be [processed](Source::step).
+    Process,
+    /// The program has this security counter: it must be stored.
+    Counter(Value),
+    /// All of the program is in flash, which must be compared with this.
+    Verify(Expected),
+    /// The program was already installed, with this record.
+    Keep(Value),
+}
+
+impl<'b> Source<'b> {
+    pub(crate) fn new(buffer: &'b mut [u8], unsealer: Unsealer<'b>) -> Self {
+        Self { queue: Queue::new(buffer), unsealer, ended: None }
+    }
+
+    /// Another program begins, or none: the queue stays.
+    pub(crate) fn rest(&mut self) {
+        self.unsealer.rest();
+        self.ended = None;
+    }
+
+    /// Discards the received data.
+    pub(crate) fn clear(&mut self) {
+        self.queue.clear();
+        self.rest();
+    }
+
+    /// The program was sent completely.
+    pub(crate) fn complete(&mut self, expected: Expected) {
+        self.ended = Some(expected);
+    }
+
+    /// Whether the program was sent completely, and is not yet to be verified.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.ended.is_some()
+    }
+
+    /// Whether the size of the program is known. That of a sealed image is not known before an
+    /// authentic piece.
+    pub(crate) fn is_sized(&self) -> bool {
+        self.is_complete() && !self.unsealer.is_active()
+    }
+
+    /// Whether there is something to do before more data arrive.
+    pub(crate) fn has_work(&self) -> bool {
+        !self.queue.is_empty() || !self.unsealer.waits() || self.is_complete()
+    }
+
+    /// Whether the queue has room for a block of the largest size. (A smaller queue takes one block
+    /// at a time.)
+    pub(crate) fn has_room(&self) -> bool {
+        self.queue.is_empty() || self.queue.free() >= MAX_BLOCK_SIZE
+    }
+
+    /// The next piece for the flash.
+    pub(crate) fn piece(&self) -> Option<Piece> {
+        if self.unsealer.is_active() {
+            self.unsealer.piece()
+        } else {
+            self.queue.first()
+        }
+    }
+
+    /// A byte of this piece.
+    pub(crate) fn byte(&self, offset: usize) -> u8 {
+        if self.unsealer.is_active() {
+            self.unsealer.data(offset)
+        } else {
+            self.queue.data(offset)
+        }
+    }
+
+    /// The piece is in flash.
+    pub(crate) fn written(&mut self) {
+        if self.unsealer.is_active() {
+            self.unsealer.written();
+        } else {
+            self.queue.pop();
+        }
+    }
+
+    /// What there is to do when no piece is ready.
+    pub(crate) fn next(&mut self) -> Result<Demand, FlashError> {
+        if self.unsealer.is_active() {
+            let ended = self.is_complete();
+            match (self.unsealer.is_installed(), self.queue.is_empty()) {
+                (false, true) if self.unsealer.waits() => {
+                    return if ended { Err(FlashError::Format) } else { Ok(Demand::Wait) };
+                }
+                (false, _) => return Ok(Demand::Process),
+                (true, false) => return Err(FlashError::Format),
+                (true, true) if !ended => return Ok(Demand::Wait),
+                (true, true) => {}
+            }
+            // Also for the same image: its certificate may have a higher epoch.
+            if let Some(counter) = self.unsealer.take_counter() {
+                return Ok(Demand::Counter(counter));
+            }
+            self.ended = None;
+            return Ok(if self.unsealer.is_same() {
+                Demand::Keep(self.unsealer.same_record())
+            } else {
+                Demand::Verify(self.unsealer.expected())
+            });
+        }
+        Ok(self.ended.take().map_or(Demand::Wait, Demand::Verify))
+    }
+
+    /// Processes received bytes with one bounded step.
+    pub(crate) fn step<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+    ) -> Result<(), FlashError> {
+        self.unsealer.step(flash, parameters, &mut self.queue)
+    }
+
+    /// The security counter that must be stored before the record of this program is removed.
+    pub(crate) fn proved<F: Flash>(
+        &self,
+        flash: &F,
+        parameters: &impl Parameters,
+        program: u8,
+    ) -> Option<Value> {
+        if self.unsealer.is_present() {
+            proved(flash, parameters, program)
+        } else {
+            None
+        }
+    }
+
+    /// The record of the program was stored, or could not be stored.
+    pub(crate) fn stored(&mut self, result: Result<(), FlashError>) {
+        if self.unsealer.is_installed() {
+            self.unsealer.end(result);
+        }
+    }
+
+    /// The work on the program failed.
+    pub(crate) fn fail(&mut self, error: FlashError) {
+        self.unsealer.end(Err(error));
+    }
+}
