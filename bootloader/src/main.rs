@@ -50,9 +50,9 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::Step;
+    use boot_core::control::{Room, Sealed};
     use boot_core::decision::StayReason;
     use boot_core::store::NodeParameters;
-    use boot_core::unseal::{Room, Unsealer};
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
@@ -194,7 +194,7 @@ mod app {
             parameters,
             flash,
             cx.local.blocks,
-            cx.local.room.first_mut().map_or(Unsealer::NONE, Room::unsealer),
+            cx.local.room.first_mut().map_or(Sealed::NONE, Room::sealed),
         );
         bootloader.confirm(report.returned);
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);

@@ -8,7 +8,7 @@ use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
-use boot_core::control::{Policy, Step};
+use boot_core::control::{Policy, Room, Step};
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances};
 use boot_core::flash::{run, Flash};
@@ -16,7 +16,6 @@ use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
-use boot_core::unseal::Room;
 use coflash::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
 use seal::access::{right, CHALLENGE, DOMAIN as ACCESS_DOMAIN, SIGNED_CHALLENGE};
 use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
@@ -474,8 +473,8 @@ impl Device {
         let mut room = Box::<Room>::default();
         let boot = Boot::new(&self.setup.config, node);
         let node: Box<dyn Node + '_> = match self.setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, room.unsealer())),
-            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, room.unsealer())),
+            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, room.sealed())),
+            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, room.sealed())),
         };
         let result = talk(&mut Host { device: self, node, now: 0 });
         self.chip.model().power_on();

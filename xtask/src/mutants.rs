@@ -28,7 +28,7 @@ It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed 
 const VERSION: &str = "27.1.0";
 const PACKAGES: [&str; 5] = ["coboot-abi", "coboot-canopen", "coboot-core", "coboot-app", "coboot-seal"];
 /// The changes in the files of coboot-core that only sealed images use.
-const SEALED: &str = r"/(unseal|intake/sealed)\b";
+const SEALED: &str = r"/(unseal|intake/sealed|control/(rights|sealed))\b";
 /// The options for them. Their tests are in another crate, too, where cargo-mutants does not look for
 /// them before the first change.
 const WITH_SEALED: &str = "--features=coboot-core/sealed --test-package=coboot-core,coboot-tests \

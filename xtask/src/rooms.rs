@@ -34,7 +34,7 @@ const BOOT_CORE: &[Rule] = &[
     ("programmer", "crc flash program queue resume sequence source store"),
     ("control", "flash intake keys policy program programmer refusal resume session source store unseal"),
     ("stored_version", "flash programmer"),
-    ("bootloader", "control decision flash resume store stored_version unseal"),
+    ("bootloader", "control decision flash resume store stored_version"),
     ("profile", "bootloader policy"),
 ];
 

@@ -22,12 +22,11 @@ use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 use {canopen::program::ACCESS, seal::access::right};
 
-use crate::control::{Downloader, Policy, Step};
+use crate::control::{Downloader, Policy, Sealed, Step};
 use crate::decision::StayReason;
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
-use crate::unseal::Unsealer;
 
 /// The objects that a dialect adds to the object dictionary.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -178,9 +177,9 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
-        unsealer: Unsealer<'b>,
+        sealed: Sealed<'b>,
     ) -> Self {
-        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer, unsealer);
+        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
         let mut bootloader = Self {
             config,
             serial_number,
@@ -232,7 +231,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
         // No other success ends the wait: anybody may send a command that succeeds.
-        if self.download.unsealer_mut().take_authentic() {
+        if self.download.rights_mut().take_authentic() {
             self.signatures.succeed();
         }
         match self.download.take_outcome() {
@@ -240,7 +239,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 // To check a signature takes the device a tenth of a second.
-                if self.download.unsealer_mut().is_present() && error == FlashError::Signature {
+                if self.download.rights().is_present() && error == FlashError::Signature {
                     self.signatures.fail(self.now);
                 }
                 let code = match error {
@@ -279,7 +278,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         if self.lock.is_waiting(self.now) {
             return true;
         }
-        if self.download.unsealer_mut().is_present() && self.signatures.remembers(self.now) {
+        if self.download.rights().is_present() && self.signatures.remembers(self.now) {
             return true;
         }
         self.download.is_finishing()
@@ -321,7 +320,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 return put(buf, version);
             }
         }
-        if let Some(read) = self.download.unsealer_mut().read(at, buf) {
+        if let Some(read) = self.download.rights_mut().read(at, buf) {
             return read;
         }
         let word = match at.index {
@@ -344,12 +343,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
         }
         match (at.index, data) {
             (ACCESS, request) => {
-                // One signature is checked at a time, and that of an image takes precedence.
-                let is_active = self.download.unsealer_mut().is_active();
-                if self.signatures.is_waiting(self.now) || self.download.busy() || is_active {
+                if self.signatures.is_waiting(self.now) {
                     return Err(AbortCode::DEVICE_STATE);
                 }
-                self.download.unsealer_mut().ask(&self.flash, request)
+                self.download.ask(&self.flash, request)
             }
             (SECOND_SERVER, &[a, b, c, d]) if self.config.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
@@ -367,7 +364,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        if self.download.unsealer_mut().takes_no_other() && self.signatures.is_waiting(self.now) {
+        if self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now) {
             return Err(AbortCode::DEVICE_STATE);
         }
         self.download.download_start(at.sub, size)
@@ -422,7 +419,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
-        if !self.download.unsealer_mut().permits(right::STORE) {
+        if !self.download.rights().permits(right::STORE) {
             return Poll::Ready(Err(StoreError::Failed));
         }
         if !self.config.lss_store {

@@ -5,7 +5,7 @@
 //! | [`decision`] | bootloader or program, after every reset | records, no flash |
 //! | `intake` | what arrives in 1F50h: bytes in, judged and placed pieces out | formats, no flash |
 //! | `queue` | the pieces between the two | |
-//! | [`unseal`] | sealed images: authentic, deciphered, unpacked | the format, no object |
+//! | `unseal` | sealed images: authentic, deciphered, unpacked | the format, no object |
 //! | `source` | where the programmer's data come from: the queue, or a sealed image in it | both |
 //! | `programmer` | erase, write, read back, verify | pieces and flash, no format, no object |
 //! | `sequence` | sectors to erase and words to program, one operation at a time | |
@@ -43,7 +43,7 @@ mod session;
 mod source;
 pub mod store;
 mod stored_version;
-pub mod unseal;
+mod unseal;
 
 /// Frames, node and transfers, used in the interface of the core: firmware that uses this crate
 /// needs no further dependency for them.

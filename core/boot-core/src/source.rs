@@ -69,6 +69,12 @@ impl<'b> Source<'b> {
         self.is_complete() && !self.unsealer.is_active()
     }
 
+    /// Whether there is something to [process](Self::step) before any piece: the signature of a
+    /// request for rights.
+    pub(crate) fn is_urgent(&self) -> bool {
+        self.unsealer.is_asked()
+    }
+
     /// Whether there is something to do before more data arrive.
     pub(crate) fn has_work(&self) -> bool {
         !self.queue.is_empty() || !self.unsealer.waits() || self.is_complete()
@@ -125,11 +131,8 @@ impl<'b> Source<'b> {
                 return Ok(Demand::Counter(counter));
             }
             self.ended = None;
-            return Ok(if self.unsealer.is_same() {
-                Demand::Keep(self.unsealer.same_record())
-            } else {
-                Demand::Verify(self.unsealer.expected())
-            });
+            let verify = Demand::Verify(self.unsealer.expected());
+            return Ok(self.unsealer.same().map_or(verify, Demand::Keep));
         }
         Ok(self.ended.take().map_or(Demand::Wait, Demand::Verify))
     }

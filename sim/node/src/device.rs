@@ -12,12 +12,11 @@ use boot_core::canopen::node::{self, NmtPolicy, Node};
 use boot_core::canopen::od::Entry;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
-use boot_core::control::Step;
+use boot_core::control::{Sealed, Step};
 use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
-use boot_core::unseal::Unsealer;
 use coboot_app::{Defaults, Next, Start};
 use shared_abi::warm_start::{BootRequest, Owed};
 
@@ -234,7 +233,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     journal,
                     flash,
                     buffer,
-                    Unsealer::NONE,
+                    Sealed::NONE,
                 );
                 let address = device.lss_address();
                 let node = NodeParameters { id: device.node_id(), ..node };

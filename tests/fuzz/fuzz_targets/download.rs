@@ -6,9 +6,8 @@
 //! install a program.
 #![cfg_attr(fuzzing, no_main)]
 
-use boot_core::control::{Downloader, Policy, Step};
+use boot_core::control::{Downloader, Policy, Room, Step};
 use boot_core::store::Journal;
-use boot_core::unseal::Room;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::Input;
 use coflash::file::block_file::{Block, CRC};
@@ -27,7 +26,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut room = Room::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.unsealer());
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     let mut input = Input::new(bytes);
     let mut next = 0_u32;
     // Whether the SDO server has an open transfer: it only makes certain calls then.
@@ -112,7 +111,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let mut room = Room::new();
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.unsealer());
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     device.command(1, ProgramControl::Clear).expect("CLEAR");
     settle(&mut device, &mut flash);
     assert_eq!(device.status(1), FlashStatus::OK);

@@ -10,11 +10,10 @@
 use std::sync::OnceLock;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
-use boot_core::control::{Policy, Step as Work};
+use boot_core::control::{Policy, Room, Step as Work};
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::{Journal, NodeParameters};
-use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA, SECOND_SERVER};
@@ -225,7 +224,7 @@ struct Host {
 fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool {
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();
-    let device = Boot::new(&CONFIG, STORED).on(flash, &mut buffer, room.unsealer());
+    let device = Boot::new(&CONFIG, STORED).on(flash, &mut buffer, room.sealed());
     let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
     let mut world = World { device, slave, now: 0, answers: Default::default() };
     world.turn();
@@ -317,7 +316,7 @@ fn is_in_flash(flash: &mut ModelFlash) {
     let mut room = Box::<Room>::default();
     let mut bytes = [0; 8];
     {
-        let mut device = Boot::new(&CONFIG, STORED).on::<_, 1>(&mut *flash, &mut buffer, room.unsealer());
+        let mut device = Boot::new(&CONFIG, STORED).on::<_, 1>(&mut *flash, &mut buffer, room.sealed());
         assert_eq!(device.read(PARTIAL, &mut bytes), Ok(8));
     }
     let [id, end] = [0, 4].map(|at| u32::from_le_bytes(bytes[at..at + 4].try_into().expect("four")));
@@ -362,7 +361,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut buffer = [0; 256];
     let mut room = Box::<Room>::default();
     {
-        let device = Boot::new(&CONFIG, STORED).on(&mut flash, &mut buffer, room.unsealer());
+        let device = Boot::new(&CONFIG, STORED).on(&mut flash, &mut buffer, room.sealed());
         let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
         let mut world = World { device, slave, now: 0, answers: Default::default() };
         world.turn();

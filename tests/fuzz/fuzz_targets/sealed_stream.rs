@@ -11,13 +11,12 @@
 use std::sync::OnceLock;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::control::{Policy, Step};
+use boot_core::control::{Policy, Room, Step};
 use boot_core::crc::CrcKind;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::program::verify;
 use boot_core::store::{Journal, NodeParameters};
-use boot_core::unseal::Room;
 use canopen::device::Device;
 use canopen::od::{Entry, Objects};
 use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA};
@@ -169,7 +168,7 @@ type Sealed<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, 1>;
 
 fn device<'b, 'f>(flash: &'f mut ModelFlash, buffer: &'b mut [u8], room: &'b mut Room) -> Sealed<'b, 'f> {
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(&CONFIG, node).on(flash, buffer, room.unsealer())
+    Boot::new(&CONFIG, node).on(flash, buffer, room.sealed())
 }
 
 fn settle(device: &mut Sealed<'_, '_>) {

@@ -8,7 +8,7 @@
 #![cfg_attr(fuzzing, no_main)]
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::control::{Policy, Step};
+use boot_core::control::{Policy, Sealed, Step};
 use boot_core::profile::Profile;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
@@ -98,7 +98,7 @@ type Model<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, PROGRAMS>;
 
 fn device<'b, 'f>(config: &'static Config, flash: &'f mut ModelFlash, buffer: &'b mut [u8]) -> Model<'b, 'f> {
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
-    Boot::new(config, node).on(flash, buffer, boot_core::unseal::Unsealer::NONE)
+    Boot::new(config, node).on(flash, buffer, Sealed::NONE)
 }
 
 fn session(config: &'static Config, flash: &mut ModelFlash, input: &mut Input<'_>) {

@@ -78,9 +78,9 @@ impl<'f> Bench<'f> {
     }
 
     pub fn with_config(flash: &'f mut ModelFlash, config: Config, size: usize) -> Self {
-        let (buffer, unsealer) = leaked(size);
+        let (buffer, sealed) = leaked(size);
         let config = Box::leak(Box::new(config));
-        Self { node: Boot::new(config, node()).on(flash, buffer, unsealer) }
+        Self { node: Boot::new(config, node()).on(flash, buffer, sealed) }
     }
 
     pub fn settle(&mut self) {

@@ -1,9 +1,9 @@
 //! The one way to make a bootloader in a test: what it starts from, and then the flash.
 
 use boot_core::bootloader::{Bootloader, Config};
+use boot_core::control::{Room, Sealed};
 use boot_core::flash::Flash;
 use boot_core::store::{Journal, NodeParameters, Parameters};
-use boot_core::unseal::{Room, Unsealer};
 
 /// What a bootloader starts from, apart from its memory.
 pub struct Boot {
@@ -29,10 +29,10 @@ impl Boot {
         self,
         flash: F,
         buffer: &'b mut [u8],
-        unsealer: Unsealer<'b>,
+        sealed: Sealed<'b>,
     ) -> Bootloader<'b, F, Journal, PROGRAMS> {
         let journal = Journal::open(&flash, self.config.layout.parameters);
-        self.with(journal, flash, buffer, unsealer)
+        self.with(journal, flash, buffer, sealed)
     }
 
     /// Starts on this flash, with the parameters in this store.
@@ -41,10 +41,10 @@ impl Boot {
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
-        unsealer: Unsealer<'b>,
+        sealed: Sealed<'b>,
     ) -> Bootloader<'b, F, P, PROGRAMS> {
         let Self { config, node, serial_number, reason } = self;
-        Bootloader::new(config, serial_number, node, reason, parameters, flash, buffer, unsealer)
+        Bootloader::new(config, serial_number, node, reason, parameters, flash, buffer, sealed)
     }
 }
 
@@ -52,10 +52,10 @@ impl Boot {
 /// images, too, and has no keys yet: both behave the same.
 const TAKES_SEALED: &str = "COBOOT_TAKES_SEALED";
 
-/// A buffer for blocks, and the unsealer, for a bootloader that lives as long as the test.
+/// A buffer for blocks, and the memory for sealed images, for a bootloader that lives as long as the test.
 #[must_use]
-pub fn leaked(buffer: usize) -> (&'static mut [u8], Unsealer<'static>) {
+pub fn leaked(buffer: usize) -> (&'static mut [u8], Sealed<'static>) {
     let takes_sealed = std::env::var_os(TAKES_SEALED).is_some();
-    let unsealer = if takes_sealed { Box::leak(Box::<Room>::default()).unsealer() } else { Unsealer::NONE };
-    (vec![0; buffer].leak(), unsealer)
+    let sealed = if takes_sealed { Box::leak(Box::<Room>::default()).sealed() } else { Sealed::NONE };
+    (vec![0; buffer].leak(), sealed)
 }

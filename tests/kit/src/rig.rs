@@ -185,13 +185,13 @@ impl Rig {
 
     fn boot(setup: &'static Setup, chip: &Chip, buffer: usize) -> Box<dyn Node> {
         let flash = chip.clone();
-        let (buffer, unsealer) = leaked(buffer);
+        let (buffer, sealed) = leaked(buffer);
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let boot = Boot::new(&setup.config, node);
         match setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, buffer, unsealer)),
-            2 => Box::new(boot.with::<_, _, 2>(parameters, flash, buffer, unsealer)),
+            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, buffer, sealed)),
+            2 => Box::new(boot.with::<_, _, 2>(parameters, flash, buffer, sealed)),
             _ => unreachable!(),
         }
     }

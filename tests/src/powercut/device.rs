@@ -8,7 +8,7 @@ use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
-use boot_core::control::{Erase, Policy, Step};
+use boot_core::control::{Erase, Policy, Room, Step};
 use boot_core::crc::CrcKind;
 use boot_core::crc32;
 use boot_core::decision::{self, decide, BootDecision, Circumstances};
@@ -16,7 +16,6 @@ use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
 use boot_core::profile::Profile;
 use boot_core::program::verify;
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord, StoreError, Value};
-use boot_core::unseal::Room;
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::layout::Layout;
 
@@ -271,7 +270,7 @@ impl Device {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
         let (mut buffer, mut room) = ([0; 256], Room::new());
-        let node = Boot::new(config, node).with(parameters, flash, &mut buffer, room.unsealer());
+        let node = Boot::new(config, node).with(parameters, flash, &mut buffer, room.sealed());
         talk(&mut Host { node })
     }
 }

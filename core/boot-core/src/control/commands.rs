@@ -1,5 +1,5 @@
 //! 1F51h: the effects of its commands, and the reasons to refuse them. Passwords are here, too:
-//! they permit a download, and one of them replaces CLEAR.
+//! they permit a download, and one of them replaces CLEAR. So are requests for rights.
 
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
@@ -7,6 +7,7 @@ use seal::access::right;
 use shared_abi::warm_start::BootRequest;
 
 use super::{find, Downloader};
+use crate::flash::Flash;
 use crate::policy::Erase;
 use crate::refusal::Refusal;
 use crate::session::Session;
@@ -56,7 +57,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let again = matches!(state.session, Session::Cleared { just: true });
         let erases = again || (self.policy.erase)(program) == Erase::AtOnce;
         let withdrawn = state.record.is_some_and(|record| record.withdrawn);
-        if !self.programmer.source().unsealer.permits(right_of(command, erases, withdrawn)) {
+        if !self.rights.permits(right_of(command, erases, withdrawn)) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
         if changes && (state.locked || !(self.policy.allowed)()) {
@@ -85,7 +86,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 // Also if the record reads this way: after a power cut it may read differently later.
                 // The store writes nothing if the value is certain.
                 let signed = command == SetSignature;
-                let withdrawn = !signed && self.programmer.source().unsealer.takes_no_other();
+                let withdrawn = !signed && self.rights.takes_no_other();
                 let record = ProgramRecord { signed, withdrawn, ..record };
                 self.programmer.record(&mut self.parameters, program, record, false);
             }
@@ -102,6 +103,20 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             let record = ProgramRecord { confirmed: true, ..record };
             self.programmer.record(&mut self.parameters, program, record, true);
         }
+    }
+
+    /// 2002h/2: a client asks for rights. One signature is checked at a time, and that of an image
+    /// takes precedence.
+    ///
+    /// # Errors
+    /// The abort for the client.
+    pub(crate) fn ask<F: Flash>(&mut self, flash: &F, request: &[u8]) -> Result<(), AbortCode> {
+        let busy = self.busy();
+        let unsealer = &mut self.programmer.source_mut().unsealer;
+        if busy || unsealer.is_active() {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        self.rights.ask(flash, request, unsealer)
     }
 
     /// A correct password arrived: from now on 1F50h accepts data, as after CLEAR. With `at_once`,
@@ -125,7 +140,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
-        let at_once = at_once && self.programmer.source().unsealer.permits(right::ERASE);
+        let at_once = at_once && self.rights.permits(right::ERASE);
         if at_once {
             self.programmer.void(program);
         }

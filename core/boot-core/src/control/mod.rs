@@ -12,6 +12,8 @@
 //! [`Erase`].
 
 mod commands;
+mod rights;
+mod sealed;
 mod transfer;
 
 use core::task::Poll;
@@ -35,10 +37,12 @@ use crate::resume::Partial;
 use crate::session::Session;
 use crate::source::Source;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
-use crate::unseal::Unsealer;
+use crate::unseal::Outcome;
+use rights::Rights;
 
 pub use crate::policy::{Erase, Policy, Verdict};
 pub use crate::programmer::Step;
+pub use sealed::{Room, Sealed};
 
 /// One program in the form of the objects 1F50h–1F57h.
 #[derive(Clone, Copy, Debug)]
@@ -77,6 +81,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     parameters: P,
     programs: [Program; PROGRAMS],
     programmer: Programmer<'b>,
+    rights: Rights<'b>,
     transfer: Option<Transfer>,
     /// The abort for a client that continues to send after the flash has failed.
     fault: AbortCode,
@@ -97,13 +102,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         parameters: P,
         flash: &F,
         buffer: &'b mut [u8],
-        mut unsealer: Unsealer<'b>,
+        sealed: Sealed<'b>,
     ) -> Self {
-        unsealer.attach(flash, &parameters, layout, policy);
+        let (mut rights, unsealer) = sealed.split();
+        rights.attach(flash, &parameters, layout, policy);
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let (record, partial) = load(&parameters, flash, number, &unsealer);
+            let (record, partial) = load(&parameters, flash, number, &rights);
             Program {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
@@ -123,6 +129,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             parameters,
             programs,
             programmer: Programmer::new(Source::new(buffer, unsealer), policy.crc, policy.crc_step),
+            rights,
             transfer: None,
             fault: AbortCode::DEVICE_STATE,
             boot_request: None,
@@ -136,9 +143,14 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.programmer.into_buffer()
     }
 
-    /// The state of sealed images.
-    pub(crate) fn unsealer_mut(&mut self) -> &mut Unsealer<'b> {
-        &mut self.programmer.source_mut().unsealer
+    /// The rights and the event log.
+    pub(crate) fn rights(&self) -> &Rights<'b> {
+        &self.rights
+    }
+
+    /// See [`rights`](Self::rights).
+    pub(crate) fn rights_mut(&mut self) -> &mut Rights<'b> {
+        &mut self.rights
     }
 
     /// 1F57h. It is busy while a command of this program is carried out, or while no further block
@@ -244,7 +256,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if !self.policy.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
-        if !self.programmer.source().unsealer.permits(right::READ_BACK) {
+        if !self.rights.permits(right::READ_BACK) {
             return Err(AbortCode::DEVICE_STATE);
         }
         // The flash cannot be read while it works.
@@ -269,13 +281,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// Continues the work with one step.
     pub fn step<F: Flash>(&mut self, flash: &mut F) -> Step {
-        let (step, event) = self.programmer.step(&mut self.parameters, flash);
+        let rights = &mut self.rights;
+        let (step, event) = self.programmer.step(&mut self.parameters, flash, || rights.take_note());
+        let unsealer = &mut self.programmer.source_mut().unsealer;
+        let news = unsealer.take_news();
+        let is_same = matches!(news.outcome, Outcome::Installed { same: true, .. });
+        self.rights.update(news, unsealer.label());
         match event {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
             Some(Event::Stored { program, ends }) => {
-                let (record, partial) =
-                    load(&self.parameters, flash, program, &self.programmer.source().unsealer);
+                let (record, partial) = load(&self.parameters, flash, program, &self.rights);
                 if let Some(state) = find(&mut self.programs, program) {
                     state.record = record;
                     if record.is_none() {
@@ -285,7 +301,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     if !open {
                         state.partial = partial;
                     }
-                    if ends && open && self.programmer.source().unsealer.is_same() {
+                    if ends && open && is_same {
                         state.session = Session::Idle;
                     }
                 }
@@ -326,7 +342,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     _ if erasing => AbortCode::GENERAL,
                     // The errors for which a sealed image is refused.
                     error
-                        if self.programmer.source().unsealer.is_present()
+                        if self.rights.is_present()
                             && !matches!(error, FlashError::Write | FlashError::NvData) =>
                     {
                         AbortCode::STORE
@@ -415,11 +431,11 @@ fn load<F: Flash>(
     parameters: &impl Parameters,
     flash: &F,
     number: u8,
-    unsealer: &Unsealer<'_>,
+    rights: &Rights<'_>,
 ) -> (Option<ProgramRecord>, Partial) {
     let value = parameters.get(flash, Key::program(number)).unwrap_or([0; 4]);
     let record = ProgramRecord::from_value(value);
-    let record = record.filter(|record| record.is_sealed() || !unsealer.takes_no_other());
+    let record = record.filter(|record| record.is_sealed() || !rights.takes_no_other());
     (record, ProgramRecord::partial_of(value))
 }
 

@@ -11,6 +11,7 @@ use crate::refusal::Refusal;
 use crate::resume::Partial;
 use crate::session::{LastBlock, Session, ANY};
 use crate::store::Parameters;
+use crate::unseal::Place;
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// 1F50h: the client starts a transfer, with its size if it is known.
@@ -107,7 +108,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             region: state.region,
             session: state.session,
             installed: state.record.is_some(),
-            images: self.programmer.source().unsealer.images(),
+            images: self.rights.images(),
             partial: state.partial,
         };
         let mut to = Destination {
@@ -171,7 +172,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 if progress.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
                     self.programmer.disown();
-                    self.programmer.unseal();
+                    self.programmer.source_mut().unsealer.begin(Place {
+                        layout: self.layout,
+                        policy: &self.policy.seal,
+                        program,
+                        region: state.region,
+                        lowered_counter: self.rights.lowered_counter(),
+                    });
                 }
                 state.partial = partial;
             }

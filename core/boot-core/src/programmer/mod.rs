@@ -105,7 +105,7 @@ enum Change {
     Node,
     /// The security counter of a sealed image.
     Counter,
-    /// An event, or the number of grants; no host waits for it.
+    /// A value for which no host waits.
     Note,
 }
 
@@ -170,13 +170,6 @@ impl<'b> Programmer<'b> {
         if target.partial.disown() && target.untouched.is_none() {
             let program = target.program;
             self.void(program);
-        }
-    }
-
-    /// The [opened](Self::open) program arrives as a sealed image.
-    pub(crate) fn unseal(&mut self) {
-        if let Some(Target { program, region, .. }) = self.target {
-            self.source.unsealer.begin(program, region);
         }
     }
 
@@ -296,11 +289,13 @@ impl<'b> Programmer<'b> {
         matches!(self.job, Some(Job::Store(Change::Node, _)))
     }
 
-    /// Continues the work with one step.
+    /// Continues the work with one step. `note` returns a value that must be stored although no host
+    /// waits for it, once; it is stored before anything else is done.
     pub(crate) fn step<F: Flash>(
         &mut self,
         parameters: &mut impl Parameters,
         flash: &mut F,
+        note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> (Step, Option<Event>) {
         let mut outcome = Ok(());
         loop {
@@ -310,7 +305,7 @@ impl<'b> Programmer<'b> {
                 outcome = ended;
             }
             if self.job.is_none() {
-                return match self.choose(parameters, flash) {
+                return match self.choose(parameters, flash, note) {
                     Ok(None) => (Step::Idle, None),
                     Ok(job) => {
                         self.job = job;
@@ -437,8 +432,9 @@ impl<'b> Programmer<'b> {
         &mut self,
         parameters: &mut impl Parameters,
         flash: &F,
+        note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> Result<Option<Job>, FlashError> {
-        if let Some(job) = self.store_note(parameters).or_else(|| self.check_request()) {
+        if let Some(job) = note().map(|note| store_note(parameters, note)).or_else(|| self.process_first()) {
             return Ok(Some(job));
         }
         let piece = self.source.piece();
@@ -459,16 +455,9 @@ impl<'b> Programmer<'b> {
         }
     }
 
-    /// Stores what no host waits for.
-    fn store_note(&mut self, parameters: &mut impl Parameters) -> Option<Job> {
-        let (key, value) = self.source.unsealer.take_store()?;
-        parameters.store(key, value);
-        Some(Job::Store(Change::Note, 0))
-    }
-
-    /// Checks the signature of a request for rights.
-    fn check_request(&self) -> Option<Job> {
-        self.source.unsealer.is_asked().then_some(Job::Process)
+    /// Does what is urgent in the source.
+    fn process_first(&self) -> Option<Job> {
+        self.source.is_urgent().then_some(Job::Process)
     }
 
     /// With the first piece, or for CLEAR, the old program is given up: its record must be removed
@@ -570,6 +559,12 @@ fn bit(program: u8) -> u32 {
 fn store(parameters: &mut impl Parameters, change: Change, program: u8, value: Value) -> Job {
     parameters.store(Key::program(program), value);
     Job::Store(change, program)
+}
+
+/// Starts to store a value for which no host waits.
+fn store_note(parameters: &mut impl Parameters, (key, value): (Key, Value)) -> Job {
+    parameters.store(key, value);
+    Job::Store(Change::Note, 0)
 }
 
 /// Starts to store the security counter of a program.

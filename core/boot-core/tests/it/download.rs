@@ -712,13 +712,13 @@ fn parameters_may_be_kept_in_an_eeprom() {
         }
     }
 
-    let unsealer = || leaked(0).1;
+    let sealed = || leaked(0).1;
     let image = program(200, 0x5E);
     let mut flash = ModelFlash::new(&CHIP);
     let mut eeprom = Eeprom::default();
     let mut buffer = [0; 256];
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, unsealer());
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, sealed());
     let settle = |device: &mut Downloader<'_, &mut Eeprom, 1>, flash: &mut ModelFlash| {
         for _ in 0..1_000_000 {
             if device.step(flash) == Step::Idle {
@@ -745,7 +745,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
 
     eeprom.fails = true;
     let mut device: Downloader<'_, _, 1> =
-        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, unsealer());
+        Downloader::new(&LAYOUT, &Policy::DEFAULT, &mut eeprom, &flash, &mut buffer, sealed());
     device.command(1, ProgramControl::ClrSignature).unwrap();
     assert_eq!(settle(&mut device, &mut flash), 0x10, "NVDATA");
     assert!(

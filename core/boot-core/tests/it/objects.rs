@@ -438,9 +438,9 @@ fn a_device_tells_why_it_stayed() {
     let messages = |reason: u8, boot_up_emergency| {
         let mut flash = ModelFlash::new(&CHIP);
         let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
-        let (buffer, unsealer) = leaked(256);
+        let (buffer, sealed) = leaked(256);
         let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), reason };
-        let mut node = boot.on::<_, 1>(&mut flash, buffer, unsealer);
+        let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
         let mut bytes = [0; 4];

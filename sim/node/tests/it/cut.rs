@@ -110,8 +110,8 @@ impl CutBus {
     fn power_on(&mut self) {
         self.chip.model().power_on();
         let config: &'static Config = &const { CONFIG };
-        let (buffer, unsealer) = leaked(BUFFER);
-        let device = Boot::new(config, node()).on(self.chip.clone(), buffer, unsealer);
+        let (buffer, sealed) = leaked(BUFFER);
+        let device = Boot::new(config, node()).on(self.chip.clone(), buffer, sealed);
         let says = slave::Config::default();
         let says = slave::Config {
             node: boot_core::canopen::node::Config {

@@ -1,0 +1,283 @@
+//! The interface to the processing of sealed images.
+
+use canopen::program::FlashError;
+use seal::wire::{flag, Fault, Head};
+
+use super::buffers::{start, Buffers};
+use super::image::{Image, Place};
+use crate::flash::Flash;
+use crate::keys::Linked;
+use crate::program::Expected;
+use crate::queue::{Piece, Queue};
+use crate::store::record::Seal;
+use crate::store::{Parameters, ProgramRecord, Value};
+
+/// The processing of a sealed image, in a device that takes them.
+pub(crate) struct Unsealer<'b>(Option<&'b mut Workshop>);
+
+/// Its state. A new one must consist of zeros, because it is in a static of the firmware: with any
+/// other byte, all of it would be stored in flash, too. So the empty variant of its enums is the
+/// first one, and `repr` keeps the compiler from another number for it; `None` has no such rule.
+pub(crate) struct Workshop {
+    work: Work,
+    news: News,
+    buffers: Buffers,
+}
+
+/// What is processed at present.
+#[repr(u8)]
+enum Work {
+    /// Nothing.
+    Idle,
+    /// The signature of a request for rights is being checked; there is no image.
+    Request(Request),
+    Image(Image),
+}
+
+/// The rights that a client asks for, and their argument.
+#[derive(Clone, Copy)]
+pub(crate) struct Request {
+    pub rights: u32,
+    pub argument: u32,
+}
+
+/// What was found out, and is not yet known to others.
+#[derive(Default)]
+pub(crate) struct News {
+    /// The manifest of an image is authentic, and the device has its keys.
+    pub accepted: bool,
+    /// The signature of this request is good.
+    pub granted: Option<Request>,
+    /// How the work on an image has ended.
+    pub outcome: Outcome,
+}
+
+/// The end of the work on an image.
+#[derive(Default)]
+#[repr(u8)]
+pub(crate) enum Outcome {
+    /// It has not ended.
+    #[default]
+    None,
+    /// It is installed; `same`: it was already installed before.
+    Installed { program: u8, same: bool },
+    /// It was refused.
+    Refused(FlashError),
+}
+
+/// Security counter and version of an image.
+#[derive(Clone, Copy)]
+pub(crate) struct Label {
+    pub counter: u32,
+    pub version: u32,
+}
+
+impl Workshop {
+    /// The state for one image at a time. All of it is zero.
+    pub(crate) const fn new() -> Self {
+        let news = News { accepted: false, granted: None, outcome: Outcome::None };
+        Self { work: Work::Idle, news, buffers: Buffers::new() }
+    }
+}
+
+impl<'b> Unsealer<'b> {
+    /// `None` in a device that takes no sealed images.
+    pub(crate) fn new(workshop: Option<&'b mut Workshop>) -> Self {
+        Self(workshop)
+    }
+
+    /// The state, in a device that takes sealed images.
+    fn workshop(&self) -> Option<&Workshop> {
+        Linked::PROOF.and(self.0.as_deref())
+    }
+
+    /// See [`workshop`](Self::workshop).
+    fn workshop_mut(&mut self) -> Option<&mut Workshop> {
+        Linked::PROOF.and(self.0.as_deref_mut())
+    }
+
+    /// The image that is being processed.
+    fn image(&self) -> Option<&Image> {
+        match &self.workshop()?.work {
+            Work::Image(image) => Some(image),
+            Work::Idle | Work::Request(_) => None,
+        }
+    }
+
+    /// See [`image`](Self::image).
+    fn image_mut(&mut self) -> Option<&mut Image> {
+        match &mut self.workshop_mut()?.work {
+            Work::Image(image) => Some(image),
+            Work::Idle | Work::Request(_) => None,
+        }
+    }
+
+    /// Whether the device takes sealed images.
+    pub(crate) fn is_present(&self) -> bool {
+        self.workshop().is_some()
+    }
+
+    /// Whether the present download is a sealed image.
+    pub(crate) fn is_active(&self) -> bool {
+        self.image().is_some()
+    }
+
+    /// Starts an image.
+    pub(crate) fn begin(&mut self, place: Place) {
+        let Some(workshop) = self.workshop_mut() else { return };
+        workshop.work = Work::Image(Image::new(place));
+    }
+
+    /// Starts to check the signature of a request for rights.
+    pub(crate) fn check(
+        &mut self,
+        request: Request,
+        key: &[u8; 32],
+        signature: &[u8; 64],
+        message: &[&[u8]],
+    ) {
+        let Some(workshop) = self.workshop_mut() else { return };
+        start(&mut workshop.buffers.verification, key, signature, message);
+        workshop.work = Work::Request(request);
+    }
+
+    /// Whether the signature of a request for rights is being checked.
+    pub(crate) fn is_asked(&self) -> bool {
+        self.workshop().is_some_and(|workshop| matches!(workshop.work, Work::Request(_)))
+    }
+
+    /// Ends the processing of an image, or of a request.
+    pub(crate) fn rest(&mut self) {
+        if let Some(workshop) = self.workshop_mut() {
+            workshop.work = Work::Idle;
+        }
+    }
+
+    /// Ends the processing of an image with this result.
+    pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
+        let Some(workshop) = self.workshop_mut() else { return };
+        if let Work::Image(image) = &workshop.work {
+            workshop.news.outcome = match outcome {
+                Ok(()) => Outcome::Installed { program: image.program(), same: image.same().is_some() },
+                Err(error) => Outcome::Refused(error),
+            };
+        }
+        workshop.work = Work::Idle;
+    }
+
+    /// Returns what was found out since the last call.
+    pub(crate) fn take_news(&mut self) -> News {
+        self.workshop_mut().map(|workshop| core::mem::take(&mut workshop.news)).unwrap_or_default()
+    }
+
+    /// Whether there is nothing to do before more bytes arrive.
+    pub(crate) fn waits(&self) -> bool {
+        self.workshop().is_none_or(|workshop| match &workshop.work {
+            Work::Idle => true,
+            Work::Request(_) => false,
+            Work::Image(image) => image.waits(),
+        })
+    }
+
+    /// Whether the flash contains the image.
+    pub(crate) fn is_installed(&self) -> bool {
+        self.image().is_some_and(Image::is_installed)
+    }
+
+    /// `Some` if it was already installed before: its record as it was read at that time. After a
+    /// power cut it may read differently the next time.
+    pub(crate) fn same(&self) -> Option<Value> {
+        self.image().and_then(Image::same)
+    }
+
+    /// The next bytes for the flash.
+    pub(crate) fn piece(&self) -> Option<Piece> {
+        self.image()?.piece()
+    }
+
+    /// A byte of these bytes.
+    pub(crate) fn data(&self, offset: usize) -> u8 {
+        let at = self.image().map_or(0, Image::out) + offset;
+        self.workshop().and_then(|workshop| workshop.buffers.bytes.get(at).copied()).unwrap_or(0)
+    }
+
+    /// These bytes are in flash.
+    pub(crate) fn written(&mut self) {
+        if let Some(image) = self.image_mut() {
+            image.written();
+        }
+    }
+
+    /// The head of the last image.
+    fn head(&self) -> Option<Head<'_>> {
+        self.workshop().map(|workshop| Head(&workshop.buffers.head))
+    }
+
+    /// The expected properties of the program.
+    pub(crate) fn expected(&self) -> Expected {
+        self.head().map_or(Expected { size: 0, crc: None }, |head| Expected {
+            size: head.size(),
+            crc: Some(head.crc()),
+        })
+    }
+
+    /// Security counter and version of the last image.
+    pub(crate) fn label(&self) -> Label {
+        self.head().map_or(Label { counter: 0, version: 0 }, |head| Label {
+            counter: head.counter(),
+            version: head.version(),
+        })
+    }
+
+    /// Returns the new counter, once.
+    pub(crate) fn take_counter(&mut self) -> Option<Value> {
+        self.image_mut()?.take_counter()
+    }
+
+    /// Marks the record of a program that was installed as a sealed image.
+    pub(crate) fn mark(&self, record: ProgramRecord) -> ProgramRecord {
+        let Some(head) = self.head().filter(|_| self.is_active()) else { return record };
+        let writes = head.flags() & flag::WRITES_FLASH != 0;
+        let seal = if writes { Seal::WritesFlash } else { Seal::Locked };
+        ProgramRecord { version: head.version(), seal: Some(seal), ..record }
+    }
+
+    /// Continues with one bounded step.
+    pub(crate) fn step<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+        queue: &mut Queue<'_>,
+    ) -> Result<(), FlashError> {
+        let Some(workshop) = self.workshop_mut() else { return Ok(()) };
+        workshop
+            .advance(flash, parameters, queue)
+            .map_err(|fault| FlashError::from_code(fault as u8).unwrap_or(FlashError::Unspecified))
+    }
+}
+
+impl Workshop {
+    fn advance<F: Flash>(
+        &mut self,
+        flash: &F,
+        parameters: &impl Parameters,
+        queue: &mut Queue<'_>,
+    ) -> Result<(), Fault> {
+        match &mut self.work {
+            Work::Idle => {}
+            Work::Request(request) => match self.buffers.verification.step() {
+                None => {}
+                Some(false) => return Err(Fault::Signature),
+                Some(true) => {
+                    self.news.granted = Some(*request);
+                    self.work = Work::Idle;
+                }
+            },
+            Work::Image(image) => {
+                let accepted = &mut self.news.accepted;
+                image.advance(&mut self.buffers, accepted, flash, parameters, queue)?;
+            }
+        }
+        Ok(())
+    }
+}
