@@ -10,7 +10,7 @@ use crate::flash::Flash;
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
 use crate::store::{Parameters, Value};
-use crate::unseal::{proved, Unsealer};
+use crate::unseal::{proved, Progress, Unsealer};
 
 /// The source of the program that is being downloaded.
 pub(crate) struct Source<'b> {
@@ -77,7 +77,8 @@ impl<'b> Source<'b> {
 
     /// Whether there is something to do before more data arrive.
     pub(crate) fn has_work(&self) -> bool {
-        !self.queue.is_empty() || !self.unsealer.waits() || self.is_complete()
+        let works = matches!(self.unsealer.progress(), Some(Progress::Works));
+        !self.queue.is_empty() || works || self.is_urgent() || self.is_complete()
     }
 
     /// Whether the queue has room for a block of the largest size. (A smaller queue takes one block
@@ -115,26 +116,26 @@ impl<'b> Source<'b> {
 
     /// What there is to do when no piece is ready.
     pub(crate) fn next(&mut self) -> Result<Demand, FlashError> {
-        if self.unsealer.is_active() {
-            let ended = self.is_complete();
-            match (self.unsealer.is_installed(), self.queue.is_empty()) {
-                (false, true) if self.unsealer.waits() => {
-                    return if ended { Err(FlashError::Format) } else { Ok(Demand::Wait) };
+        let (ended, is_empty) = (self.is_complete(), self.queue.is_empty());
+        match self.unsealer.progress() {
+            None => Ok(self.ended.take().map_or(Demand::Wait, Demand::Verify)),
+            Some(Progress::Waits) if is_empty && ended => Err(FlashError::Format),
+            Some(Progress::Waits) if is_empty => Ok(Demand::Wait),
+            Some(Progress::Waits | Progress::Works) => Ok(Demand::Process),
+            Some(Progress::Installed { .. }) if !is_empty => Err(FlashError::Format),
+            Some(Progress::Installed { .. }) if !ended => Ok(Demand::Wait),
+            Some(Progress::Installed { same }) => {
+                // Also for the same image: its certificate may have a higher epoch.
+                if let Some(counter) = self.unsealer.take_counter() {
+                    return Ok(Demand::Counter(counter));
                 }
-                (false, _) => return Ok(Demand::Process),
-                (true, false) => return Err(FlashError::Format),
-                (true, true) if !ended => return Ok(Demand::Wait),
-                (true, true) => {}
+                self.ended = None;
+                Ok(match same {
+                    Some(record) => Demand::Keep(record),
+                    None => Demand::Verify(self.unsealer.expected()),
+                })
             }
-            // Also for the same image: its certificate may have a higher epoch.
-            if let Some(counter) = self.unsealer.take_counter() {
-                return Ok(Demand::Counter(counter));
-            }
-            self.ended = None;
-            let verify = Demand::Verify(self.unsealer.expected());
-            return Ok(self.unsealer.same().map_or(verify, Demand::Keep));
         }
-        Ok(self.ended.take().map_or(Demand::Wait, Demand::Verify))
     }
 
     /// Processes received bytes with one bounded step.
@@ -162,13 +163,11 @@ impl<'b> Source<'b> {
 
     /// The record of the program was stored, or could not be stored.
     pub(crate) fn stored(&mut self, result: Result<(), FlashError>) {
-        if self.unsealer.is_installed() {
-            self.unsealer.end(result);
-        }
+        self.unsealer.stored(result);
     }
 
     /// The work on the program failed.
     pub(crate) fn fail(&mut self, error: FlashError) {
-        self.unsealer.end(Err(error));
+        self.unsealer.fail(error);
     }
 }

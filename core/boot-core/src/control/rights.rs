@@ -191,22 +191,18 @@ impl<'b> Rights<'b> {
             // The right is valid for one image.
             access.granted &= !right::LOWER_COUNTER;
         }
-        if let Some(request) = news.granted {
-            access.grant(request, label);
-        }
-        match news.outcome {
-            Outcome::None => {}
-            Outcome::Installed { program, same } => {
-                access.authentic = true;
-                // Anybody may send the installed image again: this changes nothing.
-                if !same {
-                    access.log.record(event::INSTALLED | u32::from(program), label);
-                }
+        access.authentic |= matches!(news.outcome, Outcome::Granted(_) | Outcome::Installed { .. });
+        let event = match news.outcome {
+            // Anybody may send the installed image again: this changes nothing.
+            Outcome::None | Outcome::Installed { same: true, .. } => return,
+            Outcome::Installed { program, .. } => event::INSTALLED | u32::from(program),
+            Outcome::Refused(error) => event::REFUSED | u32::from(error.code()),
+            Outcome::Granted(request) => {
+                access.grant(request);
+                event::UNLOCKED | request.rights & 0xFFFF
             }
-            Outcome::Refused(error) => {
-                access.log.record(event::REFUSED | u32::from(error.code()), label);
-            }
-        }
+        };
+        access.log.record(event, label);
     }
 
     /// Returns the next value to store, once.
@@ -259,7 +255,7 @@ impl Access {
     }
 
     /// Grants the rights after the signature was found good.
-    fn grant(&mut self, Request { rights, argument }: Request, label: Label) {
+    fn grant(&mut self, Request { rights, argument }: Request) {
         self.granted |= rights;
         if rights & right::LOWER_COUNTER != 0 {
             self.argument = argument;
@@ -268,8 +264,6 @@ impl Access {
         self.grants.opened |= rights & right::OPEN;
         self.grants.count = self.grants.count.wrapping_add(1);
         self.grants.is_changed = true;
-        self.authentic = true;
-        self.log.record(event::UNLOCKED | rights & 0xFFFF, label);
     }
 }
 

@@ -19,6 +19,8 @@ pub(super) const UNPACK: usize = 512;
 pub(super) struct Buffers {
     pub verification: Verification,
     pub lzma: Decoder,
+    /// The hash of the chunk that is being received, or of the flash that is being hashed.
+    pub hash: Sha512,
     pub head: [u8; MAX_HEAD],
     /// A chunk, and the decompressed bytes after it.
     pub bytes: [u8; UNPACKED + UNPACK],
@@ -30,6 +32,7 @@ impl Buffers {
         Self {
             verification: Verification::IDLE,
             lzma: Decoder::new(),
+            hash: Sha512::IDLE,
             head: [0; MAX_HEAD],
             bytes: [0; UNPACKED + UNPACK],
         }

@@ -60,7 +60,6 @@ enum Phase {
 
 /// Flash that is being hashed.
 struct Hashing {
-    hash: Sha512,
     /// The number of bytes so far.
     done: u32,
 }
@@ -70,7 +69,6 @@ struct Arrival {
     /// The offset in the buffer of the next byte, and the end of the chunk.
     have: usize,
     want: usize,
-    hash: Sha512,
     /// The number of compressed bytes that the previous chunk left over: they are in the buffer
     /// before this one.
     rest: usize,
@@ -97,6 +95,7 @@ impl Content {
     ) -> Self {
         let head = Head(&buffers.head);
         buffers.lzma.reset();
+        buffers.hash = Sha512::new_256();
         let mut chain = Chain {
             next: head.chain(),
             left: head.payload(),
@@ -105,7 +104,7 @@ impl Content {
             dictionary: dictionary.unwrap_or(Region::new(0, 0)),
         };
         let phase = match dictionary {
-            Some(_) => Phase::Dictionary(Hashing::new()),
+            Some(_) => Phase::Dictionary(Hashing { done: 0 }),
             None => chain.next_chunk(head, 0),
         };
         Self { verdict, chain, phase }
@@ -151,40 +150,47 @@ impl Content {
         queue: &mut Queue<'_>,
     ) -> Result<bool, Fault> {
         let chain = &mut self.chain;
-        match &mut self.phase {
-            Phase::Dictionary(hashing) => match hashing.step(flash, chain.dictionary) {
-                None => {}
-                Some(hash) if hash[..HASH] != *Head(&buffers.head).dictionary() => {
+        let head = Head(&buffers.head);
+        // The number of bytes that are left over, when the next chunk may come.
+        let rest = match &mut self.phase {
+            Phase::Dictionary(hashing) => {
+                let Some(hash) = hashing.step(flash, chain.dictionary, &mut buffers.hash) else {
+                    return Ok(false);
+                };
+                if hash[..HASH] != *head.dictionary() {
                     return Err(Fault::WrongProduct);
                 }
-                Some(_) => self.phase = chain.next_chunk(Head(&buffers.head), 0),
-            },
+                0
+            }
             Phase::Chunk(arrival) => {
-                if arrival.step(&mut buffers.bytes, queue) {
-                    if arrival.hash.finish()[..HASH] != chain.next {
-                        return Err(Fault::Signature);
-                    }
-                    chain.next.copy_from_slice(&buffers.bytes[CARRY..PAYLOAD]);
-                    self.phase = match self.verdict.same {
-                        Some(_) => chain.next_chunk(Head(&buffers.head), 0),
-                        None => Phase::Payload(Payload::new(arrival, &mut buffers.bytes)),
-                    };
+                if !arrival.step(&mut buffers.bytes, &mut buffers.hash, queue) {
+                    return Ok(false);
                 }
-            }
-            Phase::Payload(payload) => {
-                if let Some(rest) = payload.step(chain, region, buffers, flash)? {
-                    self.phase = chain.next_chunk(Head(&buffers.head), rest);
+                if buffers.hash.finish()[..HASH] != chain.next {
+                    return Err(Fault::Signature);
                 }
+                chain.next.copy_from_slice(&buffers.bytes[CARRY..PAYLOAD]);
+                if self.verdict.same.is_none() {
+                    self.phase = Phase::Payload(Payload::new(arrival, &mut buffers.bytes));
+                    return Ok(false);
+                }
+                0
             }
+            Phase::Payload(payload) => match payload.step(chain, region, buffers, flash)? {
+                Some(rest) => rest,
+                None => return Ok(false),
+            },
             Phase::Image(hashing) => {
-                let head = Head(&buffers.head);
-                return match hashing.step(flash, Region::new(region.base, head.size())) {
-                    None => Ok(false),
-                    Some(hash) if hash[..HASH] != *head.image_hash() => Err(Fault::Signature),
-                    Some(_) => Ok(true),
-                };
+                let image = Region::new(region.base, head.size());
+                let Some(hash) = hashing.step(flash, image, &mut buffers.hash) else { return Ok(false) };
+                if hash[..HASH] != *head.image_hash() {
+                    return Err(Fault::Signature);
+                }
+                return Ok(true);
             }
-        }
+        };
+        buffers.hash = Sha512::new_256();
+        self.phase = chain.next_chunk(Head(&buffers.head), rest);
         Ok(false)
     }
 }
@@ -195,26 +201,22 @@ impl Chain {
         let size = self.left.min(1 << head.chunk());
         self.left -= size;
         if size == 0 {
-            return Phase::Image(Hashing::new());
+            return Phase::Image(Hashing { done: 0 });
         }
         let want = PAYLOAD + size as usize;
-        Phase::Chunk(Arrival { have: CARRY, want, hash: Sha512::new_256(), rest })
+        Phase::Chunk(Arrival { have: CARRY, want, rest })
     }
 }
 
 impl Hashing {
-    fn new() -> Self {
-        Self { hash: Sha512::new_256(), done: 0 }
-    }
-
     /// Continues with one step; returns the hash after the last one.
-    fn step<F: Flash>(&mut self, flash: &F, place: Region) -> Option<[u8; 64]> {
+    fn step<F: Flash>(&mut self, flash: &F, place: Region, hash: &mut Sha512) -> Option<[u8; 64]> {
         let size = (place.size - self.done).min(STEP as u32);
         if size == 0 {
-            return Some(self.hash.finish());
+            return Some(hash.finish());
         }
-        let hash = core::mem::replace(&mut self.hash, Sha512::IDLE);
-        self.hash = fold(flash, hash, Region::new(place.base + self.done, size), |mut hash, bytes| {
+        let so_far = core::mem::replace(hash, Sha512::IDLE);
+        *hash = fold(flash, so_far, Region::new(place.base + self.done, size), |mut hash, bytes| {
             hash.update(bytes);
             hash
         });
@@ -225,11 +227,11 @@ impl Hashing {
 
 impl Arrival {
     /// Takes and hashes bytes; returns whether the chunk is complete.
-    fn step(&mut self, bytes: &mut [u8], queue: &mut Queue<'_>) -> bool {
+    fn step(&mut self, bytes: &mut [u8], hash: &mut Sha512, queue: &mut Queue<'_>) -> bool {
         let end = self.want.min(self.have + STEP);
         let room = &mut bytes[self.have..end];
         let taken = queue.take(room);
-        self.hash.update(&room[..taken]);
+        hash.update(&room[..taken]);
         self.have += taken;
         self.have == self.want
     }

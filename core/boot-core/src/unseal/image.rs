@@ -43,8 +43,26 @@ enum Stage {
     Manifest(Judged),
     /// The head is authentic; the rest is being processed.
     Content(Content),
-    /// The flash contains the image. `raises`: its counter is not stored yet.
-    Installed { verdict: Verdict, raises: bool },
+    /// The flash contains the image.
+    Installed(Installed),
+}
+
+/// An image that the flash contains.
+struct Installed {
+    verdict: Verdict,
+    /// The new counter is not stored yet.
+    raises: bool,
+}
+
+/// What there is to do with an image.
+pub(crate) enum Progress {
+    /// Nothing before more bytes arrive.
+    Waits,
+    /// The next step.
+    Works,
+    /// The flash contains it. `same`: it was already installed before, with this record as it was
+    /// read at that time. After a power cut it may read differently the next time.
+    Installed { same: Option<Value> },
 }
 
 /// An image that is for this device, if its signatures are good.
@@ -65,34 +83,20 @@ impl Image {
         self.place.program
     }
 
-    /// See [`Unsealer::waits`](super::Unsealer::waits).
-    pub(super) fn waits(&self) -> bool {
+    /// What there is to do with it.
+    pub(super) const fn progress(&self) -> Progress {
         match &self.stage {
-            Stage::Head { .. } | Stage::Installed { .. } => true,
-            Stage::Certificate(_) | Stage::Manifest(_) => false,
-            Stage::Content(content) => content.waits(),
+            Stage::Head { .. } => Progress::Waits,
+            Stage::Content(content) if content.waits() => Progress::Waits,
+            Stage::Certificate(_) | Stage::Manifest(_) | Stage::Content(_) => Progress::Works,
+            Stage::Installed(installed) => Progress::Installed { same: installed.verdict.same },
         }
     }
 
-    /// Whether the flash contains it.
-    pub(super) const fn is_installed(&self) -> bool {
-        matches!(self.stage, Stage::Installed { .. })
-    }
-
-    /// See [`Unsealer::same`](super::Unsealer::same).
-    pub(super) const fn same(&self) -> Option<Value> {
-        match &self.stage {
-            Stage::Installed { verdict, .. } => verdict.same,
-            _ => None,
-        }
-    }
-
-    /// See [`Unsealer::take_counter`](super::Unsealer::take_counter).
+    /// Returns the new counter of an installed image, once.
     pub(super) fn take_counter(&mut self) -> Option<Value> {
-        match &mut self.stage {
-            Stage::Installed { verdict, raises } => core::mem::take(raises).then_some(verdict.counter),
-            _ => None,
-        }
+        let Stage::Installed(Installed { verdict, raises }) = &mut self.stage else { return None };
+        core::mem::take(raises).then_some(verdict.counter)
     }
 
     /// The next bytes for the flash.
@@ -118,7 +122,13 @@ impl Image {
         }
     }
 
-    /// Continues with one bounded step. `accepted` is set when the manifest was found authentic.
+    /// Whether its next step needs a good signature.
+    pub(super) const fn has_signature(&self) -> bool {
+        matches!(self.stage, Stage::Certificate(_) | Stage::Manifest(_))
+    }
+
+    /// Continues with one bounded step. If it [has a signature](Self::has_signature), that was found
+    /// good. `accepted` is set when the manifest was found authentic.
     pub(super) fn advance<F: Flash>(
         &mut self,
         buffers: &mut Buffers,
@@ -139,30 +149,22 @@ impl Image {
                     self.stage = self.place.judge(buffers, flash, parameters)?;
                 }
             }
-            Stage::Certificate(judged) => match buffers.verification.step() {
-                None => {}
-                Some(false) => return Err(Fault::Signature),
-                Some(true) => {
-                    check_manifest(buffers, None)?;
-                    self.stage = Stage::Manifest(*judged);
-                }
-            },
-            Stage::Manifest(judged) => match buffers.verification.step() {
-                None => {}
-                Some(false) => return Err(Fault::Signature),
-                Some(true) => {
-                    let key = judged.key(self.place.layout, buffers, flash)?;
-                    *accepted = true;
-                    let dictionary = self.place.dictionary(buffers, flash, parameters)?;
-                    self.stage = Stage::Content(Content::new(judged.verdict, key, dictionary, buffers));
-                }
-            },
+            Stage::Certificate(judged) => {
+                check_manifest(buffers, None)?;
+                self.stage = Stage::Manifest(*judged);
+            }
+            Stage::Manifest(judged) => {
+                let key = judged.key(self.place.layout, buffers, flash)?;
+                *accepted = true;
+                let dictionary = self.place.dictionary(buffers, flash, parameters)?;
+                self.stage = Stage::Content(Content::new(judged.verdict, key, dictionary, buffers));
+            }
             Stage::Content(content) => {
                 if content.advance(self.place.region, buffers, flash, queue)? {
-                    self.stage = Stage::Installed { verdict: content.verdict(), raises: true };
+                    self.stage = Stage::Installed(Installed { verdict: content.verdict(), raises: true });
                 }
             }
-            Stage::Installed { .. } => {}
+            Stage::Installed(_) => {}
         }
         Ok(())
     }
@@ -238,7 +240,10 @@ impl Place {
                 start(&mut buffers.verification, root, &signature, &[certificate.signed()]);
                 Ok(Stage::Certificate(judged))
             }
-            None => check_manifest(buffers, Some(root)).map(|()| Stage::Manifest(judged)),
+            None => {
+                check_manifest(buffers, Some(root))?;
+                Ok(Stage::Manifest(judged))
+            }
         }
     }
 

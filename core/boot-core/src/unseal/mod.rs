@@ -21,5 +21,5 @@ mod content;
 mod image;
 mod unsealer;
 
-pub(crate) use image::{proved, Place};
+pub(crate) use image::{proved, Place, Progress};
 pub(crate) use unsealer::{Label, News, Outcome, Request, Unsealer, Workshop};

@@ -4,7 +4,7 @@ use canopen::program::FlashError;
 use seal::wire::{flag, Fault, Head};
 
 use super::buffers::{start, Buffers};
-use super::image::{Image, Place};
+use super::image::{Image, Place, Progress};
 use crate::flash::Flash;
 use crate::keys::Linked;
 use crate::program::Expected;
@@ -18,6 +18,9 @@ pub(crate) struct Unsealer<'b>(Option<&'b mut Workshop>);
 /// Its state. A new one must consist of zeros, because it is in a static of the firmware: with any
 /// other byte, all of it would be stored in flash, too. So the empty variant of its enums is the
 /// first one, and `repr` keeps the compiler from another number for it; `None` has no such rule.
+///
+/// The small fields come first, within reach of short instructions.
+#[repr(C)]
 pub(crate) struct Workshop {
     work: Work,
     news: News,
@@ -46,22 +49,22 @@ pub(crate) struct Request {
 pub(crate) struct News {
     /// The manifest of an image is authentic, and the device has its keys.
     pub accepted: bool,
-    /// The signature of this request is good.
-    pub granted: Option<Request>,
-    /// How the work on an image has ended.
+    /// How the work has ended.
     pub outcome: Outcome,
 }
 
-/// The end of the work on an image.
+/// The end of the work on an image or a request.
 #[derive(Default)]
 #[repr(u8)]
 pub(crate) enum Outcome {
     /// It has not ended.
     #[default]
     None,
-    /// It is installed; `same`: it was already installed before.
+    /// The signature of the request is good.
+    Granted(Request),
+    /// The image is installed; `same`: it was already installed before.
     Installed { program: u8, same: bool },
-    /// It was refused.
+    /// The image was refused.
     Refused(FlashError),
 }
 
@@ -75,7 +78,7 @@ pub(crate) struct Label {
 impl Workshop {
     /// The state for one image at a time. All of it is zero.
     pub(crate) const fn new() -> Self {
-        let news = News { accepted: false, granted: None, outcome: Outcome::None };
+        let news = News { accepted: false, outcome: Outcome::None };
         Self { work: Work::Idle, news, buffers: Buffers::new() }
     }
 }
@@ -153,15 +156,27 @@ impl<'b> Unsealer<'b> {
         }
     }
 
-    /// Ends the processing of an image with this result.
-    pub(crate) fn end(&mut self, outcome: Result<(), FlashError>) {
-        let Some(workshop) = self.workshop_mut() else { return };
-        if let Work::Image(image) = &workshop.work {
-            workshop.news.outcome = match outcome {
-                Ok(()) => Outcome::Installed { program: image.program(), same: image.same().is_some() },
-                Err(error) => Outcome::Refused(error),
-            };
+    /// The record of the image was stored, or could not be stored: ends its processing if the flash
+    /// contains it.
+    pub(crate) fn stored(&mut self, result: Result<(), FlashError>) {
+        let Some(image) = self.image() else { return };
+        let Progress::Installed { same } = image.progress() else { return };
+        self.end(match result {
+            Ok(()) => Outcome::Installed { program: image.program(), same: same.is_some() },
+            Err(error) => Outcome::Refused(error),
+        });
+    }
+
+    /// The work failed.
+    pub(crate) fn fail(&mut self, error: FlashError) {
+        if self.is_active() {
+            self.end(Outcome::Refused(error));
         }
+    }
+
+    fn end(&mut self, outcome: Outcome) {
+        let Some(workshop) = self.workshop_mut() else { return };
+        workshop.news.outcome = outcome;
         workshop.work = Work::Idle;
     }
 
@@ -170,24 +185,14 @@ impl<'b> Unsealer<'b> {
         self.workshop_mut().map(|workshop| core::mem::take(&mut workshop.news)).unwrap_or_default()
     }
 
-    /// Whether there is nothing to do before more bytes arrive.
-    pub(crate) fn waits(&self) -> bool {
-        self.workshop().is_none_or(|workshop| match &workshop.work {
-            Work::Idle => true,
-            Work::Request(_) => false,
-            Work::Image(image) => image.waits(),
-        })
+    /// What there is to do with the image, if there is one.
+    pub(crate) fn progress(&self) -> Option<Progress> {
+        self.image().map(Image::progress)
     }
 
-    /// Whether the flash contains the image.
-    pub(crate) fn is_installed(&self) -> bool {
-        self.image().is_some_and(Image::is_installed)
-    }
-
-    /// `Some` if it was already installed before: its record as it was read at that time. After a
-    /// power cut it may read differently the next time.
-    pub(crate) fn same(&self) -> Option<Value> {
-        self.image().and_then(Image::same)
+    /// Returns the new counter of an installed image, once.
+    pub(crate) fn take_counter(&mut self) -> Option<Value> {
+        self.image_mut()?.take_counter()
     }
 
     /// The next bytes for the flash.
@@ -229,11 +234,6 @@ impl<'b> Unsealer<'b> {
         })
     }
 
-    /// Returns the new counter, once.
-    pub(crate) fn take_counter(&mut self) -> Option<Value> {
-        self.image_mut()?.take_counter()
-    }
-
     /// Marks the record of a program that was installed as a sealed image.
     pub(crate) fn mark(&self, record: ProgramRecord) -> ProgramRecord {
         let Some(head) = self.head().filter(|_| self.is_active()) else { return record };
@@ -256,6 +256,17 @@ impl<'b> Unsealer<'b> {
     }
 }
 
+impl Work {
+    /// Whether a signature must be found good before it goes on.
+    fn has_signature(&self) -> bool {
+        match self {
+            Self::Idle => false,
+            Self::Request(_) => true,
+            Self::Image(image) => image.has_signature(),
+        }
+    }
+}
+
 impl Workshop {
     fn advance<F: Flash>(
         &mut self,
@@ -263,16 +274,19 @@ impl Workshop {
         parameters: &impl Parameters,
         queue: &mut Queue<'_>,
     ) -> Result<(), Fault> {
+        if self.work.has_signature() {
+            match self.buffers.verification.step() {
+                None => return Ok(()),
+                Some(false) => return Err(Fault::Signature),
+                Some(true) => {}
+            }
+        }
         match &mut self.work {
             Work::Idle => {}
-            Work::Request(request) => match self.buffers.verification.step() {
-                None => {}
-                Some(false) => return Err(Fault::Signature),
-                Some(true) => {
-                    self.news.granted = Some(*request);
-                    self.work = Work::Idle;
-                }
-            },
+            Work::Request(request) => {
+                self.news.outcome = Outcome::Granted(*request);
+                self.work = Work::Idle;
+            }
             Work::Image(image) => {
                 let accepted = &mut self.news.accepted;
                 image.advance(&mut self.buffers, accepted, flash, parameters, queue)?;
