@@ -319,19 +319,19 @@ pub const PRODUCT: Product = chosen::PRODUCT.checked();
 
 /// The choices that the resident part decides by.
 pub const FACTS: Facts = Facts {
-    size: Facts::SIZE,
     board: BOARD_IDENTITY,
-    sealed: SEALED as u32,
+    size: Facts::SIZE,
     autostart: match PRODUCT.autostart {
-        Some(number) => number as u32,
+        Some(number) => number as u16,
         None => 0,
     },
     crc_bits: match PRODUCT.crc {
         CrcKind::Crc32 => 32,
         CrcKind::Crc16 => 16,
     },
-    node_ids: *PRODUCT.node_ids.start() as u32 | (*PRODUCT.node_ids.end() as u32) << 8,
+    node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
     bit_rates: (2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()),
+    reserved: 0,
 };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.

@@ -4,10 +4,11 @@ use core::arch::global_asm;
 
 use bsp::{IDENTITY, LAYOUT};
 use shared_abi::boot_report::{BootReport, Words};
+use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Header};
 use shared_abi::services::{self, Facts};
 
-use crate::product::{BOARD_IDENTITY, FACTS, PRODUCT};
+use crate::product::{BOARD_IDENTITY, FACTS, PRODUCT, SEALED};
 
 /// The bytes of the resident part: of the released one that the product names, or a fresh one.
 const BYTES: &[u8] = match PRODUCT.resident {
@@ -23,7 +24,9 @@ const _: () = {
     };
     assert!(facts.board == FACTS.board, "product: `resident` is for another board");
     assert!(version >= ram_image::SERVICES_VERSION, "product: `resident` is older than the image needs");
-    assert!(facts.sealed == FACTS.sealed, "product: `resident` differs in the feature `sealed`");
+    let mark = MARK_OFFSET as usize;
+    let mark = u32::from_le_bytes([BYTES[mark], BYTES[mark + 1], BYTES[mark + 2], BYTES[mark + 3]]);
+    assert!((mark == KNOWS_SEALED_IMAGES) == SEALED, "product: `resident` differs in the feature `sealed`");
     assert!(facts.autostart == FACTS.autostart, "product: `resident` has another autostart");
     assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
     assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");

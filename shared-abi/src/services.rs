@@ -45,29 +45,30 @@ pub struct Services {
 }
 
 /// Choices of the product that the resident part decides by, and that a RAM image has to share. The
-/// record only grows.
+/// record only grows. (Whether the device takes sealed images is said by the
+/// [mark](crate::layout::MARK_OFFSET).)
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Facts {
-    /// Bytes of this record.
-    pub size: u32,
     /// The board, as in [`Header::board`](crate::ram_image::Header::board).
     pub board: u32,
-    /// 1 if the device takes sealed images, otherwise 0.
-    pub sealed: u32,
+    /// Bytes of this record.
+    pub size: u16,
     /// The program that starts by itself; 0 for none.
-    pub autostart: u32,
+    pub autostart: u16,
     /// Bits of the CRC of programs: 32 or 16.
-    pub crc_bits: u32,
+    pub crc_bits: u16,
     /// The lowest node-ID with which a program starts, and in bits 8 to 15 the highest one.
-    pub node_ids: u32,
+    pub node_ids: u16,
     /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1.
-    pub bit_rates: u32,
+    pub bit_rates: u16,
+    /// 0.
+    pub reserved: u16,
 }
 
 impl Facts {
     /// Its size in bytes.
-    pub const SIZE: u32 = size_of::<Self>() as u32;
+    pub const SIZE: u16 = size_of::<Self>() as u16;
 
     /// Reads the facts from the bytes of a resident part for the chip: `base` is its address, `table`
     /// that of its services. Returns them with the version of the services; `None` if this is no
@@ -78,19 +79,28 @@ impl Facts {
         const FACTS: u32 = 9 * 4;
         let Some(version) = word(bytes, table.wrapping_sub(base)) else { return None };
         let Some(at) = word(bytes, table.wrapping_sub(base).wrapping_add(FACTS)) else { return None };
-        let mut words = [0; Self::SIZE as usize / 4];
-        let mut number = 0;
-        while number < words.len() {
-            let offset = at.wrapping_sub(base).wrapping_add(number as u32 * 4);
-            let Some(word) = word(bytes, offset) else { return None };
-            words[number] = word;
-            number += 1;
-        }
-        let [size, board, sealed, autostart, crc_bits, node_ids, bit_rates] = words;
-        if size < Self::SIZE {
+        let at = at.wrapping_sub(base);
+        let (Some(board), Some(first), Some(second), Some(third)) = (
+            word(bytes, at),
+            word(bytes, at.wrapping_add(4)),
+            word(bytes, at.wrapping_add(8)),
+            word(bytes, at.wrapping_add(12)),
+        ) else {
+            return None;
+        };
+        let facts = Self {
+            board,
+            size: first as u16,
+            autostart: (first >> 16) as u16,
+            crc_bits: second as u16,
+            node_ids: (second >> 16) as u16,
+            bit_rates: third as u16,
+            reserved: (third >> 16) as u16,
+        };
+        if facts.size < Self::SIZE {
             return None;
         }
-        Some((version, Self { size, board, sealed, autostart, crc_bits, node_ids, bit_rates }))
+        Some((version, facts))
     }
 }
 
@@ -188,7 +198,7 @@ const _: () = {
     assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
     assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
     assert!(offset_of!(Services, facts) == 8 + 7 * POINTER);
-    assert!(offset_of!(Facts, bit_rates) == 24);
+    assert!(offset_of!(Facts, bit_rates) == 12 && size_of::<Facts>() == 16);
     assert!(size_of::<StoreState>() == 128);
 };
 
@@ -208,28 +218,29 @@ mod tests {
     #[test]
     fn facts_are_read_from_the_bytes_of_a_resident_part() {
         let facts = Facts {
-            size: 32,
             board: 0x1234_5678,
-            sealed: 1,
+            size: 20,
             autostart: 2,
             crc_bits: 16,
             node_ids: 0x7F01,
             bit_rates: 0x1FF,
+            reserved: 0,
         };
         // Its services are at 20h, version 3, and the facts at 60h; the record is longer than known.
         let mut bytes = [0; 0x80];
-        let words = [(0x20, 3), (0x44, 0x0800_0060)].into_iter().chain(
-            [32, 0x1234_5678, 1, 2, 16, 0x7F01, 0x1FF, 9]
-                .into_iter()
-                .zip((0x60..).step_by(4))
-                .map(|(w, a)| (a, w)),
-        );
-        for (at, word) in words {
+        for (at, word) in [
+            (0x20, 3),
+            (0x44, 0x0800_0060),
+            (0x60, 0x1234_5678),
+            (0x64, 0x0002_0014),
+            (0x68, 0x7F01_0010),
+            (0x6C, 0x0000_01FF),
+        ] {
             bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
         }
         let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
         assert_eq!(read(&bytes), Some((3, facts)));
-        for (at, word) in [(0x44, 0x0800_0068_u32), (0x44, 0x0000_0060), (0x44, !0), (0x60, 24)] {
+        for (at, word) in [(0x44, 0x0800_0074_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_000E)] {
             let mut wrong = bytes;
             wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());
             assert_eq!(read(&wrong), None, "{word:#x} at {at:#x}");

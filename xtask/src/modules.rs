@@ -15,8 +15,9 @@ pub type Graph = BTreeMap<Module, BTreeSet<Module>>;
 /// Reads the graph from the sources of a crate: the path of each below `src/`, and its text.
 /// `krate` is the name of the library in the code of a binary beside it.
 pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
-    let modules: Vec<(Module, &str)> =
+    let mut modules: Vec<(Module, &str)> =
         sources.iter().filter_map(|(path, text)| Some((module(path)?, text.as_str()))).collect();
+    modules.retain(|(module, _)| module.last().is_none_or(|name| name != "tests"));
     let known: BTreeSet<Module> = modules.iter().map(|(module, _)| module.clone()).collect();
     let krate = krate.replace('-', "_");
     let programs: Vec<Module> = sources.iter().filter_map(|(path, _)| program(path)).collect();

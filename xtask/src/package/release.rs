@@ -11,8 +11,6 @@ pub const LINUX: &str = "x86_64-unknown-linux-musl";
 pub const WINDOWS: &str = "x86_64-pc-windows-gnu";
 /// The version; all members of the workspace have the same one.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
-
-/// The file with the sums of all others.
 pub const SUMS: &str = "SHA256SUMS";
 
 /// The folders of a release, and the time of its files.
