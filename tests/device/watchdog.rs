@@ -37,6 +37,18 @@ fn running_bootloader() -> Bench {
     bench
 }
 
+/// A board with a program that was called back.
+fn bootloader_with_a_program(bench: &mut Bench) {
+    bench.power_on();
+    bench.await_boot_up(100);
+    let file = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    bench.run_ms(20);
+    bench.events();
+}
+
 /// ARMv7-M A7.7.12: a branch to itself.
 const HANG: [u16; 1] = [0xE7FE];
 /// ARMv7-M A7.7.194: permanently undefined.
@@ -70,15 +82,8 @@ fn a_task_that_is_alive_does_not_feed_for_one_that_is_not() {
 #[test]
 fn a_fault_of_the_bootloader_is_told_after_the_reset_that_follows() {
     let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    // A program is installed: without the fault it would start.
-    let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
-    bench.run_ms(20);
-    bench.events();
+    // Without the fault the program would start.
+    bootloader_with_a_program(&mut bench);
     let from = bench.time();
     patch(&mut bench, "CAN1_TX", &UNDEFINED);
     bench.run_ms(100);
@@ -123,13 +128,7 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
 fn a_watchdog_of_the_option_bytes_does_not_end_a_store_of_the_boot_stage() {
     let mut bench = Bench::new();
     bench.machine().set_hardware_watchdog(true);
-    bench.power_on();
-    bench.await_boot_up(100);
-    let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
-    bench.events();
+    bootloader_with_a_program(&mut bench);
     // The bootloader feeds it.
     bench.run_ms(5000);
     assert_eq!(bench.events(), []);
