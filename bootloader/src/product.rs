@@ -121,8 +121,8 @@ pub struct Product {
     /// installed (feature `sealed`).
     pub counter_with_confirmation: bool,
     /// The bytes of the resident part that was released with the product's devices, usually by
-    /// `include_bytes!`; the RAM image is then built for it. `None` for a fresh one. The choices that the
-    /// resident part decides by must be the same ([`FACTS`]).
+    /// `include_bytes!`; the RAM image is then built for it. `None` for a fresh one. The choices in
+    /// [`FACTS`] must be the same.
     pub resident: Option<&'static [u8]>,
 }
 
@@ -317,7 +317,7 @@ pub enum NodeSource {
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
 
-/// The choices that the resident part decides by.
+/// The choices that the resident part decides by and that the RAM image shares.
 pub const FACTS: Facts = Facts {
     board: BOARD_IDENTITY,
     size: Facts::SIZE,
@@ -330,7 +330,8 @@ pub const FACTS: Facts = Facts {
         CrcKind::Crc16 => 16,
     },
     node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
-    bit_rates: (2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()),
+    bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
+        | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
     reserved: 0,
 };
 

@@ -18,6 +18,10 @@ const BYTES: &[u8] = match PRODUCT.resident {
 
 // A released resident part decides by choices of its own: the image must not contradict them.
 const _: () = {
+    assert!(
+        PRODUCT.resident.is_none() || LAYOUT.home.is_some(),
+        "product: `resident` needs the split map: in the compact one the two parts are written together"
+    );
     let table = LAYOUT.callgate() + services::OFFSET;
     let Some((version, facts)) = Facts::of_resident(BYTES, LAYOUT.bootloader.base, table) else {
         panic!("product: `resident` is no resident part")

@@ -15,21 +15,19 @@ pub fn start(registers: &pac::IWDG, ms: u16) {
     registers.rlr().write(|w| unsafe { w.bits(ms / 2) });
 }
 
-/// Gives a watchdog that runs its longest time from now on: 33 s, 22 to 62 by the LSI.
-pub fn prolong(registers: &pac::IWDG) {
+/// The prescaler after a reset: LSI / 4.
+pub const AFTER_RESET: u16 = 0;
+/// The largest prescaler: LSI / 256. With the reload value after a reset it gives 33 s, 22 to 62 by the
+/// LSI.
+pub const SLOWEST: u16 = 6;
+
+/// Gives a watchdog that runs another prescaler, and restarts its time. It takes effect within five
+/// cycles of the LSI (section 21.4.4).
+pub fn rescale(registers: &pac::IWDG, prescaler: u16) {
     // SAFETY: the key of section 21.4.1.
     registers.kr().write(|w| unsafe { w.bits(0x5555) });
-    // SAFETY: LSI / 256.
-    registers.pr().write(|w| unsafe { w.bits(6) });
-    // SAFETY: the largest reload value.
-    registers.rlr().write(|w| unsafe { w.bits(0xFFF) });
-    // Both arrive within five cycles of the LSI (section 21.4.4), 0.3 ms at 17 kHz, after its start. The
-    // bound is a few times that at 168 MHz.
-    for _ in 0..50_000 {
-        if registers.sr().read().bits() == 0 {
-            break;
-        }
-    }
+    // SAFETY: a value of three bits (section 21.4.2).
+    registers.pr().write(|w| unsafe { w.bits(prescaler) });
     feed(registers);
 }
 

@@ -60,7 +60,8 @@ pub struct Facts {
     pub crc_bits: u16,
     /// The lowest node-ID with which a program starts, and in bits 8 to 15 the highest one.
     pub node_ids: u16,
-    /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1.
+    /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1; bit 9:
+    /// the device may find it out.
     pub bit_rates: u16,
     /// 0.
     pub reserved: u16,
@@ -219,28 +220,28 @@ mod tests {
     fn facts_are_read_from_the_bytes_of_a_resident_part() {
         let facts = Facts {
             board: 0x1234_5678,
-            size: 20,
+            size: 16,
             autostart: 2,
             crc_bits: 16,
             node_ids: 0x7F01,
             bit_rates: 0x1FF,
-            reserved: 0,
+            reserved: 0x8001,
         };
-        // Its services are at 20h, version 3, and the facts at 60h; the record is longer than known.
+        // Its services are at 20h, version 3, and the facts at 60h.
         let mut bytes = [0; 0x80];
         for (at, word) in [
             (0x20, 3),
             (0x44, 0x0800_0060),
             (0x60, 0x1234_5678),
-            (0x64, 0x0002_0014),
+            (0x64, 0x0002_0010),
             (0x68, 0x7F01_0010),
-            (0x6C, 0x0000_01FF),
+            (0x6C, 0x8001_01FF),
         ] {
             bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
         }
         let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
         assert_eq!(read(&bytes), Some((3, facts)));
-        for (at, word) in [(0x44, 0x0800_0074_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_000E)] {
+        for (at, word) in [(0x44, 0x0800_0074_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_000F)] {
             let mut wrong = bytes;
             wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());
             assert_eq!(read(&wrong), None, "{word:#x} at {at:#x}");

@@ -134,10 +134,10 @@ fn the_resident_part_has_its_facts() {
         assert_eq!((version, facts.size, facts.board), (1, 16, identity), "{image}");
         [facts.autostart, facts.crc_bits, facts.node_ids, facts.bit_rates]
     };
-    assert_eq!(facts(firmware::BOOTLOADER), [1, 32, 0x7F01, 0x1FF]);
+    assert_eq!(facts(firmware::BOOTLOADER), [1, 32, 0x7F01, 0x3FF]);
     assert_eq!(facts(firmware::BOOTLOADER_LEAST), [0, 32, 0x7F01, 0x1FF]);
-    assert_eq!(facts(firmware::BOOTLOADER_CRC_16), [1, 16, 0x7F01, 0x1FF]);
-    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), [1, 32, 0x6402, 0x7C]);
+    assert_eq!(facts(firmware::BOOTLOADER_CRC_16), [1, 16, 0x7F01, 0x3FF]);
+    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), [1, 32, 0x6402, 0x27C]);
 }
 
 /// The flash contains the 16 vectors of the core; the RAM image begins with all vectors.

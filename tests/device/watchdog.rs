@@ -1,11 +1,13 @@
 //! The behaviour of a device that has crashed or hangs.
 
 use canopen::program::ProgramControl;
+use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coflash::device::Doing;
 use coflash::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
-use emulator::time::Time;
+use emulator::time::{Span, Time};
 use object::{Object, ObjectSymbol};
 
 /// The emergencies since a time.
@@ -121,29 +123,63 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
     }
 }
 
+const IWDG_PR: u32 = 0x4000_3004;
+const IWDG_RLR: u32 = 0x4000_3008;
+
 /// The option byte WDG_SW starts the watchdog with each reset, with 512 ms at 32 kHz (RM0090 table
-/// 107); at 47 kHz the erase of a sector of 16 KiB may take longer. The boot stage gives it its longest
-/// time, 4096 periods of LSI / 256, from which on the program has to feed it.
+/// 107); at 47 kHz the erase of a sector of 16 KiB may take longer. The boot stage slows it down, and
+/// leaves it to a program as after the reset.
 #[test]
-fn a_watchdog_of_the_option_bytes_does_not_end_a_store_of_the_boot_stage() {
+fn a_watchdog_of_the_option_bytes_is_slow_in_the_boot_stage_alone() {
     let mut bench = Bench::new();
     bench.machine().set_hardware_watchdog(true);
     bootloader_with_a_program(&mut bench);
     // The bootloader feeds it.
     bench.run_ms(5000);
     assert_eq!(bench.events(), []);
-    bench.power_off();
-    bench.run_ms(10);
-    let on = bench.time();
-    bench.power_on();
-    bench.await_program(1000);
-    assert!(!bench.is_bootloader(NODE));
-    bench.events();
-    // This program does not.
-    bench.run_ms(34_000);
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    let mut prescalers = Vec::new();
+    while bench.events().is_empty() {
+        bench.world.run_for(Span::from_micros(20));
+    }
+    let register = |bench: &mut Bench, address| bench.machine().register(address).expect("it is modelled");
+    for _ in 0..200 {
+        prescalers.push(register(&mut bench, IWDG_PR));
+        bench.world.run_for(Span::from_micros(5));
+    }
+    prescalers.dedup();
+    // After the reset; in the boot stage; in the program.
+    assert_eq!(prescalers, [0, 6, 0]);
+    assert_eq!(register(&mut bench, IWDG_RLR), 0xFFF);
+    let from = bench.time();
+    // This program does not feed it.
+    bench.run_ms(600);
     let events = bench.events();
     let [(at, Stop::Reset(ResetCause::IndependentWatchdog))] = events[..] else { panic!("{events:?}") };
-    let ms = (at - on).0 / 1_000_000_000;
-    assert!((32_768..33_200).contains(&ms), "reset after {ms} ms");
+    let ms = (at - from).0 / 1_000_000_000;
+    assert!((505..=512).contains(&ms), "reset after {ms} ms");
     bench.assert_nothing_unmodelled();
+}
+
+/// An application that jumps to the bootloader while its watchdog runs: a reset ends the watchdog, and
+/// the request is kept.
+#[test]
+fn a_watchdog_does_not_survive_a_jump_into_the_bootloader() {
+    let mut bench = Bench::new();
+    bootloader_with_a_program(&mut bench);
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1000);
+    // Object 2000h of the template: the way back, 2 for a jump.
+    let way_back = Address::new(0x2000, 0);
+    bench.session().write(way_back, &[2], Doing::Write(way_back), &mut |_| {}).unwrap();
+    bench.events();
+    // LSI / 4, 100 ms: longer than the way back, and shorter than the bootloader stays.
+    bench.machine().start_watchdog(800);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    assert!(bench.is_bootloader(NODE));
+    bench.run_ms(2000);
+    let events: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    assert_eq!(events, [Stop::Reset(ResetCause::Software)]);
+    assert!(bench.is_bootloader(NODE));
 }

@@ -2,6 +2,7 @@
 //! of a device that is not sealed, and the security counter.
 
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
+use boot_core::flash::FlashFault;
 use boot_core::program::Invalid;
 use coboot_tests::sealed::{
     block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
@@ -453,6 +454,35 @@ fn with_confirmation_the_counter_waits_for_it() {
     replaced.run(|host| host.install(1, &of_counter(10, 3, &one)));
     refused(&replaced, 8, ROLLBACK);
     replaced.run(|host| host.install(1, &of_counter(9, 4, &two)));
+}
+
+/// The proved counter is stored before the record goes. If that fails, the record stays.
+#[test]
+fn a_store_that_fails_does_not_lower_the_counter() {
+    let device = Device::sealed(&CONFIRMED_1);
+    device.run(|host| {
+        host.install(1, &of_counter(9, 2, &program(900, 2)));
+        host.confirm(1);
+    });
+    let mut kept = 0;
+    for operation in 1..=12 {
+        let failing = device.copy();
+        failing.run(|host| {
+            let done = failing.chip.model().operations;
+            failing.chip.model().fail = Some((done + operation, FlashFault::Failed));
+            // The second one erases what the first one has only announced.
+            let _ = host.command(1, 3);
+            host.settle();
+            let _ = host.command(1, 3);
+            host.settle();
+        });
+        failing.chip.model().fail = None;
+        kept += u32::from(failing.record(1).is_some());
+        failing.run(|host| {
+            assert_eq!(host.update(1, &of_counter(8, 9, &program(900, 99)), 7).1, ROLLBACK, "{operation}");
+        });
+    }
+    assert!(kept > 0, "an operation before the record goes");
 }
 
 // --- two programs

@@ -63,7 +63,8 @@ const FIELDS: [(&str, &[&str]); 35] = [
     (SEALED, &["false", "true"]),
 ];
 
-/// Sealed images: a feature, and no field of a product. Boards with the compact map do not have it.
+/// Sealed images: a feature, and no field of a product. A board with the compact map has the other
+/// choices of the row.
 const SEALED: &str = "sealed";
 
 /// Seven switches for the node-ID, four for the bit rate.
@@ -89,9 +90,7 @@ pub fn run(mut args: Args) -> Outcome {
         let path = folder.join(format!("pairs-{:02}.rs", number + 1));
         files::write(&path, file(row))?;
         let product = Product::of_file(&path)?;
-        let fits = |board: &&Layout| board.home.is_some() || !is_sealed(row);
-        let boards: Vec<&Layout> = all.iter().copied().filter(fits).collect();
-        let of_row = if spread { &boards[number % boards.len()..][..1] } else { &boards[..] };
+        let of_row = if spread { &all[number % all.len()..][..1] } else { all };
         for board in of_row {
             let used = size(board, row, &product)?;
             largest = largest.max(used);
@@ -120,16 +119,13 @@ pub const PRODUCT: Product = Product {
     file + "    ..Product::DEFAULT\n};\n"
 }
 
-/// Whether a bootloader takes sealed images.
-fn is_sealed(row: &Row) -> bool {
-    FIELDS.iter().zip(row).any(|((name, _), value)| *name == SEALED && *value > 0)
-}
-
 /// The size in a board's flash of the bootloader of this product, in bytes; an error if it is over the
 /// budget.
 fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let told = |problem: String| format!("{}, {}: {problem}", board.board, words(row));
-    let elf = build::to_look_at(board, if is_sealed(row) { SEALED } else { "" }, product).map_err(told)?;
+    let is_sealed = FIELDS.iter().zip(row).any(|((name, _), value)| *name == SEALED && *value > 0);
+    let features = if is_sealed && board.home.is_some() { SEALED } else { "" };
+    let elf = build::to_look_at(board, features, product).map_err(told)?;
     let flash = Flash::of(&Elf::parse(&elf)?, &build::bootloader_flash(board)).map_err(told)?;
     for ((_, bytes), budget) in flash.used.iter().zip(budgets(board)) {
         within(*bytes, budget).map_err(told)?;
@@ -151,7 +147,7 @@ fn allowed(row: &[Option<u8>; FIELDS.len()]) -> bool {
         FIELDS.iter().zip(row).any(|((field, _), chosen)| *field == name && *chosen == Some(value))
     };
     let window = is("rescue_window_ms", 0) || is("rescue_window_confirmed_ms", 1);
-    !(is("autostart", 1) && window) && !(is(SEALED, 1) && is("crc", 1))
+    !(is("autostart", 1) && window || is(SEALED, 1) && is("crc", 1))
 }
 
 /// Rows in which any two compatible values are together at least once. Each row takes a pair that

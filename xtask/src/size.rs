@@ -89,7 +89,7 @@ pub fn within(used: u32, budget: &u32) -> Outcome {
     match used.checked_sub(*budget) {
         None | Some(0) => Ok(()),
         Some(over) => Err(format!(
-            "the bootloader is {over} bytes over its budget of {}; the tables above show where they are.",
+            "the bootloader is {over} bytes over its budget of {}; `cargo xtask size` shows where they are.",
             kib(*budget)
         )),
     }

@@ -6,7 +6,7 @@
 //! services.
 
 use boot_core::canopen::{BitRate, NodeId};
-use boot_core::decision::{decide, BootDecision, Circumstances, StayReason};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, StayReason};
 use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
@@ -43,9 +43,9 @@ pub unsafe extern "C" fn stage() -> ! {
     let reset_cause = ResetCause::from_rcc_csr(status.bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
 
-    // Without a reset cause an application has jumped here, and the flash may be locked. A reset
-    // unlocks it; the request stays in the cell.
-    if SEALED && reset_cause == ResetCause::Unknown {
+    // Without a reset cause an application has jumped here. The flash may be locked, and the watchdog,
+    // whose clock is the LSI, may run. A reset ends both; the request stays in the cell.
+    if reset_cause == ResetCause::Unknown && (SEALED || status.lsirdy().bit_is_set()) {
         SCB::sys_reset();
     }
 
@@ -57,10 +57,11 @@ pub unsafe extern "C" fn stage() -> ! {
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
     // SAFETY: as above.
     let mut flash = unsafe { ResidentFlash::steal(true) };
-    // A watchdog that the option bytes start, or that ran when an application jumped here, would end
-    // the erase of a sector. (Without its clock, the LSI, it does not run.)
-    if flash.starts_watchdog() || reset_cause == ResetCause::Unknown && status.lsirdy().bit_is_set() {
-        bsp::watchdog::prolong(&iwdg);
+    // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
+    // 349 at the fastest LSI.
+    let has_watchdog = flash.starts_watchdog();
+    if has_watchdog {
+        bsp::watchdog::rescale(&iwdg, bsp::watchdog::SLOWEST);
     }
     ResidentFlash::switch_crc_unit_on(&rcc);
     if SEALED {
@@ -80,7 +81,7 @@ pub unsafe extern "C" fn stage() -> ! {
     for turn in 0..=PROGRAMS {
         let is_damaged = turn > 0;
         if is_damaged {
-            let number = (PRODUCT.autostart.unwrap_or(1) + turn - 2) % PROGRAMS + 1;
+            let number = fallback(PRODUCT.autostart, PROGRAMS, turn);
             if PRODUCT.profile.download.data == Some(number) {
                 continue;
             }
@@ -106,6 +107,9 @@ pub unsafe extern "C" fn stage() -> ! {
             if SEALED && program.locks_flash() {
                 // SAFETY: only this code runs, and it writes the flash no more.
                 unsafe { crate::flash_lock::lock_flash() };
+            }
+            if has_watchdog {
+                bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
             }
             if let Some(ms) = PRODUCT.program_watchdog_ms {
                 bsp::watchdog::start(&iwdg, ms);

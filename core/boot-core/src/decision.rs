@@ -130,6 +130,17 @@ pub enum BootDecision {
     },
 }
 
+/// The program that is tried in this turn (1 to `programs`, at most 127) when there is no bootloader to
+/// stay in: the one with autostart first, then the next ones.
+#[must_use]
+pub const fn fallback(autostart: Option<u8>, programs: u8, turn: u8) -> u8 {
+    let first = match autostart {
+        Some(number) => number,
+        None => 1,
+    };
+    (first - 1 + turn - 1) % programs + 1
+}
+
 /// Makes the decision. `verify` checks a program completely and is called at most once.
 pub fn decide(
     circumstances: &Circumstances,

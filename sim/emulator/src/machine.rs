@@ -483,6 +483,7 @@ impl Machine {
             // These registers take these values at any time.
             let _ = chip.iwdg.write(offset, value, now);
         }
+        chip.rcc.force_lsi(now);
     }
 
     /// Protects a sector of the flash by its option byte, as a debug probe does, or no longer.

@@ -41,9 +41,13 @@ pub enum Cuts {
 }
 
 impl Cuts {
-    fn has(self, operation: u32) -> bool {
+    fn has(self, scenario: &Scenario, operation: u32) -> bool {
         match self {
-            Self::Sample(seed) => Random(seed ^ u64::from(operation)).chance(25),
+            Self::Sample(seed) => {
+                // Another sample for each scenario.
+                let name = scenario.name.bytes().fold(seed, |name, letter| name << 5 ^ u64::from(letter));
+                Random(name ^ u64::from(operation)).chance(25)
+            }
             Self::EveryOperation | Self::EveryWay => true,
         }
     }
@@ -223,7 +227,7 @@ fn completes(scenario: &Scenario, device: &Device, from: &Allowed) -> Result<(Ou
 /// All points whose first cut is at this operation.
 fn at_operation(scenario: &Scenario, device: &Device, operation: u32, cuts: Cuts) -> Report {
     let mut report = Report::default();
-    if !cuts.has(operation) {
+    if !cuts.has(scenario, operation) {
         return report;
     }
     let Ok(start) = exactly(device) else { return report };

@@ -193,7 +193,7 @@ fn room() -> Outcome {
     // POSIX: the fourth column of the second line is the free space in units of 1024 bytes.
     let said = process::output(std::process::Command::new("df").arg("-kP").arg(&folder)).unwrap_or_default();
     let free = said.lines().nth(1).and_then(|line| line.split_whitespace().nth(3)?.parse::<u64>().ok());
-    let needed = if folder.join("debug/deps").exists() { ROOM / 8 } else { ROOM };
+    let needed = if folder.join("firmware").exists() { ROOM / 8 } else { ROOM };
     match free {
         Some(free) if free < needed => Err(format!(
             "the disk of {} has {} MiB left, and the tests need {} MiB. Make room (`cargo clean` removes what older \

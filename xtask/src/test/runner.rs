@@ -138,7 +138,10 @@ pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
     thread::scope(|scope| {
         scope.spawn(|| work(&waiting));
         for _ in 0..thread::available_parallelism().map_or(2, usize::from) {
-            scope.spawn(|| work(&computing));
+            scope.spawn(|| {
+                work(&computing);
+                work(&waiting);
+            });
         }
     });
 }

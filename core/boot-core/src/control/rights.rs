@@ -1,6 +1,7 @@
 //! The functions of a sealed device that need a root key (2002h), and its event log (2003h).
 //!
-//! In a device that takes no sealed images, every question to the [`Rights`] is answered with no.
+//! A device that takes no sealed images has neither: nothing there needs a right, and the objects do not
+//! exist.
 
 use canopen::od::{put, Address};
 use canopen::program::{FlashError, ACCESS, EVENTS};

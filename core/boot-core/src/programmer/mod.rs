@@ -374,7 +374,8 @@ impl<'b> Programmer<'b> {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
             (Job::Store(Change::Counter | Change::Note, _) | Job::Process, Ok(())) => None,
             (Job::Store(change, program), result) => {
-                if change == Change::Void {
+                // A record whose counter could not be stored stays, too.
+                if matches!(change, Change::Void | Change::Counter) {
                     self.voids &= !bit(program);
                     self.kept = false;
                 }

@@ -1,7 +1,7 @@
 //! The boot decision: the promised order of its checks.
 
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, Policy, StayReason};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
@@ -249,4 +249,18 @@ fn reasons_have_their_numbers() {
         assert_eq!(reason.code(), number, "{reason:?}");
         assert_eq!(StayReason::is_trouble(number), matches!(reason, CrashLoop | Fault), "{reason:?}");
     }
+}
+
+/// Without a bootloader to stay in, each program has its turn.
+#[test]
+fn the_program_with_autostart_is_tried_first_and_then_each_other_once() {
+    let order = |autostart, programs| {
+        (1..=programs).map(move |turn| fallback(autostart, programs, turn)).collect::<Vec<_>>()
+    };
+    assert_eq!(order(Some(1), 1), [1]);
+    assert_eq!(order(None, 1), [1]);
+    assert_eq!(order(None, 2), [1, 2]);
+    assert_eq!(order(Some(2), 2), [2, 1]);
+    assert_eq!(order(Some(2), 3), [2, 3, 1]);
+    assert_eq!(fallback(Some(127), 127, 127), 126);
 }

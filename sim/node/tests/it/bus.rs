@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 use std::ffi::OsString;
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -47,6 +47,18 @@ impl Folder {
 
     pub fn read(&self, name: &str) -> Vec<u8> {
         fs::read(self.path(name)).unwrap()
+    }
+
+    /// Waits until a flash has other bytes than FFh at this offset.
+    pub fn await_bytes(&self, name: &str, offset: u64) {
+        let mut bytes = [0xFF; 64];
+        while bytes == [0xFF; 64] {
+            thread::sleep(Duration::from_millis(5));
+            // Each time another file: the node replaces it as a whole.
+            let mut file = fs::File::open(self.path(name)).unwrap();
+            file.seek(SeekFrom::Start(offset)).unwrap();
+            file.read_exact(&mut bytes).unwrap();
+        }
     }
 }
 

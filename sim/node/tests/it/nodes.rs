@@ -162,9 +162,7 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let cut = || {
         let nodes = Nodes::start(&folder, &options);
         let flashing = Coflash::new(&folder, &nodes).spawn(&flash);
-        while folder.read("1.flash")[0x2_0000 + 200 * 1024..][..64] == [0xFF; 64] {
-            std::thread::sleep(Duration::from_millis(5));
-        }
+        folder.await_bytes("1.flash", 0x2_0000 + 200 * 1024);
         drop(nodes);
         assert_eq!(flashing.wait().exit, 4, "the adapter is gone");
         Nodes::start(&folder, &options)
@@ -177,7 +175,8 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let (_, has) =
         said.split_once("going on with a download that was cut off: the device has ").expect(&said);
     let has: usize = has.split(' ').next().unwrap().parse().unwrap();
-    assert!((180 * 1024..240 * 1024).contains(&has), "{has}");
+    // How much more has arrived before the node was gone is a matter of the machine.
+    assert!((180 * 1024..program().len()).contains(&has), "{has}");
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
     assert!(folder.read("1.flash")[0x2_0000..] == flashed());
     drop(nodes);
