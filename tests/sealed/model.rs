@@ -464,16 +464,15 @@ fn a_store_that_fails_does_not_lower_the_counter() {
         host.install(1, &of_counter(9, 2, &program(900, 2)));
         host.confirm(1);
     });
+    let another = of_counter(9, 3, &program(5000, 3));
     let mut kept = 0;
     for operation in 1..=12 {
         let failing = device.copy();
         failing.run(|host| {
             let done = failing.chip.model().operations;
             failing.chip.model().fail = Some((done + operation, FlashFault::Failed));
-            // The second one erases what the first one has only announced.
-            let _ = host.command(1, 3);
-            host.settle();
-            let _ = host.command(1, 3);
+            host.clear(1);
+            let _ = host.begin(1, &another[..5000], 7);
             host.settle();
         });
         failing.chip.model().fail = None;
