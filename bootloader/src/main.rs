@@ -49,8 +49,7 @@ mod app {
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
-    use boot_core::control::Step;
-    use boot_core::control::{Room, Sealed};
+    use boot_core::control::{Room, Sealed, Step};
     use boot_core::decision::StayReason;
     use boot_core::store::NodeParameters;
     use bsp::clock::Source;

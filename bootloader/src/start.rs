@@ -28,9 +28,8 @@ const _: () = {
     };
     assert!(facts.board == FACTS.board, "product: `resident` is for another board");
     assert!(version >= ram_image::SERVICES_VERSION, "product: `resident` is older than the image needs");
-    let mark = MARK_OFFSET as usize;
-    let mark = u32::from_le_bytes([BYTES[mark], BYTES[mark + 1], BYTES[mark + 2], BYTES[mark + 3]]);
-    assert!((mark == KNOWS_SEALED_IMAGES) == SEALED, "product: `resident` differs in the feature `sealed`");
+    let is_sealed = matches!(services::word(BYTES, MARK_OFFSET), Some(KNOWS_SEALED_IMAGES));
+    assert!(is_sealed == SEALED, "product: `resident` differs in the feature `sealed`");
     assert!(facts.autostart == FACTS.autostart, "product: `resident` has another autostart");
     assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
     assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
@@ -55,7 +54,7 @@ static RESIDENT: Resident = {
 global_asm!(
     ".global __resident_reset",
     ".set __resident_reset, {reset}",
-    reset = const u32::from_le_bytes([BYTES[4], BYTES[5], BYTES[6], BYTES[7]]),
+    reset = const services::word(BYTES, 4).unwrap(),
 );
 
 // The header of the RAM image. The build writes the second word, the CRC, after the link. It is in

@@ -105,8 +105,9 @@ impl Facts {
     }
 }
 
-/// The word at an offset, if it is inside.
-const fn word(bytes: &[u8], offset: u32) -> Option<u32> {
+/// The word at an offset in the bytes of a resident part, if it is inside.
+#[must_use]
+pub const fn word(bytes: &[u8], offset: u32) -> Option<u32> {
     let Some((_, rest)) = bytes.split_at_checked(offset as usize) else { return None };
     match rest.first_chunk() {
         Some(word) => Some(u32::from_le_bytes(*word)),

@@ -26,6 +26,26 @@ impl Linked {
     };
 }
 
+/// What only a device that takes sealed images has: in any other device there is none, and without the
+/// feature the compiler knows it.
+pub(crate) struct OfSealed<'b, T>(Option<&'b mut T>);
+
+impl<'b, T> OfSealed<'b, T> {
+    pub(crate) fn new(state: Option<&'b mut T>) -> Self {
+        Self(state)
+    }
+
+    /// The state, if there is one.
+    pub(crate) fn get(&self) -> Option<&T> {
+        Linked::PROOF.and(self.0.as_deref())
+    }
+
+    /// See [`get`](Self::get).
+    pub(crate) fn get_mut(&mut self) -> Option<&mut T> {
+        Linked::PROOF.and(self.0.as_deref_mut())
+    }
+}
+
 /// The images that a device takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Images {

@@ -13,7 +13,7 @@ use seal::wire::{array, word, Fault, HASH};
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-use crate::keys::{is_sealed, Images, Linked};
+use crate::keys::{is_sealed, Images, Linked, OfSealed};
 use crate::policy::{Policy, SealPolicy};
 use crate::store::{Key, Parameters, Value};
 use crate::unseal::{Label, News, Outcome, Request, Unsealer};
@@ -34,7 +34,7 @@ const _: () = {
 };
 
 /// The rights that were granted in a device, and its event log.
-pub(crate) struct Rights<'b>(Option<&'b mut Access>);
+pub(crate) struct Rights<'b>(OfSealed<'b, Access>);
 
 /// Their state.
 pub(super) struct Access {
@@ -76,17 +76,7 @@ struct Log {
 impl<'b> Rights<'b> {
     /// `None` in a device that takes no sealed images.
     pub(super) fn new(access: Option<&'b mut Access>) -> Self {
-        Self(access)
-    }
-
-    /// The state, in a device that takes sealed images.
-    fn access(&self) -> Option<&Access> {
-        Linked::PROOF.and(self.0.as_deref())
-    }
-
-    /// See [`access`](Self::access).
-    fn access_mut(&mut self) -> Option<&mut Access> {
-        Linked::PROOF.and(self.0.as_deref_mut())
+        Self(OfSealed::new(access))
     }
 
     /// Sets the properties of the device, and loads what is stored.
@@ -97,7 +87,7 @@ impl<'b> Rights<'b> {
         layout: &Layout,
         policy: &'static Policy,
     ) {
-        let Some(access) = self.access_mut() else { return };
+        let Some(access) = self.0.get_mut() else { return };
         let log = &mut access.log;
         for (place, event) in (0..).zip(&mut log.events) {
             *event = parameters.get(flash, Key::event(place)).unwrap_or([0; 4]);
@@ -112,17 +102,17 @@ impl<'b> Rights<'b> {
 
     /// Whether the device takes sealed images.
     pub(crate) fn is_present(&self) -> bool {
-        self.access().is_some()
+        self.0.get().is_some()
     }
 
     /// Whether the device has keys and therefore accepts and starts only sealed programs.
     pub(crate) fn takes_no_other(&self) -> bool {
-        self.access().is_some_and(|access| access.takes_no_other)
+        self.0.get().is_some_and(|access| access.takes_no_other)
     }
 
     /// The images that the device takes.
     pub(super) fn images(&self) -> Images {
-        match (self.access(), Linked::PROOF) {
+        match (self.0.get(), Linked::PROOF) {
             (Some(access), Some(linked)) if access.takes_no_other => Images::Sealed(linked),
             (Some(_), Some(linked)) => Images::Both(linked),
             _ => Images::Plain,
@@ -131,18 +121,18 @@ impl<'b> Rights<'b> {
 
     /// Whether an action is permitted that needs a right in a sealed device, or none (0).
     pub(crate) fn permits(&self, right: u32) -> bool {
-        self.access().is_none_or(|access| !access.takes_no_other || right == 0 || access.granted & right != 0)
+        self.0.get().is_none_or(|access| !access.takes_no_other || right == 0 || access.granted & right != 0)
     }
 
     /// The counter that the next image must have at least, if a client has the right to lower it.
     pub(super) fn lowered_counter(&self) -> Option<u32> {
-        let access = self.access()?;
+        let access = self.0.get()?;
         (access.granted & right::LOWER_COUNTER != 0).then_some(access.argument)
     }
 
     /// Reads 2002h or 2003h; `None` for other objects.
     pub(crate) fn read(&mut self, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
-        let access = self.access_mut()?;
+        let access = self.0.get_mut()?;
         match at.index {
             ACCESS => Some(put(buf, &access.challenge())),
             EVENTS => {
@@ -166,7 +156,7 @@ impl<'b> Rights<'b> {
         request: &[u8],
         unsealer: &mut Unsealer<'_>,
     ) -> Result<(), AbortCode> {
-        let Some(access) = self.access_mut() else { return Err(AbortCode::NO_OBJECT) };
+        let Some(access) = self.0.get_mut() else { return Err(AbortCode::NO_OBJECT) };
         if request.len() != REQUEST {
             return Err(AbortCode::LENGTH);
         }
@@ -187,7 +177,7 @@ impl<'b> Rights<'b> {
     /// Takes note of what the unsealer has found out. Events are recorded with the `label` of the
     /// last image.
     pub(super) fn update(&mut self, news: News, label: Label) {
-        let Some(access) = self.access_mut() else { return };
+        let Some(access) = self.0.get_mut() else { return };
         if news.accepted {
             // The right is valid for one image.
             access.granted &= !right::LOWER_COUNTER;
@@ -208,7 +198,7 @@ impl<'b> Rights<'b> {
 
     /// Returns the next value to store, once.
     pub(super) fn take_note(&mut self) -> Option<(Key, Value)> {
-        let Access { grants, log, .. } = self.access_mut()?;
+        let Access { grants, log, .. } = self.0.get_mut()?;
         if core::mem::take(&mut grants.is_changed) {
             return Some((Key::GRANTS, [grants.count, grants.opened, 0, 0]));
         }
@@ -219,7 +209,7 @@ impl<'b> Rights<'b> {
     /// Whether a signature was found good since the last call: that of a complete image, or that of
     /// a request for rights.
     pub(crate) fn take_authentic(&mut self) -> bool {
-        self.access_mut().is_some_and(|access| core::mem::take(&mut access.authentic))
+        self.0.get_mut().is_some_and(|access| core::mem::take(&mut access.authentic))
     }
 }
 

@@ -6,14 +6,14 @@ use seal::wire::{flag, Fault, Head};
 use super::buffers::{start, Buffers};
 use super::image::{Image, Place, Progress};
 use crate::flash::Flash;
-use crate::keys::Linked;
+use crate::keys::OfSealed;
 use crate::program::Expected;
 use crate::queue::{Piece, Queue};
 use crate::store::record::Seal;
 use crate::store::{Parameters, ProgramRecord, Value};
 
 /// The processing of a sealed image, in a device that takes them.
-pub(crate) struct Unsealer<'b>(Option<&'b mut Workshop>);
+pub(crate) struct Unsealer<'b>(OfSealed<'b, Workshop>);
 
 /// Its state. A new one must consist of zeros, because it is in a static of the firmware: with any
 /// other byte, all of it would be stored in flash, too. So the empty variant of its enums is the
@@ -86,22 +86,12 @@ impl Workshop {
 impl<'b> Unsealer<'b> {
     /// `None` in a device that takes no sealed images.
     pub(crate) fn new(workshop: Option<&'b mut Workshop>) -> Self {
-        Self(workshop)
-    }
-
-    /// The state, in a device that takes sealed images.
-    fn workshop(&self) -> Option<&Workshop> {
-        Linked::PROOF.and(self.0.as_deref())
-    }
-
-    /// See [`workshop`](Self::workshop).
-    fn workshop_mut(&mut self) -> Option<&mut Workshop> {
-        Linked::PROOF.and(self.0.as_deref_mut())
+        Self(OfSealed::new(workshop))
     }
 
     /// The image that is being processed.
     fn image(&self) -> Option<&Image> {
-        match &self.workshop()?.work {
+        match &self.0.get()?.work {
             Work::Image(image) => Some(image),
             Work::Idle | Work::Request(_) => None,
         }
@@ -109,7 +99,7 @@ impl<'b> Unsealer<'b> {
 
     /// See [`image`](Self::image).
     fn image_mut(&mut self) -> Option<&mut Image> {
-        match &mut self.workshop_mut()?.work {
+        match &mut self.0.get_mut()?.work {
             Work::Image(image) => Some(image),
             Work::Idle | Work::Request(_) => None,
         }
@@ -117,7 +107,7 @@ impl<'b> Unsealer<'b> {
 
     /// Whether the device takes sealed images.
     pub(crate) fn is_present(&self) -> bool {
-        self.workshop().is_some()
+        self.0.get().is_some()
     }
 
     /// Whether the present download is a sealed image.
@@ -127,7 +117,7 @@ impl<'b> Unsealer<'b> {
 
     /// Starts an image.
     pub(crate) fn begin(&mut self, place: Place) {
-        let Some(workshop) = self.workshop_mut() else { return };
+        let Some(workshop) = self.0.get_mut() else { return };
         workshop.work = Work::Image(Image::new(place));
     }
 
@@ -139,19 +129,19 @@ impl<'b> Unsealer<'b> {
         signature: &[u8; 64],
         message: &[&[u8]],
     ) {
-        let Some(workshop) = self.workshop_mut() else { return };
+        let Some(workshop) = self.0.get_mut() else { return };
         start(&mut workshop.buffers.verification, key, signature, message);
         workshop.work = Work::Request(request);
     }
 
     /// Whether the signature of a request for rights is being checked.
     pub(crate) fn is_asked(&self) -> bool {
-        self.workshop().is_some_and(|workshop| matches!(workshop.work, Work::Request(_)))
+        self.0.get().is_some_and(|workshop| matches!(workshop.work, Work::Request(_)))
     }
 
     /// Ends the processing of an image, or of a request.
     pub(crate) fn rest(&mut self) {
-        if let Some(workshop) = self.workshop_mut() {
+        if let Some(workshop) = self.0.get_mut() {
             workshop.work = Work::Idle;
         }
     }
@@ -175,14 +165,14 @@ impl<'b> Unsealer<'b> {
     }
 
     fn end(&mut self, outcome: Outcome) {
-        let Some(workshop) = self.workshop_mut() else { return };
+        let Some(workshop) = self.0.get_mut() else { return };
         workshop.news.outcome = outcome;
         workshop.work = Work::Idle;
     }
 
     /// Returns what was found out since the last call.
     pub(crate) fn take_news(&mut self) -> News {
-        self.workshop_mut().map(|workshop| core::mem::take(&mut workshop.news)).unwrap_or_default()
+        self.0.get_mut().map(|workshop| core::mem::take(&mut workshop.news)).unwrap_or_default()
     }
 
     /// What there is to do with the image, if there is one.
@@ -203,7 +193,7 @@ impl<'b> Unsealer<'b> {
     /// A byte of these bytes.
     pub(crate) fn data(&self, offset: usize) -> u8 {
         let at = self.image().map_or(0, Image::out) + offset;
-        self.workshop().and_then(|workshop| workshop.buffers.bytes.get(at).copied()).unwrap_or(0)
+        self.0.get().and_then(|workshop| workshop.buffers.bytes.get(at).copied()).unwrap_or(0)
     }
 
     /// These bytes are in flash.
@@ -215,7 +205,7 @@ impl<'b> Unsealer<'b> {
 
     /// The head of the last image.
     fn head(&self) -> Option<Head<'_>> {
-        self.workshop().map(|workshop| Head(&workshop.buffers.head))
+        self.0.get().map(|workshop| Head(&workshop.buffers.head))
     }
 
     /// The expected properties of the program.
@@ -249,7 +239,7 @@ impl<'b> Unsealer<'b> {
         parameters: &impl Parameters,
         queue: &mut Queue<'_>,
     ) -> Result<(), FlashError> {
-        let Some(workshop) = self.workshop_mut() else { return Ok(()) };
+        let Some(workshop) = self.0.get_mut() else { return Ok(()) };
         workshop
             .advance(flash, parameters, queue)
             .map_err(|fault| FlashError::from_code(fault as u8).unwrap_or(FlashError::Unspecified))
