@@ -175,7 +175,11 @@ fn a_download_goes_on_where_the_power_was_cut() {
     let (_, has) =
         said.split_once("going on with a download that was cut off: the device has ").expect(&said);
     let has: usize = has.split(' ').next().unwrap().parse().unwrap();
-    // How much more has arrived before the node was gone is a matter of the machine.
+    // How much more has arrived before the node was gone is a matter of the machine; what the tool says
+    // is what the device said: the address in the upper four bytes of 2006h, less the program's.
+    let bytes = begun["hex"].as_str().unwrap();
+    let address = u32::from_str_radix(&bytes[8..], 16).unwrap().swap_bytes();
+    assert_eq!(has, address as usize - 0x0802_0000);
     assert!((180 * 1024..program().len()).contains(&has), "{has}");
     assert!(said.contains(&format!("verified: CRC {CRC}")), "{said}");
     assert!(folder.read("1.flash")[0x2_0000..] == flashed());
