@@ -41,7 +41,7 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
-    use boot_core::bootloader::{self, entries, entry_count, Bootloader, Extras};
+    use boot_core::bootloader::{self, entries, entry_count, Bootloader, Choices, Extras};
     use boot_core::canopen::device::Device;
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
@@ -50,7 +50,6 @@ mod app {
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
     use boot_core::control::{Room, Sealed, Step};
-    use boot_core::decision::StayReason;
     use boot_core::store::NodeParameters;
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
@@ -71,16 +70,6 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
-    /// What a debugger's start of the image alone comes to: it stays, without node-ID.
-    const NO_REPORT: BootReport = BootReport {
-        reason: StayReason::Fault.code(),
-        held_program: 0,
-        window_ms: 0,
-        owed: Owed::NOTHING,
-        returned: 0,
-        node_id: product::NO_NODE_ID,
-        bit_rate: BitRate::Auto as u8,
-    };
     /// Frames that can wait for the protocol task. The task has a higher priority than all work
     /// that takes long, so only few frames wait.
     const RX_QUEUE: usize = 32;
@@ -116,15 +105,22 @@ mod app {
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
         lss_store: PRODUCT.lss_store,
-        second_server: PRODUCT.second_server,
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };
 
+    /// What the product does without.
+    pub struct Chosen;
+
+    impl Choices for Chosen {
+        const SECOND_SERVER: bool = PRODUCT.second_server;
+        const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
+    }
+
     #[shared]
     struct Shared {
         can: CanPort,
-        bootloader: Bootloader<'static, BootFlash, Store, PROGRAMS>,
+        bootloader: Bootloader<'static, BootFlash, Store, PROGRAMS, Chosen>,
     }
 
     #[local]
@@ -161,7 +157,7 @@ mod app {
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         let parameters = Store::open(cx.local.store);
-        let report = start::boot_report().unwrap_or(NO_REPORT);
+        let report = start::boot_report().unwrap_or(BootReport::NONE);
         let node = NodeParameters {
             id: NodeId::new(report.node_id),
             // The boot stage reports only bit rates that the CAN controller can be set to.
@@ -173,7 +169,6 @@ mod app {
                 heartbeat_ms: PRODUCT.heartbeat_ms,
                 nmt: NmtPolicy::StayPreOperational,
                 sdo: SdoConfig {
-                    block_upload: PRODUCT.block_upload,
                     unknown_request: PRODUCT.profile.unknown_request,
                     request_base: PRODUCT.sdo_request_base,
                     response_base: PRODUCT.sdo_response_base,
@@ -189,7 +184,7 @@ mod app {
             &CONFIG,
             bsp::serial_number(),
             node,
-            report.reason,
+            report,
             parameters,
             flash,
             cx.local.blocks,

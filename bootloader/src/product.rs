@@ -76,10 +76,10 @@ pub struct Product {
     pub lss_announce: bool,
     /// Whether LSS may store node-ID and bit rate.
     pub lss_store: bool,
-    /// Whether objects can be read by SDO block upload.
+    /// Whether objects can be read by SDO block upload; on boards with the split map alone.
     pub block_upload: bool,
     /// Whether there is a second SDO server (1201h), by which one client writes a program to several
-    /// devices at once.
+    /// devices at once; on boards with the split map alone.
     pub second_server: bool,
     /// Whether a download of block files that was cut off can go on where it stopped (2006h).
     pub resume: bool,
@@ -147,8 +147,8 @@ impl Product {
         lss_start_in_configuration: false,
         lss_announce: false,
         lss_store: true,
-        block_upload: true,
-        second_server: true,
+        block_upload: LAYOUT.home.is_some(),
+        second_server: LAYOUT.home.is_some(),
         resume: true,
         identity_check: true,
         check: |_, _| Verdict::Standard,
@@ -177,6 +177,10 @@ impl Product {
             );
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
+        assert!(
+            LAYOUT.home.is_some() || !self.block_upload && !self.second_server,
+            "product: block_upload and second_server need the split map: the compact one has no room for them"
+        );
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
             self.rescue_window_ms

@@ -14,11 +14,73 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBBR");
 /// accepts every version from 1 on.
 pub const VERSION: u16 = 1;
 
+/// Why a device stays in the bootloader: 2007h/2, and the last byte of the emergency behind the boot-up
+/// message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Reason {
+    /// The application, or a tool through it, has requested the bootloader.
+    Requested = 0,
+    /// The entry strap is set.
+    Strap = 1,
+    /// The program has ended too often in a row by a reset that nobody requested.
+    CrashLoop = 2,
+    /// No program starts by itself, and none was requested.
+    NoAutostart = 3,
+    /// The node-ID is outside the range with which a program may start.
+    NodeId = 4,
+    /// The program is not released for autostart.
+    Unsigned = 5,
+    /// There is no program.
+    NoProgram = 6,
+    /// The bootloader had a fault or a panic.
+    Fault = 7,
+    /// A program could start, and waits until the rescue window ends.
+    Rescue = 8,
+    /// The program in flash differs from the one that was downloaded.
+    Damaged = 9,
+    /// The first two words of the program are no vectors for its flash and the RAM.
+    Vectors = 10,
+    /// The product forbids the start at present.
+    Forbidden = 11,
+}
+
+impl Reason {
+    /// All reasons, in the order of their numbers.
+    pub const ALL: [Self; 12] = [
+        Self::Requested,
+        Self::Strap,
+        Self::CrashLoop,
+        Self::NoAutostart,
+        Self::NodeId,
+        Self::Unsigned,
+        Self::NoProgram,
+        Self::Fault,
+        Self::Rescue,
+        Self::Damaged,
+        Self::Vectors,
+        Self::Forbidden,
+    ];
+
+    /// The reason with this number; `None` for a number from a later version.
+    #[must_use]
+    pub fn from_byte(byte: u8) -> Option<Self> {
+        Self::ALL.get(usize::from(byte)).copied()
+    }
+}
+
 /// The reason why the bootloader runs, and the work that is left for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BootReport {
-    /// The number of the reason (`boot_core::decision::StayReason`).
+    /// The number of a [`Reason`].
     pub reason: u8,
+    /// The program that should have started and may not; 0 for none.
+    pub refused: u8,
+    /// The reset by which the program ended, as the number of a
+    /// [`ResetCause`](crate::handoff::ResetCause); 0 after a reset of the bootloader itself.
+    pub program_reset: u8,
+    /// Resets in a row by which a program ended and that nobody requested; 255 for more.
+    pub crash_resets: u8,
     /// The program that starts when the rescue window is over; 0 for none.
     pub held_program: u8,
     /// Length of the rescue window, in ms.
@@ -42,12 +104,28 @@ pub struct BootReport {
 /// | 1 | [`VERSION`] in the lower half, 48 (bytes) in the upper one |
 /// | 2 | reason, held program, length of the window (16 bits) |
 /// | 3 | owed: program, value, node-ID; then the program that returned |
-/// | 4 | node-ID, bit rate |
-/// | 5–10 | 0 |
+/// | 4 | node-ID, bit rate, the reset that ended the program, crash resets |
+/// | 5 | refused program |
+/// | 6–10 | 0 |
 /// | 11 | [`check_word`] of the words before |
 pub type Words = [u32; 12];
 
 impl BootReport {
+    /// The report of a debugger that starts the image alone: it stays for a fault, without node-ID, and
+    /// detects the bit rate.
+    pub const NONE: Self = Self {
+        reason: Reason::Fault as u8,
+        refused: 0,
+        program_reset: 0,
+        crash_resets: 0,
+        held_program: 0,
+        window_ms: 0,
+        owed: Owed::NOTHING,
+        returned: 0,
+        node_id: 255,
+        bit_rate: 9,
+    };
+
     /// The record with this report.
     #[must_use]
     pub const fn words(&self) -> Words {
@@ -58,7 +136,8 @@ impl BootReport {
         words[1] = VERSION as u32 | (size_of::<Words>() as u32) << 16;
         words[2] = u32::from_le_bytes([self.reason, self.held_program, window, window_high]);
         words[3] = u32::from_le_bytes([program, value, node_id, self.returned]);
-        words[4] = u32::from_le_bytes([self.node_id, self.bit_rate, 0, 0]);
+        words[4] = u32::from_le_bytes([self.node_id, self.bit_rate, self.program_reset, self.crash_resets]);
+        words[5] = self.refused as u32;
         words[11] = check_of(&words);
         words
     }
@@ -73,9 +152,13 @@ impl BootReport {
         }
         let [reason, held_program, window, window_high] = words[2].to_le_bytes();
         let [program, value, node, returned] = words[3].to_le_bytes();
-        let [node_id, bit_rate, ..] = words[4].to_le_bytes();
+        let [node_id, bit_rate, program_reset, crash_resets] = words[4].to_le_bytes();
+        let [refused, ..] = words[5].to_le_bytes();
         Some(Self {
             reason,
+            refused,
+            program_reset,
+            crash_resets,
             held_program,
             window_ms: u16::from_le_bytes([window, window_high]),
             owed: Owed { program, value, node_id: node },
@@ -103,15 +186,27 @@ mod tests {
         returned: 8,
         node_id: 9,
         bit_rate: 10,
+        program_reset: 4,
+        crash_resets: 12,
+        refused: 13,
     };
 
     /// Written down by hand from the table above.
     #[test]
     fn the_words_are_frozen() {
         let words = REPORT.words();
-        assert_eq!(words[..5], [0x5242_4243, 0x0030_0001, 0x0403_0201, 0x0807_0605, 0x0000_0A09]);
-        assert_eq!(words[5..11], [0; 6]);
+        assert_eq!(words[..5], [0x5242_4243, 0x0030_0001, 0x0403_0201, 0x0807_0605, 0x0C04_0A09]);
+        assert_eq!(words[5..11], [13, 0, 0, 0, 0, 0]);
         assert_eq!(BootReport::parse(&words), Some(REPORT));
+    }
+
+    /// The numbers of docs/protocol.md, which are on the bus.
+    #[test]
+    fn each_reason_has_its_number() {
+        for (number, reason) in (0..).zip(Reason::ALL) {
+            assert_eq!((reason as u8, Reason::from_byte(number)), (number, Some(reason)));
+        }
+        assert_eq!(Reason::from_byte(12), None);
     }
 
     #[test]

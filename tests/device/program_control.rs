@@ -2,7 +2,8 @@
 //! and the meaning of 80h for a program that was just downloaded. For the applications in Rust and
 //! C.
 
-use canopen::program::ProgramControl;
+use canopen::program::{ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+use canopen::Address;
 use coboot_tests::bench::{
     control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
 };
@@ -446,5 +447,49 @@ fn coflash_calls_a_fresh_program_back() {
         assert!(running.is_bootloader(), "{image}");
         let took = bench.time() - began;
         assert!(took < Span::from_millis(4000), "{image}: {} ms", took.0 / 1_000_000_000);
+    }
+}
+
+/// A program that is damaged in flash is refused behind the reset of its START, and so it is at the start
+/// by itself: 1F57h says NOVALPROG, 1F51h and 1F56h that there is none, and 2007h why.
+#[test]
+fn a_start_of_a_damaged_program_is_refused_and_says_why() {
+    let region = firmware::board().programs[0];
+    let read = |bench: &mut Bench, index, sub| {
+        let value = bench.session().read(Address::new(index, sub)).unwrap();
+        value.iter().rev().fold(0_u32, |word, byte| word << 8 | u32::from(*byte))
+    };
+    // A byte of the code, and the first vector.
+    for (damage, reason) in [(region.base + 0x400, 9), (region.base, 10)] {
+        let mut bench = running_board(firmware::APP_V1);
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        // It came back on request.
+        let state = [1, 2, 3, 4].map(|sub| read(&mut bench, 0x2007, sub));
+        assert_eq!(state, [0, 0, 3, 0]);
+        assert_ne!(read(&mut bench, PROGRAM_ID, 1), 0);
+        bench.machine().poke(damage, &[0, 0, 0, 0]).unwrap();
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        for after in ["START", "power-on"] {
+            bench.await_boot_up(1000);
+            assert!(bench.is_bootloader(NODE), "after {after}");
+            assert_eq!(read(&mut bench, FLASH_STATUS, 1), 0x02, "after {after}");
+            assert_eq!(read(&mut bench, PROGRAM_ID, 1), 0, "after {after}");
+            assert_eq!(read(&mut bench, PROGRAM_CONTROL, 1), 3, "after {after}");
+            assert_eq!(read(&mut bench, 0x2007, 2), reason, "after {after}");
+            power_cycle(&mut bench);
+        }
+        bench.await_boot_up(1000);
+        // A new download brings everything back.
+        flash(
+            &mut bench.session(),
+            &firmware::blocks(firmware::APP_V2),
+            &FlashOptions::default(),
+            &mut |_| {},
+        )
+        .unwrap();
+        bench.run_ms(100);
+        assert!(!bench.is_bootloader(NODE));
+        bench.assert_nothing_unmodelled();
     }
 }

@@ -40,7 +40,6 @@ static CONFIG: bootloader::Config = bootloader::Config {
     supports: coboot_node::supports,
     boot_up_emergency: true,
     lss_store: true,
-    second_server: true,
     download: Profile::STANDARD.download,
     password: &[],
 };

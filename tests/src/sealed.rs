@@ -85,7 +85,6 @@ const fn config(
         supports: |_| true,
         boot_up_emergency: false,
         lss_store: true,
-        second_server: true,
         download: Policy {
             identity: Some((VENDOR_ID, PRODUCT_CODE)),
             seal: SealPolicy { data: profile.download.data, ..seal },

@@ -5,14 +5,14 @@
 //! their reset state. The rest of the bootloader gets the CRC unit with its clock on, for the
 //! services.
 
-use boot_core::canopen::{BitRate, NodeId};
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, StayReason};
+use boot_core::canopen::NodeId;
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances};
 use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
 use bsp::{pac, CLOCK_TREE, LAYOUT};
 use cortex_m::peripheral::SCB;
-use shared_abi::boot_report::{BootReport, Words};
+use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::warm_start::{BootRequest, Owed};
 
@@ -127,7 +127,12 @@ pub unsafe extern "C" fn stage() -> ! {
         // SAFETY: only the stack uses the RAM.
         match unsafe { ram_image::load(&flash) } {
             Ok(vectors) => {
-                let report = boot_report(&decision, request, node_id, node.bit_rate);
+                let report = BootReport {
+                    crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
+                    node_id,
+                    bit_rate: node.bit_rate as u8,
+                    ..boot_report(&decision, request, reset_cause)
+                };
                 drop(caches);
                 // The image changes the clock. The CRC unit keeps its clock, for the services.
                 // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
@@ -146,36 +151,34 @@ pub unsafe extern "C" fn stage() -> ! {
     SCB::sys_reset()
 }
 
-/// The report to the RAM image.
-fn boot_report(
-    decision: &BootDecision,
-    request: Option<BootRequest>,
-    node_id: u8,
-    bit_rate: BitRate,
-) -> BootReport {
-    let (reason, held_program, window_ms) = match decision {
-        BootDecision::Stay(reason) => (*reason, 0, 0),
-        BootDecision::Hold { program, window_ms } => (StayReason::Rescue, *program, *window_ms),
-        BootDecision::Start { program, .. } => (StayReason::Rescue, program.number(), 0),
+/// Why the RAM image runs, and what is left for it.
+fn boot_report(decision: &BootDecision, request: Option<BootRequest>, cause: ResetCause) -> BootReport {
+    let (reason, refused, held_program, window_ms) = match *decision {
+        BootDecision::Stay { reason, refused } => (reason, refused, 0, 0),
+        BootDecision::Hold { program, window_ms } => (Reason::Rescue, 0, program, window_ms),
+        BootDecision::Start { program, .. } => (Reason::Rescue, 0, program.number(), 0),
     };
-    // An application that requests the bootloader has shown that it can be called back. The handoff
-    // has its number; nothing has written it since.
-    let returned = match request {
+    let (returned, program_reset) = match request {
+        // An application that requests the bootloader has shown that it can be called back. The handoff
+        // has its number; nothing has written it since.
         // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
-        Some(BootRequest::Stay | BootRequest::Owed(_)) => unsafe {
-            Handoff::read_program(LAYOUT.handoff.base as *const Handoff)
-        },
-        _ => 0,
+        Some(BootRequest::Stay | BootRequest::Owed(_)) => {
+            (unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) }, cause as u8)
+        }
+        None => (0, cause as u8),
+        // The bootloader itself left these requests.
+        Some(_) => (0, 0),
     };
     let owed = if let Some(BootRequest::Owed(owed)) = request { owed } else { Owed::NOTHING };
     BootReport {
-        reason: reason.code(),
+        reason: reason as u8,
+        refused,
+        program_reset,
         held_program,
         window_ms,
         owed,
         returned,
-        node_id,
-        bit_rate: bit_rate as u8,
+        ..BootReport::NONE
     }
 }
 

@@ -1,5 +1,6 @@
 //! The bootloader as a CANopen device: its object dictionary and the download.
 
+use core::marker::PhantomData;
 use core::task::Poll;
 
 use canopen::bit_rate::BitRate;
@@ -10,20 +11,21 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, FlashError, ProgramControl, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL,
-    PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, SEALED_ENTRIES,
-    SECOND_SERVER, SOFTWARE_VERSION, UNLOCK, UNLOCK_ENTRIES,
+    control_count, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY,
+    PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
+    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_CRASH_RESETS, STATE_ENTRIES, STATE_PROGRAM_RESET,
+    STATE_REASON, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
+use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 use {canopen::program::ACCESS, seal::access::right};
 
 use crate::control::{Downloader, Policy, Sealed, Step};
-use crate::decision::StayReason;
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
@@ -75,6 +77,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
     let table = if extras.second_server { table.with(&second::ENTRIES) } else { table };
     let table = table.with_array("Program data", data, programs).with_program_control(programs);
+    let table = table.with(&STATE_ENTRIES);
     let table = if extras.resume {
         let element =
             Entry::sub(PROGRAM_PARTIAL, 1, "Begun download of a program", DataType::Unsigned64, Access::Ro);
@@ -106,12 +109,27 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
     let second_server = if extras.second_server { second::ENTRIES.len() } else { 0 };
     let resume = if extras.resume { array } else { 0 };
-    let always = device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs);
+    let always =
+        device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + STATE_ENTRIES.len();
     always + password + sealed + second_server + resume
 }
 
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
+
+/// What a bootloader can do without, on a chip with little room: the compiler leaves out the code.
+pub trait Choices {
+    /// Whether there is a second SDO server (1201h), by which one client writes a program to several
+    /// devices at once.
+    const SECOND_SERVER: bool = true;
+    /// Whether objects can be read by SDO block upload.
+    const BLOCK_UPLOAD: bool = true;
+}
+
+/// A bootloader with everything.
+pub struct Everything;
+
+impl Choices for Everything {}
 
 /// The configuration of a bootloader.
 #[derive(Clone, Copy, Debug)]
@@ -129,12 +147,10 @@ pub struct Config {
     /// Whether an emergency follows each boot-up message. It shows a master that this is the
     /// bootloader and not the application. Its code is FF00h (device specific, CiA 301 table 26);
     /// its data are "BOOT" and the reason why the device stayed
-    /// ([`StayReason::code`](crate::decision::StayReason::code)).
+    /// ([`Reason`](shared_abi::boot_report::Reason)).
     pub boot_up_emergency: bool,
     /// Whether layer setting services may store node-ID and bit rate.
     pub lss_store: bool,
-    /// Whether there is a second SDO server (1201h).
-    pub second_server: bool,
     /// How programs are downloaded.
     pub download: Policy,
     /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
@@ -143,11 +159,11 @@ pub struct Config {
 }
 
 /// The objects of the bootloader and the state that they show.
-pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
+pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices = Everything> {
     config: &'static Config,
     serial_number: u32,
-    /// Why the device stayed in the bootloader.
-    reason: u8,
+    /// Why the bootloader runs.
+    report: BootReport,
     /// Node-ID and bit rate as stored.
     node: NodeParameters,
     /// The active node-ID.
@@ -163,27 +179,30 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize> {
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
     stored_version: StoredVersion,
+    choices: PhantomData<fn() -> C>,
 }
 
-impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PROGRAMS> {
-    /// Starts with the stored parameters, for a device that stayed in the bootloader for `reason`.
-    /// The larger the `buffer`, the further the flash may lag behind the bus.
+impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<'b, F, P, PROGRAMS, C> {
+    /// Starts with the stored parameters, for a device that stayed in the bootloader as reported. The
+    /// larger the `buffer`, the further the flash may lag behind the bus.
     #[allow(clippy::too_many_arguments, reason = "each is a part of the device")]
     pub fn new(
         config: &'static Config,
         serial_number: u32,
         node: NodeParameters,
-        reason: u8,
+        report: BootReport,
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
         sealed: Sealed<'b>,
     ) -> Self {
-        let download = Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
+        let mut download =
+            Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
+        download.refused_to_start(&report);
         let mut bootloader = Self {
             config,
             serial_number,
-            reason,
+            report,
             node,
             id: config.node_id.or(node.id),
             flash,
@@ -194,9 +213,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
             signatures: Lock::new(b""),
             now: Instant::from_millis(0),
             stored_version: StoredVersion::new(),
+            choices: PhantomData,
         };
-        if StayReason::is_trouble(reason) {
-            bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [reason, 0, 0, 0, 0]);
+        if report.reason == Reason::CrashLoop as u8 || report.reason == Reason::Fault as u8 {
+            bootloader.emcy.raise(emcy::code::SOFTWARE, 0, [report.reason, 0, 0, 0, 0]);
         }
         bootloader
     }
@@ -251,6 +271,16 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
         }
     }
 
+    /// 2007h.
+    fn state(&self, sub: u8) -> u8 {
+        match sub {
+            STATE_REASON => self.report.reason,
+            STATE_PROGRAM_RESET => self.report.program_reset,
+            STATE_CRASH_RESETS => self.report.crash_resets,
+            _ => 0,
+        }
+    }
+
     /// Whether [`Bootloader::step`] has work to do.
     #[must_use]
     pub fn busy(&self) -> bool {
@@ -302,9 +332,15 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize> Bootloader<'b, F, P, PR
     }
 }
 
-impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, F, P, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
+    for Bootloader<'_, F, P, PROGRAMS, C>
+{
     fn has_second_server() -> bool {
-        true
+        C::SECOND_SERVER
+    }
+
+    fn has_block_upload() -> bool {
+        C::BLOCK_UPLOAD
     }
 
     fn entries(&self) -> &'static [Entry] {
@@ -327,8 +363,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
             PROGRAM_PARTIAL => return put(buf, &self.download.partial(at.sub)),
+            DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
             PROGRAM_ID => self.download.identification(at.sub),
-            SECOND_SERVER if self.config.second_server => self.second_server.read(at.sub),
+            SECOND_SERVER if C::SECOND_SERVER => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -348,7 +385,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
                 }
                 self.download.ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) if self.config.second_server => {
+            (SECOND_SERVER, &[a, b, c, d]) if C::SECOND_SERVER => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
@@ -401,7 +438,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 
     fn second_server(&self) -> Channel {
-        if self.config.second_server {
+        if C::SECOND_SERVER {
             self.second_server.channel()
         } else {
             Channel::NONE
@@ -413,7 +450,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> Objects for Bootloader<'_, 
     }
 }
 
-impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_, F, P, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
+    for Bootloader<'_, F, P, PROGRAMS, C>
+{
     fn supports(&mut self, rate: BitRate) -> bool {
         (self.config.supports)(rate)
     }
@@ -440,7 +479,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> LssDevice for Bootloader<'_
     }
 }
 
-impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<'_, F, P, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> SlaveDevice
+    for Bootloader<'_, F, P, PROGRAMS, C>
+{
     fn line_event(&mut self, event: LineEvent) {
         self.emcy.line_event(event);
     }
@@ -450,7 +491,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize> SlaveDevice for Bootloader<
         // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
         self.second_server = SecondServer::NONE;
         if id.is_some() && self.config.boot_up_emergency {
-            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.reason]);
+            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.report.reason]);
         }
     }
 }

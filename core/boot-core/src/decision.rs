@@ -6,6 +6,7 @@
 
 use core::ops::RangeInclusive;
 
+use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::BootRequest;
 
@@ -61,58 +62,17 @@ impl Policy {
     }
 }
 
-/// Why the device stays in the bootloader.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum StayReason {
-    /// The application (or a tool through it) has requested the bootloader.
-    Requested,
-    /// The entry strap is set.
-    Strap,
-    /// There were too many consecutive crash resets.
-    CrashLoop,
-    /// Autostart is off, and there is no request.
-    NoAutostart,
-    /// The node-ID is outside the permitted range.
-    NodeId,
-    /// The program is not released for autostart, and this is not a trial.
-    Unsigned,
-    /// The program may not be started.
-    Program(Invalid),
-    /// The bootloader had a fault or a panic.
-    Fault,
-    /// A program could start, and waits until the rescue window ends.
-    Rescue,
-}
-
-impl StayReason {
-    /// The number that reports the reason on the bus.
-    #[must_use]
-    pub const fn code(self) -> u8 {
-        match self {
-            Self::Requested => 0,
-            Self::Strap => 1,
-            Self::CrashLoop => 2,
-            Self::NoAutostart => 3,
-            Self::NodeId => 4,
-            Self::Unsigned => 5,
-            Self::Program(_) => 6,
-            Self::Fault => 7,
-            Self::Rescue => 8,
-        }
-    }
-
-    /// Whether a code stands for a problem that an emergency must report.
-    #[must_use]
-    pub const fn is_trouble(code: u8) -> bool {
-        code == Self::CrashLoop.code() || code == Self::Fault.code()
-    }
-}
-
 /// The bootloader's action after a reset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BootDecision {
     /// Stay in the bootloader.
-    Stay(StayReason),
+    Stay {
+        /// The reason.
+        reason: Reason,
+        /// The program that should have started and may not: one that a client requested, or a damaged
+        /// one that would start by itself; 0 for none.
+        refused: u8,
+    },
     /// Stay in the bootloader for a limited time. If a client sends a request meanwhile, the device
     /// stays there. Otherwise the program starts.
     Hold {
@@ -149,38 +109,36 @@ pub fn decide(
 ) -> BootDecision {
     use BootDecision::{Hold, Start, Stay};
 
+    let stay = |reason| Stay { reason, refused: 0 };
     match circumstances.request {
-        Some(BootRequest::Stay | BootRequest::Owed(_)) => return Stay(StayReason::Requested),
-        Some(BootRequest::Fault) => return Stay(StayReason::Fault),
+        Some(BootRequest::Stay | BootRequest::Owed(_)) => return stay(Reason::Requested),
+        Some(BootRequest::Fault) => return stay(Reason::Fault),
         _ => {}
     }
     if circumstances.strap {
-        return Stay(StayReason::Strap);
+        return stay(Reason::Strap);
     }
-    let (number, trial) = match circumstances.request {
-        // A request is new: its sender knows about earlier crashes.
-        Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true),
-        Some(BootRequest::Start(number) | BootRequest::Resume(number) | BootRequest::Confirm(number)) => {
-            (number, false)
-        }
-        _ => {
-            if circumstances.crash_resets >= policy.max_crash_resets {
-                return Stay(StayReason::CrashLoop);
-            }
-            match policy.autostart {
-                Some(number) => (number, false),
-                None => return Stay(StayReason::NoAutostart),
-            }
-        }
+    // A request is new: its sender knows about earlier crashes.
+    let (number, trial, is_requested) = match circumstances.request {
+        Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true, true),
+        Some(BootRequest::Start(number)) => (number, false, true),
+        Some(BootRequest::Resume(number) | BootRequest::Confirm(number)) => (number, false, false),
+        _ if circumstances.crash_resets >= policy.max_crash_resets => return stay(Reason::CrashLoop),
+        _ => match policy.autostart {
+            Some(number) => (number, false, false),
+            None => return stay(Reason::NoAutostart),
+        },
     };
+    let refuse = |reason| Stay { reason, refused: if is_requested { number } else { 0 } };
     if !policy.node_ids.contains(&circumstances.node_id) {
-        return Stay(StayReason::NodeId);
+        return refuse(Reason::NodeId);
     }
     match verify(number) {
-        Err(invalid) => Stay(StayReason::Program(invalid)),
-        Ok(program) if !(program.signed() || trial) || !(policy.start_allowed)(number) => {
-            Stay(StayReason::Unsigned)
-        }
+        Err(Invalid::NoSuchProgram | Invalid::Absent) => refuse(Reason::NoProgram),
+        Err(Invalid::Size | Invalid::Crc) => Stay { reason: Reason::Damaged, refused: number },
+        Err(Invalid::Vectors(_)) => Stay { reason: Reason::Vectors, refused: number },
+        Ok(program) if !(program.signed() || trial) => refuse(Reason::Unsigned),
+        Ok(_) if !(policy.start_allowed)(number) => refuse(Reason::Forbidden),
         Ok(program) => {
             let window_ms =
                 if program.confirmed() { policy.rescue_window_confirmed_ms } else { policy.rescue_window_ms };

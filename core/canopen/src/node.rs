@@ -5,6 +5,7 @@
 //! at [`Node::next_deadline`]).
 
 use crate::abort::AbortCode;
+use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::heartbeat::Heartbeat;
 use crate::nmt::{self, NmtCommand, NmtState};
@@ -98,10 +99,9 @@ impl Node {
         self.sdo.has_answer()
     }
 
-    /// Whether frames take long on this bus, see
-    /// [`slow_bus`](crate::sdo::server::Config::slow_bus).
-    pub fn set_slow_bus(&mut self, slow_bus: bool) {
-        self.sdo.set_slow_bus(slow_bus);
+    /// The bit rate of the bus, see [`bit_rate`](crate::sdo::server::Config::bit_rate).
+    pub fn set_bit_rate(&mut self, bit_rate: BitRate) {
+        self.sdo.set_bit_rate(bit_rate);
     }
 
     /// Withdraws the waiting SDO answer if it is `answer`; returns whether it was.

@@ -359,6 +359,16 @@ pub trait Objects {
         false
     }
 
+    /// Whether objects can be read by block upload. Without it, the compiler leaves out the code for it,
+    /// and its requests are unknown requests.
+    #[must_use]
+    fn has_block_upload() -> bool
+    where
+        Self: Sized,
+    {
+        true
+    }
+
     /// The table.
     fn entries(&self) -> &'static [Entry];
 

@@ -101,6 +101,37 @@ pub const PROGRAM_VERSION: u16 = 0x2005;
 /// address up to which its data have arrived; 0 if there is none.
 pub const PROGRAM_PARTIAL: u16 = 0x2006;
 
+/// The state of the device, an object of coboot. Sub-index 1 is reserved for the program number of the
+/// bootloader itself, 0 for none.
+pub const DEVICE_STATE: u16 = 0x2007;
+/// In [`DEVICE_STATE`]: why the device stays in the bootloader (`shared_abi::boot_report::Reason`).
+pub const STATE_REASON: u8 = 2;
+/// In [`DEVICE_STATE`]: the reset by which the last program ended
+/// (`shared_abi::handoff::ResetCause`).
+pub const STATE_PROGRAM_RESET: u8 = 3;
+/// In [`DEVICE_STATE`]: resets in a row by which a program ended and that nobody requested.
+pub const STATE_CRASH_RESETS: u8 = 4;
+/// The entries of [`DEVICE_STATE`].
+pub const STATE_ENTRIES: [Entry; 5] = [
+    Entry::record(DEVICE_STATE, "Device state", 4),
+    Entry::sub(DEVICE_STATE, 1, "Program number of the bootloader", DataType::Unsigned8, Access::Const),
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_REASON,
+        "Reason to stay in the bootloader",
+        DataType::Unsigned8,
+        Access::Ro,
+    ),
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_PROGRAM_RESET,
+        "Last reset of the program",
+        DataType::Unsigned8,
+        Access::Ro,
+    ),
+    Entry::sub(DEVICE_STATE, STATE_CRASH_RESETS, "Crash resets in a row", DataType::Unsigned8, Access::Ro),
+];
+
 /// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`
 /// bytes.
 #[must_use]

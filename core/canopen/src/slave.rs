@@ -211,10 +211,9 @@ impl Slave {
                     continue;
                 }
                 &mut Line::Down(rate) => {
-                    let slow_bus = rate.is_slow();
-                    self.config.node.sdo.slow_bus = slow_bus;
+                    self.config.node.sdo.bit_rate = rate;
                     if let Some(node) = &mut self.node {
-                        node.set_slow_bus(slow_bus);
+                        node.set_bit_rate(rate);
                     }
                     self.line = Line::Up { monitor: Monitor::new(now), recover_from_bus_off: false };
                     return Some(Output::Join(rate));

@@ -13,11 +13,12 @@ use boot_core::canopen::od::Entry;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
-use boot_core::decision::{decide, BootDecision, Circumstances, Policy, StayReason};
+use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
 use coboot_app::{Defaults, Next, Start};
+use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
@@ -66,7 +67,7 @@ pub enum Event {
         /// The active node-ID; `None` while the device waits for one.
         node: Option<NodeId>,
         /// The reason.
-        reason: StayReason,
+        reason: Reason,
     },
     /// A program would run.
     Program {
@@ -222,14 +223,17 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let decision = decide(&circumstances, &POLICY, verified);
         match decision {
             // A program that is delayed cannot occur: the policy has no rescue window.
-            BootDecision::Stay(_) | BootDecision::Hold { .. } => {
-                let reason =
-                    if let BootDecision::Stay(reason) = decision { reason } else { StayReason::Rescue };
+            BootDecision::Stay { .. } | BootDecision::Hold { .. } => {
+                let (reason, refused) = match decision {
+                    BootDecision::Stay { reason, refused } => (reason, refused),
+                    _ => (Reason::Rescue, 0),
+                };
+                let report = BootReport { reason: reason as u8, refused, ..BootReport::NONE };
                 let device = Bootloader::new(
                     config,
                     serial_number,
                     node,
-                    reason.code(),
+                    report,
                     journal,
                     flash,
                     buffer,

@@ -137,7 +137,6 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         supports,
         boot_up_emergency: true,
         lss_store: true,
-        second_server: true,
         download: Policy {
             identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
             crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },

@@ -50,7 +50,6 @@ static CONFIG: Config = Config {
     supports: |_| true,
     boot_up_emergency: false,
     lss_store: true,
-    second_server: true,
     download: Policy::DEFAULT,
     password: b"",
 };

@@ -66,7 +66,6 @@ static CONFIG: Config = Config {
     supports: |_| true,
     boot_up_emergency: false,
     lss_store: true,
-    second_server: false,
     download: Policy {
         identity: Some((VENDOR_ID, PRODUCT_CODE)),
         seal: SealPolicy {

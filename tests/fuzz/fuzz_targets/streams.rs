@@ -50,7 +50,6 @@ macro_rules! config {
             supports: |_| true,
             boot_up_emergency: false,
             lss_store: true,
-            second_server: true,
             download: Policy { identity: Some((1, 2)), ..PROFILE.download },
             password: PROFILE.password,
         };

@@ -39,7 +39,6 @@ pub const CONFIG: Config = Config {
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
     lss_store: true,
-    second_server: true,
     download: Policy::DEFAULT,
     password: b"",
 };

@@ -4,6 +4,7 @@ use boot_core::bootloader::{Bootloader, Config};
 use boot_core::control::{Room, Sealed};
 use boot_core::flash::Flash;
 use boot_core::store::{Journal, NodeParameters, Parameters};
+use shared_abi::boot_report::{BootReport, Reason};
 
 /// What a bootloader starts from, apart from its memory.
 pub struct Boot {
@@ -13,15 +14,20 @@ pub struct Boot {
     pub node: NodeParameters,
     /// The device's own number.
     pub serial_number: u32,
-    /// The code of the reason why the device stayed in the bootloader.
-    pub reason: u8,
+    /// Why the device stayed in the bootloader.
+    pub report: BootReport,
 }
 
 impl Boot {
-    /// A device with the serial number 0 that stayed for no reason.
+    /// A device with the serial number 0 that was asked to stay.
     #[must_use]
     pub fn new(config: &'static Config, node: NodeParameters) -> Self {
-        Self { config, node, serial_number: 0, reason: 0 }
+        Self {
+            config,
+            node,
+            serial_number: 0,
+            report: BootReport { reason: Reason::Requested as u8, ..BootReport::NONE },
+        }
     }
 
     /// Starts on this flash, with the journal in it.
@@ -43,8 +49,8 @@ impl Boot {
         buffer: &'b mut [u8],
         sealed: Sealed<'b>,
     ) -> Bootloader<'b, F, P, PROGRAMS> {
-        let Self { config, node, serial_number, reason } = self;
-        Bootloader::new(config, serial_number, node, reason, parameters, flash, buffer, sealed)
+        let Self { config, node, serial_number, report } = self;
+        Bootloader::new(config, serial_number, node, report, parameters, flash, buffer, sealed)
     }
 }
 

@@ -71,7 +71,6 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
         supports: |_| true,
         boot_up_emergency: false,
         lss_store: true,
-        second_server: true,
         download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
         password: profile.password,
     }

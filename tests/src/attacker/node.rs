@@ -87,7 +87,6 @@ impl Node {
             supports: coboot_node::supports,
             boot_up_emergency: true,
             lss_store: true,
-            second_server: true,
             download: Policy { ..profile.download },
             password: profile.password,
         }));

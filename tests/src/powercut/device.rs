@@ -60,7 +60,6 @@ const CONFIG: Config = Config {
     password: b"",
     boot_up_emergency: false,
     lss_store: true,
-    second_server: true,
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };
 static SOUND: Config = CONFIG;

@@ -21,6 +21,7 @@ use core::task::Poll;
 use canopen::program::{region_value, FlashError, FlashStatus, ProgramState};
 use canopen::AbortCode;
 use seal::access::right;
+use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::geometry::Region;
 use shared_abi::label;
 use shared_abi::layout::Layout;
@@ -135,6 +136,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             boot_request: None,
             outcome: None,
             node_stored: Ok(()),
+        }
+    }
+
+    /// The boot stage has refused to start a program: its status is that of a START of no valid program.
+    /// A damaged program is none any more.
+    pub(crate) fn refused_to_start(&mut self, report: &BootReport) {
+        let Some(state) = find(&mut self.programs, report.refused) else { return };
+        state.error = Some(FlashError::NoValidProgram);
+        if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {
+            state.record = None;
+            state.identification = 0;
         }
     }
 

@@ -1,11 +1,12 @@
 //! The boot decision: the promised order of its checks.
 
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, Policy, StayReason};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, Policy};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use kit::model::ModelFlash;
+use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
@@ -80,30 +81,32 @@ fn what_asks_for_the_bootloader_wins() {
     let stay = |circumstances: Circumstances, policy: Policy| match decide(&circumstances, &policy, |_| {
         panic!("the program was looked at")
     }) {
-        BootDecision::Stay(reason) => reason,
+        BootDecision::Stay { reason, refused: 0 } => reason,
         start => panic!("{start:?}"),
     };
     let request = |request| Circumstances { request: Some(request), ..QUIET };
     let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });
-    assert_eq!(stay(request(BootRequest::Stay), policy()), StayReason::Requested);
-    assert_eq!(stay(request(owed), policy()), StayReason::Requested);
-    assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), StayReason::Strap);
+    assert_eq!(stay(request(BootRequest::Stay), policy()), Reason::Requested);
+    assert_eq!(stay(request(owed), policy()), Reason::Requested);
+    assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), Reason::Strap);
     assert_eq!(
         stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),
-        StayReason::Strap
+        Reason::Strap
     );
-    assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), StayReason::CrashLoop);
-    assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), StayReason::NoAutostart);
+    assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), Reason::CrashLoop);
+    assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), Reason::NoAutostart);
     for node_id in [0, 101, 127, 255] {
-        assert_eq!(stay(Circumstances { node_id, ..QUIET }, policy()), StayReason::NodeId);
+        assert_eq!(stay(Circumstances { node_id, ..QUIET }, policy()), Reason::NodeId);
     }
 }
 
 #[test]
 fn without_signature_a_program_starts_as_a_trial_alone() {
-    assert_eq!(decide(&QUIET, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
+    let stays = BootDecision::Stay { reason: Reason::Unsigned, refused: 0 };
+    assert_eq!(decide(&QUIET, &policy(), |_| unsigned()), stays);
     let start = Circumstances { request: Some(BootRequest::Start(1)), ..QUIET };
-    assert_eq!(decide(&start, &policy(), |_| unsigned()), BootDecision::Stay(StayReason::Unsigned));
+    let refused = BootDecision::Stay { reason: Reason::Unsigned, refused: 1 };
+    assert_eq!(decide(&start, &policy(), |_| unsigned()), refused);
     let policy = Policy { autostart: None, ..policy() };
     for request in [BootRequest::Trial(1), BootRequest::Fresh(1)] {
         let trial = Circumstances { request: Some(request), crash_resets: 9, ..QUIET };
@@ -153,10 +156,10 @@ fn a_request_for_a_program_that_is_not_there_stays() {
     let journal = Journal::open(&flash, LAYOUT.parameters);
     let decision =
         decide(&start, &policy(), |number| verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, number));
-    assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::NoSuchProgram)));
+    assert_eq!(decision, BootDecision::Stay { reason: Reason::NoProgram, refused: 7 });
     let decision =
         decide(&QUIET, &policy(), |number| verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, number));
-    assert_eq!(decision, BootDecision::Stay(StayReason::Program(Invalid::Absent)));
+    assert_eq!(decision, BootDecision::Stay { reason: Reason::NoProgram, refused: 0 });
 }
 
 #[test]
@@ -228,27 +231,81 @@ fn the_rescue_window_is_for_a_start_that_nobody_asked_for() {
 #[test]
 fn a_fault_of_the_bootloader_and_the_product_s_own_check_keep_it_there() {
     let fault = Circumstances { request: Some(BootRequest::Fault), ..QUIET };
-    assert_eq!(decide(&fault, &policy(), |_| signed()), BootDecision::Stay(StayReason::Fault));
+    assert_eq!(
+        decide(&fault, &policy(), |_| signed()),
+        BootDecision::Stay { reason: Reason::Fault, refused: 0 }
+    );
     let forbids = Policy { start_allowed: |number| number != 1, ..policy() };
     for request in [None, Some(BootRequest::Start(1)), Some(BootRequest::Trial(1))] {
         let asked = Circumstances { request, ..QUIET };
-        assert_eq!(decide(&asked, &forbids, |_| signed()), BootDecision::Stay(StayReason::Unsigned));
+        let refused = u8::from(request.is_some());
+        let stays = BootDecision::Stay { reason: Reason::Forbidden, refused };
+        assert_eq!(decide(&asked, &forbids, |_| signed()), stays);
     }
     // Just below the limit.
     let crashes = Circumstances { crash_resets: 2, ..QUIET };
     assert!(matches!(decide(&crashes, &policy(), |_| signed()), BootDecision::Start { .. }));
 }
 
-/// The numbers of docs/protocol.md; the host tool has names for them.
+/// What is wrong with a program is a reason of its own.
 #[test]
-fn reasons_have_their_numbers() {
-    use StayReason::{CrashLoop, Fault, NoAutostart, NodeId, Program, Requested, Rescue, Strap, Unsigned};
-    let all =
-        [Requested, Strap, CrashLoop, NoAutostart, NodeId, Unsigned, Program(Invalid::Absent), Fault, Rescue];
-    for (number, reason) in (0..).zip(all) {
-        assert_eq!(reason.code(), number, "{reason:?}");
-        assert_eq!(StayReason::is_trouble(number), matches!(reason, CrashLoop | Fault), "{reason:?}");
+fn the_reason_names_what_is_wrong_with_the_program() {
+    for (invalid, reason) in [
+        (Invalid::NoSuchProgram, Reason::NoProgram),
+        (Invalid::Absent, Reason::NoProgram),
+        (Invalid::Size, Reason::Damaged),
+        (Invalid::Crc, Reason::Damaged),
+        (Invalid::Vectors(VectorFault::StackPointer), Reason::Vectors),
+        (Invalid::Vectors(VectorFault::NotThumb), Reason::Vectors),
+    ] {
+        let decision = decide(&QUIET, &policy(), |_| Err(invalid));
+        assert!(
+            matches!(decision, BootDecision::Stay { reason: stays, .. } if stays == reason),
+            "{invalid:?}"
+        );
     }
+}
+
+/// 1F57h reports a start that a client requested and that is not possible. Of a start that nobody
+/// requested it reports a damaged program alone: a device without a program has no error.
+#[test]
+fn a_start_that_is_refused_names_its_program() {
+    let refused = |request, policy: Policy, verified: fn() -> Result<VerifiedProgram, Invalid>| {
+        let circumstances = Circumstances { request, ..QUIET };
+        match decide(&circumstances, &policy, |_| verified()) {
+            BootDecision::Stay { refused, .. } => refused,
+            _ => 0,
+        }
+    };
+    let with = |more: fn(&mut Policy)| {
+        let mut policy = policy();
+        more(&mut policy);
+        policy
+    };
+    for request in [BootRequest::Start(1), BootRequest::Trial(1), BootRequest::Fresh(1)] {
+        assert_eq!(refused(Some(request), policy(), || Err(Invalid::Absent)), 1, "{request:?}");
+        assert_eq!(refused(Some(request), policy(), || Err(Invalid::Crc)), 1, "{request:?}");
+        let nodes = with(|policy| policy.node_ids = 6..=100);
+        assert_eq!(refused(Some(request), nodes, signed), 1, "{request:?}");
+        let forbidden = with(|policy| policy.start_allowed = |_| false);
+        assert_eq!(refused(Some(request), forbidden, signed), 1, "{request:?}");
+        assert_eq!(refused(Some(request), policy(), signed), 0, "{request:?}");
+    }
+    assert_eq!(refused(Some(BootRequest::Start(2)), policy(), || Err(Invalid::Absent)), 2);
+    assert_eq!(refused(Some(BootRequest::Start(1)), policy(), unsigned), 1);
+    for damage in [Invalid::Crc, Invalid::Size, Invalid::Vectors(VectorFault::ResetVector)] {
+        let verified: fn() -> Result<VerifiedProgram, Invalid> = match damage {
+            Invalid::Crc => || Err(Invalid::Crc),
+            Invalid::Size => || Err(Invalid::Size),
+            _ => || Err(Invalid::Vectors(VectorFault::ResetVector)),
+        };
+        assert_eq!(refused(None, policy(), verified), 1, "{damage:?}");
+        assert_eq!(refused(Some(BootRequest::Resume(1)), policy(), verified), 1, "{damage:?}");
+        assert_eq!(refused(Some(BootRequest::Stay), policy(), verified), 0, "{damage:?}");
+    }
+    assert_eq!(refused(None, policy(), || Err(Invalid::Absent)), 0);
+    assert_eq!(refused(None, policy(), unsigned), 0);
+    assert_eq!(refused(None, with(|policy| policy.node_ids = 6..=100), signed), 0);
 }
 
 /// Without a bootloader to stay in, each program has its turn.

@@ -195,7 +195,7 @@ fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
         // Other clients get an answer after the pause of a sub-block; one request may be taken for
         // the segment that is due, or for the rest of the previous answer.
         1 => {
-            world.wait(60);
+            world.wait(260);
             let first = world.ask(READ_1000, ANSWER_MS);
             let answer = if first == Some(IS_1000) { first } else { world.ask(READ_1000, ANSWER_MS) };
             assert_eq!(answer, Some(IS_1000), "seed {seed}, asked twice; the first time {first:02X?}");

@@ -19,6 +19,8 @@ use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
     crc32, program, Rig, Setup, ESACADEMY_1, LIFT_1, LIFT_2, PRODUCT_CODE, STANDARD_1, STANDARD_2, VENDOR_ID,
 };
+use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::handoff::ResetCause;
 use shared_abi::label;
 use shared_abi::warm_start::BootRequest;
 
@@ -439,7 +441,8 @@ fn a_device_tells_why_it_stayed() {
         let mut flash = ModelFlash::new(&CHIP);
         let config = Box::leak(Box::new(Config { boot_up_emergency, ..CONFIG }));
         let (buffer, sealed) = leaked(256);
-        let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), reason };
+        let report = BootReport { reason, ..BootReport::NONE };
+        let boot = Boot { config, serial_number: 0x1234_5678, node: kit::bench::node(), report };
         let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
         assert_eq!(node.node_id(), NodeId::new(5));
         assert_eq!(node.lss_address().serial_number, 0x1234_5678);
@@ -466,35 +469,108 @@ fn a_device_tells_why_it_stayed() {
     }
 }
 
+/// 2007h: what the boot stage reported.
+#[test]
+fn the_state_of_the_device_is_what_the_boot_stage_reported() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let (buffer, sealed) = leaked(256);
+    let report = BootReport {
+        reason: Reason::Unsigned as u8,
+        program_reset: ResetCause::IndependentWatchdog as u8,
+        crash_resets: 3,
+        ..BootReport::NONE
+    };
+    let boot = Boot { config: &CONFIG, serial_number: 0, node: kit::bench::node(), report };
+    let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
+    for (sub, value) in [(1, 0), (2, 5), (3, 4), (4, 3)] {
+        let mut byte = [0xEE];
+        assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
+        assert_eq!(byte, [value], "2007h/{sub}");
+    }
+}
+
+/// A START that came to nothing behind the reset: 1F57h is 02h for that program. A damaged program is
+/// none any more; a sound one that may not start at present stays.
+#[test]
+fn a_start_that_the_boot_stage_refused_is_no_valid_program() {
+    for (reason, stays) in [
+        (Reason::Damaged, false),
+        (Reason::Vectors, false),
+        (Reason::NodeId, true),
+        (Reason::Forbidden, true),
+        (Reason::Unsigned, true),
+    ] {
+        for refused in [0, 1, 2, 255] {
+            let mut rig = Rig::new(&STANDARD_1, 4096);
+            rig.install(1, &raw(&STANDARD_1, 1, 700));
+            let mut flash = rig.chip.model().clone();
+            let (buffer, sealed) = leaked(256);
+            let report = BootReport { reason: reason as u8, refused, ..BootReport::NONE };
+            let boot = Boot { report, ..Boot::new(&CONFIG, kit::bench::node()) };
+            let mut node = boot.on::<_, 1>(&mut flash, buffer, sealed);
+            let mut read = |index| {
+                let mut bytes = [0; 4];
+                node.read(Address::new(index, 1), &mut bytes).unwrap();
+                u32::from_le_bytes(bytes)
+            };
+            let is_named = refused == 1;
+            assert_eq!(read(0x1F57), if is_named { 0x02 } else { 0 }, "{reason:?}, program {refused}");
+            let is_there = stays || !is_named;
+            assert_eq!(read(0x1F56) != 0, is_there, "{reason:?}, program {refused}");
+            assert_eq!(read(0x1F51), if is_there { 0 } else { 3 }, "{reason:?}, program {refused}");
+        }
+    }
+}
+
 /// 1201h: written by a master, back to nothing with the next reset of the communication (CiA 301
 /// clause 7.3.2.2.1).
 #[test]
 fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_reset() {
-    use boot_core::bootloader::Bootloader;
-    type Device<'f> = Bootloader<'static, &'f mut ModelFlash, Journal, 1>;
-    assert!(<Device<'_> as Objects>::has_second_server());
-    for there in [true, false] {
-        let mut flash = ModelFlash::new(&CHIP);
-        let mut bench = Bench::with_config(&mut flash, Config { second_server: there, ..CONFIG }, 256);
-        let fresh = bench.node.second_server();
-        let at = |sub| Address::new(0x1201, sub);
-        let written = bench
-            .node
-            .write(at(1), &0x0000_06A0_u32.to_le_bytes())
-            .and_then(|()| bench.node.write(at(2), &0x0000_01A0_u32.to_le_bytes()));
-        if !there {
-            assert!(written.is_err());
-            assert_eq!(bench.node.second_server(), fresh);
-            let mut bytes = [0; 4];
-            assert!(bench.node.read(at(1), &mut bytes).is_err());
-            continue;
-        }
-        written.unwrap();
-        assert_eq!((bench.word(at(1)), bench.word(at(2))), (0x6A0, 0x1A0));
-        assert_ne!(bench.node.second_server(), fresh);
-        bench.node.node_id_changed(NodeId::new(5));
-        assert_eq!(bench.node.second_server(), fresh);
-        assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_config(&mut flash, CONFIG, 256);
+    let fresh = bench.node.second_server();
+    let at = |sub| Address::new(0x1201, sub);
+    bench.node.write(at(1), &0x0000_06A0_u32.to_le_bytes()).unwrap();
+    bench.node.write(at(2), &0x0000_01A0_u32.to_le_bytes()).unwrap();
+    assert_eq!((bench.word(at(1)), bench.word(at(2))), (0x6A0, 0x1A0));
+    assert_ne!(bench.node.second_server(), fresh);
+    bench.node.node_id_changed(NodeId::new(5));
+    assert_eq!(bench.node.second_server(), fresh);
+    assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
+}
+
+/// A product that does without them has no second server, and a request for a block upload is unknown.
+#[test]
+fn what_a_product_does_without_is_not_there() {
+    use boot_core::bootloader::{Bootloader, Choices};
+    use canopen::sdo::server::{Config as ServerConfig, SdoServer};
+    struct Least;
+    impl Choices for Least {
+        const SECOND_SERVER: bool = false;
+        const BLOCK_UPLOAD: bool = false;
+    }
+    let mut flash = ModelFlash::new(&CHIP);
+    let parameters = Journal::open(&flash, CONFIG.layout.parameters);
+    let (buffer, sealed) = leaked(256);
+    let node = kit::bench::node();
+    let mut least: Bootloader<'_, _, _, 1, Least> =
+        Bootloader::new(&CONFIG, 0, node, BootReport::NONE, parameters, &mut flash, buffer, sealed);
+    let channel = least.second_server();
+    assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
+    assert_eq!(least.second_server(), channel);
+    assert!(least.read(Address::new(0x1201, 1), &mut [0; 4]).is_err());
+
+    let unknown_request = AbortCode(0x0800_0000);
+    let node = NodeId::new(5).unwrap();
+    let mut server = SdoServer::new(node, ServerConfig { unknown_request, ..ServerConfig::DEFAULT });
+    let now = canopen::Instant::from_millis(0);
+    // CiA 301 section 7.2.4.3.13: initiate of 1008h, start, acknowledge, end.
+    for request in
+        [[0xA4, 0x08, 0x10, 0, 127, 0, 0, 0], [0xA3, 0, 0, 0, 0, 0, 0, 0], [0xA2, 1, 127, 0, 0, 0, 0, 0]]
+    {
+        server.handle(&canopen::Frame::full(canopen::CobId::sdo_request(node), request), now, &mut least);
+        let answer = server.poll(now, &mut least).unwrap();
+        assert_eq!(answer.exactly::<8>(), Some(&[0x80, 0, 0, 0, 0, 0, 0, 8]), "{request:02X?}");
     }
 }
 

@@ -296,6 +296,10 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
         D::has_second_server()
     }
 
+    fn has_block_upload() -> bool {
+        D::has_block_upload()
+    }
+
     /// The device's entries, which include [`ENTRIES`].
     fn entries(&self) -> &'static [Entry] {
         self.device.entries()

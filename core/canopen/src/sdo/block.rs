@@ -126,6 +126,16 @@ impl Receiver {
         self.seen != 0 && self.blksize != 0
     }
 
+    /// Whether no segment is missing before the last received one.
+    pub fn is_in_order(&self) -> bool {
+        self.ackseq == self.seen
+    }
+
+    /// Whether the last segment of the sub-block is the next one.
+    pub fn misses_one(&self) -> bool {
+        self.seen + 1 == self.blksize
+    }
+
     /// Ends the sub-block early; returns the number of the segment to acknowledge.
     pub fn close(&mut self) -> u8 {
         self.old = (self.seen + 1, self.blksize);
@@ -151,8 +161,10 @@ impl Receiver {
             return Err(AbortCode::SEQUENCE_NUMBER);
         }
         let in_order = seqno == self.ackseq + 1;
-        // CAN repeats a frame if its end was disturbed.
+        // CAN repeats a frame if its end was disturbed. Before the first segment of a sub-block it may be
+        // a client that repeats a request, which was taken for the rest of the previous one.
         if !in_order && self.frame == *frame {
+            self.is_doubtful |= doubtful && self.seen == 0 && fields::may_initiate(frame[0]);
             return Ok(Received::NOTHING);
         }
         self.frame = *frame;

@@ -14,7 +14,13 @@ const CRC_14: [u8; 2] = [CRC_1_TO_14 as u8, (CRC_1_TO_14 >> 8) as u8];
 const CRC_1_TO_14: u16 = 0x9B92;
 
 fn bench(blksize: u8) -> Bench {
-    Bench::with(ServerConfig { timeout_ms: 1000, repeat_ms: 300, blksize, ..ServerConfig::DEFAULT })
+    Bench::with(ServerConfig {
+        timeout_ms: 1000,
+        pause_ms: 300,
+        last_pause_ms: 300,
+        blksize,
+        ..ServerConfig::DEFAULT
+    })
 }
 
 /// Requests with all their answers.
@@ -331,20 +337,6 @@ fn server_switches_the_protocol_below_the_threshold() {
         (acked(1, 127), &[[0xDD, 0, 0, 0, 0, 0, 0, 0]]),
         (ENDED, &[]),
     ]);
-}
-
-/// A product may disable block upload: such a request is then an unknown request.
-#[test]
-fn server_without_block_upload_refuses_it() {
-    let unknown_request = AbortCode(0x0800_0000);
-    let config = ServerConfig { block_upload: false, unknown_request, ..ServerConfig::DEFAULT };
-    let mut bench = Bench::with(config);
-    bench.expect(&[(READ_14, &[[0x80, 0, 0, 0, 0x00, 0x00, 0x00, 0x08]])]);
-    bench.still_serves();
-    for request in [START, acked(1, 127), ENDED] {
-        bench.expect(&[(request, &[[0x80, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x08]])]);
-    }
-    bench.still_serves();
 }
 
 #[test]

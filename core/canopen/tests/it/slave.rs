@@ -263,12 +263,16 @@ fn reset_node_ends_a_transfer_at_once() {
     }
 }
 
-/// Frames of eight bytes take about 5 ms at 20 kbit/s.
+/// The bit rate that is in use decides: for the last segment there are 50 ms, 100 at 20 kbit/s and less,
+/// and a sub-block takes 80 ms at most.
 #[test]
-fn a_sub_block_may_pause_for_longer_on_a_slow_bus() {
-    for (index, rate, pause) in
-        [(0, BitRate::K1000, 50), (6, BitRate::K50, 50), (7, BitRate::K20, 100), (8, BitRate::K10, 100)]
-    {
+fn sub_blocks_follow_the_bit_rate() {
+    for (index, rate, pause, blksize) in [
+        (0, BitRate::K1000, 50, 127),
+        (6, BitRate::K50, 50, 29),
+        (7, BitRate::K20, 100, 11),
+        (8, BitRate::K10, 100, 5),
+    ] {
         // At the start, and after a change by layer setting services.
         for (from, anew) in [
             (rate, false),
@@ -288,14 +292,14 @@ fn a_sub_block_may_pause_for_longer_on_a_slow_bus() {
             if anew {
                 bench.ask(0x000, &[0x82, 5]);
             }
-            bench.ask(0x605, &[0xC2, 0x00, 0x20, 0, 0, 1, 0, 0]);
+            bench.ask(0x605, &[0xC2, 0x00, 0x20, 0, 14, 0, 0, 0]);
             assert_eq!(bench.ask(0x605, &[1, 1, 2, 3, 4, 5, 6, 7]), []);
             bench.now = pause - 1;
             assert_eq!(bench.outputs(), [], "{from:?} to {rate:?}");
             bench.now = pause;
             assert_eq!(
                 bench.outputs(),
-                [send(0x585, &[0xA2, 1, 127, 0, 0, 0, 0, 0])],
+                [send(0x585, &[0xA2, 1, blksize, 0, 0, 0, 0, 0])],
                 "{from:?} to {rate:?}"
             );
         }

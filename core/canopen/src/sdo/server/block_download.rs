@@ -10,8 +10,8 @@
 //!
 //! 1. it is out of order: a client sends the segments of a sub-block in a row, and CAN neither
 //!    changes the order of frames nor repeats one after a later one ([`Receiver::take`]),
-//!    device has, and
-//! 3. no segment follows it for as long as a sub-block may pause.
+//! 2. it reads as an initiate for an object that the device has, and
+//! 3. no segment follows it for as long as the last segment may take.
 //!
 //! The request then ends the download and is carried out. A segment is mistaken for a request if
 //! the previous segment was lost, nothing follows it (it is the last of the transfer, or the rest
@@ -40,6 +40,8 @@ impl SdoServer {
         let size = (bytes[0] & fields::BLOCK_SIZE_TOLD != 0).then(|| fields::number(bytes));
         let incoming = Incoming::start(at, data_type, size, objects)?;
         let receiver = Receiver::new(bytes[0] & fields::CRC != 0);
+        // The segments that follow are those of this download.
+        self.under_way = None;
         self.state = State::BlockDownload { incoming, receiver };
         let command = scs::INITIATE_BLOCK_DOWNLOAD | fields::CRC;
         self.answer_initiate(command, 0);
@@ -83,8 +85,14 @@ impl SdoServer {
     }
 
     /// The length of this wait in milliseconds.
-    pub(super) fn repeat_ms(&self) -> u32 {
-        self.config.repeat_ms << u32::from(self.config.slow_bus)
+    pub(super) fn pause_ms(&self) -> u32 {
+        let is_short = matches!(&self.state, State::BlockDownload { receiver, incoming }
+            if receiver.is_doubtful || receiver.is_in_order() && (receiver.misses_one() || incoming.misses_one()));
+        if is_short {
+            self.config.last_pause_ms << u32::from(self.config.bit_rate.is_slow())
+        } else {
+            self.config.pause_ms
+        }
     }
 
     /// The wait has ended: no segment will arrive.

@@ -4,6 +4,7 @@ use crate::abort::AbortCode;
 use crate::od::{Address, DataType, Objects};
 
 use super::value::VALUE_MAX;
+use crate::sdo::block::SEGMENT;
 
 /// A download by any kind of transfer: the number of bytes received, and the permitted number.
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +36,11 @@ impl Incoming {
     /// complete.
     pub fn is_domain(&self) -> bool {
         self.data_type == DataType::Domain
+    }
+
+    /// Whether one segment of a block download has the rest of the announced bytes.
+    pub fn misses_one(&self) -> bool {
+        self.announced.is_some_and(|size| size - self.received.min(size) <= SEGMENT as u32)
     }
 
     /// Processes the next bytes: data of a domain go to the object, data of a value into `value`.

@@ -9,8 +9,11 @@
 //!   download the time-out counts from the last accepted segment, whatever else arrives.
 //! - If a sub-block of a block download stops early, the received segments are acknowledged, and
 //!   the client repeats the rest.
+//! - After an abort in the middle of a sub-block, the segments that are still on their way are no
+//!   requests, see `under_way.rs`.
 
 use crate::abort::AbortCode;
+use crate::bit_rate::BitRate;
 use crate::frame::{CobId, Frame, NodeId};
 use crate::od::{self, Address, Entry, Objects};
 use crate::sdo::block::{Receiver, BLKSIZE_MAX, SEGMENT};
@@ -23,16 +26,26 @@ mod incoming;
 mod outgoing;
 mod segmented;
 mod sender;
+mod under_way;
 mod value;
 
 use incoming::Incoming;
 use outgoing::Outgoing;
 use sender::Sender;
+use under_way::UnderWay;
 pub use value::VALUE_MAX;
 
 /// How long an answer is delayed for lack of room before the device is asked for room in its
 /// reserve, in milliseconds.
 pub const HOLD_MS: u32 = 2;
+
+/// The longest time that the segments of a sub-block take on the bus, in milliseconds. Clients send a
+/// sub-block within their time-out, of 100 ms at least.
+pub const SUB_BLOCK_MS: u32 = 80;
+
+/// The most bits of a frame with eight bytes, with stuff bits and the space to the next frame (CiA 301
+/// leaves them to ISO 11898-1: 111 bits, and 24 stuff bits).
+const FRAME_BITS: u32 = 135;
 
 /// The configuration of a server.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,17 +54,18 @@ pub struct Config {
     /// aborted.
     pub timeout_ms: u32,
     /// How long a sub-block of a block download may pause before the received part is acknowledged,
-    /// in milliseconds. It must be longer than a client's pause between two segments, and shorter
-    /// than a client's time-out: 300 to 500 ms by default in most clients.
-    pub repeat_ms: u32,
-    /// The bus is slow (20 kbit/s and below): frames take so long that `repeat_ms` is doubled. A
-    /// [`Slave`](crate::slave::Slave) sets this when it joins the bus.
-    pub slow_bus: bool,
+    /// in milliseconds. It must be longer than a busy client's pause between two segments, and
+    /// shorter than a client's time-out: 300 to 500 ms by default in most clients.
+    pub pause_ms: u32,
+    /// The same where only the last segment of the sub-block is missing: the client waits for the
+    /// acknowledgement already. Doubled on a slow bus ([`BitRate::is_slow`]).
+    pub last_pause_ms: u32,
+    /// The bit rate of the bus, [`BitRate::Auto`] for a fast one. A [`Slave`](crate::slave::Slave)
+    /// sets it when it joins the bus.
+    pub bit_rate: BitRate,
     /// Segments of a sub-block of a block download: 1 to 127, and no more than the receive queue
-    /// can hold.
+    /// can hold. At low bit rates a sub-block has fewer, see [`SUB_BLOCK_MS`].
     pub blksize: u8,
-    /// Whether block upload is supported. If not, its requests are unknown requests.
-    pub block_upload: bool,
     /// The abort for a request that CiA 301 does not define, or that does not fit into the
     /// transfer.
     pub unknown_request: AbortCode,
@@ -65,13 +79,13 @@ pub struct Config {
 }
 
 impl Config {
-    /// Two seconds, 50 ms, 127 segments, with block upload, 05040001h.
+    /// Two seconds; 250 ms, 50 ms for the last segment; 127 segments; 05040001h.
     pub const DEFAULT: Self = Self {
         timeout_ms: 2000,
-        repeat_ms: 50,
-        slow_bus: false,
+        pause_ms: 250,
+        last_pause_ms: 50,
+        bit_rate: BitRate::Auto,
         blksize: BLKSIZE_MAX,
-        block_upload: true,
         unknown_request: AbortCode::COMMAND,
         request_base: 0x600,
         response_base: 0x580,
@@ -87,6 +101,14 @@ impl Config {
     #[must_use]
     pub const fn response(&self, node: NodeId) -> CobId {
         from_base(self.response_base, node)
+    }
+}
+
+/// The segments of a sub-block that take [`SUB_BLOCK_MS`] at most.
+fn in_time(bit_rate: BitRate) -> u8 {
+    match bit_rate.bits_per_second() {
+        Some(bits) => (bits / 1000 * SUB_BLOCK_MS / FRAME_BITS).clamp(1, BLKSIZE_MAX.into()) as u8,
+        None => BLKSIZE_MAX,
     }
 }
 
@@ -121,6 +143,8 @@ pub struct SdoServer {
     heard: Instant,
     /// The answer that waits to be fetched by [`SdoServer::poll`].
     answer: Option<[u8; 8]>,
+    /// Segments of an aborted sub-block that may still arrive.
+    under_way: Option<UnderWay>,
     /// The value of the transferred variable or string.
     value: [u8; VALUE_MAX],
 }
@@ -156,6 +180,7 @@ impl SdoServer {
             moved: Instant::from_millis(0),
             heard: Instant::from_millis(0),
             answer: None,
+            under_way: None,
             value: [0; VALUE_MAX],
         }
     }
@@ -178,9 +203,9 @@ impl SdoServer {
         self.answer.is_some()
     }
 
-    /// Sets the value of [`Config::slow_bus`].
-    pub fn set_slow_bus(&mut self, slow_bus: bool) {
-        self.config.slow_bus = slow_bus;
+    /// Sets the value of [`Config::bit_rate`].
+    pub fn set_bit_rate(&mut self, bit_rate: BitRate) {
+        self.config.bit_rate = bit_rate;
     }
 
     /// The time at which [`poll`](Self::poll) must be called even without a frame; `None` for
@@ -190,7 +215,7 @@ impl SdoServer {
         let timeout = self.moved + self.config.timeout_ms;
         match &self.state {
             State::Idle => None,
-            _ if self.is_within() => Some(timeout.earlier(self.heard + self.repeat_ms())),
+            _ if self.is_within() => Some(timeout.earlier(self.heard + self.pause_ms())),
             _ => Some(timeout),
         }
     }
@@ -225,11 +250,15 @@ impl SdoServer {
             response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
+        if self.is_under_way(bytes, response, now, objects) {
+            return;
+        }
         let is_other = O::has_second_server() && core::mem::replace(&mut self.response, response) != response;
         match &self.state {
             // A frame of the other server is no segment.
             State::BlockDownload { receiver, .. } if !receiver.is_complete() && !is_other => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
+                    self.under_way = UnderWay::behind(bytes, response, now);
                     self.abort(code, objects);
                 }
             }
@@ -277,7 +306,7 @@ impl SdoServer {
         }
         if now.has_reached(self.moved + self.config.timeout_ms) {
             self.abort(AbortCode::TIMEOUT, objects);
-        } else if self.is_within() && now.has_reached(self.heard + self.repeat_ms()) {
+        } else if self.is_within() && now.has_reached(self.heard + self.pause_ms()) {
             self.pause(now, objects);
         }
     }
@@ -293,7 +322,7 @@ impl SdoServer {
         if space < SEGMENT && now.has_reached(self.moved + HOLD_MS) {
             space = objects.download_space(self.at, true).min(SEGMENT);
         }
-        let most = self.config.blksize.clamp(1, BLKSIZE_MAX);
+        let most = self.config.blksize.clamp(1, BLKSIZE_MAX).min(in_time(self.config.bit_rate));
         let granted = (space / SEGMENT).min(usize::from(most)) as u8;
         match &mut self.state {
             State::BlockDownload { receiver, .. } => receiver.grant(answer, granted, most),
@@ -302,7 +331,7 @@ impl SdoServer {
     }
 
     /// A request outside the sub-blocks of a block download.
-    fn request(&mut self, bytes: &[u8; 8], objects: &mut impl Objects) -> Result<(), AbortCode> {
+    fn request<O: Objects>(&mut self, bytes: &[u8; 8], objects: &mut O) -> Result<(), AbortCode> {
         match fields::specifier(bytes[0]) {
             ccs::INITIATE_DOWNLOAD => self.initiate_download(bytes, objects),
             ccs::DOWNLOAD_SEGMENT => self.download_segment(bytes, objects),
@@ -310,9 +339,7 @@ impl SdoServer {
             ccs::UPLOAD_SEGMENT => self.upload_segment(bytes, objects),
             ccs::INITIATE_BLOCK_DOWNLOAD => self.initiate_block_download(bytes, objects),
             ccs::END_BLOCK_DOWNLOAD => self.end_block_download(bytes, objects),
-            ccs::INITIATE_BLOCK_UPLOAD if self.config.block_upload => {
-                self.initiate_block_upload(bytes, objects)
-            }
+            ccs::INITIATE_BLOCK_UPLOAD if O::has_block_upload() => self.initiate_block_upload(bytes, objects),
             ccs::START_BLOCK_UPLOAD => self.start_block_upload(),
             ccs::ACK_BLOCK_UPLOAD => self.ack_block_upload(bytes),
             ccs::END_BLOCK_UPLOAD => self.end_block_upload(),

@@ -1,0 +1,78 @@
+//! Segments that arrive after the abort of their block download.
+//!
+//! A client reads an abort only after it has sent more segments. They are no requests: number 2Fh with
+//! the data 51h 1Fh 01h 03h would be a CLEAR. What continues the aborted sub-block is therefore
+//! ignored: the next numbers in order, without a pause, until another block download begins. Every
+//! other frame is a request at once.
+//!
+//! The number of a segment and the command specifier of a request have the same place. Where a read
+//! (40h) has the number that is due, it is answered: an answer that nobody asked for changes nothing.
+
+use crate::frame::CobId;
+use crate::od::{self, Objects};
+use crate::sdo::block::BLKSIZE_MAX;
+use crate::sdo::fields::{self, ccs};
+use crate::time::Instant;
+
+use super::{SdoServer, FRAME_BITS};
+
+/// A pause of this many frames is the end of the aborted sub-block.
+const FRAMES: u32 = 8;
+
+/// The segments that continue an aborted sub-block.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct UnderWay {
+    /// The COB-ID of the answers to their client.
+    response: CobId,
+    /// The number of the next one.
+    next: u8,
+    /// The time of the last one.
+    heard: Instant,
+}
+
+impl UnderWay {
+    /// What may follow a segment; `None` behind the last one.
+    pub fn behind(segment: &[u8; 8], response: CobId, heard: Instant) -> Option<Self> {
+        let last = segment[0] & fields::LAST_OF_BLOCKS != 0;
+        let next = (segment[0] & !fields::LAST_OF_BLOCKS) + 1;
+        (!last && next <= BLKSIZE_MAX).then_some(Self { response, next, heard })
+    }
+}
+
+impl SdoServer {
+    /// Whether a frame continues the aborted sub-block.
+    pub(super) fn is_under_way(
+        &mut self,
+        bytes: &[u8; 8],
+        response: CobId,
+        now: Instant,
+        objects: &impl Objects,
+    ) -> bool {
+        let Some(due) = self.under_way else { return false };
+        if now.has_reached(due.heard + self.frames_ms()) {
+            self.under_way = None;
+            return false;
+        }
+        let is_due = bytes[0] & !fields::LAST_OF_BLOCKS == due.next && response == due.response;
+        if !is_due || is_read(bytes, objects) {
+            return false;
+        }
+        self.under_way = UnderWay::behind(bytes, response, now);
+        true
+    }
+
+    /// The length of [`FRAMES`], in milliseconds. The clock of the device counts whole ones.
+    fn frames_ms(&self) -> u32 {
+        1 + match self.config.bit_rate.bits_per_second() {
+            Some(bits) => (FRAMES * FRAME_BITS).div_ceil(bits / 1000),
+            None => 1,
+        }
+    }
+}
+
+/// Whether a frame is a request to read an object that exists.
+fn is_read(bytes: &[u8; 8], objects: &impl Objects) -> bool {
+    bytes[0] == ccs::INITIATE_UPLOAD
+        && bytes[4..] == [0; 4]
+        && od::find(objects.entries(), fields::address(bytes)).is_ok()
+}
