@@ -104,13 +104,33 @@ impl Config {
     }
 }
 
-/// The segments of a sub-block that take [`SUB_BLOCK_MS`] at most.
-fn in_time(bit_rate: BitRate) -> u8 {
-    match bit_rate.bits_per_second() {
-        Some(bits) => (bits / 1000 * SUB_BLOCK_MS / FRAME_BITS).clamp(1, BLKSIZE_MAX.into()) as u8,
-        None => BLKSIZE_MAX,
-    }
+/// What follows from a bit rate.
+#[derive(Clone, Copy)]
+struct Pace {
+    /// The segments that take [`SUB_BLOCK_MS`] at most.
+    segments: u8,
+    /// The time after which no segment follows an aborted sub-block, in milliseconds.
+    gap_ms: u8,
 }
+
+/// For each bit rate, by its index.
+const PACES: [Pace; 10] = {
+    let mut paces = [Pace { segments: BLKSIZE_MAX, gap_ms: 2 }; 10];
+    let mut index = 0;
+    while index < paces.len() {
+        if let Some(rate) = BitRate::from_index(index as u8) {
+            if let Some(bits) = rate.bits_per_second() {
+                let segments = bits / 1000 * SUB_BLOCK_MS / FRAME_BITS;
+                let segments = if segments < BLKSIZE_MAX as u32 { segments as u8 } else { BLKSIZE_MAX };
+                // The clock of the device counts whole milliseconds.
+                let gap_ms = 1 + (under_way::FRAMES * FRAME_BITS).div_ceil(bits / 1000) as u8;
+                paces[index] = Pace { segments, gap_ms };
+            }
+        }
+        index += 1;
+    }
+    paces
+};
 
 /// An impossible COB-ID becomes that of NMT, which no server uses.
 const fn from_base(base: u16, node: NodeId) -> CobId {
@@ -233,6 +253,11 @@ impl SdoServer {
         }
     }
 
+    /// What follows from the bit rate.
+    fn pace(&self) -> Pace {
+        PACES[self.config.bit_rate as usize]
+    }
+
     /// Ends the transfer without a message to the client, and drops a waiting answer.
     pub fn reset(&mut self, objects: &mut impl Objects) {
         self.end(objects);
@@ -315,6 +340,7 @@ impl SdoServer {
     /// until there is room for a segment. If the answer opens a sub-block, its block size is set
     /// here.
     fn may_answer(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
+        let most = self.config.blksize.clamp(1, BLKSIZE_MAX).min(self.pace().segments);
         let Some(answer) = &mut self.answer else { return false };
         let Some(incoming) = self.state.incoming() else { return true };
         let mut space =
@@ -322,7 +348,6 @@ impl SdoServer {
         if space < SEGMENT && now.has_reached(self.moved + HOLD_MS) {
             space = objects.download_space(self.at, true).min(SEGMENT);
         }
-        let most = self.config.blksize.clamp(1, BLKSIZE_MAX).min(in_time(self.config.bit_rate));
         let granted = (space / SEGMENT).min(usize::from(most)) as u8;
         match &mut self.state {
             State::BlockDownload { receiver, .. } => receiver.grant(answer, granted, most),

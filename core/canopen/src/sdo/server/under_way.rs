@@ -14,10 +14,10 @@ use crate::sdo::block::BLKSIZE_MAX;
 use crate::sdo::fields::{self, ccs};
 use crate::time::Instant;
 
-use super::{SdoServer, FRAME_BITS};
+use super::SdoServer;
 
 /// A pause of this many frames is the end of the aborted sub-block.
-const FRAMES: u32 = 8;
+pub(super) const FRAMES: u32 = 8;
 
 /// The segments that continue an aborted sub-block.
 #[derive(Clone, Copy, Debug)]
@@ -49,7 +49,7 @@ impl SdoServer {
         objects: &impl Objects,
     ) -> bool {
         let Some(due) = self.under_way else { return false };
-        if now.has_reached(due.heard + self.frames_ms()) {
+        if now.has_reached(due.heard + u32::from(self.pace().gap_ms)) {
             self.under_way = None;
             return false;
         }
@@ -59,14 +59,6 @@ impl SdoServer {
         }
         self.under_way = UnderWay::behind(bytes, response, now);
         true
-    }
-
-    /// The length of [`FRAMES`], in milliseconds. The clock of the device counts whole ones.
-    fn frames_ms(&self) -> u32 {
-        1 + match self.config.bit_rate.bits_per_second() {
-            Some(bits) => (FRAMES * FRAME_BITS).div_ceil(bits / 1000),
-            None => 1,
-        }
     }
 }
 
