@@ -6,7 +6,7 @@
 
 use core::task::Poll;
 
-use boot_core::flash::{FlashFault, Operation};
+use boot_core::flash::{is_write_protected, FlashFault, Operation};
 use bsp::{pac, LAYOUT};
 use shared_abi::geometry::Region;
 
@@ -52,6 +52,16 @@ impl FlashController {
     /// Whether the option bytes start the watchdog at each reset (WDG_SW, section 3.6.2).
     pub fn starts_watchdog(&self) -> bool {
         self.registers.optcr().read().wdg_sw().bit_is_clear()
+    }
+
+    /// Whether the option bytes protect a sector.
+    pub fn is_protected(&self, sector: u8) -> bool {
+        /// `FLASH_OPTCR1` of a chip with two banks (RM0090 section 3.9.11).
+        const OPTCR1: *const u32 = 0x4002_3C18 as *const u32;
+        // SAFETY: a register of the controller, which a read does not change. Chips without such a
+        // sector, which may lack it, do not read it.
+        let optcr1 = if sector < 12 { 0 } else { unsafe { OPTCR1.read_volatile() } };
+        is_write_protected(sector, self.registers.optcr().read().bits(), optcr1)
     }
 
     /// Copies bytes; addresses outside the flash read as FFh.

@@ -81,7 +81,8 @@ pub struct Product {
     /// Whether there is a second SDO server (1201h), by which one client writes a program to several
     /// devices at once; on boards with the split map alone.
     pub second_server: bool,
-    /// Whether a download of block files that was cut off can go on where it stopped (2006h).
+    /// Whether a download of block files that was cut off can go on where it stopped (2006h); on boards
+    /// with the split map alone.
     pub resume: bool,
     /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
@@ -149,7 +150,7 @@ impl Product {
         lss_store: true,
         block_upload: LAYOUT.home.is_some(),
         second_server: LAYOUT.home.is_some(),
-        resume: true,
+        resume: LAYOUT.home.is_some(),
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -178,8 +179,9 @@ impl Product {
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(
-            LAYOUT.home.is_some() || !self.block_upload && !self.second_server,
-            "product: block_upload and second_server need the split map: the compact one has no room for them"
+            LAYOUT.home.is_some() || !(self.block_upload || self.second_server || self.resume),
+            "product: block_upload, second_server and resume need the split map: the compact one has no room \
+             for them"
         );
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
@@ -267,7 +269,6 @@ impl Product {
                 Some(erase) => erase,
                 None => self.profile.download.erase,
             },
-            resume: self.resume,
             crc: self.crc,
             crc_step: self.crc_step,
             seal: if SEALED { self.seal() } else { SealPolicy::NONE },

@@ -10,6 +10,7 @@ use shared_abi::geometry::{Region, Sector};
 use shared_abi::services::{OperationResult, Services, Step, StoreState, ERASE, OFFSET};
 
 use crate::flash_controller::FlashController;
+use crate::product::PRODUCT;
 
 /// The resident part's services.
 fn services() -> &'static Services {
@@ -64,6 +65,10 @@ impl Flash for BootFlash {
         self.0.poll()
     }
 
+    fn is_protected(&self, sector: Sector) -> bool {
+        self.0.is_protected(sector.number)
+    }
+
     fn sector_at(&self, address: u32) -> Option<Sector> {
         let mut words = [0; 3];
         // SAFETY: the words are writable.
@@ -93,6 +98,8 @@ impl Store {
 }
 
 impl Parameters for Store {
+    const RESUMES: bool = PRODUCT.resume;
+
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.

@@ -362,7 +362,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         let word = match at.index {
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
-            PROGRAM_PARTIAL => return put(buf, &self.download.partial(at.sub)),
+            PROGRAM_PARTIAL if P::RESUMES => return put(buf, &self.download.partial(at.sub)),
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
             PROGRAM_ID => self.download.identification(at.sub),
             SECOND_SERVER if C::SECOND_SERVER => self.second_server.read(at.sub),

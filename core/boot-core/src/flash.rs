@@ -75,12 +75,45 @@ pub trait Flash {
         fold(self, true, region, |blank, bytes| blank && bytes.iter().all(|byte| *byte == u8::MAX))
     }
 
+    /// Whether the option bytes protect a sector against writing. A register says so: it may be read
+    /// at any time.
+    fn is_protected(&self, sector: Sector) -> bool {
+        let _ = sector;
+        false
+    }
+
     /// The word at a word-aligned address.
     fn read_word(&self, address: u32) -> u32 {
         let mut bytes = [0; 4];
         self.read(address, &mut bytes);
         u32::from_le_bytes(bytes)
     }
+}
+
+/// Whether a sector is protected against writing, by the option bytes as the chip has them in its
+/// registers: `FLASH_OPTCR` for sectors 0 to 11, `FLASH_OPTCR1` for those of a second bank (RM0090
+/// sections 3.9.10 and 3.9.11). A bit nWRP that is 0 protects its sector. With SPRMOD, which not all
+/// chips have, the bits mean read-out protection, and a 1 protects against reading and writing.
+#[must_use]
+pub const fn is_write_protected(sector: u8, optcr: u32, optcr1: u32) -> bool {
+    const SPRMOD: u32 = 1 << 31;
+    const FIRST: u8 = 16;
+    let register = if sector < 12 { optcr } else { optcr1 };
+    let nwrp = register >> (FIRST + sector % 12) & 1 != 0;
+    nwrp == (optcr & SPRMOD != 0)
+}
+
+/// The first protected sector of a region: nothing in it may be written now. The flash must be idle.
+pub(crate) fn protected<F: Flash>(flash: &F, region: Region) -> Option<Sector> {
+    let mut at = region.base;
+    while at < region.end() {
+        let sector = flash.sector_at(at)?;
+        if flash.is_protected(sector) {
+            return Some(sector);
+        }
+        at = sector.region.end();
+    }
+    None
 }
 
 /// [`Flash::crc32`] for a chip without a CRC unit, and for data that the unit cannot process.
@@ -152,6 +185,10 @@ impl<F: Flash> Flash for &mut F {
 
     fn is_blank(&self, region: Region) -> bool {
         (**self).is_blank(region)
+    }
+
+    fn is_protected(&self, sector: Sector) -> bool {
+        (**self).is_protected(sector)
     }
 
     fn read_word(&self, address: u32) -> u32 {

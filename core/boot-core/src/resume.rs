@@ -33,6 +33,12 @@ impl Partial {
         Self { id, end, resumed: true }
     }
 
+    /// The same for a device on which no download goes on after a cut.
+    #[must_use]
+    pub(crate) const fn disowned(self) -> Self {
+        Self { id: 0, ..self }
+    }
+
     /// The stored form: the CRC of its control block, and the address up to which its data are in
     /// flash.
     #[must_use]

@@ -69,6 +69,15 @@ impl<'b> Source<'b> {
         self.is_complete() && !self.unsealer.is_active()
     }
 
+    /// The size of the program, if it is known: that of an authentic image, or of a complete one.
+    pub(crate) fn size(&self) -> Option<u32> {
+        if self.unsealer.is_active() {
+            Some(self.unsealer.expected().size)
+        } else {
+            self.ended.map(|expected| expected.size)
+        }
+    }
+
     /// Whether there is something to [process](Self::step) before any piece: the signature of a
     /// request for rights.
     pub(crate) fn is_urgent(&self) -> bool {

@@ -90,6 +90,8 @@ pub struct ModelFlash {
     pub fail: Option<(u32, FlashFault)>,
     /// Make the operation with this number do a part, selected by the seed, and report success.
     pub weak: Option<(u32, u64)>,
+    /// The numbers of the sectors that are protected against writing.
+    pub protected: Vec<u8>,
     /// Every region that was written or erased.
     pub touched: Vec<Region>,
     /// The number of bytes that were read.
@@ -109,6 +111,7 @@ impl ModelFlash {
             cut: None,
             fail: None,
             weak: None,
+            protected: Vec::new(),
             touched: Vec::new(),
             bytes_read: Cell::new(0),
         }
@@ -149,6 +152,9 @@ impl ModelFlash {
             Operation::Erase(region) => region,
             Operation::Program { address, .. } => Region::new(address, 4),
         };
+        if self.chip.sector_at(region.base).is_some_and(|sector| self.protected.contains(&sector.number)) {
+            return Err(FlashFault::Protected);
+        }
         self.touched.push(region);
         self.running = Some(operation);
         self.polls_left = 2;
@@ -283,6 +289,10 @@ impl Flash for ModelFlash {
         }
     }
 
+    fn is_protected(&self, sector: Sector) -> bool {
+        self.protected.contains(&sector.number)
+    }
+
     fn sector_at(&self, address: u32) -> Option<Sector> {
         assert!(self.running.is_none(), "the store was asked while the flash is busy");
         self.chip.sector_at(address)
@@ -369,6 +379,10 @@ impl Flash for Chip {
 
     fn start(&mut self, operation: Started) -> Result<(), FlashFault> {
         self.model().start(operation)
+    }
+
+    fn is_protected(&self, sector: Sector) -> bool {
+        self.0.borrow().is_protected(sector)
     }
 
     fn sector_at(&self, address: u32) -> Option<Sector> {

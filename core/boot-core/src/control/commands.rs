@@ -72,11 +72,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 // Before the transfer is aborted, because the abort marks an open session as
                 // failed.
                 state.session = Session::Cleared { just: true };
-                // The erase of a sector for the old download must end first.
-                let at_once = erases && !busy;
                 self.download_cancel();
                 self.programmer.abort();
-                if at_once {
+                if erases {
                     self.programmer.erase_all(program, region);
                 }
             }
@@ -141,8 +139,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
         let at_once = at_once && self.rights.permits(right::ERASE);
-        if at_once {
-            self.programmer.void(program);
+        if let (true, Some(region)) = (at_once, self.program(program).map(|state| state.region)) {
+            self.programmer.void_if_writable(program, region);
         }
         Ok(())
     }

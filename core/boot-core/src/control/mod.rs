@@ -56,6 +56,8 @@ struct Program {
     identification: u32,
     /// The result of the last block or command.
     error: Option<FlashError>,
+    /// The sector that was protected, for [`FlashError::Secured`].
+    sector: u8,
     session: Session,
     /// The download that was cut off or is going on, as stored; a copy for the same reason.
     partial: Partial,
@@ -116,6 +118,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 record,
                 identification: record.map_or(0, |record| record.crc),
                 error: None,
+                sector: 0,
                 session: Session::Idle,
                 partial,
                 version: 0,
@@ -169,8 +172,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// can be accepted.
     #[must_use]
     pub fn status(&self, program: u8) -> FlashStatus {
-        let error = self.program(program).and_then(|state| state.error);
-        FlashStatus { busy: self.programmer.is_busy_with(program), error, detail: 0 }
+        let busy = self.programmer.is_busy_with(program);
+        let Some(state) = self.program(program) else { return FlashStatus { busy, ..FlashStatus::OK } };
+        let is_secured = state.error == Some(FlashError::Secured);
+        FlashStatus { busy, error: state.error, detail: if is_secured { state.sector.into() } else { 0 } }
     }
 
     /// 1F51h: no program runs. The value shows whether a program exists.
@@ -349,7 +354,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     Err(error) => self.end(program, Err(error)),
                 }
             }
-            Some(Event::Failed { program, error, erasing }) => {
+            Some(Event::Failed { program, error, erasing, sector }) => {
+                if let Some(state) = find(&mut self.programs, program) {
+                    state.sector = sector;
+                }
                 self.fault = match error {
                     _ if erasing => AbortCode::GENERAL,
                     // The errors for which a sealed image is refused.
@@ -461,6 +469,7 @@ impl Program {
     fn refuse(&mut self, Refusal(error, abort): Refusal) -> AbortCode {
         if !matches!(self.session, Session::Failed) || self.error.is_none() {
             self.error = Some(error);
+            self.sector = 0;
         }
         abort
     }

@@ -149,19 +149,18 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(begin) = progress.begins {
             state.version = begin.version;
             let mut next = 1;
-            let is_same = state.partial.is_same(begin.partial);
-            let goes_on = self.policy.resume && is_same;
+            let goes_on = P::RESUMES && state.partial.is_same(begin.partial);
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
                     next = ANY;
                 }
-                if !is_same {
+                if P::RESUMES && !goes_on {
                     state.partial = Partial::NONE;
                     self.programmer.disown();
                 }
             } else {
-                let mut partial = begin.partial;
+                let mut partial = if P::RESUMES { begin.partial } else { begin.partial.disowned() };
                 if goes_on && matches!(state.session, Session::Idle) && progress.sealed.is_none() {
                     partial = state.partial;
                     next = ANY;

@@ -62,8 +62,6 @@ pub struct Policy {
     pub read_back: bool,
     /// Whether a download replaces the existing program without CLEAR.
     pub replaces: bool,
-    /// Whether a download of block files that was cut off can go on where it stopped.
-    pub resume: bool,
     /// The CRC of blocks and programs.
     pub crc: CrcKind,
     /// The bytes of flash that one step of a CRC covers. One step is the longest time that other
@@ -125,7 +123,6 @@ impl Policy {
         locked: false,
         read_back: false,
         replaces: false,
-        resume: true,
         crc: CrcKind::Crc32,
         crc_step: 1024,
         seal: SealPolicy::NONE,

@@ -19,7 +19,7 @@ use canopen::program::FlashError;
 use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
-use crate::flash::{Flash, FlashFault, Next, Operation};
+use crate::flash::{protected, Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Piece;
 use crate::resume::Partial;
@@ -53,7 +53,7 @@ pub(crate) enum Event {
     /// The storing of node-ID and bit rate has ended.
     NodeStored(Result<(), FlashError>),
     /// The work on a program failed. `erasing`: an erase failed.
-    Failed { program: u8, error: FlashError, erasing: bool },
+    Failed { program: u8, error: FlashError, erasing: bool, sector: u8 },
 }
 
 /// The program that is being downloaded, and the state of its flash.
@@ -117,6 +117,10 @@ pub(crate) struct Programmer<'b> {
     target: Option<Target>,
     /// Bit n: the record of program n must be removed before anything is erased or written.
     voids: u32,
+    /// The region of a program whose record is only removed if all of it may be written.
+    unwritten: Option<Region>,
+    /// The number of the protected sector that was found last.
+    sector: u8,
     /// Whether the counter proved by the next of these programs is already stored.
     kept: bool,
     job: Option<Job>,
@@ -127,7 +131,18 @@ pub(crate) struct Programmer<'b> {
 impl<'b> Programmer<'b> {
     /// One step of a CRC covers `crc_step` bytes.
     pub(crate) fn new(source: Source<'b>, crc_kind: CrcKind, crc_step: u32) -> Self {
-        Self { source, crc_kind, crc_step, target: None, voids: 0, kept: false, job: None, running: None }
+        Self {
+            source,
+            crc_kind,
+            crc_step,
+            target: None,
+            voids: 0,
+            unwritten: None,
+            sector: 0,
+            kept: false,
+            job: None,
+            running: None,
+        }
     }
 
     pub(crate) fn into_buffer(self) -> &'b mut [u8] {
@@ -185,6 +200,12 @@ impl<'b> Programmer<'b> {
     /// work on it has ended.
     pub(crate) fn void(&mut self, program: u8) {
         self.voids |= bit(program);
+    }
+
+    /// The same for a password, which needs no data, if the program's flash may be written.
+    pub(crate) fn void_if_writable(&mut self, program: u8, region: Region) {
+        self.unwritten = Some(region);
+        self.void(program);
     }
 
     /// The program was sent completely.
@@ -291,9 +312,9 @@ impl<'b> Programmer<'b> {
 
     /// Continues the work with one step. `note` returns a value that must be stored although no host
     /// waits for it, once; it is stored before anything else is done.
-    pub(crate) fn step<F: Flash>(
+    pub(crate) fn step<F: Flash, P: Parameters>(
         &mut self,
-        parameters: &mut impl Parameters,
+        parameters: &mut P,
         flash: &mut F,
         note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> (Step, Option<Event>) {
@@ -325,7 +346,7 @@ impl<'b> Programmer<'b> {
                     }
                 }
                 Next::Again => return (Step::Again, None),
-                Next::Done(result) => return (Step::Again, self.done(result)),
+                Next::Done(result) => return (Step::Again, self.done::<P>(result)),
             }
         }
     }
@@ -363,13 +384,21 @@ impl<'b> Programmer<'b> {
         match next {
             Ok(Some(operation)) => Next::Start(operation),
             Ok(None) => Next::Done(Ok(())),
-            Err(FlashFault::Protected) => Next::Done(Err(FlashError::Secured)),
+            Err(FlashFault::Protected) => {
+                let at = match &self.job {
+                    Some(Job::Erase { until, .. }) => until - 1,
+                    Some(Job::Write(write)) => write.address(),
+                    _ => 0,
+                };
+                self.sector = flash.sector_at(at).map_or(0, |sector| sector.number);
+                Next::Done(Err(FlashError::Secured))
+            }
             Err(_) => Next::Done(Err(FlashError::Write)),
         }
     }
 
     /// Ends the job.
-    fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
+    fn done<P: Parameters>(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
             (Job::Store(Change::Counter | Change::Note, _) | Job::Process, Ok(())) => None,
@@ -391,7 +420,7 @@ impl<'b> Programmer<'b> {
                         if self.program() == Some(program) {
                             self.abort();
                         }
-                        Some(Event::Failed { program, error, erasing: false })
+                        Some(Event::Failed { program, error, erasing: false, sector: 0 })
                     }
                 }
             }
@@ -401,7 +430,9 @@ impl<'b> Programmer<'b> {
                 None
             }
             (Job::Write(_), Ok(())) => {
-                self.note();
+                if P::RESUMES {
+                    self.note();
+                }
                 self.source.written();
                 None
             }
@@ -425,13 +456,14 @@ impl<'b> Programmer<'b> {
         // The signature of a request for rights belongs to no program.
         let program = self.program().unwrap_or(0);
         self.abort();
-        Some(Event::Failed { program, error, erasing })
+        let sector = if error == FlashError::Secured { self.sector } else { 0 };
+        Some(Event::Failed { program, error, erasing, sector })
     }
 
     /// Chooses the next work for an idle flash: the first of these that there is.
-    fn choose<F: Flash>(
+    fn choose<F: Flash, P: Parameters>(
         &mut self,
-        parameters: &mut impl Parameters,
+        parameters: &mut P,
         flash: &F,
         note: impl FnOnce() -> Option<(Key, Value)>,
     ) -> Result<Option<Job>, FlashError> {
@@ -439,7 +471,10 @@ impl<'b> Programmer<'b> {
             return Ok(Some(job));
         }
         let piece = self.source.piece();
-        self.give_up_old(flash, piece)?;
+        self.give_up_old::<F, P>(flash, piece)?;
+        if let Some(region) = self.unwritten.take() {
+            self.check_writable(flash, region).inspect_err(|_| self.voids = 0)?;
+        }
         if let Some(job) = self.remove_record(parameters, flash) {
             return Ok(Some(job));
         }
@@ -451,7 +486,7 @@ impl<'b> Programmer<'b> {
             return Ok(Some(job));
         }
         match piece {
-            Some(piece) => target.write(flash, piece).map(Some),
+            Some(piece) => target.write::<F, P>(flash, piece).map(Some),
             None => self.complete_program(parameters),
         }
     }
@@ -463,14 +498,25 @@ impl<'b> Programmer<'b> {
 
     /// With the first piece, or for CLEAR, the old program is given up: its record must be removed
     /// first.
-    fn give_up_old<F: Flash>(&mut self, flash: &F, piece: Option<Piece>) -> Result<(), FlashError> {
+    fn give_up_old<F: Flash, P: Parameters>(
+        &mut self,
+        flash: &F,
+        piece: Option<Piece>,
+    ) -> Result<(), FlashError> {
         let Some(target) = &mut self.target else { return Ok(()) };
         if piece.is_none() && !target.clearing && !self.source.is_sized() {
             return Ok(());
         }
-        let Some(ahead) = target.untouched.take() else { return Ok(()) };
+        let Some(ahead) = target.untouched else { return Ok(()) };
+        // Nothing is lost for a program that the flash does not take.
+        let region = target.region;
+        let told = Some(ahead - region.base).filter(|size| *size > 0);
+        let size = self.source.size().or(told).unwrap_or(region.size);
+        self.check_writable(flash, Region::new(region.base, size.min(region.size)))?;
+        let Some(target) = &mut self.target else { return Ok(()) };
+        target.untouched = None;
         target.ahead = target.ahead.max(ahead);
-        if target.partial.is_resumed() {
+        if P::RESUMES && target.partial.is_resumed() {
             // The data end within a sector that was erased for them; or at the start of one that
             // may be half erased.
             let sector = flash.sector_at(target.erased).ok_or(FlashError::Address)?;
@@ -481,6 +527,17 @@ impl<'b> Programmer<'b> {
         let program = target.program;
         self.void(program);
         Ok(())
+    }
+
+    /// Whether all sectors of a region may be written now.
+    fn check_writable<F: Flash>(&mut self, flash: &F, region: Region) -> Result<(), FlashError> {
+        match protected(flash, region) {
+            None => Ok(()),
+            Some(sector) => {
+                self.sector = sector.number;
+                Err(FlashError::Secured)
+            }
+        }
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.
@@ -545,8 +602,8 @@ impl Target {
     }
 
     /// Writes the piece.
-    fn write<F: Flash>(&self, flash: &F, piece: Piece) -> Result<Job, FlashError> {
-        let again = self.partial.is_resumed();
+    fn write<F: Flash, P: Parameters>(&self, flash: &F, piece: Piece) -> Result<Job, FlashError> {
+        let again = P::RESUMES && self.partial.is_resumed();
         WritePiece::new(flash, piece, again).map(Job::Write).ok_or(FlashError::NotCleared)
     }
 }

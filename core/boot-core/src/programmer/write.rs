@@ -28,6 +28,11 @@ impl WritePiece {
         Some(Self { piece, edges, words: ProgramWords::new(first) })
     }
 
+    /// The address of its first byte.
+    pub(super) fn address(&self) -> u32 {
+        self.piece.address
+    }
+
     /// The next operation, `None` when the whole piece is in flash and was read back.
     pub(super) fn next<F: Flash>(
         &mut self,

@@ -62,6 +62,10 @@ pub enum StoreError {
 /// already writes nothing. Callers rely on the last one: they store whenever a value must be
 /// certain, also if it reads so already.
 pub trait Parameters {
+    /// Whether the progress of a download is stored, so that one that was cut off goes on where it
+    /// stopped (2006h). Without it, the compiler leaves out the code.
+    const RESUMES: bool = true;
+
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 

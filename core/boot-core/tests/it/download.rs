@@ -421,7 +421,8 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
         let fail_to_clear = |bench: &mut Bench<'_>| {
             bench.node.flash().fail = Some((last as u32 + 1, fault));
             assert_eq!(bench.command(CLEAR), 0);
-            assert_eq!(bench.command(CLEAR), status);
+            // The upper half names a protected sector.
+            assert_eq!(bench.command(CLEAR) & 0xFFFF, status);
             assert_eq!(bench.command(CLEAR), 0);
             bench.good(&good[0]);
             bench.node.flash().operations
@@ -436,7 +437,9 @@ fn faults_of_the_flash_are_told_and_clear_begins_anew() {
         let mut bench = Bench::new(&mut flash);
         let operations = fail_to_clear(&mut bench);
         bench.node.flash().fail = Some((operations + of_the_block, fault));
-        assert_eq!(bench.block(&good[1]), (Ok(()), status));
+        let (sent, shown) = bench.block(&good[1]);
+        assert_eq!((sent, shown & 0xFFFF), (Ok(()), status));
+        let status = shown;
         // Half a block is in flash: only CLEAR helps, and until then the cause stays visible.
         assert_eq!(bench.block(&good[1]), (Err(AbortCode(0x0800_0022)), status));
         bench.install(&image);
@@ -659,7 +662,7 @@ fn a_fault_at_any_operation_costs_no_more_than_another_attempt() {
                 0 => assert_eq!(autostart(&flash), Ok(0xB0), "{what}"),
                 status => {
                     failed += 1;
-                    assert!(allowed.contains(&status), "{what}: {status:#x}");
+                    assert!(allowed.contains(&(status & 0xFFFF)), "{what}: {status:#x}");
                     assert!(matches!(autostart(&flash), Ok(0xA0) | Err(_)), "{what}");
                 }
             }

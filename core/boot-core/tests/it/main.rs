@@ -11,5 +11,6 @@ mod label;
 mod masters;
 mod objects;
 mod parameters;
+mod protection;
 mod resume;
 mod streams;
