@@ -523,7 +523,7 @@ impl Device {
         let circumstances = Circumstances { request, strap: false, crash_resets: 0, node_id: 5 };
         match decide(&circumstances, &DECISION, |program| self.verified(program)) {
             BootDecision::Start { program, .. } => Some(program.number()),
-            BootDecision::Stay(_) | BootDecision::Hold { .. } => None,
+            BootDecision::Stay { .. } | BootDecision::Hold { .. } => None,
         }
     }
 

@@ -180,7 +180,7 @@ impl Device {
         match decide(&circumstances, &DECISION, |n| {
             verify(&self.flash, &parameters, &LAYOUT, CrcKind::Crc32, n)
         }) {
-            BootDecision::Stay(_) | BootDecision::Hold { .. } => Ok(Outcome::Bootloader),
+            BootDecision::Stay { .. } | BootDecision::Hold { .. } => Ok(Outcome::Bootloader),
             BootDecision::Start { program, .. } => {
                 let region = LAYOUT.programs[usize::from(program.number()) - 1];
                 let cells = self.flash.cells(region);
