@@ -58,9 +58,9 @@ impl FlashController {
     pub fn is_protected(&self, sector: u8) -> bool {
         /// `FLASH_OPTCR1` of a chip with two banks (RM0090 section 3.9.11).
         const OPTCR1: *const u32 = 0x4002_3C18 as *const u32;
-        // SAFETY: a register of the controller, which a read does not change. Chips without such a
-        // sector, which may lack it, do not read it.
-        let optcr1 = if sector < 12 { 0 } else { unsafe { OPTCR1.read_volatile() } };
+        let has_two_banks = LAYOUT.chip.second_bank.is_some();
+        // SAFETY: a register of the controller of these chips, which a read does not change.
+        let optcr1 = if has_two_banks { unsafe { OPTCR1.read_volatile() } } else { 0 };
         is_write_protected(sector, self.registers.optcr().read().bits(), optcr1)
     }
 

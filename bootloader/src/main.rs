@@ -184,7 +184,7 @@ mod app {
             &CONFIG,
             bsp::serial_number(),
             node,
-            report,
+            &report,
             parameters,
             flash,
             cx.local.blocks,

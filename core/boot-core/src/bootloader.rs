@@ -13,8 +13,7 @@ use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY,
     PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
-    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_CRASH_RESETS, STATE_ENTRIES, STATE_PROGRAM_RESET,
-    STATE_REASON, UNLOCK, UNLOCK_ENTRIES,
+    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -162,8 +161,8 @@ pub struct Config {
 pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices = Everything> {
     config: &'static Config,
     serial_number: u32,
-    /// Why the bootloader runs.
-    report: BootReport,
+    /// 2007h/1 to 4.
+    state: [u8; 4],
     /// Node-ID and bit rate as stored.
     node: NodeParameters,
     /// The active node-ID.
@@ -190,7 +189,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         config: &'static Config,
         serial_number: u32,
         node: NodeParameters,
-        report: BootReport,
+        report: &BootReport,
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
@@ -198,11 +197,11 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     ) -> Self {
         let mut download =
             Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
-        download.refused_to_start(&report);
+        download.refused_to_start(report);
         let mut bootloader = Self {
             config,
             serial_number,
-            report,
+            state: [0, report.reason, report.program_reset, report.crash_resets],
             node,
             id: config.node_id.or(node.id),
             flash,
@@ -273,12 +272,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
 
     /// 2007h.
     fn state(&self, sub: u8) -> u8 {
-        match sub {
-            STATE_REASON => self.report.reason,
-            STATE_PROGRAM_RESET => self.report.program_reset,
-            STATE_CRASH_RESETS => self.report.crash_resets,
-            _ => 0,
-        }
+        self.state.get(usize::from(sub).wrapping_sub(1)).copied().unwrap_or(0)
     }
 
     /// Whether [`Bootloader::step`] has work to do.
@@ -491,7 +485,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> SlaveDevice
         // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
         self.second_server = SecondServer::NONE;
         if id.is_some() && self.config.boot_up_emergency {
-            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.report.reason]);
+            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.state[1]]);
         }
     }
 }

@@ -98,8 +98,12 @@ pub trait Flash {
 pub const fn is_write_protected(sector: u8, optcr: u32, optcr1: u32) -> bool {
     const SPRMOD: u32 = 1 << 31;
     const FIRST: u8 = 16;
-    let register = if sector < 12 { optcr } else { optcr1 };
-    let nwrp = register >> (FIRST + sector % 12) & 1 != 0;
+    const OF_A_BANK: u8 = 12;
+    let nwrp = match sector.checked_sub(OF_A_BANK) {
+        None => optcr >> (FIRST + sector),
+        Some(sector) => optcr1.wrapping_shr((FIRST + sector) as u32),
+    } & 1
+        != 0;
     nwrp == (optcr & SPRMOD != 0)
 }
 

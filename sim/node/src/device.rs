@@ -233,7 +233,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     config,
                     serial_number,
                     node,
-                    report,
+                    &report,
                     journal,
                     flash,
                     buffer,

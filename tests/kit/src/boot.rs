@@ -50,7 +50,7 @@ impl Boot {
         sealed: Sealed<'b>,
     ) -> Bootloader<'b, F, P, PROGRAMS> {
         let Self { config, node, serial_number, report } = self;
-        Bootloader::new(config, serial_number, node, report, parameters, flash, buffer, sealed)
+        Bootloader::new(config, serial_number, node, &report, parameters, flash, buffer, sealed)
     }
 }
 

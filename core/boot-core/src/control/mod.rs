@@ -447,8 +447,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
 /// The record of a program, if the device may start it; and its download that was cut off. Both are of
 /// one reading: after a power cut the next one may differ.
-fn load<F: Flash>(
-    parameters: &impl Parameters,
+fn load<F: Flash, P: Parameters>(
+    parameters: &P,
     flash: &F,
     number: u8,
     rights: &Rights<'_>,
@@ -456,7 +456,7 @@ fn load<F: Flash>(
     let value = parameters.get(flash, Key::program(number)).unwrap_or([0; 4]);
     let record = ProgramRecord::from_value(value);
     let record = record.filter(|record| record.is_sealed() || !rights.takes_no_other());
-    (record, ProgramRecord::partial_of(value))
+    (record, if P::RESUMES { ProgramRecord::partial_of(value) } else { Partial::NONE })
 }
 
 /// The program with this number, if it exists.

@@ -554,7 +554,7 @@ fn what_a_product_does_without_is_not_there() {
     let (buffer, sealed) = leaked(256);
     let node = kit::bench::node();
     let mut least: Bootloader<'_, _, _, 1, Least> =
-        Bootloader::new(&CONFIG, 0, node, BootReport::NONE, parameters, &mut flash, buffer, sealed);
+        Bootloader::new(&CONFIG, 0, node, &BootReport::NONE, parameters, &mut flash, buffer, sealed);
     let channel = least.second_server();
     assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
     assert_eq!(least.second_server(), channel);
