@@ -107,19 +107,6 @@ pub const fn is_write_protected(sector: u8, optcr: u32, optcr1: u32) -> bool {
     nwrp == (optcr & SPRMOD != 0)
 }
 
-/// The first protected sector of a region: nothing in it may be written now. The flash must be idle.
-pub(crate) fn protected<F: Flash>(flash: &F, region: Region) -> Option<Sector> {
-    let mut at = region.base;
-    while at < region.end() {
-        let sector = flash.sector_at(at)?;
-        if flash.is_protected(sector) {
-            return Some(sector);
-        }
-        at = sector.region.end();
-    }
-    None
-}
-
 /// [`Flash::crc32`] for a chip without a CRC unit, and for data that the unit cannot process.
 pub fn crc32_by_software<F: Flash + ?Sized>(flash: &F, crc: u32, region: Region) -> u32 {
     fold(flash, crc, region, crc::resume)

@@ -175,7 +175,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let busy = self.programmer.is_busy_with(program);
         let Some(state) = self.program(program) else { return FlashStatus { busy, ..FlashStatus::OK } };
         let is_secured = state.error == Some(FlashError::Secured);
-        FlashStatus { busy, error: state.error, detail: if is_secured { state.sector.into() } else { 0 } }
+        FlashStatus { busy, error: state.error, detail: u16::from(state.sector) * u16::from(is_secured) }
     }
 
     /// 1F51h: no program runs. The value shows whether a program exists.
@@ -354,10 +354,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     Err(error) => self.end(program, Err(error)),
                 }
             }
-            Some(Event::Failed { program, error, erasing, sector }) => {
-                if let Some(state) = find(&mut self.programs, program) {
-                    state.sector = sector;
-                }
+            Some(Event::Failed { program, error, erasing }) => {
                 self.fault = match error {
                     _ if erasing => AbortCode::GENERAL,
                     // The errors for which a sealed image is refused.
@@ -424,6 +421,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let Some(state) = find(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
         state.error = outcome.err();
+        state.sector = self.programmer.protected_sector();
         if outcome.is_err() {
             state.streamed = false;
             if !matches!(state.session, Session::Idle) {

@@ -19,7 +19,7 @@ use canopen::program::FlashError;
 use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
-use crate::flash::{protected, Flash, FlashFault, Next, Operation};
+use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Piece;
 use crate::resume::Partial;
@@ -53,7 +53,7 @@ pub(crate) enum Event {
     /// The storing of node-ID and bit rate has ended.
     NodeStored(Result<(), FlashError>),
     /// The work on a program failed. `erasing`: an erase failed.
-    Failed { program: u8, error: FlashError, erasing: bool, sector: u8 },
+    Failed { program: u8, error: FlashError, erasing: bool },
 }
 
 /// The program that is being downloaded, and the state of its flash.
@@ -251,6 +251,11 @@ impl<'b> Programmer<'b> {
         self.target.as_ref().is_none_or(|target| target.half_erased)
     }
 
+    /// The number of the protected sector that was found last.
+    pub(crate) fn protected_sector(&self) -> u8 {
+        self.sector
+    }
+
     /// The program that is being downloaded.
     pub(crate) fn program(&self) -> Option<u8> {
         self.target.map(|target| target.program)
@@ -420,7 +425,7 @@ impl<'b> Programmer<'b> {
                         if self.program() == Some(program) {
                             self.abort();
                         }
-                        Some(Event::Failed { program, error, erasing: false, sector: 0 })
+                        Some(Event::Failed { program, error, erasing: false })
                     }
                 }
             }
@@ -456,8 +461,7 @@ impl<'b> Programmer<'b> {
         // The signature of a request for rights belongs to no program.
         let program = self.program().unwrap_or(0);
         self.abort();
-        let sector = if error == FlashError::Secured { self.sector } else { 0 };
-        Some(Event::Failed { program, error, erasing, sector })
+        Some(Event::Failed { program, error, erasing })
     }
 
     /// Chooses the next work for an idle flash: the first of these that there is.
@@ -510,9 +514,12 @@ impl<'b> Programmer<'b> {
         let Some(ahead) = target.untouched else { return Ok(()) };
         // Nothing is lost for a program that the flash does not take.
         let region = target.region;
-        let told = Some(ahead - region.base).filter(|size| *size > 0);
-        let size = self.source.size().or(told).unwrap_or(region.size);
-        self.check_writable(flash, Region::new(region.base, size.min(region.size)))?;
+        let size = match (self.source.size(), ahead - region.base) {
+            (Some(size), _) => size,
+            (None, 0) => region.size,
+            (None, told) => told,
+        };
+        self.check_writable(flash, Region::new(region.base, size))?;
         let Some(target) = &mut self.target else { return Ok(()) };
         target.untouched = None;
         target.ahead = target.ahead.max(ahead);
@@ -531,13 +538,16 @@ impl<'b> Programmer<'b> {
 
     /// Whether all sectors of a region may be written now.
     fn check_writable<F: Flash>(&mut self, flash: &F, region: Region) -> Result<(), FlashError> {
-        match protected(flash, region) {
-            None => Ok(()),
-            Some(sector) => {
+        let mut at = region.base;
+        while at < region.end() {
+            let sector = flash.sector_at(at).ok_or(FlashError::Address)?;
+            if flash.is_protected(sector) {
                 self.sector = sector.number;
-                Err(FlashError::Secured)
+                return Err(FlashError::Secured);
             }
+            at = sector.region.end();
         }
+        Ok(())
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.

@@ -40,7 +40,7 @@ impl Incoming {
 
     /// Whether one segment of a block download has the rest of the announced bytes.
     pub fn misses_one(&self) -> bool {
-        self.announced.is_some_and(|size| size - self.received.min(size) <= SEGMENT as u32)
+        self.announced.is_some_and(|size| size.wrapping_sub(self.received) <= SEGMENT as u32)
     }
 
     /// Processes the next bytes: data of a domain go to the object, data of a value into `value`.

@@ -340,7 +340,7 @@ impl SdoServer {
     /// until there is room for a segment. If the answer opens a sub-block, its block size is set
     /// here.
     fn may_answer(&mut self, now: Instant, objects: &mut impl Objects) -> bool {
-        let most = self.config.blksize.clamp(1, BLKSIZE_MAX).min(self.pace().segments);
+        let most = self.config.blksize.max(1).min(self.pace().segments);
         let Some(answer) = &mut self.answer else { return false };
         let Some(incoming) = self.state.incoming() else { return true };
         let mut space =

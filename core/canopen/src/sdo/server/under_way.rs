@@ -65,6 +65,6 @@ impl SdoServer {
 /// Whether a frame is a request to read an object that exists.
 fn is_read(bytes: &[u8; 8], objects: &impl Objects) -> bool {
     bytes[0] == ccs::INITIATE_UPLOAD
-        && bytes[4..] == [0; 4]
+        && fields::number(bytes) == 0
         && od::find(objects.entries(), fields::address(bytes)).is_ok()
 }
