@@ -258,7 +258,35 @@ fn a_program_for_another_address_is_refused_by_linker_and_coflash() {
     let elf = project.build(&[]).unwrap_or_else(|refused| panic!("{refused}"));
     let (good, told) = judged(&FLASH, &elf);
     assert!(!good && told.contains("0x60000021"), "{told}");
-    assert!(told.contains("does not begin with an initial stack pointer and a reset vector"), "{told}");
+    assert!(told.contains("is linked for 08080000h, and the program begins at 08020000h"), "{told}");
+}
+
+/// The stack begins at the end of the chip's RAM, as CubeMX lets it.
+#[test]
+fn a_stack_over_the_handoff_is_refused_by_linker_and_coflash() {
+    let top = || {
+        let names = ("_stack_start = ORIGIN(RAM) + LENGTH(RAM);", "_stack_start = 0x20020000;");
+        Project::new("stack").edit("app.x", names.0, names.1)
+    };
+    let refused = top().build(&[]).expect_err("it links");
+    let words = "ERROR(coboot): the stack (_stack_start) begins over the handoff";
+    assert!(refused.contains(words), "{refused}");
+
+    let elf = top().edit("app.x", "  INCLUDE coboot.x\n", "").build(&[]);
+    let elf = elf.unwrap_or_else(|refused| panic!("{refused}"));
+    for words in [&["convert"][..], &FLASH] {
+        let (good, told) = judged(words, &elf);
+        let both = "its stack begins at 20020000h, over the handoff (2001FFC0h)";
+        assert!(!good && told.contains(both) && told.contains("0x60000021"), "{told}");
+    }
+}
+
+#[test]
+fn the_linker_says_that_layout_x_is_missing() {
+    let memory = "MEMORY\n{\n  FLASH : ORIGIN = 0x08000000, LENGTH = 1M\n  RAM : ORIGIN = 0x20000000, LENGTH = 128K\n}\n";
+    let project = Project::new("layout").edit("app.x", "INCLUDE layout.x\n", memory);
+    let refused = project.build(&[]).expect_err("it links");
+    assert!(refused.contains("ERROR(coboot): layout.x is missing"), "{refused}");
 }
 
 /// `VTOR` is left at the bootloader's vectors, as by the start-up of a project for the whole flash:
