@@ -1,7 +1,9 @@
 //! Program images: ELF and Intel HEX.
 
-use object::elf::{self, FileHeader32, ProgramHeader32, PT_LOAD};
-use object::read::elf::{FileHeader, ProgramHeader};
+use std::ops::Range;
+
+use object::elf::{self, FileHeader32, ProgramHeader32, SectionHeader32, PT_LOAD, SHF_ALLOC, SHT_NOBITS};
+use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::LittleEndian;
 
 use crate::error::Error;
@@ -24,7 +26,12 @@ pub struct LoadedImage {
     pub entry: Option<u32>,
 }
 
-/// The segments of a 32-bit little-endian ARM ELF by their physical addresses.
+/// The segments of a 32-bit little-endian ARM ELF by their physical addresses, or by their virtual
+/// ones where no segment has a physical address.
+///
+/// Of a segment only what allocated sections cover is stored: linkers with large pages let the first
+/// segment begin with the headers of the file, which would lie over the bootloader. A file without
+/// sections is stored as it is.
 ///
 /// # Errors
 /// [`Error::Image`] says what is wrong with the file.
@@ -38,20 +45,59 @@ pub fn parse_elf(image: &[u8]) -> Result<(Vec<Segment>, u32), Error> {
     }
     let headers: &[ProgramHeader32<LittleEndian>] =
         header.program_headers(endian, image).map_err(|e| bad(&format!("the program headers: {e}")))?;
+    let sections = header.section_headers(endian, image).map_err(|e| bad(&format!("the sections: {e}")))?;
+    let contents = contents(sections, endian);
+    let is_loaded = |segment: &ProgramHeader32<LittleEndian>| {
+        segment.p_type(endian) == PT_LOAD && segment.p_filesz(endian) != 0
+    };
+    let has_physical = headers.iter().any(|segment| is_loaded(segment) && segment.p_paddr(endian) != 0);
     let mut segments = Vec::new();
-    for (index, segment) in headers.iter().enumerate() {
-        if segment.p_type(endian) != PT_LOAD || segment.p_filesz(endian) == 0 {
-            continue;
-        }
+    for (index, segment) in headers.iter().enumerate().filter(|(_, segment)| is_loaded(segment)) {
         let bytes = segment.data(endian, image).map_err(|()| {
             bad(&format!("segment {index} reaches beyond the end of the file: is it truncated?"))
         })?;
-        segments.push(Segment { address: segment.p_paddr(endian), bytes: bytes.to_vec() });
+        let base = if has_physical { segment.p_paddr(endian) } else { segment.p_vaddr(endian) };
+        if u64::from(base) + bytes.len() as u64 > 1 << 32 {
+            return Err(bad(&format!("segment {index} reaches beyond the end of the address space")));
+        }
+        // In RAM of its own, and nothing says from where the start-up would copy it.
+        if !has_physical && is_ram(base) {
+            continue;
+        }
+        let start = u64::from(segment.p_offset(endian));
+        for part in parts(&contents, start..start + bytes.len() as u64) {
+            let (from, to) = ((part.start - start) as usize, (part.end - start) as usize);
+            segments.push(Segment { address: base + from as u32, bytes: bytes[from..to].to_vec() });
+        }
     }
     if segments.is_empty() {
         return Err(bad("the ELF file has nothing to load"));
     }
     Ok((segments, header.e_entry(endian)))
+}
+
+/// The bytes of the file that allocated sections have; `None` for a file without sections.
+fn contents(sections: &[SectionHeader32<LittleEndian>], endian: LittleEndian) -> Option<Vec<Range<u64>>> {
+    let in_memory = |section: &&SectionHeader32<LittleEndian>| {
+        section.sh_flags(endian) & SHF_ALLOC != 0 && section.sh_type(endian) != SHT_NOBITS
+    };
+    let range = |section: &SectionHeader32<LittleEndian>| {
+        let start = u64::from(section.sh_offset(endian));
+        start..start + u64::from(section.sh_size(endian))
+    };
+    (!sections.is_empty()).then(|| sections.iter().filter(in_memory).map(range).collect())
+}
+
+/// What of a segment is in the memory.
+fn parts(contents: &Option<Vec<Range<u64>>>, segment: Range<u64>) -> Vec<Range<u64>> {
+    let Some(contents) = contents else { return vec![segment] };
+    let inside = contents.iter().map(|part| part.start.max(segment.start)..part.end.min(segment.end));
+    inside.filter(|part| !part.is_empty()).collect()
+}
+
+/// The SRAM and the core-coupled RAM (RM0090 section 2.3).
+fn is_ram(address: u32) -> bool {
+    matches!(address, 0x1000_0000..=0x1000_FFFF | 0x2000_0000..=0x3FFF_FFFF)
 }
 
 /// The bytes of an Intel HEX file (record types 00 to 05), runs that touch joined, in file order.
@@ -128,6 +174,60 @@ mod tests {
         assert_eq!(segments.len(), 1);
         assert_eq!((segments[0].address, segments[0].bytes.len()), (0x0800_0100, 64));
         assert_eq!(segments[0].bytes[..4], [0x21, 0x46, 0x01, 0x36]);
+    }
+
+    /// An ELF file by the System V ABI (gABI chapters 4 and 5): a segment of 8 bytes of headers' place
+    /// and 8 bytes of program for each (offset, vaddr, paddr, size), and a section table with the null
+    /// section and one of SHT_PROGBITS, SHF_ALLOC for each (offset, size).
+    fn elf(segments: &[[u32; 4]], sections: &[[u32; 2]]) -> Vec<u8> {
+        let (count, table) = (segments.len() as u16, 52 + 32 * segments.len());
+        let shoff = if sections.is_empty() { 0 } else { (table + PROGRAM.len()) as u32 };
+        let mut bytes = b"\x7FELF\x01\x01\x01\0\0\0\0\0\0\0\0\0\x02\0\x28\0".to_vec();
+        bytes.extend([1, 0x0800_C009, 52, shoff, 0].into_iter().flat_map(u32::to_le_bytes));
+        let sections_in_table = if sections.is_empty() { 0 } else { 1 + sections.len() as u16 };
+        bytes.extend([52, 32, count, 40, sections_in_table, 0].into_iter().flat_map(u16::to_le_bytes));
+        for &[offset, vaddr, paddr, size] in segments {
+            bytes.extend([1, offset, vaddr, paddr, size, size, 5, 4].into_iter().flat_map(u32::to_le_bytes));
+        }
+        bytes.extend(PROGRAM);
+        if !sections.is_empty() {
+            bytes.extend([0; 40]);
+        }
+        for &[offset, size] in sections {
+            bytes.extend([0, 1, 2, 0, offset, size, 0, 0, 4, 0].into_iter().flat_map(u32::to_le_bytes));
+        }
+        bytes
+    }
+
+    const PROGRAM: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8];
+    /// The offset of the program in a file with one segment, and with two.
+    const ONE: u32 = 52 + 32;
+    const TWO: u32 = 52 + 64;
+
+    fn stored(image: &[u8]) -> Vec<(u32, Vec<u8>)> {
+        parse_elf(image).unwrap().0.into_iter().map(|segment| (segment.address, segment.bytes)).collect()
+    }
+
+    /// GNU ld with pages of 64 KiB: the first segment begins with the file's headers, before the
+    /// program's address.
+    #[test]
+    fn what_no_section_covers_is_not_stored() {
+        let start = 0x0800_C000;
+        let headers = elf(&[[0, start - ONE, start - ONE, ONE + 8]], &[[ONE, 4], [ONE + 4, 4]]);
+        assert_eq!(stored(&headers), [(start, PROGRAM[..4].to_vec()), (start + 4, PROGRAM[4..].to_vec())]);
+        let plain = elf(&[[ONE, start, start, 8]], &[]);
+        assert_eq!(stored(&plain), [(start, PROGRAM.to_vec())]);
+        assert!(parse_elf(&elf(&[[ONE, start, start, 8]], &[[0, 4]])).is_err(), "nothing to load");
+    }
+
+    #[test]
+    fn virtual_addresses_count_where_there_are_no_others() {
+        let image = elf(&[[TWO, 0x0800_C000, 0, 4], [TWO + 4, 0x2000_0000, 0, 4]], &[]);
+        assert_eq!(stored(&image), [(0x0800_C000, PROGRAM[..4].to_vec())]);
+        let image = elf(&[[TWO, 0x0800_C000, 0, 4], [TWO + 4, 0x2000_0000, 0x0800_C004, 4]], &[]);
+        assert_eq!(stored(&image)[0].0, 0);
+        let beyond = elf(&[[ONE, 0xFFFF_FFFC, 0xFFFF_FFFC, 8]], &[]);
+        assert!(parse_elf(&beyond).unwrap_err().to_string().contains("address space"));
     }
 
     #[test]
