@@ -97,7 +97,8 @@ impl Entry {
 }
 
 impl Eds {
-    /// Parses a data sheet. Bytes that are not UTF-8 are replaced.
+    /// Parses a data sheet: UTF-8, UTF-16 with a byte order mark, or Windows-1252, in which most editors
+    /// of data sheets write.
     ///
     /// # Errors
     /// [`EdsError`].
@@ -112,7 +113,7 @@ impl Eds {
         // "Motor 1; speed" is a valid name.
         form.inline_comment_symbols = Some(Vec::new());
         ini.load_defaults(form);
-        let sections = ini.read(String::from_utf8_lossy(bytes).into_owned()).map_err(EdsError::Syntax)?;
+        let sections = ini.read(text_of(bytes)).map_err(EdsError::Syntax)?;
         let mut eds = Self::default();
         for (name, keys) in &sections {
             let Some((head, rest)) = name.split_at_checked(4) else { continue };
@@ -195,6 +196,36 @@ impl Eds {
                 Err(NoObject::Ambiguous { name: name.to_string(), all: all.collect() })
             }
         }
+    }
+}
+
+/// The text of a sheet. CiA 306-1 wants ASCII, and does not name another encoding.
+fn text_of(bytes: &[u8]) -> String {
+    let utf_16 = |of: fn([u8; 2]) -> u16, bytes: &[u8]| {
+        let units: Vec<u16> = bytes.chunks_exact(2).map(|pair| of([pair[0], pair[1]])).collect();
+        String::from_utf16_lossy(&units)
+    };
+    match bytes {
+        [0xFF, 0xFE, rest @ ..] => utf_16(u16::from_le_bytes, rest),
+        [0xFE, 0xFF, rest @ ..] => utf_16(u16::from_be_bytes, rest),
+        bytes => {
+            let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+            let windows = || bytes.iter().copied().map(windows_1252).collect();
+            std::str::from_utf8(bytes).map_or_else(|_| windows(), str::to_owned)
+        }
+    }
+}
+
+/// A character of Windows-1252: ISO 8859-1 with other characters from 80h to 9Fh (Unicode's mapping
+/// file CP1252.TXT). The five bytes without a character stay the controls that they are there.
+fn windows_1252(byte: u8) -> char {
+    const FROM_80H: [char; 32] = [
+        '€', '\u{81}', '‚', 'ƒ', '„', '…', '†', '‡', 'ˆ', '‰', 'Š', '‹', 'Œ', '\u{8d}', 'Ž', '\u{8f}',
+        '\u{90}', '‘', '’', '“', '”', '•', '–', '—', '˜', '™', 'š', '›', 'œ', '\u{9d}', 'ž', 'Ÿ',
+    ];
+    match byte {
+        0x80..=0x9F => FROM_80H[usize::from(byte - 0x80)],
+        byte => char::from(byte),
     }
 }
 
@@ -297,6 +328,32 @@ mod tests {
         assert_eq!((speed.kind, speed.low), (Some(DataType::Integer(2)), None));
         assert_eq!(eds.at(address(0x2001, 1)).unwrap().kind, Some(DataType::Real32));
         assert_eq!(eds.at(address(0x1018, 9)), None);
+    }
+
+    /// The bytes of each encoding by Python's `encode`: cp1252, utf-8, utf-8-sig, utf-16.
+    #[test]
+    fn a_name_is_read_in_the_encoding_that_its_editor_wrote() {
+        const HEAD: &[u8] =
+            b"[1018]\nParameterName=Identity object\nSubNumber=1\nObjectType=9\n[1018sub1]\nParameterName=";
+        let sheet = |name: &[u8]| [HEAD, name, b"\nDataType=7\n"].concat();
+        let wide = |mark: [u8; 2], of: fn(u16) -> [u8; 2]| {
+            let text = String::from_utf8(sheet("Größe in €".as_bytes())).unwrap();
+            mark.into_iter().chain(text.encode_utf16().flat_map(of)).collect::<Vec<u8>>()
+        };
+        for (name, bytes) in [
+            ("Vendor-ID ü", sheet(b"Vendor-ID \xFC")),
+            ("Größe in €", sheet(b"Gr\xF6\xDFe in \x80")),
+            ("‚Š’ – 10 °C", sheet(b"\x82\x8A\x92 \x96 10 \xB0C")),
+            ("Vendor-ID ü", sheet(b"Vendor-ID \xC3\xBC")),
+            ("Vendor-ID", [b"\xEF\xBB\xBF", &sheet(b"Vendor-ID")[..]].concat()),
+            ("Größe in €", wide([0xFF, 0xFE], u16::to_le_bytes)),
+            ("Größe in €", wide([0xFE, 0xFF], u16::to_be_bytes)),
+        ] {
+            let eds = Eds::parse(&bytes).unwrap();
+            let path = format!("Identity object/{name}");
+            assert_eq!(eds.find(&path).map(|entry| entry.at), Ok(address(0x1018, 1)), "{name}");
+            assert_eq!(eds.find(name).map(|entry| entry.at), Ok(address(0x1018, 1)), "{name}");
+        }
     }
 
     #[test]
