@@ -86,6 +86,33 @@ pub struct Identity {
     pub product_code: u32,
 }
 
+/// The number in which a program and a device differ.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Difference {
+    /// The vendor-ID, 1018h/1.
+    VendorId,
+    /// The product code, 1018h/2.
+    ProductCode,
+}
+
+/// Whether a program for this vendor-ID and product code is for the device with these. 0 in the program
+/// is any. A device with 0 and 0 has no identity, and takes any program.
+///
+/// # Errors
+/// The first difference.
+pub const fn fits(program: (u32, u32), device: (u32, u32)) -> Result<(), Difference> {
+    if device.0 == 0 && device.1 == 0 {
+        return Ok(());
+    }
+    if program.0 != 0 && program.0 != device.0 {
+        return Err(Difference::VendorId);
+    }
+    if program.1 != 0 && program.1 != device.1 {
+        return Err(Difference::ProductCode);
+    }
+    Ok(())
+}
+
 /// The largest data of block 0.
 pub const CONTROL_MAX: usize = 24;
 
@@ -200,6 +227,24 @@ mod tests {
     extern crate std;
 
     use super::*;
+
+    #[test]
+    fn zero_is_any_in_a_program_and_both_zeros_are_in_a_device() {
+        use Difference::{ProductCode, VendorId};
+        for (program, device, expected) in [
+            ((7, 8), (7, 8), Ok(())),
+            ((0, 8), (7, 8), Ok(())),
+            ((7, 0), (7, 8), Ok(())),
+            ((0, 0), (7, 8), Ok(())),
+            ((7, 8), (0, 0), Ok(())),
+            ((6, 8), (7, 8), Err(VendorId)),
+            ((7, 9), (7, 8), Err(ProductCode)),
+            ((7, 8), (0, 8), Err(VendorId)),
+            ((7, 8), (7, 0), Err(ProductCode)),
+        ] {
+            assert_eq!(fits(program, device), expected, "{program:?} {device:?}");
+        }
+    }
 
     /// The offsets of the tables of chapter 5.1, filled with distinct bytes.
     #[test]

@@ -21,7 +21,7 @@ use crate::device::lock::Lock;
 use crate::device::{info, DeviceInfo, Error, Session, Timing};
 use crate::update::event::Phase;
 use crate::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
-use crate::update::{DeviceState, Event, FlashOptions, Program, Report, Target};
+use crate::update::{DeviceState, Event, FlashOptions, Program, Report};
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
@@ -140,10 +140,9 @@ impl Devices for Buses<'_> {
 
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
         let Order { device, program, kept } = order;
-        let target = program.target().filter(|target| *target != Target { vendor_id: 0, product_code: 0 });
         let options = FlashOptions::default()
             .program(device.program)
-            .check_target(target.filter(|_| device.check_target))
+            .check_target(program.target().filter(|_| device.check_target))
             .trial_run(device.trial_run)
             .verify(device.verify);
         let (done, result) = channel();

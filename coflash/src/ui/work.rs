@@ -188,9 +188,7 @@ fn for_node(shared: &Shared, file: &Loaded, node: NodeId, options: FlashOptions)
         device.product()
     });
     let target = match (file.shown.vendor_id, file.shown.product_code) {
-        (Some(vendor_id), Some(product_code)) if vendor_id != 0 || product_code != 0 => {
-            Some(Target { vendor_id, product_code })
-        }
+        (Some(vendor_id), Some(product_code)) => Some(Target { vendor_id, product_code }),
         _ => None,
     };
     FlashOptions { check_target: target.filter(|_| told.is_some()), ..options }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use canopen::program::{self, FlashError, ProgramControl};
 use canopen::{AbortCode, Address};
+use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
 use super::options::Target;
@@ -21,21 +22,45 @@ const LEAVES_WITHIN: Duration = Duration::from_secs(2);
 /// another manufacturer has no other sub-index.
 pub(super) const CALL_BACK: u8 = 1;
 
-/// Compares the device's identity with the file's target. Bootloader and application have the same
-/// identity.
+/// Compares the device's identity with the file's target ([`fits`]). Bootloader and application have
+/// the same identity.
 ///
 /// # Errors
 /// [`Error::WrongTarget`], and the errors of a [read](Session::read).
 pub fn check_target(session: &mut Session<'_>, target: Target) -> Result<(), Error> {
-    let wanted = [(1, target.vendor_id), (2, target.product_code)];
-    for (sub, file) in wanted {
-        let device = session.read_number(Address::new(program::IDENTITY, sub))?;
-        if device != file {
-            let what = if sub == 1 { Mismatch::VendorId } else { Mismatch::ProductCode };
-            return Err(Error::WrongTarget { node: session.node(), what, device, file });
+    compare_target(session, target, |session, at| session.read_number(at).map(Some))
+}
+
+/// Compares 1018h/1 and 1018h/2 with the target, by the rule of the bootloader. A value that the device
+/// does not report (`None`) cannot differ.
+pub(super) fn compare_target(
+    session: &mut Session<'_>,
+    target: Target,
+    read: impl Fn(&mut Session<'_>, Address) -> Result<Option<u32>, Error>,
+) -> Result<(), Error> {
+    let Target { vendor_id, product_code } = target;
+    let mut told = |sub| read(session, Address::new(program::IDENTITY, sub));
+    let mut device = (vendor_id, product_code);
+    // What the file leaves open is read only if the rest differs: 0 and 0 are no identity.
+    for is_open in [false, true] {
+        for (sub, file, value) in [(1, vendor_id, &mut device.0), (2, product_code, &mut device.1)] {
+            if (file == 0) == is_open {
+                *value = told(sub)?.unwrap_or(file);
+            }
+        }
+        if device == (vendor_id, product_code) {
+            return Ok(());
         }
     }
-    Ok(())
+    let node = session.node();
+    fits((vendor_id, product_code), device).map_err(|difference| match difference {
+        Difference::VendorId => {
+            Error::WrongTarget { node, what: Mismatch::VendorId, device: device.0, file: vendor_id }
+        }
+        Difference::ProductCode => {
+            Error::WrongTarget { node, what: Mismatch::ProductCode, device: device.1, file: product_code }
+        }
+    })
 }
 
 /// Steps 2 and 3: makes the bootloader run.

@@ -138,7 +138,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         boot_up_emergency: true,
         lss_store: true,
         download: Policy {
-            identity: Some((args.vendor_id, args.product_code)).filter(|identity| *identity != (0, 0)),
+            identity: Some((args.vendor_id, args.product_code)),
             crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },
             ..profile.download
         },

@@ -215,10 +215,10 @@ fn a_file_for_another_device_erases_nothing() {
     for running in [APPLICATION, BOOTLOADER] {
         // The fake has vendor-ID 3Fh and product code 1234.
         let mut fake = Fake::new(running);
-        let (result, events) = run(&mut fake, check(target));
+        let (result, events) = run(&mut fake, check(Target { vendor_id: 0x40, ..target }));
         let error = result.unwrap_err();
         assert_eq!(error.number(), 0x6000_0180);
-        assert_eq!(error.to_string(), "the program is for vendor-ID 00000000h, and node 5 has 0000003Fh");
+        assert_eq!(error.to_string(), "the program is for vendor-ID 00000040h, and node 5 has 0000003Fh");
         assert_eq!((fake.writes().len(), left(&events)), (0, DeviceState::Untouched));
 
         let mut fake = Fake::new(running);

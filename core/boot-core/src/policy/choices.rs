@@ -33,7 +33,8 @@ pub enum Verdict {
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
     /// Vendor-ID and product code of the device. A control block with other values is refused; 0 in
-    /// a control block stands for any value.
+    /// a control block is any value, and 0 and 0 here take any program
+    /// ([`fits`](shared_abi::block_file::fits)).
     pub identity: Option<(u32, u32)>,
     /// The integrator's own check, with the contents of the control block (`TgtProcessAppInfoData`
     /// of the manual).

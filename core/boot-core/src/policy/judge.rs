@@ -1,7 +1,7 @@
 //! The rules for all formats: the permitted addresses, and the target device of a program.
 
 use canopen::program::FlashError;
-use shared_abi::block_file::{Control, Identity};
+use shared_abi::block_file::{fits, Control, Difference, Identity};
 use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
@@ -95,18 +95,17 @@ impl Judge<'_> {
             Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
         };
         match ((self.policy.check)(self.program, control), identity, self.policy.identity) {
-            (Verdict::Refuse(error), ..) => return Err(Refusal::unfit(error)),
-            (Verdict::Standard, Some(told), Some((vendor_id, product_code))) => {
-                if told.vendor_id != 0 && told.vendor_id != vendor_id {
-                    return Err(Refusal::unfit(FlashError::WrongVendorId));
-                }
-                if told.product_code != 0 && told.product_code != product_code {
-                    return Err(Refusal::unfit(FlashError::WrongProductId));
-                }
+            (Verdict::Refuse(error), ..) => Err(Refusal::unfit(error)),
+            (Verdict::Standard, Some(told), Some(device)) => {
+                fits((told.vendor_id, told.product_code), device).map_err(|difference| {
+                    Refusal::unfit(match difference {
+                        Difference::VendorId => FlashError::WrongVendorId,
+                        Difference::ProductCode => FlashError::WrongProductId,
+                    })
+                })
             }
-            _ => {}
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Whether a program is for this device, from its label; returns its version, 0 without a

@@ -266,6 +266,17 @@ fn a_program_for_another_product_is_refused() {
     assert!(folder.read("1.flash")[0x2_0000..] == before[0x2_0000..]);
 }
 
+/// A node has no identity unless it is given one, and takes any program: the first example of the page.
+#[test]
+fn a_node_without_identity_takes_a_program_with_one() {
+    let folder = folder("nobody");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    let named = ["-N", "5", "--vid", "0x3F", "--pid", "0x4007D151"];
+    coflash.done(&[FLASH, &named].concat());
+    coflash.done(&[FLASH, &named, &["--check-target"]].concat());
+}
+
 /// One of three devices that are updated together is another product: it refuses alone.
 #[test]
 fn another_product_among_the_devices_of_a_group_refuses_alone() {
