@@ -311,6 +311,17 @@ impl BlockFile {
         &self.control
     }
 
+    /// The values of 1F56h of a device with this program: its CRC by the checksum of the file, and by
+    /// the other one, which the device may use for a program that it got without blocks.
+    #[must_use]
+    pub fn program_crcs(&self) -> [u32; 2] {
+        let other = match self.checksum {
+            Checksum::Crc32 => Checksum::Crc16,
+            Checksum::Crc16 => Checksum::Crc32,
+        };
+        [self.program_crc(), other.of([self.flash_image().as_slice()].into_iter())]
+    }
+
     /// The CRC of the blocks and the program.
     #[must_use]
     pub fn checksum(&self) -> Checksum {

@@ -36,6 +36,15 @@ impl<'f> Content<'f> {
         }
     }
 
+    /// The values that 1F56h may have after the download: a device that computes the CRC by itself
+    /// does it with the checksum of its product.
+    pub(super) fn program_crcs(self) -> [u32; 2] {
+        match self {
+            Self::Blocks(file) => file.program_crcs(),
+            Self::Sealed(file) => [file.head().crc(); 2],
+        }
+    }
+
     /// The data for a device that takes everything in one download: the result of `of_blocks`, or
     /// the sealed image unchanged.
     pub(super) fn stream(self, of_blocks: impl FnOnce(&BlockFile) -> Vec<u8>) -> Cow<'f, [u8]> {

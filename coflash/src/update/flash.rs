@@ -130,8 +130,7 @@ fn procedure(
         None
     };
     if options.verify {
-        let crc = file.program_crc();
-        compare_crc(session, options.program, crc)?;
+        let crc = compare_crc(session, options.program, file.program_crcs())?;
         update.tell(Phase::VerifiedAgain { crc }.into());
     }
     let took = session.now().saturating_sub(began);

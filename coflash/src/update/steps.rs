@@ -256,17 +256,18 @@ fn explain(session: &mut Session<'_>, number: u8, doing: Doing, code: AbortCode)
     }
 }
 
-/// Compares the CRC that the bootloader computed with the file's (manual, chapter 5.2, step 4).
+/// Compares the CRC that the bootloader computed with the file's (manual, chapter 5.2, step 4): one of
+/// `crcs`, the first of which is that of the file itself.
 ///
 /// # Errors
 /// [`Error::WrongCrc`].
 pub fn verify(
     session: &mut Session<'_>,
     number: u8,
-    crc: u32,
+    crcs: [u32; 2],
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
-    compare_crc(session, number, crc)?;
+    let crc = compare_crc(session, number, crcs)?;
     tell(Phase::Verified { crc }.into());
     Ok(())
 }
@@ -286,12 +287,13 @@ pub(super) fn told_before(session: &mut Session<'_>, number: u8) -> Result<Optio
     }
 }
 
-pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crc: u32) -> Result<(), Error> {
+/// Compares 1F56h with the values that it may have; returns the value.
+pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crcs: [u32; 2]) -> Result<u32, Error> {
     let device = identification(session, number)?;
-    if device != crc {
-        return Err(Error::WrongCrc { device, file: crc });
+    if crcs.contains(&device) {
+        return Ok(device);
     }
-    Ok(())
+    Err(Error::WrongCrc { device, file: crcs[0] })
 }
 
 /// Steps 10, 11 and 15: starts the program and waits until it answers; returns its device type.

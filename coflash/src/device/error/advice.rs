@@ -35,6 +35,11 @@ impl Error {
             Self::Protocol { .. } => "look for a second tool or a second device with this node-ID on the bus; a longer \
                                       --sdo-timeout helps against answers that come late"
                 .to_string(),
+            Self::Failed { error: FlashError::Crc, doing: Doing::Block(0), .. } => {
+                "the device finds a wrong CRC in a block that has arrived whole: it checks with the other CRC. Convert the \
+                 program again, with --crc16 for a product with CRC-16 and without it for one with CRC-32"
+                    .to_string()
+            }
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::NoProgram { advice, .. } => (*advice).to_string(),
@@ -107,7 +112,10 @@ impl Error {
 fn failure_advice(error: FlashError) -> &'static str {
     match error {
         FlashError::NoValidProgram => "flash a program, and release it for autostart",
-        FlashError::Format => "check that the file is a block file for this bootloader, or convert it again",
+        FlashError::Format => {
+            "check that the file is for this bootloader and this board: coflash inspect --board tells whether its \
+             stack and its reset vector are those of a program there"
+        },
         FlashError::Crc => "run the command again; if it happens again, check bus and terminators",
         FlashError::NotCleared => {
             "run the flash command, which erases first; another tool may be at work on the device"

@@ -54,7 +54,7 @@ impl Procedure for Block {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (number, crc) = (options.program, file.program_crc());
+        let (number, crcs) = (options.program, file.program_crcs());
         let mut in_group = session.join_group()?;
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
@@ -68,7 +68,7 @@ impl Procedure for Block {
             Content::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
-                    None => return cia302::download(session, sealed.bytes(), crc, options, update),
+                    None => return cia302::download(session, sealed.bytes(), crcs, options, update),
                     Some(size) => size,
                 };
                 is_sealed = true;
@@ -78,7 +78,7 @@ impl Procedure for Block {
         };
         let larger = options.group_blocks.filter(|_| in_group).map(|size| file.joined(size));
         let file = larger.as_ref().unwrap_or(file);
-        let sent = send_verified(session, file, crc, &mut in_group, options, update);
+        let sent = send_verified(session, file, crcs, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
         }
@@ -138,7 +138,7 @@ impl PartialDownload {
 fn send_verified(
     session: &mut Session<'_>,
     file: &BlockFile,
-    crc: u32,
+    crcs: [u32; 2],
     in_group: &mut bool,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
@@ -148,7 +148,7 @@ fn send_verified(
     let partial = partial.filter(|partial| partial.is_of(file));
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, options, update)?;
-        steps::verify(session, number, crc, &mut |event| update.tell(event))?;
+        steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
         Ok(sent)
     };
     match all(partial, update) {

@@ -33,7 +33,7 @@ pub(super) fn enter(
 pub(super) fn download(
     session: &mut Session<'_>,
     content: &[u8],
-    crc: u32,
+    crcs: [u32; 2],
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<Downloaded, Error> {
@@ -41,7 +41,7 @@ pub(super) fn download(
     let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
         clear_and_wait(session, number, &mut |event| update.tell(event))
     };
-    let whole = Whole { content, crc, prepare: &prepare, status: whole::status };
+    let whole = Whole { content, crcs, prepare: &prepare, status: whole::status };
     whole::download(session, &whole, options, update)
 }
 

@@ -48,8 +48,8 @@ impl Procedure for EsAcademy {
         let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
         let prepare =
             |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| unlock(session, options, update);
-        let crc = file.program_crc();
-        let whole = Whole { content: &content, crc, prepare: &prepare, status };
+        let crcs = file.program_crcs();
+        let whole = Whole { content: &content, crcs, prepare: &prepare, status };
         whole::download(session, &whole, options, update)
     }
 

@@ -30,6 +30,6 @@ impl Procedure for Hex {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
-        cia302::download(session, &content, file.program_crc(), options, update)
+        cia302::download(session, &content, file.program_crcs(), options, update)
     }
 }

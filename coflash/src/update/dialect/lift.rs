@@ -71,10 +71,10 @@ impl Procedure for Lift {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (content, crc) = (file.stream(BlockFile::flash_image), file.program_crc());
+        let (content, crcs) = (file.stream(BlockFile::flash_image), file.program_crcs());
         // The device is already unlocked; the download overwrites the old program.
         let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
-        let whole = Whole { content: &content, crc, prepare: &prepare, status: whole::status };
+        let whole = Whole { content: &content, crcs, prepare: &prepare, status: whole::status };
         whole::download(session, &whole, options, update)
     }
 

@@ -30,6 +30,6 @@ impl Procedure for Raw {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(BlockFile::flash_image);
-        cia302::download(session, &content, file.program_crc(), options, update)
+        cia302::download(session, &content, file.program_crcs(), options, update)
     }
 }

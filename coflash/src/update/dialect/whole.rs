@@ -26,8 +26,8 @@ pub(super) type Said = Option<(FlashError, u16)>;
 pub(super) struct Whole<'w> {
     /// All that is sent.
     pub(super) content: &'w [u8],
-    /// CRC of the program.
-    pub(super) crc: u32,
+    /// The CRC of the program, as the device may compute it.
+    pub(super) crcs: [u32; 2],
     /// The action at the start of each attempt.
     pub(super) prepare: &'w dyn Fn(&mut Session<'_>, &mut RunningUpdate<'_>) -> Result<(), Error>,
     /// Reads the device's result of the download.
@@ -51,7 +51,7 @@ pub(super) fn download(
     // 1F56h is a CRC in bootloaders of this kind; elsewhere it is whatever the manufacturer has
     // chosen.
     if knows_crc(session)? {
-        steps::verify(session, options.program, whole.crc, &mut |event| update.tell(event))?;
+        steps::verify(session, options.program, whole.crcs, &mut |event| update.tell(event))?;
     }
     Ok(Downloaded { repeats, took, released: None })
 }
