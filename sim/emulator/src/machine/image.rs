@@ -29,9 +29,9 @@ pub struct LoadedImage {
 /// The segments of a 32-bit little-endian ARM ELF by their physical addresses, or by their virtual
 /// ones where no segment has a physical address.
 ///
-/// Of a segment only what allocated sections cover is stored: linkers with large pages let the first
-/// segment begin with the headers of the file, which would lie over the bootloader. A file without
-/// sections is stored as it is.
+/// What a segment has before its first allocated section and after its last one is not stored: linkers
+/// with large pages let the first segment begin with the headers of the file, which would lie over the
+/// bootloader. A file without sections is stored as it is.
 ///
 /// # Errors
 /// [`Error::Image`] says what is wrong with the file.
@@ -65,10 +65,9 @@ pub fn parse_elf(image: &[u8]) -> Result<(Vec<Segment>, u32), Error> {
             continue;
         }
         let start = u64::from(segment.p_offset(endian));
-        for part in parts(&contents, start..start + bytes.len() as u64) {
-            let (from, to) = ((part.start - start) as usize, (part.end - start) as usize);
-            segments.push(Segment { address: base + from as u32, bytes: bytes[from..to].to_vec() });
-        }
+        let Some(part) = part_of(&contents, start..start + bytes.len() as u64) else { continue };
+        let (from, to) = ((part.start - start) as usize, (part.end - start) as usize);
+        segments.push(Segment { address: base + from as u32, bytes: bytes[from..to].to_vec() });
     }
     if segments.is_empty() {
         return Err(bad("the ELF file has nothing to load"));
@@ -88,11 +87,12 @@ fn contents(sections: &[SectionHeader32<LittleEndian>], endian: LittleEndian) ->
     (!sections.is_empty()).then(|| sections.iter().filter(in_memory).map(range).collect())
 }
 
-/// What of a segment is in the memory.
-fn parts(contents: &Option<Vec<Range<u64>>>, segment: Range<u64>) -> Vec<Range<u64>> {
-    let Some(contents) = contents else { return vec![segment] };
+/// The part of a segment from its first allocated section to its last one; `None` without any.
+fn part_of(contents: &Option<Vec<Range<u64>>>, segment: Range<u64>) -> Option<Range<u64>> {
+    let Some(contents) = contents else { return Some(segment) };
     let inside = contents.iter().map(|part| part.start.max(segment.start)..part.end.min(segment.end));
-    inside.filter(|part| !part.is_empty()).collect()
+    let inside = inside.filter(|part| !part.is_empty());
+    inside.reduce(|all, part| all.start.min(part.start)..all.end.max(part.end))
 }
 
 /// The SRAM and the core-coupled RAM (RM0090 section 2.3).
@@ -214,7 +214,10 @@ mod tests {
     fn what_no_section_covers_is_not_stored() {
         let start = 0x0800_C000;
         let headers = elf(&[[0, start - ONE, start - ONE, ONE + 8]], &[[ONE, 4], [ONE + 4, 4]]);
-        assert_eq!(stored(&headers), [(start, PROGRAM[..4].to_vec()), (start + 4, PROGRAM[4..].to_vec())]);
+        assert_eq!(stored(&headers), [(start, PROGRAM.to_vec())]);
+        // Padding between two sections belongs to the program.
+        let padded = elf(&[[0, start - ONE, start - ONE, ONE + 8]], &[[ONE + 6, 1], [ONE + 1, 2]]);
+        assert_eq!(stored(&padded), [(start + 1, PROGRAM[1..7].to_vec())]);
         let plain = elf(&[[ONE, start, start, 8]], &[]);
         assert_eq!(stored(&plain), [(start, PROGRAM.to_vec())]);
         assert!(parse_elf(&elf(&[[ONE, start, start, 8]], &[[0, 4]])).is_err(), "nothing to load");
