@@ -1,4 +1,5 @@
-//! Vector tables: the proof that a table was checked, and the jump to it.
+//! Vector tables: the judge of their first two words, the proof that a table was checked, and the
+//! jump to it. Device and host tool judge by the same rules.
 
 use crate::geometry::{Region, CORE_VECTORS_SIZE};
 use crate::layout::Layout;
@@ -10,10 +11,88 @@ pub enum VectorFault {
     Misaligned,
     /// The initial stack pointer is not in RAM, or not a multiple of 8.
     StackPointer,
+    /// The initial stack pointer is after the program's RAM: the stack would run over the handoff
+    /// and the warm-start cell, which are there.
+    StackOverHandoff,
     /// The reset vector does not point into the program.
     ResetVector,
     /// The reset vector lacks the Thumb bit.
     NotThumb,
+}
+
+/// The memory that the first two words of a program's vector table may name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Memory {
+    /// The RAM of a program. The rest of `sram` has the handoff and the warm-start cell.
+    pub ram: Region,
+    /// The whole SRAM of the chip.
+    pub sram: Region,
+    /// The core-coupled RAM, which may have a stack, too.
+    pub ccm: Region,
+    /// The size of the vector table in bytes, which is before all code.
+    pub table: u32,
+}
+
+impl Memory {
+    /// The memory of any STM32F4, for a judge that does not know the board: at most 320 KiB of SRAM
+    /// (STM32F413, STM32F469) and 64 KiB of core-coupled RAM. It has no handoff, whose place is that
+    /// of the board.
+    pub const ANY: Self = Self {
+        ram: Region::new(0x2000_0000, 320 * 1024),
+        sram: Region::new(0x2000_0000, 320 * 1024),
+        ccm: Region::new(0x1000_0000, 64 * 1024),
+        table: 8,
+    };
+
+    /// The memory of a board.
+    #[must_use]
+    pub const fn of(layout: &Layout) -> Self {
+        let chip = layout.chip;
+        Self { ram: layout.ram, sram: chip.sram, ccm: chip.ccm, table: chip.vector_table_size() }
+    }
+
+    /// Judges initial stack pointer and reset vector of a program whose bytes lie at `program`.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub const fn judge(&self, words: [u32; 2], program: Region) -> Result<(), VectorFault> {
+        let [initial_sp, reset] = words;
+        if let Err(fault) = self.judge_stack(initial_sp) {
+            return Err(fault);
+        }
+        let table = if self.table < program.size { self.table } else { program.size };
+        let code = Region::new(program.base + table, program.size - table);
+        if !code.contains(reset & !1, 2) {
+            return Err(VectorFault::ResetVector);
+        }
+        if reset & 1 == 0 {
+            return Err(VectorFault::NotThumb);
+        }
+        Ok(())
+    }
+
+    /// Judges an initial stack pointer.
+    ///
+    /// # Errors
+    /// [`VectorFault::StackPointer`] or [`VectorFault::StackOverHandoff`].
+    pub const fn judge_stack(&self, initial_sp: u32) -> Result<(), VectorFault> {
+        if !initial_sp.is_multiple_of(8) {
+            return Err(VectorFault::StackPointer);
+        }
+        if is_stack_in(&self.ram, initial_sp) || is_stack_in(&self.ccm, initial_sp) {
+            return Ok(());
+        }
+        if is_stack_in(&self.sram, initial_sp) {
+            return Err(VectorFault::StackOverHandoff);
+        }
+        Err(VectorFault::StackPointer)
+    }
+}
+
+/// Whether a stack that begins at this address lies in a memory. It is a full descending stack: the
+/// pointer may point directly after the last byte, and needs room below.
+const fn is_stack_in(ram: &Region, initial_sp: u32) -> bool {
+    initial_sp > ram.base && initial_sp <= ram.end()
 }
 
 /// A vector table that has passed its checks. Only [`VectorTable::check`] makes this value, and
@@ -31,22 +110,11 @@ impl VectorTable {
     /// # Errors
     /// The first broken rule.
     pub fn check(words: [u32; 2], program: Region, layout: &Layout) -> Result<Self, VectorFault> {
-        let [initial_sp, reset] = words;
-        let chip = layout.chip;
-        if !program.base.is_multiple_of(chip.vector_table_alignment()) {
+        if !program.base.is_multiple_of(layout.chip.vector_table_alignment()) {
             return Err(VectorFault::Misaligned);
         }
-        if !Self::is_stack_pointer(initial_sp, layout) {
-            return Err(VectorFault::StackPointer);
-        }
-        let table = chip.vector_table_size();
-        let code = Region::new(program.base + table, program.size - table);
-        if !code.contains(reset & !1, 2) {
-            return Err(VectorFault::ResetVector);
-        }
-        if reset & 1 == 0 {
-            return Err(VectorFault::NotThumb);
-        }
+        Memory::of(layout).judge(words, program)?;
+        let [initial_sp, reset] = words;
         Ok(Self { address: program.base, initial_sp, reset })
     }
 
@@ -55,7 +123,7 @@ impl VectorTable {
     #[must_use]
     pub(crate) const fn of_ram_image(words: [u32; 2], image: Region, ram: Region) -> Option<Self> {
         let [initial_sp, reset] = words;
-        let is_stack = initial_sp.is_multiple_of(8) && initial_sp > ram.base && initial_sp <= ram.end();
+        let is_stack = initial_sp.is_multiple_of(8) && is_stack_in(&ram, initial_sp);
         let code = Region::new(image.base + CORE_VECTORS_SIZE, image.size - CORE_VECTORS_SIZE);
         if is_stack && code.contains(reset & !1, 2) && reset & 1 == 1 {
             Some(Self { address: image.base, initial_sp, reset })
@@ -67,10 +135,7 @@ impl VectorTable {
     /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
     #[must_use]
     pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
-        // A full descending stack: the pointer may point directly after the last byte, and needs
-        // room below.
-        let on_stack = |ram: &Region| word > ram.base && word <= ram.end();
-        word.is_multiple_of(8) && (on_stack(&layout.ram) || on_stack(&layout.chip.ccm))
+        Memory::of(layout).judge_stack(word).is_ok()
     }
 
     /// Address of the table, the value for `VTOR`.
@@ -146,14 +211,35 @@ mod tests {
         assert!(check(0x1001_0000, 0x080F_FFFF).is_ok(), "a stack in CCM RAM is fine");
     }
 
+    /// Without a board every chip of the family counts, and nothing is known of a handoff.
+    #[test]
+    fn any_chip_has_no_more_than_the_family() {
+        for chip in crate::geometry::CHIPS {
+            assert!(Memory::ANY.sram.contains(chip.sram.base, chip.sram.size), "{}", chip.chip);
+            assert!(
+                chip.ccm.size == 0 || Memory::ANY.ccm.contains(chip.ccm.base, chip.ccm.size),
+                "{}",
+                chip.chip
+            );
+            assert_eq!(Memory::ANY.judge_stack(chip.sram.end()), Ok(()), "{}", chip.chip);
+        }
+        assert_eq!(Memory::ANY.judge_stack(0x2005_0008), Err(VectorFault::StackPointer));
+        // An image that ends in its own table has no code.
+        let short = Region::new(0x0802_0000, 4);
+        assert_eq!(Memory::ANY.judge([0x2001_0000, 0x0802_0001], short), Err(VectorFault::ResetVector));
+    }
+
     #[test]
     fn refuses_everything_else() {
-        use VectorFault::{Misaligned, NotThumb, ResetVector, StackPointer};
+        use VectorFault::{Misaligned, NotThumb, ResetVector, StackOverHandoff, StackPointer};
         for (sp, reset, fault) in [
             (0xFFFF_FFFF, 0xFFFF_FFFF, StackPointer),
             (0, 0x0802_0189, StackPointer),
             (0x2000_0000, 0x0802_0189, StackPointer),
-            (0x2001_FFC8, 0x0802_0189, StackPointer),
+            // CubeMX and cortex-m-rt put the stack at the end of the SRAM if nobody says otherwise.
+            (0x2002_0000, 0x0802_0189, StackOverHandoff),
+            (0x2001_FFC8, 0x0802_0189, StackOverHandoff),
+            (0x2002_0008, 0x0802_0189, StackPointer),
             (0x2001_FFBC, 0x0802_0189, StackPointer),
             (0x2001_FFC0, 0x0800_0189, ResetVector),
             (0x2001_FFC0, 0x0810_0001, ResetVector),
