@@ -1,5 +1,6 @@
 //! The artifact as a program.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use super::config::Device;
@@ -16,7 +17,7 @@ use crate::update::Program;
 pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Program, Vec<String>> {
     let lines = |what: String, advice: &str| vec![what, format!("what to do: {advice}")];
     let anew = "deploy the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image";
-    let format = Format::detect(bytes);
+    let format = Format::of(Path::new(name), bytes);
     if format == Some(Format::Sealed) {
         let file = SealedFile::for_program(bytes.to_vec(), device.program);
         let file = file.map_err(|refusal| lines(format!("{name}: {refusal}"), refusal.advice()))?;
@@ -24,22 +25,16 @@ pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Progr
     }
     let region: Option<AddressRange> =
         device.board.and_then(|board| board.program(device.program)).map(Into::into);
-    // A raw file has no distinctive bytes: its name shows the format, and the board gives its
-    // address.
-    let raw = format.is_none() && name.to_lowercase().ends_with(".bin");
-    let (format, place) = match region {
-        _ if !raw => (format, None),
-        Some(region) => (Some(Format::Raw), Some(region.first)),
-        None => {
-            let advice = "set board in the agent's configuration";
-            return Err(lines(format!("{name}: a raw binary does not contain its address"), advice));
-        }
-    };
+    let place = region.map(|region| region.first);
+    if format == Some(Format::Raw) && place.is_none() {
+        let advice = "set board in the agent's configuration";
+        return Err(lines(format!("{name}: a raw binary does not contain its address"), advice));
+    }
     let firmware =
         file::read(bytes, format, place).map_err(|error| lines(error.of(name).to_string(), anew))?;
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
     let blocks = blocks_of(firmware, &options).map_err(|error| lines(format!("{name}: {error}"), anew))?.file;
-    judge(&blocks.image(), blocks.program_start())
+    judge(&blocks.image(), blocks.program_start(), device.board)
         .map_err(|fault| lines(format!("{name}: {fault}"), fault.advice()))?;
     Ok(Arc::new(blocks).into())
 }

@@ -14,7 +14,7 @@ use serde_json::json;
 
 use super::context::Context;
 use super::device::cancelled;
-use super::file::{warn_left_out, Source};
+use super::file::{warn, Source};
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
@@ -124,7 +124,7 @@ impl Conform {
     fn image(&self, context: &Context) -> Result<Option<Program>, Failure> {
         let Some(path) = &self.image else { return Ok(None) };
         let done = self.source.blocks(path, 1, Label::OfImage { date: 0 })?;
-        warn_left_out(context, path, &done);
+        warn(context, path, &done);
         Ok(Some(Arc::new(done.file).into()))
     }
 

@@ -7,13 +7,14 @@ use ::seal::wire::CERTIFICATE;
 use clap::Args;
 use coflash::file::block_file::{BlockFile, FRAMING};
 use coflash::file::convert::{Converted, Label};
+use coflash::file::judge::{judge, StackAtEnd};
 use coflash::file::read::Firmware;
 use coflash::file::sealed::{Kek, Sealer, SigningKey};
 use serde_json::json;
 use shared_abi::block_file::{Control, Identity, ProgramVersion};
 
 use super::context::Context;
-use super::file::{warn_left_out, Input, Source};
+use super::file::{warn, Input, Source};
 use super::keys::{self, value_of_128_bits};
 use super::output::Failure;
 use super::seal::{self, Form, Program};
@@ -175,7 +176,13 @@ impl Convert {
             }
         }
         let done = self.source.convert(firmware, input, self.program, self.labels.label(input)?)?;
-        warn_left_out(context, input, &done);
+        warn(context, input, &done);
+        let (image, start) = (done.file.image(), done.file.program_start());
+        match (self.source.layout()?, StackAtEnd::of(&image, start)) {
+            (None, Some(stack)) => context.out.warn(format_args!("{}: {stack}", input.display())),
+            (None, None) => {}
+            (board, _) => judge(&image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
+        }
         if sealing.is_none() {
             write(&output, &done.file.emit())?;
         }
@@ -213,6 +220,7 @@ impl Convert {
         let program = Program {
             path: self.input.path(),
             blocks,
+            board: self.source.layout()?,
             identity: (vid, pid),
             options: ("--vid and --pid", "--vid and --pid"),
             version: ver,
@@ -241,7 +249,7 @@ impl Convert {
     }
 
     fn tell(&self, context: &Context, output: &Path, done: &Converted) {
-        let Converted { file, left_out } = done;
+        let Converted { file, left_out, .. } = done;
         let (start, size, crc) = (file.program_start(), file.program_size(), file.program_crc());
         let count = file.blocks().len();
         let largest = file.blocks().iter().map(|block| block.data.len() + FRAMING).max();

@@ -189,6 +189,11 @@ impl Source {
         Self { place, ..self.clone() }
     }
 
+    /// The memory map of the device, if the options give one.
+    pub(super) fn layout(&self) -> Result<Option<&'static layout::Layout>, Failure> {
+        self.place.layout()
+    }
+
     /// The size of a block in bytes, including framing.
     pub(super) fn block_size(&self) -> usize {
         self.block_size.map_or(DEFAULT_BLOCK_SIZE, |size| size as usize)
@@ -213,6 +218,11 @@ impl Source {
 }
 
 impl Place {
+    /// The memory map of the device, if the options give one.
+    pub(super) fn layout(&self) -> Result<Option<&'static layout::Layout>, Failure> {
+        self.map.layout()
+    }
+
     /// Reads `file` for program `number`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
         // A raw file begins at the start of the region; the conversion adjusts this address like
@@ -300,8 +310,11 @@ pub(super) fn bytes(path: &Path) -> Result<Vec<u8>, Failure> {
     Ok(limit::read(path).map_err(|cause| file::Place::File.fault(cause).of(path.display()))?)
 }
 
-/// Warns if data were left out.
-pub(super) fn warn_left_out(context: &Context, file: &Path, converted: &Converted) {
+/// Warns of what is odd about the file, and if data were left out.
+pub(super) fn warn(context: &Context, file: &Path, converted: &Converted) {
+    for note in &converted.notes {
+        context.out.warn(format_args!("{}: {note}", file.display()));
+    }
     if converted.left_out > 0 {
         context.out.warn(format_args!(
             "{}: {} bytes outside the address range were left out [0x60002001]",

@@ -26,7 +26,7 @@ use super::context::Context;
 use super::convert::Labels;
 use super::device::{cancelled, Patience};
 use super::dialect::Access;
-use super::file::{warn_left_out, Source};
+use super::file::{warn, Source};
 use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
@@ -294,19 +294,20 @@ impl Flash {
             return Ok(Arc::new(file).into());
         }
         let done = source.blocks(path, program, label)?;
-        warn_left_out(context, path, &done);
-        self.judge(path, &done.file, program)?;
+        warn(context, path, &done);
+        self.judge(path, &done.file, program, source)?;
         Ok(Arc::new(done.file).into())
     }
 
     /// Refuses a file that cannot be a program, before any request to a device. For a possible lift
     /// device, the meaning of a program number above 1 is not known without the device.
-    fn judge(&self, path: &Path, file: &BlockFile, program: u8) -> Result<(), Failure> {
+    fn judge(&self, path: &Path, file: &BlockFile, program: u8, source: &Source) -> Result<(), Failure> {
         let dialect = self.access.dialect();
         if self.force || is_data(dialect.unwrap_or(Dialect::Lift), program) {
             return Ok(());
         }
-        judge(&file.image(), file.program_start()).map_err(|fault| Failure::no_program(path, fault))
+        let board = source.layout()?;
+        judge(&file.image(), file.program_start(), board).map_err(|fault| Failure::no_program(path, fault))
     }
 
     /// The options of the command line, unless the device's own settings replace them.

@@ -45,7 +45,7 @@ impl Inspect {
             let done = self.source.convert(firmware.clone(), path, self.program, Default::default())?;
             start = Some(done.file.program_start());
         }
-        let inspection = Inspection::of(&firmware, format, start);
+        let inspection = Inspection::of(&firmware, format, start, self.source.layout()?);
         context.out.result(format_args!("{}: {inspection}", path.display()), || value(&inspection));
         Ok(())
     }
@@ -90,6 +90,8 @@ fn value(inspection: &Inspection) -> Value {
             "vendor_id": label.vendor_id, "product_code": label.product_code, "version": label.version,
         })),
         "fault": inspection.judgement.err().map(|fault| fault.to_string()),
+        "stack_at_end_of_sram": inspection.stack_at_end.map(|at| at.stack),
+        "notes": inspection.notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "blocks": blocks,
     })
 }

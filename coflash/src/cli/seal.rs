@@ -12,6 +12,7 @@ use coflash::file::sealed::sealer::CHUNK;
 use coflash::file::sealed::{hash, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
 use seal::wire::{flag, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
+use shared_abi::layout::Layout;
 
 use super::context::Context;
 use super::file::{base, Input, Place};
@@ -155,6 +156,8 @@ pub(super) struct Program<'p> {
     pub(super) path: &'p Path,
     /// Its blocks.
     pub(super) blocks: &'p BlockFile,
+    /// The memory map of its device, if it is known.
+    pub(super) board: Option<&'static Layout>,
     /// Vendor-ID and product code; if absent, those of its label.
     pub(super) identity: (Option<u32>, Option<u32>),
     /// The names of these options, for messages.
@@ -167,7 +170,7 @@ impl Program<'_> {
     /// Refuses a file that cannot be a program, like `flash`.
     pub(super) fn judge(&self) -> Result<(), Failure> {
         let (image, start) = (self.blocks.image(), self.blocks.program_start());
-        judge(&image, start).map_err(|fault| Failure::no_program(self.path, fault))
+        judge(&image, start, self.board).map_err(|fault| Failure::no_program(self.path, fault))
     }
 
     /// Adds the program's identity and version to the parameters in `sealer`.
@@ -263,10 +266,11 @@ impl Seal {
         let (firmware, _) = self.place.load(path, self.program)?;
         let done = blocks_of(firmware, &self.place.options(self.program)?);
         let done = done.map_err(|error| Failure::convert(error, path))?;
-        super::file::warn_left_out(context, path, &done);
+        super::file::warn(context, path, &done);
         let program = Program {
             path,
             blocks: &done.file,
+            board: self.place.layout()?,
             identity: (self.vendor, self.product),
             options: ("--vendor", "--product"),
             version: self.ver,

@@ -249,20 +249,21 @@ impl BlockFile {
     /// and CRC must be right when counted from the start of the region, as the device counts them.
     ///
     /// # Errors
-    /// [`Cause::Outside`] or [`Cause::ProgramCrc`].
+    /// [`Cause::Outside`], [`Cause::Elsewhere`] or [`Cause::OtherPlace`].
     pub fn check_region(&self, region: AddressRange) -> Result<(), ReadError> {
         let mut offset = self.blocks[0].data.len() + FRAMING;
         for block in self.program_blocks() {
-            let (first, last) = (block.flash_address, last_address(block));
-            if !region.contains(&AddressRange { first, last }) {
-                return Err(Place::Offset(offset).fault(Cause::Outside { first, last, region }));
+            let data = AddressRange { first: block.flash_address, last: last_address(block) };
+            if !region.contains(&data) {
+                return Err(Place::Offset(offset).fault(Cause::outside(data, region)));
             }
             offset += block.data.len() + FRAMING;
         }
         if self.starts_at(region.first) {
             Ok(())
         } else {
-            Err(Place::Offset(offset).fault(self.program_fault()))
+            let (linked, start) = (self.program_start(), region.first);
+            Err(Place::File.fault(Cause::OtherPlace { linked, start }))
         }
     }
 

@@ -8,6 +8,7 @@ use super::block_file::{BlockFile, Checksum, LastBlock, FRAMING, MAX_BLOCK_SIZE,
 use super::fault::{Cause, Place, ReadError};
 use super::image::Image;
 use super::label::label_of;
+use super::note::Note;
 use super::range::AddressRange;
 use super::raw;
 use super::read::Firmware;
@@ -222,6 +223,8 @@ pub struct Converted {
     pub file: BlockFile,
     /// Bytes of the input that [`Region::Cut`] left out.
     pub left_out: u64,
+    /// What is odd about the input.
+    pub notes: Vec<Note>,
 }
 
 /// Makes blocks from a program.
@@ -245,7 +248,7 @@ pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertErr
     let blocks = blocks(&image, payload, options);
     let control = |app_size| label.control(app_size);
     let file = BlockFile::new(start, blocks, control, options.checksum, options.last_block);
-    Ok(Converted { file, left_out })
+    Ok(Converted { file, left_out, notes: image.notes().to_vec() })
 }
 
 /// Makes the blocks of any firmware file: an image is [converted](convert); blocks are checked
@@ -267,7 +270,7 @@ pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, Con
                     file.check_region(AddressRange { first: file.program_start(), last })?;
                 }
             }
-            Ok(Converted { file, left_out: 0 })
+            Ok(Converted { file, left_out: 0, notes: Vec::new() })
         }
     }
 }
@@ -315,6 +318,7 @@ fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32
     match options.region {
         Region::Unknown => {
             let image = adjusted(Cow::Borrowed(image))?;
+            image.check_areas()?;
             let start = start(&image);
             Ok((image, start, 0))
         }

@@ -1,18 +1,29 @@
-//! ELF executables: the loadable segments at their load addresses.
+//! ELF executables: what the sections put into the loadable segments, at its load addresses.
 
-use object::elf::{FileHeader32, EM_ARM, ET_EXEC, PT_LOAD};
-use object::read::elf::{FileHeader, ProgramHeader};
+use std::ops::Range;
+
+use object::elf::{
+    FileHeader32, ProgramHeader32, SectionHeader32, EM_ARM, ET_EXEC, PT_LOAD, SHF_ALLOC, SHT_NOBITS,
+};
+use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::Endianness;
 
+use super::area::Area;
 use super::block_file::MAX_PROGRAM_SIZE;
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
+use super::note::Note;
+use super::range::AddressRange;
 
 /// Parses a whole file.
 ///
 /// The memory contents are those of the `PT_LOAD` program headers: `p_filesz` bytes at `p_paddr`,
 /// their address in flash. (Sections and `p_vaddr` give the addresses at run time, which lie in RAM
-/// for initialised data.)
+/// for initialised data.) If no segment has a load address, the virtual addresses count, as for GNU
+/// binutils.
+///
+/// What a segment has before its first allocated section and after its last one is no program: with
+/// large pages GNU ld and lld let the first segment begin with the headers of the file.
 ///
 /// # Errors
 /// The first fault, with its offset.
@@ -58,25 +69,114 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     if loads().map(|(_, size)| size).sum::<u64>() > MAX_PROGRAM_SIZE.into() {
         return Err(Place::File.fault(Cause::SegmentsTooLarge { most: MAX_PROGRAM_SIZE }));
     }
-    let mut pieces = Pieces::default();
     for (segment, size) in loads() {
-        let offset = u64::from(segment.p_offset(endian));
-        let data = segment.data(endian, bytes).map_err(|()| cut_off("the file", offset + size))?;
-        let place = Place::Offset(offset as usize);
-        let address = segment.p_paddr(endian);
-        if u64::from(address) + size > 1 << 32 {
-            return Err(place.fault(Cause::AddressOverflow { address, what: "the address space" }));
+        let end = u64::from(segment.p_offset(endian)) + size;
+        if end > bytes.len() as u64 {
+            return Err(cut_off("the file", end));
         }
-        pieces.add(address, data.to_vec(), place);
     }
     // Linkers write the section headers last: without them the file was cut off, even if all
     // segments are present.
-    let sections = u64::from(header.e_shoff(endian));
-    let sections_end = sections + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
-    if sections != 0 && sections_end > bytes.len() as u64 {
-        return Err(cut_off("the table of section headers", sections_end));
+    let table = u64::from(header.e_shoff(endian));
+    let table_end = table + u64::from(header.e_shentsize(endian)) * u64::from(header.e_shnum(endian));
+    if table != 0 && table_end > bytes.len() as u64 {
+        return Err(cut_off("the table of section headers", table_end));
+    }
+    let sections = header.section_headers(endian, bytes).map_err(|_| {
+        Place::Offset(table as usize).fault(Cause::WrongElf("has a damaged table of sections"))
+    })?;
+    let contents = Contents::of(sections, endian);
+
+    let has_load_addresses = loads().any(|(segment, _)| segment.p_paddr(endian) != 0);
+    let address_of = |segment: &ProgramHeader32<Endianness>| match has_load_addresses {
+        true => segment.p_paddr(endian),
+        false => segment.p_vaddr(endian),
+    };
+    let runs_in_ram = |address| Area::of(address).is_some_and(Area::is_ram);
+    let only_ram = loads().all(|(segment, _)| runs_in_ram(address_of(segment)));
+    let mut pieces = Pieces::default();
+    for (segment, size) in loads() {
+        let (start, address) = (u64::from(segment.p_offset(endian)), address_of(segment));
+        if u64::from(address) + size > 1 << 32 {
+            let what = "the address space";
+            return Err(Place::Offset(start as usize).fault(Cause::AddressOverflow { address, what }));
+        }
+        if !has_load_addresses && runs_in_ram(address) && !only_ram {
+            let last = address + (size - 1) as u32;
+            pieces.note(Note::NoLoadAddress(AddressRange { first: address, last }));
+            continue;
+        }
+        if let Some(part) = contents.inside(start..start + size, bytes) {
+            // Inside the file and inside the address space, as the segment is.
+            let (from, to) = (part.start as usize, part.end as usize);
+            pieces.add(address + (part.start - start) as u32, bytes[from..to].to_vec(), Place::Offset(from));
+        }
     }
     pieces.into_image()
+}
+
+/// The parts of a file that are the contents of the memory.
+enum Contents {
+    /// The bytes of its allocated sections: in order, without overlap and not adjacent.
+    Sections(Vec<Range<u64>>),
+    /// A file without sections.
+    Unknown,
+}
+
+impl Contents {
+    fn of(sections: &[SectionHeader32<Endianness>], endian: Endianness) -> Self {
+        if sections.is_empty() {
+            return Self::Unknown;
+        }
+        let allocated = sections.iter().filter(|section| {
+            section.sh_flags(endian) & SHF_ALLOC != 0 && section.sh_type(endian) != SHT_NOBITS
+        });
+        let mut all: Vec<Range<u64>> = allocated
+            .map(|section| {
+                let offset = u64::from(section.sh_offset(endian));
+                offset..offset + u64::from(section.sh_size(endian))
+            })
+            .filter(|range| !range.is_empty())
+            .collect();
+        all.sort_by_key(|range| range.start);
+        all.dedup_by(|next, last| {
+            let joins = next.start <= last.end;
+            if joins {
+                last.end = last.end.max(next.end);
+            }
+            joins
+        });
+        Self::Sections(all)
+    }
+
+    /// The part of a segment that is contents: from its first allocated section to its last one, with
+    /// the padding between them. `segment` lies inside the file.
+    fn inside(&self, segment: Range<u64>, bytes: &[u8]) -> Option<Range<u64>> {
+        match self {
+            Self::Sections(all) => {
+                let first = all.get(all.partition_point(|part| part.end <= segment.start))?;
+                let last = all[..all.partition_point(|part| part.start < segment.end)].last()?;
+                let part = first.start.max(segment.start)..last.end.min(segment.end);
+                (!part.is_empty()).then_some(part)
+            }
+            Self::Unknown => Some(after_headers(segment, bytes)),
+        }
+    }
+}
+
+/// A segment of a file without sections. If it begins with the file's headers, the program begins
+/// after them and after the zeros that fill the page, with a word that is not 0: no stack begins at 0.
+fn after_headers(segment: Range<u64>, bytes: &[u8]) -> Range<u64> {
+    const WORD: u64 = 4;
+    let header = FileHeader32::<Endianness>::parse(bytes).ok().filter(|_| segment.start == 0);
+    let Some((header, endian)) = header.and_then(|header| Some((header, header.endian().ok()?))) else {
+        return segment;
+    };
+    let table = u64::from(header.e_phentsize(endian)) * u64::from(header.e_phnum(endian));
+    let end = (u64::from(header.e_phoff(endian)) + table).min(segment.end);
+    let filled = bytes[end as usize..segment.end as usize].iter().position(|byte| *byte != 0);
+    let start = filled.map_or(segment.end, |at| end + at as u64);
+    start - start % WORD..segment.end
 }
 
 #[cfg(test)]
@@ -106,6 +206,121 @@ mod tests {
         1, 2, 3, 4,
         5, 6, 7, 8,
     ];
+
+    /// The example with a section table at its end: one section header of 40 bytes for each
+    /// (type, flags, offset, size), after the null section (gABI chapter 4, "Sections").
+    fn with_sections(sections: &[[u32; 4]]) -> Vec<u8> {
+        let mut bytes = EXAMPLE.to_vec();
+        bytes[32..36].copy_from_slice(&124_u32.to_le_bytes());
+        bytes[48] = 1 + sections.len() as u8;
+        bytes.extend([0; 40]);
+        for &[kind, flags, offset, size] in sections {
+            for word in [0, kind, flags, 0, offset, size, 0, 0, 1, 0] {
+                bytes.extend(u32::to_le_bytes(word));
+            }
+        }
+        bytes
+    }
+
+    /// Sets a field of a program header of the example: its number and the offset in it.
+    fn set(bytes: &mut [u8], header: usize, field: usize, value: u32) {
+        let at = 52 + 32 * header + field;
+        bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
+    }
+
+    const OFFSET: usize = 4;
+    const VADDR: usize = 8;
+    const PADDR: usize = 12;
+    const FILESZ: usize = 16;
+    /// SHT_PROGBITS, SHT_NOBITS; SHF_ALLOC.
+    const PROGBITS: u32 = 1;
+    const NOBITS: u32 = 8;
+    const ALLOC: u32 = 2;
+
+    fn segments(bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
+        read(bytes).unwrap().segments().collect()
+    }
+
+    const BOTH: [(u32, &[u8]); 2] = [(0x0801_0000, &[1, 2, 3, 4]), (0x0801_0100, &[5, 6, 7, 8])];
+
+    fn is_both(bytes: &[u8]) -> bool {
+        read(bytes).unwrap().segments().eq(BOTH.map(|(address, data)| (address, data.to_vec())))
+    }
+
+    /// As GNU ld links with pages of 64 KiB, and rust-lld: the first segment begins with the headers.
+    #[test]
+    fn what_no_allocated_section_covers_is_no_program() {
+        let all = [[PROGBITS, ALLOC, 116, 4], [PROGBITS, ALLOC, 120, 4]];
+        assert!(is_both(&with_sections(&all)));
+        let mut bytes = with_sections(&all);
+        set(&mut bytes, 0, OFFSET, 0);
+        set(&mut bytes, 0, PADDR, 0x0801_0000 - 116);
+        set(&mut bytes, 0, FILESZ, 120);
+        assert!(is_both(&bytes), "{:x?}", segments(&bytes));
+        // A section in two parts, one that reaches out of its segment, and sections that are not
+        // in the memory: debug information, .bss.
+        let mut odd = with_sections(&[
+            [PROGBITS, ALLOC, 118, 30],
+            [PROGBITS, 0, 0, 100],
+            [NOBITS, ALLOC, 52, 64],
+            [PROGBITS, ALLOC, 116, 2],
+        ]);
+        set(&mut odd, 0, OFFSET, 0);
+        set(&mut odd, 0, PADDR, 0x0801_0000 - 116);
+        set(&mut odd, 0, FILESZ, 120);
+        assert!(is_both(&odd), "{:x?}", segments(&odd));
+        // Padding between two sections of a segment belongs to the program, as the linker filled it.
+        let mut padded = with_sections(&[[PROGBITS, ALLOC, 122, 1], [PROGBITS, ALLOC, 117, 2]]);
+        set(&mut padded, 0, FILESZ, 8);
+        set(&mut padded, 1, FILESZ, 0);
+        assert_eq!(segments(&padded), [(0x0801_0001, vec![2, 3, 4, 5, 6, 7])]);
+        let none = with_sections(&[[PROGBITS, 0, 116, 8]]);
+        assert_eq!(read(&none).unwrap_err().to_string(), "the file: holds no data");
+    }
+
+    /// Without a section table, too: the headers and the zeros after them are no program.
+    #[test]
+    fn headers_are_no_program_in_a_stripped_file_either() {
+        let mut bytes = EXAMPLE.to_vec();
+        set(&mut bytes, 0, OFFSET, 0);
+        set(&mut bytes, 0, PADDR, 0x0801_0000 - 116);
+        set(&mut bytes, 0, FILESZ, 120);
+        assert!(is_both(&bytes), "{:x?}", segments(&bytes));
+        // A stack at 2001_0000h: its first two bytes are 0 as well.
+        bytes[116..120].copy_from_slice(&[0, 0, 1, 0x20]);
+        assert_eq!(segments(&bytes)[0], (0x0801_0000, vec![0, 0, 1, 0x20]));
+    }
+
+    /// As BFD reads it: without any load address, the virtual addresses are meant.
+    #[test]
+    fn without_load_addresses_the_virtual_ones_count() {
+        let mut bytes = EXAMPLE.to_vec();
+        set(&mut bytes, 0, PADDR, 0);
+        set(&mut bytes, 1, PADDR, 0);
+        let image = read(&bytes).unwrap();
+        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4])]));
+        let words = image.notes()[0].to_string();
+        assert!(
+            words.contains("0x20000000..=0x20000003 were left out") && words.contains("AT > FLASH"),
+            "{words}"
+        );
+        set(&mut bytes, 1, VADDR, 0x0801_0100);
+        assert!(is_both(&bytes) && read(&bytes).unwrap().notes().is_empty());
+        // One load address is enough: then 0 is an address like any other.
+        set(&mut bytes, 1, PADDR, 0x0801_0100);
+        assert_eq!(segments(&bytes)[0].0, 0);
+    }
+
+    #[test]
+    fn the_same_bytes_in_two_segments_are_taken_once() {
+        let mut bytes = EXAMPLE.to_vec();
+        set(&mut bytes, 1, OFFSET, 118);
+        set(&mut bytes, 1, PADDR, 0x0801_0002);
+        let image = read(&bytes).unwrap();
+        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4, 5, 6])]));
+        let words = "offset 0x76: the data at 0x08010002 are those of offset 0x74 once more";
+        assert_eq!(image.notes()[0].to_string(), words);
+    }
 
     fn fault(change: impl FnOnce(&mut Vec<u8>)) -> String {
         let mut bytes = EXAMPLE.to_vec();

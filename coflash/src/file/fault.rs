@@ -4,6 +4,8 @@ use std::fmt;
 
 use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
+use super::area::Area;
+use super::judge::FLASH;
 use super::range::AddressRange;
 
 /// A place in a file.
@@ -109,6 +111,9 @@ pub enum Cause {
     /// A file in none of the known formats.
     #[error("is not a firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
     NotFirmware,
+    /// A text with a byte order mark.
+    #[error("begins with a byte order mark of {0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
+    ByteOrderMark(&'static str),
     /// A sealed image in a place that needs the program itself.
     #[error("is a sealed image and cannot be converted: `coflash flash` downloads it, `coflash show` and `coflash verify` describe it")]
     Sealed,
@@ -197,6 +202,22 @@ pub enum Cause {
         /// The region of the program.
         region: AddressRange,
     },
+    /// A program for another place of the same region: size and CRC count from its start.
+    #[error("the program begins at {linked:#010x}, and the region at {start:#010x}: link the program for that address, or choose another board or program")]
+    OtherPlace {
+        /// The start of the program in the file.
+        linked: u32,
+        /// The start of the region.
+        start: u32,
+    },
+    /// Data in an area that is not the main flash.
+    #[error("the data at {range} lies in {area}, not in the flash of a program: {}", .area.advice())]
+    Elsewhere {
+        /// First and last address of the data.
+        range: AddressRange,
+        /// The area of the first address.
+        area: Area,
+    },
     /// A well-formed file without data.
     #[error("holds no data")]
     NoData,
@@ -262,18 +283,33 @@ pub enum Cause {
 }
 
 impl Cause {
+    /// The fault of data that lie outside a program's region.
+    pub(crate) fn outside(data: AddressRange, region: AddressRange) -> Self {
+        let first_outside = if region.has(data.first) { region.last.saturating_add(1) } else { data.first };
+        // A region that is not in the flash is not that of an STM32F4.
+        match Area::outside(first_outside).filter(|_| FLASH.has(region.first)) {
+            Some(area) => Self::Elsewhere { range: data, area },
+            None => Self::Outside { first: data.first, last: data.last, region },
+        }
+    }
+
     /// The stable error number: the manual's number (L-1112e_5, table 5) if there is one, otherwise
     /// the operating system's.
     #[must_use]
     pub fn number(&self) -> u32 {
         match self {
             Self::Io(error) => error.raw_os_error().and_then(|code| u32::try_from(code).ok()).unwrap_or(5),
-            Self::Outside { .. } | Self::TooSparse { .. } | Self::SegmentsTooLarge { .. } => 0x6000_0015,
+            Self::Outside { .. }
+            | Self::Elsewhere { .. }
+            | Self::OtherPlace { .. }
+            | Self::TooSparse { .. }
+            | Self::SegmentsTooLarge { .. } => 0x6000_0015,
             Self::Checksum { .. } | Self::BlockCrc { .. } | Self::ProgramCrc { .. } => 0x6000_0020,
             Self::Empty
             | Self::NoRegularFile(_)
             | Self::TooLarge { .. }
             | Self::NotFirmware
+            | Self::ByteOrderMark(_)
             | Self::Sealed
             | Self::NoAddress
             | Self::WrongElf(_)

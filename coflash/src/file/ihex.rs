@@ -193,7 +193,10 @@ mod tests {
             (format!("{good}:00000001FF\n{good}"), "line 3: there is more text after the end record"),
             (good.to_string(), "the file: the file ends without its end record"),
             (":00000001FF\n".to_string(), "the file: holds no data"),
-            (format!("{good}{good}:00000001FF\n"), "line 2: the data at 0x00000000 overlaps that of line 1"),
+            (
+                format!("{good}:0100000002FD\n:00000001FF\n"),
+                "line 2: the data at 0x00000000 overlaps that of line 1",
+            ),
             (
                 ":02FFFF000102FD\n:00000001FF".to_string(),
                 "line 1: the data from 0x0000ffff on exceeds the end of its 64 KiB segment",

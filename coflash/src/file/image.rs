@@ -1,6 +1,9 @@
 //! The memory contents in a firmware file, with gaps.
 
+use super::area::Area;
 use super::fault::{Cause, Place, ReadError};
+use super::judge::FLASH;
+use super::note::Note;
 use super::range::AddressRange;
 
 /// The bytes of one record or segment of a file.
@@ -22,39 +25,60 @@ impl Piece {
 
 /// Pieces in the order of the file, before they become an [`Image`].
 #[derive(Debug, Default)]
-pub(crate) struct Pieces(Vec<Piece>);
+pub(crate) struct Pieces {
+    pieces: Vec<Piece>,
+    notes: Vec<Note>,
+}
 
 impl Pieces {
     /// Adds the data at `place` of the file. The caller has checked that the data end inside the
     /// address space.
     pub(crate) fn add(&mut self, address: u32, data: Vec<u8>, place: Place) {
         if !data.is_empty() {
-            self.0.push(Piece { address, data, place });
+            self.pieces.push(Piece { address, data, place });
         }
     }
 
-    /// Sorts the pieces by address.
+    /// Adds a warning.
+    pub(crate) fn note(&mut self, note: Note) {
+        self.notes.push(note);
+    }
+
+    /// Sorts the pieces by address. Pieces with the same bytes for the same addresses become one,
+    /// with a warning.
     pub(crate) fn into_image(self) -> Result<Image, ReadError> {
-        let Self(mut pieces) = self;
+        let Self { mut pieces, mut notes } = self;
         if pieces.is_empty() {
             return Err(Place::File.fault(Cause::NoData));
         }
         // The sort is stable: of two pieces at one address, the one that comes earlier in the file
         // stays first.
         pieces.sort_by_key(|piece| piece.address);
-        for pair in pieces.windows(2) {
-            let (low, high) = (&pair[0], &pair[1]);
-            if low.range().last >= high.address {
-                let (with, place) = (low.place.min(high.place), low.place.max(high.place));
+        let mut distinct: Vec<Piece> = Vec::with_capacity(pieces.len());
+        let (mut first, mut count) = (None, 0);
+        for high in pieces {
+            let Some(low) = distinct.last_mut().filter(|low| low.range().last >= high.address) else {
+                distinct.push(high);
+                continue;
+            };
+            let (with, place) = (low.place.min(high.place), low.place.max(high.place));
+            // `low` begins at or before `high` and reaches into it.
+            let known = &low.data[(high.address - low.address) as usize..];
+            let (common, rest) = high.data.split_at(known.len().min(high.data.len()));
+            if !known.starts_with(common) {
                 return Err(place.fault(Cause::Overlap { address: high.address, with }));
             }
+            first = first.or(Some((high.address, place, with)));
+            count += 1;
+            low.data.extend_from_slice(rest);
         }
-        Ok(Image { pieces })
+        notes.extend(first.map(|(address, place, with)| Note::Twice { address, place, with, count }));
+        Ok(Image { pieces: distinct, notes })
     }
 
     /// An image from pieces that are already in address order and do not overlap.
     pub(crate) fn in_order(self) -> Image {
-        Image { pieces: self.0 }
+        Image { pieces: self.pieces, notes: self.notes }
     }
 }
 
@@ -70,6 +94,8 @@ const VERSION_MAX: usize = 255;
 pub struct Image {
     /// In address order, without overlap.
     pieces: Vec<Piece>,
+    /// What is odd about the file.
+    notes: Vec<Note>,
 }
 
 impl Image {
@@ -107,14 +133,14 @@ impl Image {
     /// 2³² − n moves it down by n.
     #[must_use]
     pub fn moved(&self, offset: u32) -> Option<Self> {
-        let mut pieces = self.pieces.clone();
-        for piece in &mut pieces {
+        let mut moved = self.clone();
+        for piece in &mut moved.pieces {
             piece.address = piece.address.wrapping_add(offset);
             piece.address.checked_add((piece.data.len() - 1) as u32)?;
         }
         // If some pieces wrapped around and others did not, the order is lost.
-        let in_order = pieces.windows(2).all(|pair| pair[0].address < pair[1].address);
-        in_order.then_some(Self { pieces })
+        let in_order = moved.pieces.windows(2).all(|pair| pair[0].address < pair[1].address);
+        in_order.then_some(moved)
     }
 
     /// The software version after `$CANopenSoftwareVersion` in the program (CiA 814-1, section
@@ -163,17 +189,38 @@ impl Image {
         &self.pieces
     }
 
+    /// What is odd about the file: its reader warns of it.
+    #[must_use]
+    pub fn notes(&self) -> &[Note] {
+        &self.notes
+    }
+
+    /// The first data in an area that is not the main flash, if the image also has data in the
+    /// flash.
+    pub(crate) fn strays(&self) -> Option<(&Piece, Area)> {
+        self.pieces.iter().find(|piece| FLASH.has(piece.address))?;
+        self.pieces.iter().find_map(|piece| Some((piece, Area::of(piece.address)?)))
+    }
+
+    /// Checks that all data lie in the main flash, if some of them do.
+    ///
+    /// # Errors
+    /// [`Cause::Elsewhere`] with the place in the file.
+    pub fn check_areas(&self) -> Result<(), ReadError> {
+        match self.strays() {
+            None => Ok(()),
+            Some((piece, area)) => Err(piece.place.fault(Cause::Elsewhere { range: piece.range(), area })),
+        }
+    }
+
     /// Checks that no data lie outside `range`.
     ///
     /// # Errors
-    /// [`Cause::Outside`] with the place in the file.
+    /// [`Cause::Outside`] or [`Cause::Elsewhere`] with the place in the file.
     pub fn check_inside(&self, range: AddressRange) -> Result<(), ReadError> {
         match self.pieces.iter().find(|piece| !range.contains(&piece.range())) {
             None => Ok(()),
-            Some(piece) => {
-                let AddressRange { first, last } = piece.range();
-                Err(piece.place.fault(Cause::Outside { first, last, region: range }))
-            }
+            Some(piece) => Err(piece.place.fault(Cause::outside(piece.range(), range))),
         }
     }
 
@@ -192,7 +239,7 @@ impl Image {
                 })
             })
             .collect();
-        (!pieces.is_empty()).then_some(Self { pieces })
+        (!pieces.is_empty()).then(|| Self { pieces, notes: self.notes.clone() })
     }
 }
 
@@ -223,6 +270,40 @@ mod tests {
         all.add(0x0F, vec![0; 2], Place::Line(3));
         let error = all.into_image().unwrap_err().to_string();
         assert_eq!(error, "line 3: the data at 0x00000010 overlaps that of line 1");
+    }
+
+    /// A linker with two program headers for one place, a HEX file with a record twice: the bytes
+    /// are the same, so the program is.
+    #[test]
+    fn the_same_bytes_twice_are_taken_with_a_warning() {
+        let with = |pieces: &[(u32, &[u8])]| {
+            let mut all = Pieces::default();
+            for (line, (address, data)) in pieces.iter().enumerate() {
+                all.add(*address, data.to_vec(), Place::Line(line + 1));
+            }
+            all.into_image()
+        };
+        // The same record, a part of it, one that reaches further, and one that begins inside both.
+        let image = with(&[
+            (4, &[1, 2, 3, 4]),
+            (4, &[1, 2, 3, 4]),
+            (5, &[2]),
+            (6, &[3, 4, 5, 6]),
+            (7, &[4, 5]),
+            (12, &[9]),
+        ])
+        .unwrap();
+        assert!(image.segments().eq([(4, vec![1, 2, 3, 4, 5, 6]), (12, vec![9])]));
+        let words: Vec<String> = image.notes().iter().map(ToString::to_string).collect();
+        assert_eq!(
+            words,
+            ["line 2: the data at 0x00000004 are those of line 1 once more, the first of 4 repetitions"]
+        );
+        assert!(with(&[(4, &[1, 2]), (6, &[1, 2])]).unwrap().notes().is_empty());
+        for other in [&[9, 2, 3, 4][..], &[1, 2, 3, 9], &[1, 9], &[1, 2, 3, 4, 5, 9]] {
+            let pieces = [(4, &[1, 2, 3, 4][..]), (8, &[5, 6]), (4, other)];
+            assert!(with(&pieces).unwrap_err().to_string().contains("overlaps"), "{other:?}");
+        }
     }
 
     #[test]

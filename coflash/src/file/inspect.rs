@@ -5,11 +5,14 @@ use std::fmt;
 
 use shared_abi::block_file::{Control, Identity, ProgramVersion, NUMBER_CONTROL, NUMBER_LAST};
 use shared_abi::label::Label;
+use shared_abi::layout::Layout;
 
+use super::area::Area;
 use super::block_file::{Block, BlockFile, Checksum};
 use super::image::Image;
-use super::judge::{judge, Fault};
+use super::judge::{judge, Fault, StackAtEnd};
 use super::label::{label_of, Words};
+use super::note::Note;
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
 
@@ -28,6 +31,10 @@ pub struct Inspection {
     pub label: Option<Label>,
     /// Whether the image can be a program.
     pub judgement: Result<(), Fault>,
+    /// A stack at the end of a chip's SRAM, if the board is not known.
+    pub stack_at_end: Option<StackAtEnd>,
+    /// What is odd about the file.
+    pub notes: Vec<Note>,
     /// The parts that only a block file has.
     pub blocks: Option<Blocks>,
 }
@@ -64,20 +71,23 @@ pub struct BlockLine {
 
 impl Inspection {
     /// Describes the contents of a file of this format. `start` is the program's start, if it is
-    /// known from elsewhere; otherwise an image starts with its first byte.
+    /// known from elsewhere; otherwise an image starts with its first byte. `board` is the memory map
+    /// of the device, if it is known.
     #[must_use]
-    pub fn of(firmware: &Firmware, format: Format, start: Option<u32>) -> Self {
+    pub fn of(firmware: &Firmware, format: Format, start: Option<u32>, board: Option<&Layout>) -> Self {
         match firmware {
-            Firmware::Image(image) => Self::of_image(image, format, start.unwrap_or(image.span().first)),
+            Firmware::Image(image) => {
+                Self::of_image(image, format, start.unwrap_or(image.span().first), board)
+            }
             Firmware::Blocks(file) => {
                 let start = start.unwrap_or_else(|| file.program_start());
-                let inspection = Self::of_image(&file.image(), format, start);
+                let inspection = Self::of_image(&file.image(), format, start, board);
                 Self { blocks: Some(Blocks::of(file)), ..inspection }
             }
         }
     }
 
-    fn of_image(image: &Image, format: Format, start: u32) -> Self {
+    fn of_image(image: &Image, format: Format, start: u32, board: Option<&Layout>) -> Self {
         let segments = image.segments().map(|(first, data)| {
             // A segment is not empty and ends inside the address space.
             AddressRange { first, last: first + (data.len() as u32 - 1) }
@@ -88,7 +98,9 @@ impl Inspection {
             bytes: image.byte_count(),
             software_version: image.software_version(),
             label: label_of(image, start),
-            judgement: judge(image, start),
+            judgement: judge(image, start, board),
+            stack_at_end: StackAtEnd::of(image, start).filter(|_| board.is_none()),
+            notes: image.notes().to_vec(),
             blocks: None,
         }
     }
@@ -209,6 +221,12 @@ impl fmt::Display for Inspection {
             }
             Err(fault) => writeln!(f, "  judged       {fault}: coflash flash refuses it")?,
         }
+        if let (Ok(()), Some(stack)) = (&self.judgement, self.stack_at_end) {
+            writeln!(f, "  caution      {stack}")?;
+        }
+        for note in &self.notes {
+            writeln!(f, "  caution      {note}")?;
+        }
         let (bytes, pieces) = (self.bytes, self.segments.len());
         writeln!(
             f,
@@ -216,7 +234,8 @@ impl fmt::Display for Inspection {
             if pieces == 1 { "piece" } else { "pieces" }
         )?;
         for segment in &self.segments {
-            writeln!(f, "    {segment}  {:>7} bytes", segment.len())?;
+            let area = Area::of(segment.first).map(|area| format!(", in {area}")).unwrap_or_default();
+            writeln!(f, "    {segment}  {:>7} bytes{area}", segment.len())?;
         }
         for gap in self.gaps() {
             writeln!(f, "  gap          {gap}, {} bytes", gap.len())?;

@@ -1,9 +1,16 @@
-//! Checks whether an image can be a program of an STM32F4, without a device and without its memory
-//! map.
+//! Judges whether an image can be a program, without a device. The rules for the first two words are
+//! those of the device, [`Memory::judge`].
 //!
-//! The checks are not stricter than the device's, with two exceptions: an image at the start of the
+//! The checks are not stricter than the device's, with these exceptions: an image at the start of the
 //! flash is a bootloader and not a program, and a reset vector must point into the image.
 
+use std::fmt;
+
+use shared_abi::geometry::{Region, CHIPS};
+use shared_abi::layout::Layout;
+use shared_abi::vectors::{Memory, VectorFault};
+
+use super::area::Area;
 use super::image::Image;
 use super::range::AddressRange;
 
@@ -12,12 +19,8 @@ pub(crate) const FLASH: AddressRange = AddressRange { first: 0x0800_0000, last: 
 /// Its first sector, which has 16 KiB on every chip. No program can have it, because the CPU starts
 /// there after a reset.
 const FIRST_SECTOR: AddressRange = AddressRange { first: 0x0800_0000, last: 0x0800_3FFF };
-/// The possible ends of a stack: inside the RAM, or directly after its last byte. The RAM has at
-/// most 320 KiB (STM32F413, STM32F469), the core-coupled RAM 64 KiB.
-const STACKS: [AddressRange; 2] = [
-    AddressRange { first: 0x2000_0008, last: 0x2005_0000 },
-    AddressRange { first: 0x1000_0008, last: 0x1001_0000 },
-];
+/// The bytes of handoff and warm-start cell, which every board has at the end of its SRAM.
+const SHARED: u32 = 64;
 
 /// Why an image cannot be a program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -28,15 +31,42 @@ pub enum Fault {
     /// All its bytes have this value, 00h or FFh.
     #[error("is not a program: all its bytes are {0:02X}h")]
     Blank(u8),
+    /// It has data that no bootloader writes.
+    #[error("has data at {range}, in {area}, and not in the flash of a program")]
+    Elsewhere {
+        /// First and last address of the data.
+        range: AddressRange,
+        /// Their area.
+        area: Area,
+    },
     /// It does not contain the first two vectors.
     #[error("is not a program: it does not begin with an initial stack pointer and a reset vector")]
     NoVectors,
+    /// It begins with vectors, but not where the program begins.
+    #[error("is linked for {linked:08X}h, and the program begins at {start:08X}h")]
+    OtherPlace {
+        /// The address of its vectors.
+        linked: u32,
+        /// The address where the device looks for them.
+        start: u32,
+    },
     /// The first word cannot be an initial stack pointer.
     #[error(
         "is not a program: its first word, {0:08X}h, is not an initial stack pointer (a multiple \
          of 8 in the RAM)"
     )]
     StackPointer(u32),
+    /// The stack would run over what bootloader and program tell each other.
+    #[error(
+        "cannot be started: its stack begins at {stack:08X}h, over the handoff ({handoff:08X}h), which the \
+         bootloader writes for the program at the end of the RAM"
+    )]
+    StackOverHandoff {
+        /// The initial stack pointer.
+        stack: u32,
+        /// The address of the handoff.
+        handoff: u32,
+    },
     /// The second word does not point into the program.
     #[error("is not a program: its reset vector is {vector:08X}h, outside {range}")]
     ResetVector {
@@ -62,6 +92,20 @@ impl Fault {
             Self::Bootloader => {
                 "give the program, linked for an address after the bootloader; use a debug probe to write a bootloader"
             }
+            Self::Elsewhere { area, .. } => area.advice(),
+            Self::OtherPlace { .. } => {
+                "let FLASH begin at that address in the linker script (cargo xtask layout --ld program-1 prints \
+                 the board's), or check --board and --program; --force leaves that to the device"
+            }
+            Self::StackOverHandoff { .. } => {
+                "let RAM end before the handoff in the linker script: 64 bytes less than the chip has (LENGTH = \
+                 128K - 64), so that _estack or _stack_start is at most the handoff's address; --force leaves that \
+                 to the device"
+            }
+            Self::ResetVector { .. } => {
+                "check that it is the right file, and that it is linked for this address (--board, --program); \
+                 --force leaves that to the device"
+            }
             _ => {
                 "check that it is the right file, and that it begins with the vector table; \
                  --force leaves that to the device"
@@ -70,49 +114,129 @@ impl Fault {
     }
 }
 
-/// Checks an image with a program that starts at `start`; 0 for an image without addresses.
+/// Judges an image with a program that starts at `start`; 0 for an image without addresses. `board` is
+/// the memory map of the device, if it is known.
 ///
 /// # Errors
 /// The first fault.
-pub fn judge(image: &Image, start: u32) -> Result<(), Fault> {
-    let end = image.span().last;
+pub fn judge(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fault> {
+    let AddressRange { first, last } = image.span();
     if start == FLASH.first
         || image.part(AddressRange { first: FLASH.first, last: FLASH.first + 3 }).is_some()
     {
         return Err(Fault::Bootloader);
     }
+    if let Some((range, area)) = elsewhere(image, start) {
+        return Err(Fault::Elsewhere { range, area });
+    }
     if let Some(byte) = image.only_byte().filter(|byte| matches!(byte, 0 | 0xFF)) {
         return Err(Fault::Blank(byte));
     }
-    let [stack_pointer, vector] = vectors(image, start).ok_or(Fault::NoVectors)?;
-    if !stack_pointer.is_multiple_of(8) || !STACKS.iter().any(|stacks| stacks.has(stack_pointer)) {
-        return Err(Fault::StackPointer(stack_pointer));
-    }
-    let code = vector & !1;
-    if start == 0 && FIRST_SECTOR.has(code) {
+    let memory = memory_of(board);
+    let [stack, vector] = match vectors(image, start) {
+        Some(words) => words,
+        None if is_begin(image, first, &memory) => return Err(Fault::OtherPlace { linked: first, start }),
+        None => return Err(Fault::NoVectors),
+    };
+    if start == 0 && FIRST_SECTOR.has(vector & !1) {
+        judge_stack(stack, board)?;
         return Err(Fault::Bootloader);
     }
-    let range = if start == 0 { FLASH } else { AddressRange { first: start, last: end } };
-    judge_reset_vector(vector, range)
+    let range = if start == 0 { FLASH } else { AddressRange { first: start, last } };
+    judge_words([stack, vector], range, board)
 }
 
-/// Checks the reset vector of an image without addresses, when its place is known.
+/// Judges the reset vector of an image without addresses, when its place is known: it begins at the
+/// first address of `region`.
 ///
 /// # Errors
 /// [`Fault::ResetVector`], [`Fault::NotThumb`] or [`Fault::NoVectors`].
 pub fn judge_place(image: &Image, region: AddressRange) -> Result<(), Fault> {
-    let [_, vector] = vectors(image, 0).ok_or(Fault::NoVectors)?;
-    judge_reset_vector(vector, region)
+    let words = vectors(image, 0).ok_or(Fault::NoVectors)?;
+    let last = region.first.saturating_add(image.span().last).min(region.last);
+    judge_words(words, AddressRange { first: region.first, last }, None)
 }
 
-fn judge_reset_vector(vector: u32, range: AddressRange) -> Result<(), Fault> {
-    if !range.has(vector & !1) {
-        return Err(Fault::ResetVector { vector, range });
+/// A stack that begins at the end of a chip's SRAM, the default of CubeMX and of cortex-m-rt. On a board
+/// with such a chip the handoff is there; on one with more RAM the program starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct StackAtEnd {
+    /// The initial stack pointer.
+    pub stack: u32,
+    /// The end of that SRAM.
+    pub end: u32,
+}
+
+impl StackAtEnd {
+    /// The stack of a program that starts at `start`, if it begins there.
+    #[must_use]
+    pub fn of(image: &Image, start: u32) -> Option<Self> {
+        let [stack, _] = vectors(image, start)?;
+        let mut ends = CHIPS.iter().map(|chip| chip.sram.end());
+        let end = ends.find(|end| (end - SHARED + 1..=*end).contains(&stack))?;
+        Some(Self { stack, end })
     }
-    if vector & 1 == 0 {
-        return Err(Fault::NotThumb(vector));
+}
+
+impl fmt::Display for StackAtEnd {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { stack, end } = self;
+        write!(
+            f,
+            "its stack begins at {stack:08X}h, over the handoff ({:08X}h) of a board whose SRAM ends at {end:08X}h: \
+             such a board does not start it; --board says whether yours is one",
+            end - SHARED
+        )
     }
-    Ok(())
+}
+
+/// The memory of the board, or that of the family. A reset vector inside the chip's vector table is left
+/// to the device: an image says nothing of the length of its own table.
+fn memory_of(board: Option<&Layout>) -> Memory {
+    board.map_or(Memory::ANY, |layout| Memory { table: Memory::ANY.table, ..Memory::of(layout) })
+}
+
+/// Data outside the main flash, of an image with addresses.
+fn elsewhere(image: &Image, start: u32) -> Option<(AddressRange, Area)> {
+    if let Some((piece, area)) = image.strays() {
+        return Some((piece.range(), area));
+    }
+    let area = Area::of(start).filter(|_| start != 0)?;
+    Some((image.span(), area))
+}
+
+/// Whether a vector table begins at this address of the image.
+fn is_begin(image: &Image, address: u32, memory: &Memory) -> bool {
+    let range = AddressRange { first: address, last: image.span().last };
+    vectors(image, address).is_some_and(|[stack, vector]| {
+        !matches!(memory.judge_stack(stack), Err(VectorFault::StackPointer)) && range.has(vector & !1)
+    })
+}
+
+fn judge_stack(stack: u32, board: Option<&Layout>) -> Result<(), Fault> {
+    let memory = memory_of(board);
+    memory.judge_stack(stack).map_err(|fault| named(fault, [stack, 0], FLASH, board))
+}
+
+fn judge_words(words: [u32; 2], range: AddressRange, board: Option<&Layout>) -> Result<(), Fault> {
+    let memory = memory_of(board);
+    // The range lies in the flash, so its size has 32 bits.
+    let program = Region::new(range.first, range.last - range.first + 1);
+    memory.judge(words, program).map_err(|fault| named(fault, words, range, board))
+}
+
+/// The fault with its addresses.
+fn named(fault: VectorFault, words: [u32; 2], range: AddressRange, board: Option<&Layout>) -> Fault {
+    let [stack, vector] = words;
+    match (fault, board) {
+        (VectorFault::StackOverHandoff, Some(layout)) => {
+            Fault::StackOverHandoff { stack, handoff: layout.handoff.base }
+        }
+        (VectorFault::StackPointer | VectorFault::StackOverHandoff, _) => Fault::StackPointer(stack),
+        (VectorFault::ResetVector, _) => Fault::ResetVector { vector, range },
+        (VectorFault::NotThumb, _) => Fault::NotThumb(vector),
+        (VectorFault::Misaligned, _) => Fault::NoVectors,
+    }
 }
 
 /// Initial stack pointer and reset vector.
@@ -124,6 +248,9 @@ fn vectors(image: &Image, start: u32) -> Option<[u32; 2]> {
 
 #[cfg(test)]
 mod tests {
+    use shared_abi::layout::nucleo_f446re::LAYOUT as NUCLEO;
+    use shared_abi::layout::stm32f429i_disc1::LAYOUT as F429;
+
     use super::super::raw;
     use super::*;
 
@@ -133,7 +260,7 @@ mod tests {
         let mut bytes = vec![0x5A; 0x400];
         bytes[..4].copy_from_slice(&stack_pointer.to_le_bytes());
         bytes[4..8].copy_from_slice(&vector.to_le_bytes());
-        judge(&raw::read(&bytes, Some(at)).unwrap(), at)
+        judge(&raw::read(&bytes, Some(at)).unwrap(), at, None)
     }
 
     #[test]
@@ -159,7 +286,7 @@ mod tests {
             assert_eq!(with(stack_pointer, START + 0x189, START), fault);
         }
         let range = AddressRange { first: START, last: START + 0x3FF };
-        for vector in [0, START - 1, START + 0x401, 0x0800_0189, 0xFFFF_FFFF] {
+        for vector in [0, START - 1, START + 1, START + 0x401, 0x0800_0189, 0xFFFF_FFFF] {
             assert_eq!(with(0x2001_FFC0, vector, START), Err(Fault::ResetVector { vector, range }));
         }
         assert_eq!(with(0x2001_FFC0, START + 0x188, START), Err(Fault::NotThumb(START + 0x188)));
@@ -181,23 +308,95 @@ mod tests {
     fn blank_and_short_images_are_no_programs() {
         for (byte, len) in [(0, 8), (0xFF, 0x2000), (0, 1)] {
             let image = raw::read(&vec![byte; len], Some(START)).unwrap();
-            assert_eq!(judge(&image, START), Err(Fault::Blank(byte)));
+            assert_eq!(judge(&image, START, None), Err(Fault::Blank(byte)));
         }
         let image = raw::read(&[0, 0, 1, 0x20, 0x89, 1, 1], Some(START)).unwrap();
-        assert_eq!(judge(&image, START), Err(Fault::NoVectors));
+        assert_eq!(judge(&image, START, None), Err(Fault::NoVectors));
         // Vectors after the start do not count.
         let image = raw::read(&[0x5A; 64], Some(START + 4)).unwrap();
-        assert_eq!(judge(&image, START), Err(Fault::NoVectors));
+        assert_eq!(judge(&image, START, None), Err(Fault::NoVectors));
     }
 
     #[test]
     fn an_image_without_addresses_is_judged_by_the_place_that_it_goes_to() {
         let mut bytes = vec![0x5A; 0x400];
+        bytes[..4].copy_from_slice(&0x2001_0000_u32.to_le_bytes());
         bytes[4..8].copy_from_slice(&0x0801_0189_u32.to_le_bytes());
         let image = raw::read(&bytes, Some(0)).unwrap();
         let region = |first| AddressRange { first, last: first + 0xFFFF };
         assert_eq!(judge_place(&image, region(START)), Ok(()));
-        let other = Fault::ResetVector { vector: 0x0801_0189, range: region(0x0808_0000) };
-        assert_eq!(judge_place(&image, region(0x0808_0000)), Err(other));
+        // In the region, but not in the image when that lies at the region's start.
+        for first in [0x0808_0000, 0x0800_C000] {
+            let range = AddressRange { first, last: first + 0x3FF };
+            let other = Fault::ResetVector { vector: 0x0801_0189, range };
+            assert_eq!(judge_place(&image, region(first)), Err(other));
+            let words = other.to_string();
+            assert!(words.contains("08010189h") && words.contains(&format!("{first:#010x}..=")), "{words}");
+        }
+    }
+
+    /// A program with these first words, at a place of its own.
+    fn program(stack: u32, vector: u32, at: u32) -> Image {
+        let mut bytes = vec![0x5A; 0x400];
+        bytes[..4].copy_from_slice(&stack.to_le_bytes());
+        bytes[4..8].copy_from_slice(&vector.to_le_bytes());
+        raw::read(&bytes, Some(at)).unwrap()
+    }
+
+    /// The end of the SRAM is the default stack of CubeMX and cortex-m-rt: 2002_0000h on an F446 and
+    /// 2003_0000h on an F429 (RM0090 section 2.3.1). With the board it is refused with both addresses;
+    /// without it is a suspicion.
+    #[test]
+    fn a_stack_over_the_handoff_is_refused_with_the_board() {
+        for (board, end) in [(&NUCLEO, 0x2002_0000), (&F429, 0x2003_0000)] {
+            let at = board.programs[0].base;
+            let (vector, handoff) = (at + 0x1D1, end - 64);
+            for stack in [end, end - 8, end - 56] {
+                let image = program(stack, vector, at);
+                let fault = judge(&image, at, Some(board)).unwrap_err();
+                assert_eq!(fault, Fault::StackOverHandoff { stack, handoff });
+                let words = fault.to_string();
+                let both = format!("stack begins at {stack:08X}h, over the handoff ({handoff:08X}h)");
+                assert!(words.contains(&both), "{words}");
+                assert_eq!(judge(&image, at, None), Ok(()));
+                assert_eq!(StackAtEnd::of(&image, at), Some(StackAtEnd { stack, end }));
+            }
+            let image = program(handoff, vector, at);
+            assert_eq!((judge(&image, at, Some(board)), StackAtEnd::of(&image, at)), (Ok(()), None));
+            let beyond = program(end + 8, vector, at);
+            assert_eq!(judge(&beyond, at, Some(board)), Err(Fault::StackPointer(end + 8)));
+            // An image without addresses has a stack as well.
+            assert!(matches!(
+                judge(&program(end, vector, 0), 0, Some(board)),
+                Err(Fault::StackOverHandoff { .. })
+            ));
+        }
+    }
+
+    #[test]
+    fn a_program_for_another_place_in_the_region_is_told_with_both_addresses() {
+        for linked in [0x0801_2000, 0x0800_C000] {
+            let image = program(0x2001_0000, linked + 0x1C1, linked);
+            for board in [None, Some(&NUCLEO)] {
+                let fault = judge(&image, START, board).unwrap_err();
+                assert_eq!(fault, Fault::OtherPlace { linked, start: START });
+                let words = fault.to_string();
+                assert!(words.contains(&format!("{linked:08X}h")) && words.contains("08010000h"), "{words}");
+            }
+        }
+        // Data without vectors are linked for nothing.
+        let image = program(0x5A5A_5A5A, 0x0801_2189, 0x0801_2000);
+        assert_eq!(judge(&image, START, None), Err(Fault::NoVectors));
+    }
+
+    #[test]
+    fn data_outside_the_flash_are_named_by_their_area() {
+        let at = |address| program(0x2001_0000, address + 0x189, address);
+        for (address, area) in
+            [(0x2000_0000, Area::Ram), (0x1000_0000, Area::Ccm), (0x9000_0000, Area::External)]
+        {
+            let range = AddressRange { first: address, last: address + 0x3FF };
+            assert_eq!(judge(&at(address), address, None), Err(Fault::Elsewhere { range, area }));
+        }
     }
 }

@@ -1,5 +1,6 @@
 //! Reads, checks, converts and writes firmware files, without a device or a bus.
 
+pub mod area;
 pub mod block_file;
 pub use coboot_linker::board;
 pub mod convert;
@@ -11,6 +12,7 @@ pub mod inspect;
 pub mod judge;
 pub mod label;
 pub mod limit;
+mod note;
 mod range;
 pub mod raw;
 pub mod read;
@@ -22,5 +24,6 @@ pub use self::block_file::BlockFile;
 pub use self::convert::{blocks_of, convert};
 pub use self::fault::{Cause, FileError, Place, ReadError};
 pub use self::image::Image;
+pub use self::note::Note;
 pub use self::range::AddressRange;
 pub use self::read::{load, read, Firmware, Format};

@@ -8,6 +8,7 @@ use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
 use super::sealed::{blocks, Sealed};
+use super::text::marked_encoding;
 use super::{elf, ihex, limit, raw, srec};
 
 /// The formats of a firmware file.
@@ -43,6 +44,16 @@ impl Format {
             }
             _ => None,
         }
+    }
+}
+
+impl Format {
+    /// The format of a file with this name: that of its first bytes, and without distinctive bytes
+    /// that of a raw binary if the name ends with `.bin`.
+    #[must_use]
+    pub fn of(name: &Path, bytes: &[u8]) -> Option<Self> {
+        let is_bin = name.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("bin"));
+        Self::detect(bytes).or_else(|| (is_bin && !bytes.is_empty()).then_some(Self::Raw))
     }
 }
 
@@ -98,7 +109,7 @@ pub fn load_telling(
 ) -> Result<(Firmware, Format), FileError> {
     limit::read(path)
         .map_err(|cause| Place::File.fault(cause))
-        .and_then(|bytes| read_telling(&bytes, format, raw_address))
+        .and_then(|bytes| read_telling(&bytes, format.or_else(|| Format::of(path, &bytes)), raw_address))
         .map_err(|error| error.of(path.display()))
 }
 
@@ -110,7 +121,13 @@ fn read_telling(
     if bytes.is_empty() {
         return Err(Place::File.fault(Cause::Empty));
     }
-    let format = format.or_else(|| Format::detect(bytes)).ok_or(Place::File.fault(Cause::NotFirmware))?;
+    let format = format.or_else(|| Format::detect(bytes));
+    if matches!(format, None | Some(Format::IntelHex | Format::SRecord)) {
+        if let Some(encoding) = marked_encoding(bytes) {
+            return Err(Place::File.fault(Cause::ByteOrderMark(encoding)));
+        }
+    }
+    let format = format.ok_or(Place::File.fault(Cause::NotFirmware))?;
     let firmware = match format {
         Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
         Format::SRecord => srec::read(bytes).map(Firmware::Image),
@@ -121,4 +138,70 @@ fn read_telling(
         Format::BlockFile | Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
     };
     Ok((firmware?, format))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The record of a HEX file for address 0, with its end.
+    const HEX: &str = ":0100000001FE\n:00000001FF\n";
+
+    fn fault(bytes: &[u8], format: Option<Format>) -> String {
+        read(bytes, format, Some(0)).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn what_is_detected_can_be_read() {
+        let segments = |text: &str, format| match read(text.as_bytes(), format, None) {
+            Ok(Firmware::Image(image)) => image.segments().collect::<Vec<_>>(),
+            other => panic!("{other:?}"),
+        };
+        for blanks in ["", " ", "\t", "\n \n\t ", "\r\n"] {
+            let indented = format!("{blanks}{}", HEX.replace('\n', &format!("\n{blanks}")));
+            for format in [None, Some(Format::IntelHex)] {
+                assert_eq!(segments(&indented, format), [(0, vec![1])], "{indented:?}");
+            }
+            let records = format!("{blanks}S1040000AA51\n{blanks}S9030000FC");
+            assert!(read(records.as_bytes(), None, None).is_ok(), "{records:?}");
+        }
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_named() {
+        let wide = |mark: [u8; 2], bytes: fn(u16) -> [u8; 2]| {
+            let text = HEX.encode_utf16().flat_map(bytes);
+            mark.into_iter().chain(text).collect::<Vec<u8>>()
+        };
+        let texts = [
+            ("UTF-8", [b"\xEF\xBB\xBF", HEX.as_bytes()].concat()),
+            ("UTF-8", [b"\xEF\xBB\xBF\r\n", HEX.as_bytes()].concat()),
+            ("UTF-8", b"\xEF\xBB\xBFS1040000AA51\nS9030000FC".to_vec()),
+            ("UTF-16", wide([0xFF, 0xFE], u16::to_le_bytes)),
+            ("UTF-16", wide([0xFE, 0xFF], u16::to_be_bytes)),
+        ];
+        for (encoding, text) in texts {
+            for format in [None, Some(Format::IntelHex), Some(Format::SRecord)] {
+                let words = format!("the file: begins with a byte order mark of {encoding}");
+                assert!(fault(&text, format).starts_with(&words), "{}", fault(&text, format));
+            }
+        }
+        // Another text with a mark is no firmware, and the bytes of a raw binary are its own.
+        assert!(fault(b"\xEF\xBB\xBF<html>", None).contains("is not a firmware file"));
+        assert!(read(b"\xEF\xBB\xBF:", Some(Format::Raw), Some(0x0801_0000)).is_ok());
+    }
+
+    #[test]
+    fn the_name_shows_a_raw_binary_if_its_bytes_show_nothing() {
+        for (name, bytes, format) in [
+            ("app.bin", &[0, 0, 2, 0x20][..], Some(Format::Raw)),
+            ("APP.BIN", &[0xFF; 4], Some(Format::Raw)),
+            ("app.bin", HEX.as_bytes(), Some(Format::IntelHex)),
+            ("app.bin", b"", None),
+            ("app.dat", &[0, 0, 2, 0x20], None),
+            ("bin", &[0, 0, 2, 0x20], None),
+        ] {
+            assert_eq!(Format::of(Path::new(name), bytes), format, "{name}");
+        }
+    }
 }

@@ -12,6 +12,9 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     let mut pieces = Pieces::default();
     let mut counted = 0usize;
     let mut ended = false;
+    // Whether a count record after the data says that none is missing. Some writers (bincopy) end a
+    // file with it.
+    let mut complete = false;
     for (place, line) in lines(bytes) {
         if ended {
             return Err(place.fault(Cause::AfterEnd));
@@ -32,6 +35,7 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
                     return Err(place.fault(Cause::AddressOverflow { address, what }));
                 }
                 counted += 1;
+                complete = false;
                 pieces.add(address, data, place);
             }
             b'5' | b'6' => {
@@ -39,13 +43,16 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
                 if counted & mask != address as usize {
                     return Err(place.fault(Cause::Count { says: address, counted }));
                 }
+                complete = true;
             }
             // b'7'..=b'9': the start address; a device starts through its vector table.
             _ => ended = true,
         }
     }
-    if !ended {
-        return Err(Place::File.fault(Cause::NoEnd("its end record (S7, S8 or S9)")));
+    if !ended && !complete {
+        return Err(Place::File.fault(Cause::NoEnd(
+            "its end record (S7, S8 or S9) and without a count of its records (S5 or S6)",
+        )));
     }
     pieces.into_image()
 }
@@ -129,6 +136,31 @@ mod tests {
         assert!(image(text).segments().eq([(0x01_0000, vec![0xAA]), (0x0801_0000, vec![0xBB])]));
     }
 
+    /// The count record (S5, S6) proves that the data are complete, if nothing follows it.
+    #[test]
+    fn a_count_record_ends_a_file_as_well() {
+        let good = "S1040000AA51\nS1040001AA50\n";
+        for count in ["S5030002FA", "S604000002F9"] {
+            assert!(image(&format!("{good}{count}")).segments().eq([(0, vec![0xAA, 0xAA])]));
+            let more = fault(&format!("{good}{count}\nS1040002AA4F\n"));
+            assert!(more.starts_with("the file: the file ends without its end record"), "{more}");
+        }
+        assert!(fault(&format!("{good}S5030001FB\n")).contains("its count record has 1"));
+    }
+
+    #[test]
+    fn blanks_and_what_fills_a_file_are_no_text() {
+        let good = "S1040000AA51\nS9030000FC";
+        for text in [format!(" \n\t{good} \n"), format!("{good}\u{1a}"), format!("{good}\n\0\0\u{1a}\n")] {
+            assert!(image(&text).segments().eq(image(good).segments()), "{text:?}");
+        }
+        let filled = [good.as_bytes(), &[0xFF; 7]].concat();
+        assert_eq!(read(&filled).unwrap(), image(good));
+        for text in [format!("{good}\n\u{1a}\n{good}"), format!("{good}\n\0x")] {
+            assert!(fault(&text).contains("more text after the end record"), "{text:?}");
+        }
+    }
+
     #[test]
     fn a_fault_is_named_with_its_line() {
         let good = "S1040000AA51\n";
@@ -155,7 +187,7 @@ mod tests {
             (format!("{good}S00600004844521B\n"), "line 2: a header (S0) after data records"),
             (good.to_string(), "the file: the file ends without its end record"),
             (end.to_string(), "the file: holds no data"),
-            (format!("{good}{good}{end}"), "line 2: the data at 0x00000000 overlaps that of line 1"),
+            (format!("{good}S1040000AB50\n{end}"), "line 2: the data at 0x00000000 overlaps that of line 1"),
             (
                 format!("S307FFFFFFFF0102F9\n{end}"),
                 "line 1: the data from 0xffffffff on exceeds the end of the address space",

@@ -2,10 +2,13 @@
 
 use super::fault::{Cause, Place, ReadError};
 
-/// The lines with their numbers, without line end (LF, CR LF or CR) and trailing blanks. Empty
-/// lines are left out.
+/// The lines with their numbers, without line end (LF, CR LF or CR) and blanks around them. Empty
+/// lines are left out, and so is what fills a file after its last line: the end mark of CP/M and
+/// DOS (1Ah), zeros, and erased flash.
 pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (Place, &[u8])> {
-    let mut rest = Some(bytes);
+    let is_text = |byte: &u8| !matches!(byte, 0x1A | 0x00 | 0xFF) && !byte.is_ascii_whitespace();
+    let end = bytes.iter().rposition(is_text).map_or(0, |last| last + 1);
+    let mut rest = Some(&bytes[..end]);
     let mut number = 0;
     std::iter::from_fn(move || {
         let text = rest?;
@@ -19,7 +22,7 @@ pub(super) fn lines(bytes: &[u8]) -> impl Iterator<Item = (Place, &[u8])> {
         rest = Some(after.strip_prefix(b"\r\n").unwrap_or(&after[1..]));
         Some((Place::Line(number), line))
     })
-    .map(|(place, line)| (place, line.trim_ascii_end()))
+    .map(|(place, line)| (place, line.trim_ascii()))
     .filter(|(_, line)| !line.is_empty())
 }
 
@@ -38,6 +41,17 @@ pub(super) fn bytes_of(digits: &[u8], skipped: usize, place: Place) -> Result<Ve
             .fault(Cause::Malformed("the last byte has only one digit; the line is truncated or damaged")));
     }
     Ok(nibbles.chunks_exact(2).map(|pair| pair[0] << 4 | pair[1]).collect())
+}
+
+/// The encoding of a text that begins with a byte order mark, if its first letter is that of an
+/// Intel HEX file or of an S-record.
+pub(super) fn marked_encoding(bytes: &[u8]) -> Option<&'static str> {
+    const MARKS: [(&[u8], &str); 3] =
+        [(b"\xEF\xBB\xBF", "UTF-8"), (b"\xFF\xFE", "UTF-16"), (b"\xFE\xFF", "UTF-16")];
+    let (text, encoding) =
+        MARKS.iter().find_map(|(mark, encoding)| Some((bytes.strip_prefix(*mark)?, *encoding)))?;
+    let letter = text.iter().find(|byte| **byte != 0 && !byte.is_ascii_whitespace());
+    matches!(letter, Some(b':' | b'S')).then_some(encoding)
 }
 
 /// Checks that a record of `found` bytes has the announced length.

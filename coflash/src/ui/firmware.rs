@@ -1,13 +1,15 @@
 //! The firmware file that the user dropped on the page.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use shared_abi::block_file::ProgramVersion;
-use shared_abi::layout;
+use shared_abi::layout::{self, Layout};
 
 use super::state::{Firmware, Notice, Seal, Settings};
 use crate::file::convert::{blocks_of, ConvertError, Options, Region};
 use crate::file::inspect::Inspection;
+use crate::file::judge::{judge, Fault};
 use crate::file::sealed::show::flags;
 use crate::file::sealed::SealedFile;
 use crate::file::{self, label, AddressRange, BlockFile, Format};
@@ -41,30 +43,29 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         return Err(Notice::failed(words, "choose the firmware file itself"));
     }
     let region = region(settings)?;
-    if Format::detect(&bytes) == Some(Format::Sealed) {
+    let format = Format::of(Path::new(&name), &bytes);
+    if format == Some(Format::Sealed) {
         return sealed(bytes, name, settings);
     }
-    // A raw file has no distinctive bytes: its name shows the format, and the board gives its
-    // address.
-    let raw = name.to_lowercase().ends_with(".bin");
-    let (format, place) = match (Format::detect(&bytes), region) {
-        (Some(format), _) => (Some(format), None),
-        (None, Some(region)) if raw => (Some(Format::Raw), Some(region.first)),
-        (None, _) if raw && !bytes.is_empty() => {
-            let words = format!("{name}: a raw binary does not contain its address");
-            return Err(Notice::failed(words, "choose the board"));
-        }
-        (None, _) => (None, None),
-    };
-    let firmware = file::read(&bytes, format, place).map_err(|error| bad(&error.of(&name)))?;
     let start = region.map(|region| region.first);
-    let inspection = format.map(|format| Inspection::of(&firmware, format, start));
+    if format == Some(Format::Raw) && start.is_none() {
+        let words = format!("{name}: a raw binary does not contain its address");
+        return Err(Notice::failed(words, "choose the board"));
+    }
+    let firmware = file::read(&bytes, format, start).map_err(|error| bad(&error.of(&name)))?;
+    let board = board(settings);
+    let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
     let converted = blocks_of(firmware, &options).map_err(|error| match error {
         ConvertError::File(error) => bad(&error.of(&name)),
         error => bad(&format!("{name}: {error}")),
     })?;
     let blocks = converted.file;
+    // The update itself judges the rest, but does not know the board.
+    if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(&blocks.image(), blocks.program_start(), board)
+    {
+        return Err(Notice::failed(format!("{name}: {fault}"), fault.advice()));
+    }
     let label = label_of(&blocks);
     let shown = Firmware {
         size: bytes.len(),
@@ -125,9 +126,14 @@ fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     }
 }
 
+/// The selected board.
+fn board(settings: &Settings) -> Option<&'static Layout> {
+    settings.board.and_then(layout::by_name)
+}
+
 /// The region of the program on the selected board, if there is one.
 fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
-    let Some(layout) = settings.board.and_then(layout::by_name) else { return Ok(None) };
+    let Some(layout) = board(settings) else { return Ok(None) };
     match layout.program(settings.program) {
         Some(region) => Ok(Some(region.into())),
         None => {

@@ -1,18 +1,20 @@
 //! Checks before the tool changes a device: whether the image can be a program, whether it is for
 //! this device, and whether it is linked for the device's region.
 
-use canopen::program::IDENTITY;
+use canopen::program::{DEVICE_NAME, IDENTITY};
 use canopen::Address;
+use shared_abi::layout;
 
 use super::content::Content;
 use super::dialect::is_data;
 use super::options::{FlashOptions, Target};
+use super::steps::compare_target;
 use crate::device::access::told_challenge;
 use crate::device::error::{optional, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
 use crate::file::image::Image;
-use crate::file::judge::{judge, judge_place, Fault};
+use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{AddressRange, BlockFile};
 
@@ -36,16 +38,18 @@ pub(super) fn admit(
         Content::Sealed(file) => return admit_sealed(session, file, options.program),
     };
     let image = file.image();
+    let mut is_judged = true;
     if !is_data(dialect, options.program) {
-        judge(&image, file.program_start()).map_err(no_program)?;
+        judge(&image, file.program_start(), None).map_err(no_program)?;
+        is_judged = admit_stack(session, file, &image)?;
         for target in [Target::of_control(file), Target::of_label(&image, file.program_start())] {
             check_identity(session, target)?;
         }
     }
-    admit_place(session, file, &image, dialect, options.program)
+    Ok(admit_place(session, file, &image, dialect, options.program)? && is_judged)
 }
 
-/// Checks only the region; returns whether the device has reported its region.
+/// Checks stack and region; returns whether the device has reported its region.
 ///
 /// # Errors
 /// As [`admit`].
@@ -57,7 +61,13 @@ pub(super) fn admit_to_bootloader(
 ) -> Result<bool, Error> {
     match file {
         _ if options.force => Ok(true),
-        Content::Blocks(file) => admit_place(session, file, &file.image(), dialect, options.program),
+        Content::Blocks(file) => {
+            let image = file.image();
+            if !is_data(dialect, options.program) {
+                admit_stack(session, file, &image)?;
+            }
+            admit_place(session, file, &image, dialect, options.program)
+        }
         Content::Sealed(file) => admit_capable(session, file, options.program),
     }
 }
@@ -107,6 +117,20 @@ fn refused(refusal: &Refusal) -> Error {
     Error::NoProgram { why: format!("does not fit: {refusal}"), advice: refusal.advice() }
 }
 
+/// Checks a stack that begins at the end of a chip's SRAM: whether the handoff is there depends on the
+/// board, which the device's name (1008h) gives. Returns whether the device has told its name, or need
+/// not.
+fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Result<bool, Error> {
+    let start = file.program_start();
+    if StackAtEnd::of(image, start).is_none() {
+        return Ok(true);
+    }
+    let Some(name) = optional(session.read_text(Address::new(DEVICE_NAME, 0)))? else { return Ok(false) };
+    let board = name.strip_prefix("coboot ").and_then(|name| layout::by_name(&name.to_lowercase()));
+    judge(image, start, board).map_err(no_program)?;
+    Ok(true)
+}
+
 fn admit_place(
     session: &mut Session<'_>,
     file: &BlockFile,
@@ -120,7 +144,12 @@ fn admit_place(
     let fits = match dialect {
         // The CRC of the program counts from the region's start.
         Dialect::Block => file.check_region(region).is_ok(),
-        Dialect::Hex | Dialect::EsAcademy => region.contains(&file.span()),
+        Dialect::Hex | Dialect::EsAcademy if region.contains(&file.span()) => {
+            // The data go to their own addresses: the vectors must be there.
+            judge(image, region.first, None).map_err(no_program)?;
+            true
+        }
+        Dialect::Hex | Dialect::EsAcademy => false,
         Dialect::Raw | Dialect::Lift if start == 0 => {
             if !is_data(dialect, program) {
                 judge_place(image, region).map_err(no_program)?;
@@ -142,17 +171,13 @@ fn admit_place(
     })
 }
 
-/// Compares the identity in the file with 1018h. 0 in the file stands for any device, as it does
-/// for a bootloader; a value that the device does not report cannot differ.
+/// Compares the identity in the file with 1018h, by the rule of the bootloader. A value that the device
+/// does not report cannot differ.
 fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
-    let Some(Target { vendor_id, product_code }) = target else { return Ok(()) };
-    for (sub, file, what) in [(1, vendor_id, Mismatch::VendorId), (2, product_code, Mismatch::ProductCode)] {
-        if file == 0 {
-            continue;
-        }
-        compare_identity(session, sub, file, what)?;
+    match target {
+        Some(target) => compare_target(session, target, |session, at| optional(session.read_number(at))),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {

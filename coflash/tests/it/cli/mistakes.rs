@@ -321,10 +321,10 @@ const MISTAKES: &[Mistake] = &[
         &["node 5", "coflash catch", "strap"],
     ),
     Mistake(
-        "flash -N 5 {blk} --check-target {quick} --bus {bus}",
+        "flash -N 5 {hex} --vid 0x40 --pid 1234 --check-target {quick} --bus {bus}",
         Device(|| Fake::new(APPLICATION)),
         6,
-        &["the program is for vendor-ID 00000000h", "it was not changed", "belong together"],
+        &["the program is for vendor-ID 00000040h", "it was not changed", "belong together"],
     ),
     // The file.
     Mistake(
@@ -341,6 +341,33 @@ const MISTAKES: &[Mistake] = &[
         3,
         &["not a firmware file", "name the linker's output"],
     ),
+    Mistake(
+        "flash {top} --board nucleo-f446re --bus {bus}",
+        Device(absent),
+        3,
+        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"],
+    ),
+    Mistake(
+        "convert {top} {out} --board nucleo-f446re",
+        Nothing,
+        3,
+        &["its stack begins at 20020000h, over the handoff (2001FFC0h)", "LENGTH = 128K - 64"],
+    ),
+    Mistake("flash {top} --bus {bus}", Device(absent), 3, &["does not contain its address", "--board"]),
+    Mistake("flash {options} --bus {bus}", Device(absent), 3, &["line 4", "option bytes", "debug probe"]),
+    Mistake(
+        "convert {options} {out} --board nucleo-f446re",
+        Nothing,
+        3,
+        &["line 4", "option bytes", "debug probe"],
+    ),
+    Mistake(
+        "convert {eeprom} {out} --board nucleo-f446re",
+        Nothing,
+        3,
+        &["line 4", "EEPROM", "leave this section out"],
+    ),
+    Mistake("convert {marked} {out}", Nothing, 3, &["byte order mark of UTF-8", "ASCII"]),
     Mistake("convert {cut} {out}", Nothing, 3, &["line 25", "cut off", "copy the file again"]),
     // The command.
     Mistake("flsh {blk}", Nothing, 2, &["unrecognized subcommand", "flash"]),
@@ -367,6 +394,17 @@ impl Room {
         folder.file("port", b"");
         let hex = fs::read_to_string(data("program.hex")).unwrap();
         folder.file("cut.hex", &hex.as_bytes()[..hex.len() / 2 - 7]);
+        // A program at 08010000h, whose stack begins at the end of an SRAM of 128 KiB.
+        let mut top = vec![0x5A; 1024];
+        top[..8].copy_from_slice(&[0x00, 0x00, 0x02, 0x20, 0x01, 0x02, 0x01, 0x08]);
+        folder.file("top.bin", &top);
+        // Its first words, and a record elsewhere. Checksums by hand: the two's complement of the sum.
+        let and =
+            |record: &str| format!(":020000040801F1\n:0800000000FF012001020108CC\n{record}\n:00000001FF\n");
+        let options = and(":020000041FFFDC\n:02C00000FFAA95");
+        folder.file("options.hex", options.as_bytes());
+        folder.file("eeprom.hex", and(":020000040808EA\n:020000001234B8").as_bytes());
+        folder.file("marked.hex", &[b"\xEF\xBB\xBF", options.as_bytes()].concat());
         Self { folder, shim }
     }
 
@@ -384,6 +422,11 @@ impl Room {
             ("{empty}", at("empty.hex")),
             ("{html}", at("page.html")),
             ("{cut}", at("cut.hex")),
+            ("{hex}", data("program.hex")),
+            ("{top}", at("top.bin")),
+            ("{options}", at("options.hex")),
+            ("{eeprom}", at("eeprom.hex")),
+            ("{marked}", at("marked.hex")),
             ("{out}", at("out.blk")),
             ("{port}", at("port")),
             ("{file}", at("port")),

@@ -322,9 +322,9 @@ fn a_bad_file_is_named_and_no_device_is_touched() {
     let elf = fs::read(data("program.elf")).unwrap();
     let damaged = hex.replacen(":08", ":09", 1);
     let line = 1 + hex.lines().position(|line| line.starts_with(":08")).unwrap();
-    // One byte more at 08010000h, where line 2 has put one.
-    let twice = hex.replacen(":04000005", ":020000040801F1\n:0100000000FF\n:04000005", 1);
-    let twice_line = 1 + twice.lines().position(|line| line == ":0100000000FF").unwrap();
+    // Another byte at 08010000h, where line 2 has put 00h.
+    let twice = hex.replacen(":04000005", ":020000040801F1\n:0100000001FE\n:04000005", 1);
+    let twice_line = 1 + twice.lines().position(|line| line == ":0100000001FE").unwrap();
     let twice_words = format!("twice.hex, line {twice_line}: the data at 0x08010000 overlaps that of line 2");
     let far = hex.replacen(":020000040801F1", ":020000040800F2", 1);
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -472,14 +472,16 @@ fn a_script_for_the_manuals_download_tools_works() {
 
 #[test]
 fn the_target_is_checked_before_anything_is_erased() {
-    let file = data("identity-110.blk");
+    let file = data("program.hex");
+    // --force leaves the device to judge, but not what the user asks to be checked.
+    let other = ["--force", "--vid", "0x40", "--pid", "1234"];
     for option in [&["--check-target"][..], &["--chk_tgt", "1"]] {
         let (bus, server) = serve(Fake::new(APPLICATION));
-        let done = coflash(&[&["--bus", &bus, "flash", "--node", "5", &file][..], option].concat());
+        let done = coflash(&[&["--bus", &bus, "flash", "--node", "5", &file][..], &other, option].concat());
         assert_eq!(done.exit, 6, "{}", done.err);
         assert_eq!(
             done.err,
-            "error: the program is for vendor-ID 00000000h, and node 5 has 0000003Fh [0x60000180]\n  \
+            "error: the program is for vendor-ID 00000040h, and node 5 has 0000003Fh [0x60000180]\n  \
              the device: it was not changed\n  what to do: check that file and device belong together \
              (coflash info shows the device's identity)\n"
         );

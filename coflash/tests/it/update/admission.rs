@@ -126,6 +126,75 @@ fn a_label_that_fits_goes_in_and_is_in_block_0() {
     run(&mut fake, &file(&labelled(VENDOR, 9), START, Told::default()), FlashOptions::default()).0.unwrap();
 }
 
+/// A device with these objects in place of the fake's own, while this device type runs or always.
+struct Other(&'static [((u16, u8), &'static [u8])], Option<u32>);
+
+impl Maker for Other {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        if self.1.is_some_and(|only| only != running) {
+            return None;
+        }
+        self.0.iter().find(|(other, _)| *other == at).map(|(_, value)| Ok(value.to_vec()))
+    }
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+fn other(objects: &'static [((u16, u8), &'static [u8])], only: Option<u32>) -> Fake {
+    let mut fake = Fake::new(APPLICATION);
+    fake.maker = Some(Box::new(Other(objects, only)));
+    fake
+}
+
+/// 0 names no vendor and no product, on the device's side as on the file's (`coboot-node` has 0 and 0
+/// by default, and its first example sends a program with a label).
+#[test]
+fn a_device_without_identity_takes_any_program() {
+    const NOBODY: &[((u16, u8), &[u8])] = &[((0x1018, 1), &[0; 4]), ((0x1018, 2), &[0; 4])];
+    let file = file(&labelled(VENDOR, PRODUCT), START, Told::default());
+    let target = coflash::update::Target::of(&file);
+    for options in [FlashOptions::default(), FlashOptions::default().check_target(target)] {
+        run(&mut other(NOBODY, None), &file, options).0.unwrap();
+    }
+    // Each of the two numbers counts by itself.
+    const NO_PRODUCT: &[((u16, u8), &[u8])] = &[((0x1018, 2), &[0; 4])];
+    let foreign = self::file(&labelled(0x40, PRODUCT), START, Told::default());
+    let target = coflash::update::Target::of(&foreign);
+    for options in [FlashOptions::default(), FlashOptions::default().force(true).check_target(target)] {
+        let error = run(&mut other(NO_PRODUCT, None), &foreign, options).0.unwrap_err();
+        assert!(matches!(error, Error::WrongTarget { file: 0x40, .. }), "{error}");
+    }
+}
+
+/// The default stack of CubeMX and cortex-m-rt: the end of the SRAM. Where the user names no board, the
+/// name of the device (1008h) does.
+#[test]
+fn a_stack_over_the_handoff_is_refused_before_anything_is_erased() {
+    const F446: &[((u16, u8), &[u8])] = &[((0x1008, 0), b"coboot NUCLEO-F446RE")];
+    const F429: &[((u16, u8), &[u8])] = &[((0x1008, 0), b"coboot STM32F429I-DISC1")];
+    const FOREIGN: &[((u16, u8), &[u8])] = &[((0x1008, 0), b"pump 2")];
+    let mut bytes = labelled(VENDOR, PRODUCT);
+    bytes[..4].copy_from_slice(&0x2002_0000_u32.to_le_bytes());
+    let file = file(&bytes, START, Told::default());
+    let error = refused(&mut other(F446, None), &file, FlashOptions::default());
+    let words = "its stack begins at 20020000h, over the handoff (2001FFC0h)";
+    assert!(error.to_string().contains(words), "{error}");
+    assert!(error.advice().contains("LENGTH = 128K - 64"), "{}", error.advice());
+    // Only the bootloader tells its name: the program was stopped, and is still there.
+    let mut fake = other(F446, Some(BOOTLOADER));
+    let error = run(&mut fake, &file, FlashOptions::default()).0.unwrap_err();
+    assert!(error.to_string().contains(words), "{error}");
+    assert_eq!(fake.writes(), ["command 80"]);
+    // 192 KiB of SRAM, or nobody knows: the device judges.
+    for objects in [F429, FOREIGN] {
+        run(&mut other(objects, None), &file, FlashOptions::default()).0.unwrap();
+    }
+}
+
 #[test]
 fn what_is_forced_is_left_to_the_device() {
     let file = file(&labelled(VENDOR, PRODUCT + 1), START, Told::default());
@@ -212,6 +281,12 @@ fn what_is_for_another_place_than_the_devices_is_refused() {
         let error = refused(&mut at(START - 0x1000, 0x1_0000, APPLICATION, &BOTH), &file, speaks(dialect));
         assert_eq!(error.number(), 0x6000_0015, "{dialect:?}");
     }
+    // Intel HEX says where its data go, and the device would look for vectors where none are.
+    for dialect in [Dialect::Hex, Dialect::EsAcademy] {
+        let error = refused(&mut at(START - 0x1000, 0x1_0000, APPLICATION, &BOTH), &file, speaks(dialect));
+        let words = "the image is linked for 08010000h, and the program begins at 0800F000h";
+        assert_eq!((error.number(), error.to_string().as_str()), (0x6000_0021, words), "{dialect:?}");
+    }
     run(&mut at(START, 1024, APPLICATION, &BOTH), &file, FlashOptions::default()).0.unwrap();
     run(&mut at(START + 0x1_0000, 1024, APPLICATION, &BOTH), &file, FlashOptions::default().force(true))
         .0
@@ -244,7 +319,7 @@ fn an_image_without_addresses_is_judged_by_the_devices_place() {
     for dialect in [Dialect::Raw, Dialect::Lift] {
         let error = refused(&mut at(START + 0x1_0000, 0x1_0000, APPLICATION, &BOTH), &file, speaks(dialect));
         let words =
-            "the image is not a program: its reset vector is 08010201h, outside 0x08020000..=0x0802ffff";
+            "the image is not a program: its reset vector is 08010201h, outside 0x08020000..=0x080203ff";
         assert_eq!(error.to_string(), words);
     }
     let mut fake = at(START, 1024, BOOTLOADER, &BOTH);
