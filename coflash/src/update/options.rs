@@ -96,12 +96,10 @@ pub struct Target {
 }
 
 impl Target {
-    /// The device that a file names in its block 0 or in the program's label, if it does: 0 and 0 name
-    /// none.
+    /// The device that a file names in its block 0 or in the program's label, if it does.
     #[must_use]
     pub fn of(file: &BlockFile) -> Option<Self> {
-        let target = Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()));
-        target.filter(|target| *target != Self { vendor_id: 0, product_code: 0 })
+        Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()))
     }
 
     /// The device that a sealed image names.
