@@ -43,6 +43,9 @@ pub struct Health {
     pub unacknowledged: u32,
     /// Bit, stuff, form and CRC errors.
     pub disturbed: u32,
+    /// Errors of an unknown kind: socketcand sends the class of an error frame alone, and an SLCAN
+    /// adapter refuses a frame without a reason.
+    pub unclear: u32,
     /// The transmit and receive error counters, if the adapter reports them.
     pub counters: Option<(u8, u8)>,
     /// The bit rate in bit/s, where it is known.
@@ -62,12 +65,18 @@ pub enum Trouble {
     Unacknowledged,
     /// The controller is error passive, and the adapter does not report the kind of the errors.
     Passive,
+    /// There are errors, and the adapter does not report their kind.
+    Unclear,
 }
 
 /// The transmit error counter of a sender without any receiver stays at this value: an error
 /// passive sender does not count missing acknowledgements (ISO 11898-1, fault confinement,
 /// exception A).
 const LONELY: u8 = 128;
+
+/// The classes of errors that need their data: CAN_ERR_CRTL, CAN_ERR_PROT, CAN_ERR_TRX and
+/// CAN_ERR_BUSERROR; and CAN_ERR_TX_TIMEOUT, which has none. A lost arbitration is no error.
+const UNCLEAR: u32 = 0x04 | 0x08 | 0x10 | 0x80 | 0x01;
 
 impl Health {
     /// The problem of the bus, if there is one.
@@ -87,6 +96,7 @@ impl Health {
                 Some(Trouble::Unacknowledged)
             }
             _ if passive => Some(Trouble::Passive),
+            _ if self.unclear > 0 => Some(Trouble::Unclear),
             _ => None,
         }
     }
@@ -127,11 +137,29 @@ impl Health {
                 "the adapter is error passive: no node acknowledges its frames, or the bit rate is wrong{rate}; check \
                  power, cable, terminators and bit rate"
             ),
+            Trouble::Unclear => format!(
+                "the adapter has reported {} of the bus, but not which: no other node acknowledges its frames, or the \
+                 bit rate is wrong{rate}; check power, cable, terminators and bit rate",
+                match self.unclear {
+                    1 => "1 error".to_string(),
+                    count => format!("{count} errors"),
+                }
+            ),
         })
     }
 
+    /// [`advice`](Self::advice), if the problem can exist although frames of other nodes arrive.
+    #[must_use]
+    pub fn disturbance(&self) -> Option<String> {
+        match self.trouble()? {
+            Trouble::Off | Trouble::Disturbed | Trouble::Unclear => self.advice(),
+            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive => None,
+        }
+    }
+
     /// Adds an error frame of Linux (`linux/can/error.h`), the format of SocketCAN and gs_usb: the
-    /// bits of the identifier below `CAN_ERR_FLAG`, and the data.
+    /// bits of the identifier below `CAN_ERR_FLAG`, and the data. Without data (socketcand), the
+    /// class alone counts.
     pub fn error_frame(&mut self, class: u32, data: &[u8]) {
         let byte = |at: usize| data.get(at).copied().unwrap_or_default();
         // CAN_ERR_ACK, or CAN_ERR_PROT with the location CAN_ERR_PROT_LOC_ACK.
@@ -142,6 +170,8 @@ impl Health {
             self.unacknowledged = self.unacknowledged.saturating_add(1);
         } else if disturbed {
             self.disturbed = self.disturbed.saturating_add(1);
+        } else if data.is_empty() && class & UNCLEAR != 0 {
+            self.unclear = self.unclear.saturating_add(1);
         }
         // CAN_ERR_CRTL: TX and RX PASSIVE, TX and RX WARNING, ACTIVE.
         if class & 0x04 != 0 {
@@ -153,7 +183,8 @@ impl Health {
             };
         }
         // CAN_ERR_CNT; drivers older than this flag set the counters alone.
-        if class & 0x200 != 0 || byte(6) != 0 || byte(7) != 0 {
+        let counts = class & 0x200 != 0 && !data.is_empty();
+        if counts || byte(6) != 0 || byte(7) != 0 {
             self.counters = Some((byte(6), byte(7)));
         }
         // CAN_ERR_BUSOFF, CAN_ERR_RESTARTED.
@@ -229,6 +260,36 @@ mod tests {
         let mut health = Health::default();
         health.error_frame(0xFFFF_FFFF, &[]);
         assert_eq!(health.trouble(), Some(Trouble::Unacknowledged));
+    }
+
+    /// socketcand: the class without the data.
+    #[test]
+    fn error_frames_without_data_count_by_their_class() {
+        let of = |classes: &[u32]| {
+            let mut health = Health::default();
+            classes.iter().for_each(|class| health.error_frame(*class, &[]));
+            health
+        };
+        for (classes, trouble) in [
+            // CRTL, BUSERROR with PROT, TX_TIMEOUT, TRX.
+            (&[0x004][..], Some(Trouble::Unclear)),
+            (&[0x088], Some(Trouble::Unclear)),
+            (&[0x001], Some(Trouble::Unclear)),
+            (&[0x010], Some(Trouble::Unclear)),
+            // ACK says it all; so do BUSOFF and RESTARTED.
+            (&[0x020, 0x004], Some(Trouble::Unacknowledged)),
+            (&[0x004, 0x040], Some(Trouble::Off)),
+            (&[0x040, 0x100], None),
+            // LOSTARB is the normal case on a busy bus; CNT without counters tells nothing.
+            (&[0x002], None),
+            (&[0x200], None),
+            (&[], None),
+        ] {
+            assert_eq!(of(classes).trouble(), trouble, "{classes:X?}");
+            assert_eq!(of(classes).counters, None, "{classes:X?}");
+        }
+        let advice = of(&[4, 4, 4]).advice().unwrap();
+        assert!(advice.contains("3 errors of the bus") && advice.contains("terminators"), "{advice}");
     }
 
     #[test]

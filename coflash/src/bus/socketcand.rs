@@ -10,11 +10,14 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
+use super::health::Health;
 use super::hex::{hex_bytes, hex_number};
 use super::tcp::{connect, PATIENCE};
 
 /// Longer than any message of the protocol.
 const LONGEST_MESSAGE: usize = 4096;
+/// The bits of an error frame's identifier that tell its class: those below `CAN_ERR_FLAG`.
+const ERROR_CLASS: u32 = 0x1FFF_FFFF;
 /// The default port of socketcand.
 const DEFAULT_PORT: u16 = 29536;
 
@@ -25,6 +28,8 @@ pub struct Socketcand {
     name: String,
     opened: Instant,
     messages: Messages,
+    /// What the error frames have reported.
+    health: Health,
 }
 
 impl Socketcand {
@@ -40,7 +45,13 @@ impl Socketcand {
         // them.
         stream.set_nodelay(true).map_err(open)?;
         stream.set_write_timeout(Some(PATIENCE)).map_err(open)?;
-        let mut adapter = Self { stream, name, opened: Instant::now(), messages: Messages::default() };
+        let mut adapter = Self {
+            stream,
+            name,
+            opened: Instant::now(),
+            messages: Messages::default(),
+            health: Health::default(),
+        };
         adapter.expect("hi")?;
         adapter.send_text(&format!("< open {bus} >"))?;
         adapter.expect("ok")?;
@@ -52,17 +63,29 @@ impl Socketcand {
     /// Waits for a message of one word during the log-in.
     fn expect(&mut self, word: &str) -> Result<(), AdapterError> {
         let deadline = Instant::now() + PATIENCE;
-        loop {
-            match self.message(deadline)? {
-                Some(message) if message == word => return Ok(()),
-                // Frames may arrive as soon as the bus is open.
-                Some(message) if message.starts_with("frame ") => {}
-                Some(message) => {
-                    return Err(self.unexpected(format!("'< {message} >' instead of '< {word} >'")))
-                }
-                None => return Err(self.unexpected(format!("nothing instead of '< {word} >'"))),
+        while let Some(message) = self.message(deadline)? {
+            if message == word {
+                return Ok(());
+            }
+            // Frames may arrive as soon as the bus is open.
+            if !message.starts_with("frame ") && !self.is_error_frame(&message) {
+                return Err(self.unexpected(format!("'< {message} >' instead of '< {word} >'")));
+            }
+            // A bus without a pause does not keep the client in this loop.
+            if Instant::now() >= deadline {
+                break;
             }
         }
+        Err(self.unexpected(format!("nothing instead of '< {word} >'")))
+    }
+
+    /// Adds an error frame of the bus to what is known about it. `false` for any other message.
+    fn is_error_frame(&mut self, message: &str) -> bool {
+        let frame = parse_error_frame(message);
+        if let Some((class, data)) = &frame {
+            self.health.error_frame(*class, data);
+        }
+        frame.is_some()
     }
 
     fn send_text(&mut self, message: &str) -> Result<(), AdapterError> {
@@ -91,13 +114,16 @@ impl Socketcand {
                     return Err(self.lost(closed));
                 }
                 Ok(len) => self.messages.add(&bytes[..len]),
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
-                    if left.is_zero() {
-                        return Ok(None);
-                    }
-                }
+                Err(error)
+                    if matches!(
+                        error.kind(),
+                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
+                    ) => {}
                 Err(error) => return Err(self.lost(error)),
+            }
+            // After the deadline the stream is read once: text between messages may have no end.
+            if left.is_zero() {
+                return self.messages.next().map_err(|said| self.unexpected(said));
             }
         }
     }
@@ -130,8 +156,8 @@ impl Adapter for Socketcand {
             if let Some(frame) = parse_frame(&message) {
                 return Ok(Some(frame));
             }
-            if let Some(error) = message.strip_prefix("error") {
-                return Err(self.unexpected(format!("error{error}")));
+            if !self.is_error_frame(&message) && message.starts_with("error") {
+                return Err(self.unexpected(message));
             }
             // Other messages (echo, statistics, CAN FD frames) are ignored. A server that sends
             // only such messages cannot keep the client in this loop.
@@ -144,6 +170,11 @@ impl Adapter for Socketcand {
 
     fn now(&self) -> Duration {
         self.opened.elapsed()
+    }
+
+    /// The reports of the error frames. A server sends them if it was told to (`--error-mask`).
+    fn health(&mut self) -> Option<Health> {
+        Some(self.health)
     }
 }
 
@@ -165,6 +196,24 @@ pub fn parse_frame(message: &str) -> Option<Frame> {
     let id = parse_identifier(id)?;
     let digits: String = words.collect();
     Frame::new(id, &hex_bytes(&digits)?)
+}
+
+/// The error frame of the bus in a server's message `error 004 12.345678`, passed without the
+/// brackets: the class of the error and the data, in the form of Linux (`linux/can/error.h`).
+/// socketcand sends no data, and its description of the protocol names no time. `None` for any other message; an
+/// error of the server itself is words: `error unknown command`.
+fn parse_error_frame(message: &str) -> Option<(u32, Vec<u8>)> {
+    let mut words = message.split_ascii_whitespace();
+    let ("error", class) = (words.next()?, words.next()?) else { return None };
+    let number = hex_number(class).filter(|_| class.len() <= 8)?;
+    match words.next() {
+        Some(time) if time.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.') => {}
+        // "bad", for one, could also be a word.
+        None if class.starts_with(|first: char| first.is_ascii_digit()) => {}
+        _ => return None,
+    }
+    let data = hex_bytes(&words.collect::<String>())?;
+    Some((number & ERROR_CLASS, data))
 }
 
 /// The server's message for a frame on the bus at `time` after its start: `< frame 585 12.345678
@@ -359,6 +408,85 @@ mod tests {
         let answer = frame(0x581, &[0x43, 0, 0x10, 0, 0, 0, 0, 0x10]);
         assert_eq!(bus.receive(long).unwrap(), Some(answer));
         assert!(matches!(bus.receive(long), Err(AdapterError::Lost { .. })));
+    }
+
+    /// linux-can/socketcand, pull request 67: the class of the error in hexadecimal, and the time.
+    #[test]
+    fn error_frames_of_the_bus_are_told_from_errors_of_the_server() {
+        for (message, frame) in [
+            ("error 004 1700000123.000456", Some((0x004, vec![]))),
+            ("error 088 1700000123.000456", Some((0x088, vec![]))),
+            ("error 20000020 5.000000", Some((0x020, vec![]))),
+            ("error 0A8 0.000000 00 00 04 00 00 00 00 00", Some((0x0A8, vec![0, 0, 4, 0, 0, 0, 0, 0]))),
+            ("error 4", Some((4, vec![]))),
+            ("error", None),
+            ("error unknown command", None),
+            ("error could not open bus", None),
+            ("error bad", None),
+            ("error bad command", None),
+            ("error 404 not found", None),
+            ("error 004 12.5 xyz", None),
+            ("error 123456789 1.0", None),
+            ("errors 004 1.0", None),
+            ("frame 004 1.0 00", None),
+        ] {
+            assert_eq!(parse_error_frame(message), frame, "{message}");
+        }
+    }
+
+    #[test]
+    fn error_frames_are_counted_and_end_no_session() {
+        let address = server(&[
+            LOG_IN[0],
+            LOG_IN[1],
+            (
+                "< rawmode >",
+                "< error 020 0.9 >< ok >< error 004 1700000123.000456 >< frame 701 1.0 00 >\
+                 < error 020 1.1 >< frame 701 1.1 7F >< error 020 1.2 >< error unknown command >",
+            ),
+            ("never", ""),
+        ]);
+        let mut bus = Socketcand::connect(&address, "can0").unwrap();
+        let long = Duration::from_secs(20);
+        assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0])));
+        assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0x7F])));
+        let error = bus.receive(long).unwrap_err();
+        assert!(error.to_string().ends_with("answered unexpectedly: error unknown command"), "{error}");
+        // CAN_ERR_ACK is 20h.
+        let health = bus.health().unwrap();
+        assert_eq!((health.unacknowledged, health.unclear), (3, 1));
+    }
+
+    /// The server sends while the client waits, until its connection is closed.
+    fn flood(log_in: &'static [&'static [u8]], text: &'static [u8]) -> String {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        thread::spawn(move || {
+            let (mut stream, _) = listener.accept().unwrap();
+            for (number, answer) in log_in.iter().enumerate() {
+                // The client's message before this answer; it fits into one read.
+                if number > 0 {
+                    let _ = stream.read(&mut [0; 64]).unwrap();
+                }
+                stream.write_all(answer).unwrap();
+            }
+            while stream.write_all(text).is_ok() {}
+        });
+        address
+    }
+
+    /// These tests end, or they hang: no time is measured.
+    #[test]
+    fn a_server_that_never_pauses_keeps_nobody_waiting() {
+        const OPEN: &[&[u8]] = &[b"< hi >"];
+        const OPEN_AND_OK: &[&[u8]] = &[b"< hi >", b"< ok >", b"< ok >"];
+        for text in [&b"no bracket at all "[..], b"< error 004 1.5 >"] {
+            let mut bus = Socketcand::connect(&flood(OPEN_AND_OK, text), "can0").unwrap();
+            assert_eq!(bus.receive(Duration::from_millis(20)).unwrap(), None);
+            drop(bus);
+            let error = Socketcand::connect(&flood(OPEN, text), "can0").unwrap_err();
+            assert!(error.to_string().contains("instead of '< ok >'"), "{error}");
+        }
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::Frame;
 
 use super::adapter::{Adapter, AdapterError};
+use super::health::Health;
 
 /// A function that gets the bus time and each frame, sent or received.
 pub type Ear = Box<dyn FnMut(Duration, &Frame) + Send>;
@@ -46,5 +47,9 @@ impl<A: Adapter> Adapter for Tap<A> {
 
     fn now(&self) -> Duration {
         self.adapter.now()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        self.adapter.health()
     }
 }

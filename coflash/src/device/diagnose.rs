@@ -52,7 +52,7 @@ pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
 
 impl fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { node, frames, heard, health } = self;
+        let Self { node, frames, health, .. } = self;
         if *frames == 0 {
             if let Some(advice) = health.and_then(|health| health.advice()) {
                 return f.write_str(&advice);
@@ -74,6 +74,19 @@ impl fmt::Display for Diagnosis {
                  catch holds it in the bootloader when it is switched on, and so does the entry strap)"
             );
         }
+        self.traffic(f)?;
+        match health.and_then(|health| health.disturbance()) {
+            // Others may be heard although many of their frames are lost.
+            Some(advice) => write!(f, "; besides, {advice}"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Diagnosis {
+    /// The conclusion from the frames that were heard.
+    fn traffic(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { node, heard, .. } = self;
         match heard.get(node) {
             Some(Some(NmtState::Stopped)) => write!(
                 f,
@@ -108,5 +121,34 @@ impl fmt::Display for Diagnosis {
                 )
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// socketcand's error frames, of which class 004h does not tell the error.
+    #[test]
+    fn errors_of_the_bus_are_told_beside_the_frames_that_were_heard() {
+        let node = NodeId::new(5).unwrap();
+        let mut health = Health::default();
+        let mut diagnosis = Diagnosis { node, frames: 0, heard: BTreeMap::new(), health: Some(health) };
+        assert!(diagnosis.to_string().starts_with("nothing at all is heard"), "{diagnosis}");
+        health.error_frame(0x004, &[]);
+        diagnosis.health = Some(health);
+        assert!(
+            diagnosis.to_string().starts_with("the adapter has reported 1 error of the bus"),
+            "{diagnosis}"
+        );
+        diagnosis.frames = 3;
+        diagnosis.heard.insert(NodeId::new(9).unwrap(), None);
+        let words = diagnosis.to_string();
+        assert!(words.starts_with("the bus works, and node 9 is heard"), "{words}");
+        assert!(words.contains("besides, the adapter has reported 1 error of the bus"), "{words}");
+        // A missing acknowledgement is over when others are heard.
+        let health = Health { unacknowledged: 7, ..Health::default() };
+        diagnosis.health = Some(health);
+        assert!(!diagnosis.to_string().contains("besides"), "{diagnosis}");
     }
 }

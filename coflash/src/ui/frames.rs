@@ -11,7 +11,7 @@ use tokio::sync::watch;
 use super::load;
 use crate::bus::candump::Line;
 use crate::bus::decode::Decoder;
-use crate::bus::{Adapter, AdapterError};
+use crate::bus::{Adapter, AdapterError, Health};
 
 /// The most frames in words that the page can request.
 const ROWS: usize = 2000;
@@ -166,6 +166,10 @@ impl Adapter for Tap {
 
     fn now(&self) -> Duration {
         self.adapter.now()
+    }
+
+    fn health(&mut self) -> Option<Health> {
+        self.adapter.health()
     }
 }
 
