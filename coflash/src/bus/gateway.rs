@@ -42,6 +42,13 @@ pub trait Gateway {
     /// See [`GatewayError`].
     fn reset_node(&mut self, node: NodeId) -> Result<(), GatewayError>;
 
+    /// Waits for a word of the gateway: sends a command that changes nothing on the bus, with `sdo`
+    /// as the time that a node may take for an answer.
+    ///
+    /// # Errors
+    /// No gateway is at the other end.
+    fn greet(&mut self, sdo: Duration) -> Result<(), AdapterError>;
+
     /// Waits for `time`. Returns early with the node-ID if the gateway reports a boot-up message.
     /// Many gateways report none.
     ///
@@ -62,8 +69,11 @@ pub struct Ask<'c> {
     pub at: Address,
     /// How long the node may take for an answer, measured by the gateway on its bus.
     pub sdo: Duration,
-    /// How long the gateway may send nothing or accept nothing before the request is given up.
+    /// How long the gateway may send nothing of its answer, or accept nothing, before the request is
+    /// given up.
     pub patience: Duration,
+    /// The longest value that is accepted, in bytes.
+    pub longest: usize,
     /// Whether the user has cancelled.
     pub cancelled: &'c dyn Fn() -> bool,
 }

@@ -11,6 +11,7 @@ use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
 use super::work;
 use crate::bus::{bit_rate_of, AdapterError, Link, SdoIds};
+use crate::device::Timing;
 
 /// How long the thread listens before it checks for an order.
 const SLICE: Duration = Duration::from_millis(50);
@@ -91,7 +92,11 @@ fn link(shared: &Shared, url: &str, sdo_ids: Option<SdoBases>) -> Result<Link, A
                 Some((request, response)) => Link::Bus(Box::new(SdoIds::new(tap, request, response))),
             }
         }
-        gateway @ Link::Gateway(_) => gateway,
+        Link::Gateway(mut gateway) => {
+            // Any server accepts a connection.
+            gateway.greet(Timing::default().sdo)?;
+            Link::Gateway(gateway)
+        }
     })
 }
 

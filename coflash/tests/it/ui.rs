@@ -575,3 +575,23 @@ fn a_lost_adapter_is_shown_and_opened_again() {
     assert!(!state["notice"]["advice"].as_str().unwrap().is_empty());
     assert_eq!(ui.finish(), None);
 }
+
+/// Any server accepts a connection: the page shows a gateway as open when it has answered.
+#[test]
+fn a_gateway_is_open_when_it_has_said_something() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("cia309://{}/1", listener.local_addr().unwrap());
+    let ui = Ui::new(Some(url.clone()));
+    let (mute, _) = listener.accept().unwrap();
+    let state = ui.until("the refusal", |state| {
+        assert_ne!(state["adapter"]["state"], "open", "{state}");
+        state["adapter"]["state"] == "closed" && !state["notice"].is_null()
+    });
+    assert!(state["notice"]["words"].as_str().unwrap().contains("it has not answered for 5.0 s"), "{state}");
+    drop(mute);
+    ui.post("open", &json!({ "url": url }));
+    let (mut gateway, _) = listener.accept().unwrap();
+    gateway.write_all(b"1 7 ERROR 205\r\n[1] OK\r\n").unwrap();
+    let state = ui.until("the gateway", |state| state["adapter"]["state"] == "open");
+    assert_eq!(state["adapter"]["gateway"], true, "{state}");
+}

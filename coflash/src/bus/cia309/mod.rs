@@ -39,7 +39,12 @@ const PIECE: usize = 4096;
 /// How long the gateway may take to answer a command that concerns the gateway alone.
 const AT_ONCE: Duration = Duration::from_secs(5);
 /// Longer than the text of any value that is read as a whole.
-const LONGEST_LINE: usize = 100 * 1024 * 1024;
+const LONGEST_LINE: usize = 100 << 20;
+/// Longer than any line that is not an answer, and than any answer without a value.
+const LONGEST_WORDS: usize = 4096;
+/// The characters of an answer that a gateway on the slowest bus sends in a second. An answer that
+/// comes so fast may take longer than the time limit.
+const SLOWEST: u32 = 250;
 /// The longest SDO time-out: 16 bits of milliseconds.
 const LONGEST_TIMEOUT: u128 = 0xFFFF;
 /// Codes from this value on are SDO abort codes.
@@ -163,7 +168,7 @@ impl Cia309 {
     }
 
     /// Waits for the answer to a command. Calls `arrived` with the number of bytes of the answer
-    /// that have arrived.
+    /// that have arrived. Only these extend the wait: other lines, and bytes without an end, do not.
     fn answer(
         &mut self,
         sequence: u32,
@@ -171,11 +176,10 @@ impl Cia309 {
         whole: bool,
         mut arrived: impl FnMut(usize),
     ) -> Result<String, GatewayError> {
-        let mut deadline = Instant::now() + wait.patience;
-        let mut known = self.inbox.len();
+        let limit = Instant::now() + wait.patience;
         let mut begun: Option<String> = None;
         loop {
-            if let Some((text, ended)) = self.line()? {
+            while let Some((text, ended)) = self.line()? {
                 match self.parse(&text)? {
                     Line::Answer(number, answer)
                         if number == sequence && (ended || !whole || answer.starts_with(ERROR)) =>
@@ -196,17 +200,21 @@ impl Cia309 {
                     }
                     Line::BootUp(..) | Line::Event => {}
                 }
-                continue;
             }
-            if self.inbox.len() > known {
-                deadline = Instant::now() + wait.patience;
-                arrived(self.inbox.len());
+            let begins = self.inbox.starts_with(format!("[{sequence}]").as_bytes());
+            let part = if begins { self.inbox.len() } else { 0 };
+            if part > wait.longest {
+                let said = format!(
+                    "an answer to command [{sequence}] that is longer than {} characters",
+                    wait.longest
+                );
+                return Err(self.protocol(&said).into());
             }
-            known = self.inbox.len();
+            arrived(part);
             if (wait.cancelled)() {
                 return Err(GatewayError::Cancelled);
             }
-            if Instant::now() >= deadline {
+            if Instant::now() >= limit + Duration::from_secs(part as u64) / SLOWEST {
                 let seconds = wait.patience.as_secs_f64();
                 return Err(self.failed(format!("it has not answered for {seconds:.1} s")).into());
             }
@@ -235,6 +243,11 @@ impl Cia309 {
             let end = self.inbox[self.searched..].iter().position(|byte| *byte == b'\n');
             let Some(end) = end.map(|end| end + self.searched) else {
                 self.searched = self.inbox.len();
+                // The wait for an answer limits its length.
+                if self.inbox.len() > LONGEST_WORDS && !self.inbox.starts_with(b"[") {
+                    let begin = String::from_utf8_lossy(&self.inbox[..LONGEST_WORDS]);
+                    return Err(self.protocol(&format!("a line without an end: {begin}")));
+                }
                 return Ok(None);
             };
             self.searched = 0;
@@ -285,19 +298,19 @@ impl Cia309 {
 
     /// Sets in the gateway how long a node may take. A gateway without this command keeps its own
     /// time-out.
-    fn set_timeout(&mut self, ask: &Ask<'_>) -> Result<(), GatewayError> {
-        if self.timeout == Some(ask.sdo) {
+    fn set_timeout(&mut self, sdo: Duration, cancelled: &dyn Fn() -> bool) -> Result<(), GatewayError> {
+        if self.timeout == Some(sdo) {
             return Ok(());
         }
-        let wait = Wait { patience: AT_ONCE, cancelled: ask.cancelled };
-        let words = format!("set sdo_timeout {}", ask.sdo.as_millis().clamp(1, LONGEST_TIMEOUT));
+        let wait = Wait { patience: AT_ONCE, longest: LONGEST_WORDS, cancelled };
+        let words = format!("set sdo_timeout {}", sdo.as_millis().clamp(1, LONGEST_TIMEOUT));
         let sequence = self.command(&words, &wait, |_| {})?;
         let answer = self.answer(sequence, &wait, false, |_| {})?;
         match self.error(&answer) {
             Some(GatewayError::Adapter(AdapterError::Gateway { .. })) | None => {}
             Some(error) => return Err(error),
         }
-        self.timeout = Some(ask.sdo);
+        self.timeout = Some(sdo);
         Ok(())
     }
 
@@ -314,12 +327,18 @@ impl Cia309 {
 /// How long to wait for the gateway, and until when.
 struct Wait<'c> {
     patience: Duration,
+    /// The longest answer, in characters.
+    longest: usize,
     cancelled: &'c dyn Fn() -> bool,
 }
 
 impl<'c> From<&Ask<'c>> for Wait<'c> {
     fn from(ask: &Ask<'c>) -> Self {
-        Self { patience: ask.patience, cancelled: ask.cancelled }
+        Self {
+            patience: ask.patience,
+            longest: base64::length(ask.longest).saturating_add(LONGEST_WORDS),
+            cancelled: ask.cancelled,
+        }
     }
 }
 
@@ -330,7 +349,7 @@ fn waits(error: &io::Error) -> bool {
 
 impl Gateway for Cia309 {
     fn upload(&mut self, ask: &Ask<'_>, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError> {
-        self.set_timeout(ask)?;
+        self.set_timeout(ask.sdo, ask.cancelled)?;
         let words = format!("{} r {:#06X} {} d", ask.node, ask.at.index, ask.at.sub);
         let wait = Wait::from(ask);
         let sequence = self.command(&words, &wait, |_| {})?;
@@ -350,7 +369,7 @@ impl Gateway for Cia309 {
         data: &[u8],
         progress: &mut dyn FnMut(u32),
     ) -> Result<(), GatewayError> {
-        self.set_timeout(ask)?;
+        self.set_timeout(ask.sdo, ask.cancelled)?;
         let number = || data.iter().rev().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
         let value = match data.len() {
             length @ (1 | 2 | 4) => format!("u{} {:#X}", length * 8, number()),
@@ -366,10 +385,18 @@ impl Gateway for Cia309 {
     }
 
     fn reset_node(&mut self, node: NodeId) -> Result<(), GatewayError> {
-        let wait = Wait { patience: AT_ONCE, cancelled: &|| false };
+        let wait = Wait { patience: AT_ONCE, longest: LONGEST_WORDS, cancelled: &|| false };
         let sequence = self.command(&format!("{node} reset node"), &wait, |_| {})?;
         let answer = self.answer(sequence, &wait, false, |_| {})?;
         self.done(&answer)
+    }
+
+    fn greet(&mut self, sdo: Duration) -> Result<(), AdapterError> {
+        match self.set_timeout(sdo, &|| false) {
+            Err(GatewayError::Adapter(error)) => Err(error),
+            // A refusal is a word, too.
+            _ => Ok(()),
+        }
     }
 
     fn wait(&mut self, time: Duration) -> Result<Option<NodeId>, GatewayError> {

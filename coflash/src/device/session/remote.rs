@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::{AbortCode, Address};
 
 use super::transfer::{VALUE_MAX, WORTH_BLOCKS};
-use super::{Session, Way};
+use super::{Session, Way, UPLOAD_MAX};
 use crate::bus::gateway::{Ask, Gateway, GatewayError};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
@@ -20,7 +20,10 @@ const GATEWAY_BYTES: u64 = 250;
 impl Session<'_> {
     /// Reads a short value through the gateway.
     pub(super) fn read_there(&mut self, at: Address) -> Result<Vec<u8>, Error> {
-        let value = self.upload_there(at, self.timing.sdo + GATEWAY_GRACE, &mut |_| {})?;
+        let patience = self.timing.sdo + GATEWAY_GRACE;
+        let value = self.through_gateway(at, Doing::Read(at), patience, VALUE_MAX, |gateway, ask| {
+            gateway.upload(ask, &mut |_| {})
+        })?;
         let long = Error::Protocol { doing: Doing::Read(at), code: AbortCode::OUT_OF_MEMORY };
         if value.len() > VALUE_MAX {
             Err(long)
@@ -36,7 +39,9 @@ impl Session<'_> {
         patience: Duration,
         progress: &mut dyn FnMut(u32),
     ) -> Result<Vec<u8>, Error> {
-        self.through_gateway(at, Doing::Read(at), patience, |gateway, ask| gateway.upload(ask, progress))
+        self.through_gateway(at, Doing::Read(at), patience, UPLOAD_MAX, |gateway, ask| {
+            gateway.upload(ask, progress)
+        })
     }
 
     /// Writes a value through the gateway.
@@ -51,7 +56,7 @@ impl Session<'_> {
             0..=WORTH_BLOCKS => self.timing.sdo + GATEWAY_GRACE,
             len => self.timing.command + Duration::from_secs(len as u64 / GATEWAY_BYTES),
         };
-        self.through_gateway(at, doing, patience, |gateway, ask| gateway.download(ask, data, progress))
+        self.through_gateway(at, doing, patience, 0, |gateway, ask| gateway.download(ask, data, progress))
     }
 
     /// Runs a request of the gateway, and returns its result in the form of a transfer over the
@@ -61,13 +66,14 @@ impl Session<'_> {
         at: Address,
         doing: Doing,
         patience: Duration,
+        longest: usize,
         act: impl FnOnce(&mut dyn Gateway, &Ask<'_>) -> Result<T, GatewayError>,
     ) -> Result<T, Error> {
         self.check_cancelled()?;
         let flag = self.cancelled.clone();
         let cancelled = move || flag.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed));
         let (node, sdo) = (self.node, self.timing.sdo);
-        let ask = Ask { node, at, sdo, patience, cancelled: &cancelled };
+        let ask = Ask { node, at, sdo, patience, longest, cancelled: &cancelled };
         match &mut self.way {
             Way::Gateway(gateway) => {
                 act(&mut **gateway, &ask).map_err(|error| of_gateway(error, node, doing))

@@ -356,6 +356,7 @@ fn ask(gateway: &mut Cia309) -> Result<Vec<u8>, GatewayError> {
         at: Address::new(0x1000, 0),
         sdo: Duration::from_millis(100),
         patience: Duration::from_millis(300),
+        longest: 4096,
         cancelled: &|| false,
     };
     gateway.upload(&ask, &mut |_| {})
@@ -426,6 +427,54 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
     assert!(words(result).contains("it has not answered for 0.3 s"));
 }
 
+/// A gateway for one command, which then sends this without end; returns its address.
+fn flood(answer: &'static [u8], text: &'static [u8]) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap().to_string();
+    thread::spawn(move || {
+        let (mut stream, _) = listener.accept().unwrap();
+        let mut line = String::new();
+        BufReader::new(stream.try_clone().unwrap()).read_line(&mut line).unwrap();
+        stream.write_all(answer).unwrap();
+        // Lines come as fast as they can; bytes without an end would fill the memory.
+        let pause = Duration::from_millis(u64::from(!text.ends_with(b"\n")));
+        while stream.write_all(text).is_ok() {
+            thread::sleep(pause);
+        }
+    });
+    address
+}
+
+/// What comes without end is no answer, and no reason to wait. The test ends, or it hangs.
+#[test]
+fn a_gateway_that_never_stops_is_given_up() {
+    for (text, expected) in [
+        (&b"1 5 EMCY 8130 11 00 00 00 00 00\r\n"[..], "it has not answered for 0.3 s"),
+        (b"1 7 ERROR 205\r\n", "it has not answered for 0.3 s"),
+        (b"\r\n", "it has not answered for 0.3 s"),
+        // Bytes without LF: few, then more than an event has; and part of an answer.
+        (b"", "it has not answered for 0.3 s"),
+        (b"xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx", "a line without an end: xxxx"),
+        (b"[7] AAAAAAAAAAAAAAAAAAAAAAAAAAAA", "it has not answered for 0.3 s"),
+    ] {
+        let mut gateway = Cia309::connect(&flood(b"[1] OK\r\n", text), 1).unwrap();
+        let found = words(ask(&mut gateway));
+        assert!(found.contains(expected), "{text:?}: {found}");
+    }
+    // An answer that is longer than any that was asked for.
+    for (first, text) in [(&b"[1] OK\r\n[2] "[..], &[b'A'; 64][..]), (b"[1] ", &[b'A'; 64])] {
+        let mut gateway = Cia309::connect(&flood(first, text), 1).unwrap();
+        let found = words(ask(&mut gateway));
+        assert!(found.contains("that is longer than"), "{first:?}: {found}");
+    }
+    // The first word is awaited for 5 s in place of 0.3 s.
+    let mut gateway = Cia309::connect(&flood(b"", b"1 7 ERROR 205\r\n"), 1).unwrap();
+    let error = gateway.greet(Duration::from_millis(100)).unwrap_err().to_string();
+    assert!(error.contains("it has not answered for 5.0 s"), "{error}");
+    let mut gateway = Cia309::connect(&flood(b"[1] ERROR:100\r\n", b""), 1).unwrap();
+    assert!(gateway.greet(Duration::from_millis(100)).is_ok(), "a refusal is a word");
+}
+
 /// A late answer belongs to a command that timed out, and to no other.
 #[test]
 fn a_late_answer_is_not_taken_for_another_ones() {
@@ -460,6 +509,7 @@ fn a_gateway_that_goes_away_or_takes_nothing_ends_it() {
         at: Address::new(0x1F50, 1),
         sdo: Duration::from_millis(100),
         patience: Duration::from_millis(300),
+        longest: 4096,
         cancelled: &|| false,
     };
     let result = gateway.download(&ask, &image, &mut |_| {}).map(|()| Vec::new());
