@@ -60,10 +60,16 @@ const SETTLE: Duration = Duration::from_secs(2);
 /// How long one wait lasts before the flag of Ctrl-C is looked at.
 const TURN: Duration = Duration::from_millis(100);
 
+/// The most answers of other devices that are looked at.
+const MOST_ANSWERS: usize = 128;
+
 /// The device on its bus.
 pub struct Bench<'a> {
     adapter: &'a mut dyn Adapter,
     pub(super) node: NodeId,
+    /// Whether the answers of layer setting services can be judged, or why not; `None` until this
+    /// was looked at.
+    pub(super) lss: Option<Result<(), String>>,
     means: Means<'a>,
     cancelled: &'a Arc<AtomicBool>,
 }
@@ -94,7 +100,7 @@ impl<'a> Bench<'a> {
         means: Means<'a>,
         cancelled: &'a Arc<AtomicBool>,
     ) -> Self {
-        Self { adapter, node, means, cancelled }
+        Self { adapter, node, lss: None, means, cancelled }
     }
 
     /// Does something with the client of updates; its error is the device's failure.
@@ -186,6 +192,25 @@ impl<'a> Bench<'a> {
                 _ => {}
             }
         }
+    }
+
+    /// All data frames with this COB-ID within `time`: several devices may answer.
+    pub(super) fn hear_all(&mut self, id: CobId, time: Duration) -> Result<Vec<Frame>, Stop> {
+        let end = self.now() + time;
+        let mut frames = Vec::new();
+        while let Some(frame) = self.hear(id, end.saturating_sub(self.now()))? {
+            frames.push(frame);
+            if frames.len() == MOST_ANSWERS || self.now() >= end {
+                break;
+            }
+        }
+        Ok(frames)
+    }
+
+    /// Whether a device with this node-ID answers SDO requests.
+    pub(super) fn reaches(&mut self, node: NodeId) -> Result<bool, Stop> {
+        self.send(&Frame::full(CobId::sdo_request(node), request(0x40, 0x1000, 0, [0; 4])))?;
+        Ok(self.hear(CobId::sdo_response(node), self.means.answer)?.is_some())
     }
 
     /// The next SDO answer.

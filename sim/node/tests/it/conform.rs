@@ -144,6 +144,14 @@ const FAULTS: &[Fault] = &[
     // Wrong values of layer setting services are taken for right ones.
     takes(&["LSS-015"], |f| lss(f, [0x11, 0], [0x11, 1])),
     takes(&["LSS-014"], |f| lss(f, [0x04, 2], [0x04, 0])),
+    // Parts of the LSS address that are not compared: a serial number next to the device's.
+    takes(&["LSS-003"], |f| serial(f, &[0x43])),
+    takes(&["LSS-022"], |f| serial(f, &[0x4A, 0x4B])),
+    // The inquiry tells a node-ID that nobody has.
+    answers(
+        &["LSS-002", "LSS-012", "LSS-014", "LSS-015", "LSS-016", "LSS-017", "LSS-018", "LSS-019"],
+        |_, f| Some(if is_inquiry(&f) { Frame::full(CobId::LSS_RESPONSE, [0x5E, 77, 0, 0, 0, 0, 0, 0]) } else { f }),
+    ),
     // Answers of layer setting services.
     answers(&["LSS-008"], |_, f| {
         let data = f.exactly::<8>().copied().filter(|data| f.has_cob_id(CobId::LSS_RESPONSE) && data[0] == 0x5B);
@@ -165,6 +173,17 @@ fn obeys(frame: Frame, which: fn(&Frame) -> bool) -> Option<Frame> {
 fn lss(frame: Frame, of: [u8; 2], to: [u8; 2]) -> Option<Frame> {
     let is = frame.has_cob_id(CobId::LSS_REQUEST) && frame.data().starts_with(&of);
     Some(if is { Frame::full(CobId::LSS_REQUEST, [to[0], to[1], 0, 0, 0, 0, 0, 0]) } else { frame })
+}
+
+/// The device's own serial number, 1, in place of the one of these requests.
+fn serial(frame: Frame, commands: &[u8]) -> Option<Frame> {
+    let of = frame.has_cob_id(CobId::LSS_REQUEST) && commands.contains(&frame.data()[0]);
+    Some(if of { Frame::full(CobId::LSS_REQUEST, [frame.data()[0], 1, 0, 0, 0, 0, 0, 0]) } else { frame })
+}
+
+/// The answer to the inquiry of the node-ID.
+fn is_inquiry(frame: &Frame) -> bool {
+    frame.has_cob_id(CobId::LSS_RESPONSE) && frame.data()[0] == 0x5E
 }
 
 /// What the node has not, or need not have: remote frames are not in socketcand's protocol, 1017h
@@ -205,14 +224,17 @@ impl Adapter for Faulty<'_> {
 /// The checks that fail, and those that cannot be judged.
 fn verdicts(nodes: &Nodes, fault: Option<&Fault>) -> (Vec<String>, Vec<String>) {
     let bus = coflash::bus::open(nodes.url()).unwrap();
-    let mut bus = Faulty { bus, fault, asked: Vec::new() };
+    judge(&mut Faulty { bus, fault, asked: Vec::new() }, &harmless())
+}
+
+fn judge(bus: &mut dyn Adapter, checks: &[Check]) -> (Vec<String>, Vec<String>) {
     let (mut failed, mut skipped) = (Vec::new(), Vec::new());
-    run(&mut bus, NODE, &harmless(), Means::of(Duration::from_secs(1)), &Arc::default(), &mut |verdict| {
-        match &verdict.outcome {
-            Outcome::Passed => {}
-            Outcome::Failed(what) => failed.push(format!("{}: {what}", verdict.check.id)),
-            Outcome::Skipped(why) => skipped.push(format!("{}: {why}", verdict.check.id)),
-        }
+    run(bus, NODE, checks, Means::of(Duration::from_secs(1)), &Arc::default(), &mut |verdict| match &verdict
+        .outcome
+    {
+        Outcome::Passed => {}
+        Outcome::Failed(what) => failed.push(format!("{}: {what}", verdict.check.id)),
+        Outcome::Skipped(why) => skipped.push(format!("{}: {why}", verdict.check.id)),
     })
     .unwrap();
     (failed, skipped)
@@ -255,4 +277,111 @@ fn each_fault_is_found_by_its_checks_alone() {
         runs.into_iter().filter_map(|run| run.join().unwrap()).collect()
     });
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
+
+/// The checks of these groups.
+fn of(groups: &[&str]) -> Vec<Check> {
+    harmless().into_iter().filter(|check| groups.contains(&check.group())).collect()
+}
+
+/// The next devices of the lot: their serial numbers are the neighbours of this device's.
+#[test]
+fn answers_of_other_devices_are_not_blamed_on_this_one() {
+    for serial in ["1", "2", "0x7FFFFFFF"] {
+        let folder = Folder::new(&format!("conform-lot-{serial}"));
+        let lot = ["--node", "1", "--count", "5", "--serial", serial, "--flash", "instant"];
+        let nodes = Nodes::start(&folder, &lot);
+        let mut bus = coflash::bus::open(nodes.url()).unwrap();
+        assert_eq!(judge(&mut bus, &of(&["LSS"])), (Vec::new(), Vec::new()), "{serial}");
+    }
+}
+
+/// The identities of the nodes are equal, as those of examples often are.
+#[test]
+fn a_device_with_the_same_lss_address_is_named() {
+    let node_9 = (&["--node", "9"][..], Frame::full(CobId::sdo_request(NodeId::new(9).unwrap()), UPLOAD));
+    // LSS identify non-configured remote slave.
+    let unconfigured =
+        (&["--unconfigured"][..], Frame::full(CobId::LSS_REQUEST, [0x4C, 0, 0, 0, 0, 0, 0, 0]));
+    for ((arguments, ask), answer, name) in [
+        (node_9, CobId::sdo_response(NodeId::new(9).unwrap()), "node 9"),
+        (unconfigured, CobId::LSS_RESPONSE, "a device without node-ID"),
+    ] {
+        let folder = Folder::new(&format!("conform-twin-of-{}", name.len()));
+        let twin = Folder::new(&format!("conform-twin-{}", name.len()));
+        let nodes = Nodes::start(&folder, &["--node", "1", "--flash", "instant"]);
+        let _twin = Nodes::join(&twin, nodes.url(), &[arguments, &["--flash", "instant"]].concat());
+        let mut bus = coflash::bus::open(nodes.url()).unwrap();
+        // It has joined when it answers.
+        let mut answered = false;
+        while !answered {
+            bus.send(&ask).unwrap();
+            let heard = bus.receive(Duration::from_millis(100)).unwrap();
+            answered = heard.is_some_and(|frame| frame.has_cob_id(answer));
+        }
+        let (failed, skipped) = judge(&mut bus, &of(&["LSS"]));
+        assert!(failed.is_empty(), "{failed:#?}");
+        assert_eq!(skipped.len(), of(&["LSS"]).len());
+        let words = format!("{name} has the same LSS address");
+        assert!(skipped.iter().all(|line| line.contains(&words)), "{skipped:#?}");
+    }
+}
+
+/// A bus with a device that answers the inquiry of the node-ID without having been selected.
+struct Intruder {
+    bus: Box<dyn Adapter + Send>,
+    node: u8,
+    answers: Vec<Frame>,
+}
+
+impl Adapter for Intruder {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if frame.has_cob_id(CobId::LSS_REQUEST) && frame.exactly::<8>().is_some_and(|data| data[0] == 0x5E) {
+            self.answers.push(Frame::full(CobId::LSS_RESPONSE, [0x5E, self.node, 0, 0, 0, 0, 0, 0]));
+        }
+        self.bus.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        match self.answers.pop() {
+            Some(frame) => Ok(Some(frame)),
+            None => self.bus.receive(timeout),
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.bus.now()
+    }
+}
+
+#[test]
+fn a_device_that_answers_without_being_selected_is_named() {
+    let folder = Folder::new("conform-intruder");
+    let nodes = Nodes::start(&folder, &["--node", "1", "--count", "2", "--flash", "instant"]);
+    let mut bus = Intruder { bus: coflash::bus::open(nodes.url()).unwrap(), node: 2, answers: Vec::new() };
+    let (failed, skipped) = judge(&mut bus, &of(&["LSS"]));
+    assert!(failed.is_empty(), "{failed:#?}");
+    assert!(skipped.iter().all(|line| line.contains("node 2 answers in LSS waiting state")), "{skipped:#?}");
+    // Nobody has node-ID 77: it is this device that answers.
+    bus.node = 77;
+    let (failed, _) = judge(&mut bus, &of(&["LSS"]));
+    assert!(ids(&failed).contains(&"LSS-001"), "{failed:#?}");
+}
+
+/// 1017h is optional (CiA 301): a master may guard its nodes.
+#[test]
+fn a_device_without_heartbeat_time_is_not_blamed() {
+    let (_folder, nodes) = device("conform-no-1017");
+    let absent = answers(&[], |asked, f| {
+        sdo(f, |data| {
+            if asked.get(1..3) == Some(&[0x17, 0x10]) {
+                *data = [0x80, 0x17, 0x10, 0, 0, 0, 2, 6];
+            }
+        })
+    });
+    let bus = coflash::bus::open(nodes.url()).unwrap();
+    let mut bus = Faulty { bus, fault: Some(&absent), asked: Vec::new() };
+    let (failed, skipped) = judge(&mut bus, &of(&["HB", "OD"]));
+    assert!(failed.is_empty(), "{failed:#?}");
+    assert_eq!(ids(&skipped), ["HB-002", "HB-003", "HB-004", "HB-005", "OD-007"], "{skipped:#?}");
 }
