@@ -75,8 +75,9 @@ fn slcan_over_tcp() {
     flash(&format!("slcan:tcp://{address}@250k"));
     let (fake, said) = server.join().unwrap();
     check(&fake);
-    // Closed before and after, 250 kbit/s is S5.
-    assert_eq!(said, ["", "", "C", "V", "S5", "O", "C"]);
+    // Closed before and after, 250 kbit/s is S5. No empty line: some adapters repeat their last
+    // command for it.
+    assert_eq!(said, ["C", "C", "V", "S5", "O", "C"]);
 }
 
 #[test]
@@ -121,7 +122,7 @@ fn slcan_over_a_serial_port() {
     drop(slave);
     assert_eq!(flashed.exit, 0, "{}{}", flashed.out, flashed.err);
     check(&fake);
-    assert_eq!(said[2..6], ["C", "V", "S4", "O"]);
+    assert_eq!(said[1..5], ["C", "V", "S4", "O"]);
 }
 
 /// A line that ends on request: a pseudo-terminal does not notice that its other end was closed.

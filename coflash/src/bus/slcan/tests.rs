@@ -1,0 +1,572 @@
+//! The protocol's messages, and the adapters and other devices that are found at a serial port.
+
+use std::collections::VecDeque;
+
+use canopen::CobId;
+use proptest::prelude::*;
+
+use super::*;
+
+fn frame(id: u16, data: &[u8]) -> Frame {
+    Frame::of(CobId::new(id).unwrap(), data)
+}
+
+/// Examples of the CAN232 manual.
+#[test]
+fn messages_are_those_of_the_protocol() {
+    assert_eq!(text_of(&frame(0x100, &[0x11, 0x22, 0x33])), "t1003112233\r");
+    assert_eq!(text_of(&frame(0x7FF, &[])), "t7FF0\r");
+    assert_eq!(parse_frame(b"t10021133"), Some(frame(0x100, &[0x11, 0x33])));
+    assert_eq!(parse_frame(b"t100211330A1B"), Some(frame(0x100, &[0x11, 0x33])), "with time");
+    let extended = Frame::new(ExtendedId::new(0x100).unwrap(), &[0x11, 0x33]).unwrap();
+    assert_eq!(parse_frame(b"T0000010021133"), Some(extended));
+    assert_eq!(text_of(&extended), "T0000010021133\r");
+    let remote = Frame::new_remote(StandardId::new(0x100).unwrap(), 2).unwrap();
+    assert_eq!((parse_frame(b"r1002"), text_of(&remote)), (Some(remote), "r1002\r".to_string()));
+    for bad in [
+        &b""[..],
+        b"z",
+        b"Z",
+        b"V1013",
+        b"t",
+        b"t10",
+        b"t100",
+        b"t1009",
+        b"t10011",
+        b"t100111223",
+        b"t8000",
+        b"txyz0",
+        b"T200000000",
+        b"t100\xC3\xA91",
+        b"t1001+1",
+        b"t+121AA",
+    ] {
+        assert_eq!(parse_frame(bad), None, "{bad:?}");
+    }
+}
+
+/// The answer of a device to a line; the number counts the lines.
+type Answers = fn(line: &str, number: usize) -> String;
+
+/// A device at the other end of a line, in virtual time.
+struct Device {
+    epoch: Instant,
+    now: Duration,
+    timeout: Duration,
+    answers: Answers,
+    /// How long an answer takes.
+    latency: Duration,
+    /// It answers one command after the other: when the last answer came.
+    busy: Option<Duration>,
+    /// It is deaf and mute until then.
+    starts: Duration,
+    /// What it sends by itself, and how often.
+    says: &'static [u8],
+    period: Option<Duration>,
+    next: Duration,
+    /// Bytes on their way to the host, in the order of time.
+    coming: VecDeque<(Duration, u8)>,
+    /// A line that is not complete.
+    line: String,
+    /// The lines it received.
+    lines: Vec<String>,
+    gone: bool,
+}
+
+const fn ms(ms: u64) -> Duration {
+    Duration::from_millis(ms)
+}
+
+impl Device {
+    fn new(answers: Answers) -> Self {
+        Self {
+            epoch: Instant::now(),
+            now: Duration::ZERO,
+            timeout: Duration::ZERO,
+            answers,
+            latency: ms(1),
+            busy: None,
+            starts: Duration::ZERO,
+            says: b"",
+            period: None,
+            next: Duration::ZERO,
+            coming: VecDeque::new(),
+            line: String::new(),
+            lines: Vec::new(),
+            gone: false,
+        }
+    }
+
+    fn slow(answers: Answers, latency: u64) -> Self {
+        Self { latency: ms(latency), ..Self::new(answers) }
+    }
+
+    /// It needs so many milliseconds for each command.
+    fn busy(answers: Answers, latency: u64) -> Self {
+        Self { busy: Some(Duration::ZERO), ..Self::slow(answers, latency) }
+    }
+
+    /// It restarts when its port opens, and then says this.
+    fn restarts(answers: Answers, starts: u64, says: &'static [u8]) -> Self {
+        Self { starts: ms(starts), next: ms(starts), says, ..Self::new(answers) }
+    }
+
+    /// It sends this by itself, each time after so many milliseconds.
+    fn talks(answers: Answers, says: &'static [u8], first: u64, period: u64) -> Self {
+        Self { says, next: ms(first), period: Some(ms(period)), ..Self::new(answers) }
+    }
+
+    /// Puts what it says by itself until `end` behind what is on its way.
+    fn talk(&mut self, end: Duration) {
+        while !self.says.is_empty() && self.next <= end {
+            self.coming.extend(self.says.iter().map(|byte| (self.next, *byte)));
+            match self.period {
+                Some(period) => self.next += period,
+                None => self.says = b"",
+            }
+        }
+    }
+}
+
+impl Read for Device {
+    fn read(&mut self, bytes: &mut [u8]) -> io::Result<usize> {
+        if self.gone {
+            return Ok(0);
+        }
+        let end = self.now + self.timeout.max(Duration::from_micros(1));
+        self.talk(end);
+        // One byte at a time: the reader must not rely on more.
+        match self.coming.front() {
+            Some((at, byte)) if *at <= end => {
+                self.now = self.now.max(*at);
+                bytes[0] = *byte;
+                self.coming.pop_front();
+                Ok(1)
+            }
+            _ => {
+                self.now = end;
+                Err(ErrorKind::TimedOut.into())
+            }
+        }
+    }
+}
+
+impl Write for Device {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.talk(self.now);
+        for byte in bytes {
+            if self.now < self.starts {
+                continue;
+            }
+            if *byte != b'\r' {
+                self.line.push((*byte).into());
+                continue;
+            }
+            let line = std::mem::take(&mut self.line);
+            let answer = (self.answers)(&line, self.lines.len());
+            let at = self.busy.map_or(self.now, |busy| busy.max(self.now)) + self.latency;
+            self.busy = self.busy.map(|_| at);
+            self.coming.extend(answer.bytes().map(|byte| (at, byte)));
+            self.lines.push(line);
+        }
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Line for &mut Device {
+    fn set_timeout(&mut self, timeout: Duration) -> io::Result<()> {
+        self.timeout = timeout;
+        Ok(())
+    }
+
+    fn now(&self) -> Instant {
+        self.epoch + self.now
+    }
+}
+
+fn open(device: &mut Device, rate: Option<u32>) -> Result<Slcan<&mut Device>, AdapterError> {
+    Slcan::open(device, "SLCAN adapter test".to_string(), rate)
+}
+
+/// CAN232 manual: CR is yes, BEL is no; `C` is refused while the bus is closed.
+fn lawicel(line: &str, number: usize) -> String {
+    match line.chars().next() {
+        Some('C') if number < 2 => "\x07",
+        Some('V') => "V1013\r",
+        Some('N') => "NA123\r",
+        Some('F') => "F00\r",
+        Some('t') => "z\r",
+        Some('C' | 'S' | 'O') => "\r",
+        _ => "\x07",
+    }
+    .to_string()
+}
+
+/// The firmware that CANables are sold with: no acknowledgements, and a version in its own words.
+fn quiet(line: &str, _: usize) -> String {
+    if line == "V" { "1a2b3c4 git.example/slcan-firmware\r" } else { "" }.to_string()
+}
+
+/// The first firmware of CANables acknowledges each line, and writes the version before it.
+fn worded(line: &str, _: usize) -> String {
+    if line == "V" { "1a2b3c4 git.example/first\r\r" } else { "\r" }.to_string()
+}
+
+/// A firmware that describes its board in a long line.
+fn board(line: &str, _: usize) -> String {
+    if line == "V" {
+        format!("+Board: {}\r", "Some:Thing ".repeat(11))
+    } else {
+        String::new()
+    }
+}
+
+/// USBtin: BEL for what it does not know.
+fn usbtin(line: &str, _: usize) -> String {
+    match line.chars().next() {
+        Some('V') => "V0101\r",
+        Some('S' | 'O' | 'C') => "\r",
+        _ => "\x07",
+    }
+    .to_string()
+}
+
+/// It has no version.
+fn nameless(line: &str, number: usize) -> String {
+    if line == "V" {
+        "\x07".to_string()
+    } else {
+        lawicel(line, number)
+    }
+}
+
+fn echoes(line: &str, number: usize) -> String {
+    format!("{line}\r{}", lawicel(line, number))
+}
+
+/// The echo has no CR of its own.
+fn echoes_characters(line: &str, number: usize) -> String {
+    format!("{line}{}", lawicel(line, number))
+}
+
+/// Each line ends with CR LF.
+fn crlf(line: &str, number: usize) -> String {
+    lawicel(line, number).replace('\r', "\r\n")
+}
+
+/// It answers the opening of the bus alone.
+fn opens(line: &str, _: usize) -> String {
+    if line == "O" { "\r" } else { "" }.to_string()
+}
+
+/// It answers nothing, but its frames arrive.
+fn frames_alone(line: &str, _: usize) -> String {
+    if line == "O" { "t70517F\r" } else { "" }.to_string()
+}
+
+fn nothing(_: &str, _: usize) -> String {
+    String::new()
+}
+
+#[test]
+fn adapters_of_the_field_are_opened() {
+    for (name, mut device, rate) in [
+        ("Lawicel CAN232", Device::new(lawicel), true),
+        ("CANable as it is sold", Device::new(quiet), true),
+        ("CANable, first firmware", Device::new(worded), true),
+        ("a version of 130 characters", Device::new(board), true),
+        ("USBtin", Device::new(usbtin), true),
+        ("BEL for V", Device::new(nameless), true),
+        ("an echo", Device::new(echoes), true),
+        ("an echo of characters", Device::new(echoes_characters), true),
+        ("CR LF", Device::new(crlf), true),
+        ("answers after 400 ms", Device::slow(lawicel, 400), true),
+        ("works 400 ms on each command", Device::busy(lawicel, 400), true),
+        ("quiet, after 400 ms", Device::slow(quiet, 400), true),
+        ("restarts for 1.6 s", Device::restarts(lawicel, 1600, b""), true),
+        ("restarts for 1.6 s with a greeting", Device::restarts(usbtin, 1600, b"\r\nCAN init ok!\r\n"), true),
+        ("quiet, restarts for 2.5 s", Device::restarts(quiet, 2500, b""), true),
+        ("restarts while S is sent", Device::restarts(lawicel, 700, b""), true),
+        ("frames before the opening", Device::talks(lawicel, b"t70517F\r", 0, 3), true),
+        ("quiet, frames before the opening", Device::talks(quiet, b"t70517F\r", 0, 3), true),
+        ("frames alone", Device::new(frames_alone), true),
+        ("O alone", Device::new(opens), false),
+    ] {
+        let opened = open(&mut device, rate.then_some(125_000)).map(drop).map_err(|e| e.to_string());
+        assert_eq!(opened, Ok(()), "{name}: {:?}", device.lines);
+        assert!(device.now < ms(10_000), "{name}: {:?}", device.now);
+        // The last attempt is whole: closed, the bit rate, opened; and closed at the end.
+        let begun = device.lines.iter().rposition(|line| line == "V").unwrap_or_default();
+        let tail: Vec<&str> =
+            device.lines[begun..].iter().map(String::as_str).filter(|l| *l != "V").collect();
+        let rate: &[&str] = if rate { &["S4"] } else { &[] };
+        assert_eq!(tail, [rate, &["O", "C"]].concat(), "{name}: {:?}", device.lines);
+        // Some firmwares repeat their last command for a line without characters.
+        assert!(device.lines.iter().all(|line| !line.is_empty()), "{name}: {:?}", device.lines);
+    }
+}
+
+/// A modem with and without its echo.
+fn modem(line: &str, _: usize) -> String {
+    format!("{line}\r\r\nERROR\r\n")
+}
+
+fn modem_without_echo(_: &str, _: usize) -> String {
+    "\r\nERROR\r\n".to_string()
+}
+
+/// The prompt of a shell sets the title of its window, which ends with BEL.
+fn shell(line: &str, _: usize) -> String {
+    format!("{line}\r\nbash: {line}: command not found\r\n\x1B]0;root@board: /root\x07root@board:~# ")
+}
+
+/// Its words begin with the name of the command.
+fn monitor(line: &str, _: usize) -> String {
+    format!("{line}: unknown command\r\n> ")
+}
+
+/// A name, then a password that is not shown, and so on.
+fn login(line: &str, number: usize) -> String {
+    if number.is_multiple_of(2) {
+        format!("{line}\r\nPassword: ")
+    } else {
+        "\r\n\r\nLogin incorrect\r\nboard login: ".to_string()
+    }
+}
+
+fn mirror(line: &str, _: usize) -> String {
+    format!("{line}\r")
+}
+
+/// A measuring device: each line gets a value.
+fn meter(_: &str, number: usize) -> String {
+    format!("+{number}.25\r\n")
+}
+
+/// It measures only for V, and each time something else.
+fn voltage(line: &str, number: usize) -> String {
+    if line == "V" {
+        format!("12.{number}\r\n")
+    } else {
+        String::new()
+    }
+}
+
+#[test]
+fn what_is_no_adapter_is_refused_and_quoted() {
+    refused_and_quoted(None);
+    refused_and_quoted(Some(125_000));
+}
+
+fn refused_and_quoted(rate: Option<u32>) {
+    const GPS: &[u8] = b"$GPGGA,120000,4807.038,N\r\n$GPGSA,A,3\r\n";
+    for (name, mut device, said) in [
+        ("silence", Device::new(nothing), "as an adapter does"),
+        ("modem", Device::new(modem), "it sent 'ERROR'"),
+        ("modem without echo", Device::new(modem_without_echo), "it sent 'ERROR'"),
+        ("GPS receiver, 1 Hz", Device::talks(nothing, GPS, 350, 1000), "it sent '$GPGGA,120000,4807.038,N'"),
+        ("GPS receiver, 10 Hz", Device::talks(nothing, GPS, 350, 100), "it sent '$GPGGA,120000,4807.038,N'"),
+        ("shell", Device::new(shell), "it sent 'bash: C: command not found'"),
+        ("monitor", Device::new(monitor), "it sent 'C: unknown command'"),
+        ("login", Device::new(login), "it sent 'Password:'"),
+        ("a plug that joins both wires", Device::new(mirror), "it sent back what it got"),
+        ("measuring device", Device::new(meter), "it sent '+0.25'"),
+        ("voltmeter", Device::new(voltage), "it sent '12."),
+        ("text without CR", Device::talks(nothing, b"hello\n", 10, 10), "it sent 'hellohello"),
+        ("bytes without a pause", Device::talks(nothing, &[b'x'; 100], 0, 1), "it sent 'xxxx"),
+        (
+            "lines without a pause",
+            Device::talks(nothing, b"xxxxxxxxxxxxxxxxxxxxxxx\r", 0, 1),
+            "it sent 'xxxx",
+        ),
+    ] {
+        let error = open(&mut device, rate).map(drop).unwrap_err();
+        let words = error.to_string();
+        assert!(words.contains("it answered neither V (version) nor O (open the bus)"), "{name}: {words}");
+        assert!(words.contains(said), "{name}: {words}");
+        assert!(error.advice().contains("not an SLCAN adapter"), "{name}: {}", error.advice());
+        assert!(device.now < ms(8_000), "{name}: {:?}", device.now);
+    }
+}
+
+/// It acknowledges until the bus is to be opened.
+fn half(line: &str, number: usize) -> String {
+    if line == "O" {
+        String::new()
+    } else {
+        lawicel(line, number)
+    }
+}
+
+/// A modem that becomes an adapter, and an adapter that becomes a modem.
+fn modem_first(line: &str, number: usize) -> String {
+    if number < 6 {
+        modem(line, number)
+    } else {
+        lawicel(line, number)
+    }
+}
+
+fn modem_at_last(line: &str, number: usize) -> String {
+    if number < 3 {
+        lawicel(line, number)
+    } else {
+        modem(line, number)
+    }
+}
+
+fn refuses(line: &str, number: usize, what: char) -> String {
+    if line.starts_with(what) {
+        "\x07".to_string()
+    } else {
+        lawicel(line, number)
+    }
+}
+
+#[test]
+fn an_adapter_that_refuses_or_changes_its_mind_is_named() {
+    for (name, answers, rate, words) in [
+        ("rate", (|line, n| refuses(line, n, 'S')) as Answers, 125_000, "it refuses the bit rate"),
+        ("bus", |line, n| refuses(line, n, 'O'), 125_000, "it refuses to open the bus"),
+        ("no such rate", lawicel, 123_456, "it does not support 123456 bit/s"),
+        ("S is acknowledged, O is not", half, 125_000, "it acknowledges S4, but not O"),
+        ("O is acknowledged, S is not", opens, 125_000, "it acknowledges O, but not S4"),
+    ] {
+        let mut device = Device::new(answers);
+        let error = open(&mut device, Some(rate)).map(drop).unwrap_err().to_string();
+        assert!(error.contains(words), "{name}: {error}");
+        assert!(device.now < ms(8_000), "{name}: {:?}", device.now);
+    }
+    let mut device = Device::new(modem_first);
+    assert!(open(&mut device, Some(125_000)).is_ok(), "{:?}", device.lines);
+    // Its version was that of an adapter.
+    let mut device = Device::new(modem_at_last);
+    let error = open(&mut device, Some(125_000)).map(drop).unwrap_err().to_string();
+    assert!(error.contains("it sent 'ERROR'"), "{error}");
+    let mut gone = Device { gone: true, ..Device::new(lawicel) };
+    let error = open(&mut gone, None).map(drop).unwrap_err();
+    assert!(matches!(error, AdapterError::Lost { .. }), "{error}");
+}
+
+#[test]
+fn a_session_sets_the_bit_rate_opens_and_closes() {
+    // A frame follows the acknowledgement directly.
+    let answers = |line: &str, number| match line {
+        "O" => "\rt70517F\r".to_string(),
+        "t6050" => "z\rt5850\r".to_string(),
+        _ => lawicel(line, number),
+    };
+    let mut device = Device::new(answers);
+    let mut bus = open(&mut device, Some(500_000)).unwrap();
+    let soon = ms(20);
+    assert_eq!(bus.receive(soon).unwrap(), Some(frame(0x705, &[0x7F])));
+    bus.send(&frame(0x605, &[])).unwrap();
+    assert_eq!(bus.receive(soon).unwrap(), Some(frame(0x585, &[])));
+    assert_eq!(bus.receive(soon).unwrap(), None);
+    drop(bus);
+    // The first C ends a line that an earlier session left incomplete.
+    assert_eq!(device.lines, ["C", "C", "V", "S6", "O", "t6050", "C"]);
+}
+
+#[test]
+fn the_status_flags_tell_the_controllers_state() {
+    for (answer, controller) in [
+        ("F00\r", Some(Controller::Active)),
+        ("t70517F\rF04\r", Some(Controller::Warning)),
+        ("FA4\r", Some(Controller::Passive)),
+        ("\x07", None),
+        ("F1\r", None),
+        ("", None),
+    ] {
+        let mut device = Device::new(lawicel);
+        let mut bus = open(&mut device, None).unwrap();
+        let now = bus.line.now;
+        bus.line.coming.extend(answer.bytes().map(|byte| (now, byte)));
+        bus.line.answers = nothing;
+        assert_eq!(bus.health().and_then(|health| health.controller), controller, "{answer:?}");
+        // A frame that arrives meanwhile is not lost.
+        assert_eq!(bus.receive(Duration::ZERO).unwrap().is_some(), answer.starts_with('t'));
+    }
+}
+
+/// The port is opened while the adapter sends a frame.
+#[test]
+fn the_rest_of_a_frame_costs_no_second_attempt() {
+    let mut device = Device::restarts(quiet, 0, b"7F00\rt70517F\r");
+    assert!(open(&mut device, Some(125_000)).is_ok());
+    assert_eq!(device.lines, ["C", "C", "V", "V", "S4", "O", "C"]);
+}
+
+/// The frames of this tool are not those of another one.
+#[test]
+fn an_echo_is_no_frame_of_the_bus() {
+    let mut device = Device::new(echoes);
+    let mut bus = open(&mut device, None).unwrap();
+    bus.send(&frame(0x605, &[0x40])).unwrap();
+    bus.send(&frame(0x605, &[0x60])).unwrap();
+    let later = bus.line.now + ms(2);
+    bus.line.coming.extend(b"t5851FF\r".iter().map(|byte| (later, *byte)));
+    assert_eq!(bus.receive(ms(20)).unwrap(), Some(frame(0x585, &[0xFF])));
+    // Another tool sends the same.
+    bus.line.coming.extend(b"t605140\r".iter().map(|byte| (later, *byte)));
+    assert_eq!(bus.receive(ms(20)).unwrap(), Some(frame(0x605, &[0x40])));
+    assert_eq!(bus.receive(ms(20)).unwrap(), None);
+}
+
+/// It takes commands, and refuses frames: nobody acknowledges them, and its queue is full.
+#[test]
+fn refused_frames_are_errors_of_the_bus() {
+    let mut device = Device::new(|line, number| refuses(line, number, 't'));
+    let mut bus = open(&mut device, None).unwrap();
+    for _ in 0..3 {
+        bus.send(&frame(0x605, &[0x40])).unwrap();
+        assert_eq!(bus.receive(ms(20)).unwrap(), None);
+    }
+    let health = bus.health().unwrap();
+    assert_eq!((health.controller, health.unclear), (Some(Controller::Active), 3));
+    assert!(!health.acknowledged());
+    bus.line.answers = nothing;
+    assert_eq!(bus.health().unwrap().unclear, 3);
+}
+
+#[test]
+fn a_line_that_is_too_long_is_skipped_and_the_session_goes_on() {
+    let mut device = Device::new(lawicel);
+    let mut bus = open(&mut device, None).unwrap();
+    let long = |len| "t70517F".repeat(len);
+    // As long as a CAN FD frame; longer than any buffer; a frame may follow in the same line's end.
+    for line in [long(10), long(5000), format!("d0058{}", "00".repeat(64)), "x\x07".repeat(100)] {
+        let now = bus.line.now;
+        let text = format!("{line}\rt70517F\r");
+        bus.line.coming.extend(text.bytes().map(|byte| (now, byte)));
+        assert_eq!(bus.receive(ms(100)).unwrap(), Some(frame(0x705, &[0x7F])), "{}", line.len());
+        assert_eq!(bus.receive(ms(100)).unwrap(), None, "{}", line.len());
+    }
+}
+
+#[test]
+fn waiting_ends_beside_a_flood() {
+    let mut device = Device::new(lawicel);
+    let mut bus = open(&mut device, None).unwrap();
+    for flood in [&b"xxxxxxxxxxxxxxxxxxxxx"[..], b"xx\r", b"\r\x07"] {
+        let before = bus.line.now;
+        (bus.line.says, bus.line.next, bus.line.period) = (flood, before, Some(Duration::from_micros(1)));
+        assert_eq!(bus.receive(ms(5)).unwrap(), None, "{flood:?}");
+        assert!(bus.line.now < before + ms(50), "{flood:?}: {:?}", bus.line.now - before);
+        bus.line.says = b"";
+    }
+}
+
+proptest! {
+    #[test]
+    fn any_text_is_a_frame_or_not(text in "[tTrRzZ][0-9A-Fa-f]{0,30}") {
+        if let Some(frame) = parse_frame(text.as_bytes()) {
+            let again = text_of(&frame);
+            prop_assert_eq!(parse_frame(again.trim_end().as_bytes()), Some(frame));
+        }
+    }
+}
