@@ -140,20 +140,28 @@ impl Health {
             Trouble::Unclear => format!(
                 "the adapter has reported {} of the bus, but not which: no other node acknowledges its frames, or the \
                  bit rate is wrong{rate}; check power, cable, terminators and bit rate",
-                match self.unclear {
-                    1 => "1 error".to_string(),
-                    count => format!("{count} errors"),
-                }
+                self.unclear_errors()
             ),
         })
     }
 
-    /// [`advice`](Self::advice), if the problem can exist although frames of other nodes arrive.
+    /// The problem and the advice, if frames of other nodes arrive although it exists.
     #[must_use]
     pub fn disturbance(&self) -> Option<String> {
         match self.trouble()? {
-            Trouble::Off | Trouble::Disturbed | Trouble::Unclear => self.advice(),
+            Trouble::Off | Trouble::Disturbed => self.advice(),
+            Trouble::Unclear => Some(format!(
+                "the adapter has reported {} of the bus: check the bit rate of each node, cable and terminators",
+                self.unclear_errors()
+            )),
             Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive => None,
+        }
+    }
+
+    fn unclear_errors(&self) -> String {
+        match self.unclear {
+            1 => "1 error".to_string(),
+            count => format!("{count} errors"),
         }
     }
 
