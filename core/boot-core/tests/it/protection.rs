@@ -193,7 +193,7 @@ fn the_option_bytes_are_read_as_the_manual_has_them() {
     const FACTORY: (u32, u32) = (0x0FFF_AAED, 0x0FFF_0000);
     let protects =
         |optcr, optcr1| (0..24).filter(|n| is_write_protected(*n, optcr, optcr1)).collect::<Vec<u8>>();
-    assert_eq!(protects(FACTORY.0, FACTORY.1), []);
+    assert!(protects(FACTORY.0, FACTORY.1).is_empty());
     for sector in 0..12 {
         assert_eq!(protects(FACTORY.0 & !(1 << (16 + sector)), FACTORY.1), [sector]);
         assert_eq!(protects(FACTORY.0, FACTORY.1 & !(1 << (16 + sector))), [12 + sector]);
