@@ -105,6 +105,10 @@ mod app {
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
         lss_store: PRODUCT.lss_store,
+        program_watchdog_ms: match PRODUCT.program_watchdog_ms {
+            Some(ms) => ms,
+            None => 0,
+        },
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };

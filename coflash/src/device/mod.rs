@@ -20,6 +20,7 @@ pub(crate) mod recognise;
 pub mod region;
 pub mod scan;
 pub mod session;
+pub mod state;
 mod timing;
 pub mod value;
 

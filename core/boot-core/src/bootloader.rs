@@ -13,7 +13,8 @@ use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY,
     PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
-    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, UNLOCK, UNLOCK_ENTRIES,
+    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_PROGRAM_WATCHDOG, UNLOCK,
+    UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -150,6 +151,9 @@ pub struct Config {
     pub boot_up_emergency: bool,
     /// Whether layer setting services may store node-ID and bit rate.
     pub lss_store: bool,
+    /// 2007h/10: the time in ms within which a program must feed the independent watchdog; 0 if the
+    /// bootloader does not start it.
+    pub program_watchdog_ms: u16,
     /// How programs are downloaded.
     pub download: Policy,
     /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
@@ -357,6 +361,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
             PROGRAM_PARTIAL if P::RESUMES => return put(buf, &self.download.partial(at.sub)),
+            DEVICE_STATE if at.sub == STATE_PROGRAM_WATCHDOG => {
+                return put(buf, &self.config.program_watchdog_ms.to_le_bytes());
+            }
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
             PROGRAM_ID => self.download.identification(at.sub),
             SECOND_SERVER if C::SECOND_SERVER => self.second_server.read(at.sub),

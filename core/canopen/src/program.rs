@@ -111,9 +111,12 @@ pub const STATE_REASON: u8 = 2;
 pub const STATE_PROGRAM_RESET: u8 = 3;
 /// In [`DEVICE_STATE`]: resets in a row by which a program ended and that nobody requested.
 pub const STATE_CRASH_RESETS: u8 = 4;
+/// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
+/// watchdog, which the bootloader starts; 0 if it does not.
+pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 5] = [
-    Entry::record(DEVICE_STATE, "Device state", 4),
+pub const STATE_ENTRIES: [Entry; 6] = [
+    Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_WATCHDOG),
     Entry::sub(DEVICE_STATE, 1, "Program number of the bootloader", DataType::Unsigned8, Access::Const),
     Entry::sub(
         DEVICE_STATE,
@@ -130,6 +133,13 @@ pub const STATE_ENTRIES: [Entry; 5] = [
         Access::Ro,
     ),
     Entry::sub(DEVICE_STATE, STATE_CRASH_RESETS, "Crash resets in a row", DataType::Unsigned8, Access::Ro),
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_PROGRAM_WATCHDOG,
+        "Watchdog of a program",
+        DataType::Unsigned16,
+        Access::Const,
+    ),
 ];
 
 /// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`

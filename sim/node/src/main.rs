@@ -137,6 +137,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         supports,
         boot_up_emergency: true,
         lss_store: true,
+        program_watchdog_ms: 0,
         download: Policy {
             identity: Some((args.vendor_id, args.product_code)),
             crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },

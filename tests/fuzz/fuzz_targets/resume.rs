@@ -50,6 +50,7 @@ static CONFIG: Config = Config {
     supports: |_| true,
     boot_up_emergency: false,
     lss_store: true,
+    program_watchdog_ms: 0,
     download: Policy::DEFAULT,
     password: b"",
 };

@@ -39,6 +39,7 @@ pub const CONFIG: Config = Config {
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
     lss_store: true,
+    program_watchdog_ms: 0,
     download: Policy::DEFAULT,
     password: b"",
 };

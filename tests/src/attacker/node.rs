@@ -87,6 +87,7 @@ impl Node {
             supports: coboot_node::supports,
             boot_up_emergency: true,
             lss_store: true,
+            program_watchdog_ms: 0,
             download: Policy { ..profile.download },
             password: profile.password,
         }));

@@ -487,6 +487,9 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
         assert_eq!(byte, [value], "2007h/{sub}");
     }
+    let mut word = [0xEE; 2];
+    assert_eq!(node.read(Address::new(0x2007, 10), &mut word), Ok(2));
+    assert_eq!(word, [0, 0]);
 }
 
 /// A START that came to nothing behind the reset: 1F57h is 02h for that program. A damaged program is

@@ -1,0 +1,130 @@
+//! The state of a device in its own words: object 2007h of coboot.
+
+use std::fmt;
+use std::time::Duration;
+
+use canopen::program::{
+    DEVICE_STATE, STATE_CRASH_RESETS, STATE_PROGRAM_RESET, STATE_PROGRAM_WATCHDOG, STATE_REASON,
+};
+use canopen::Address;
+use serde::Serialize;
+use shared_abi::boot_report::Reason;
+use shared_abi::handoff::ResetCause;
+
+use super::error::{optional, Error};
+use super::session::Session;
+
+/// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct DeviceState {
+    /// 2007h/2: the number of a [`Reason`].
+    pub reason: u8,
+    /// 2007h/3: the number of a [`ResetCause`]; 0 if it is not known.
+    pub program_reset: u8,
+    /// 2007h/4: resets in a row by which a program ended and that nobody requested.
+    pub crash_resets: u8,
+}
+
+impl DeviceState {
+    /// Reads the state; `None` from a device without the object, such as an application.
+    ///
+    /// # Errors
+    /// Those of a [read](Session::read).
+    pub fn read(session: &mut Session<'_>) -> Result<Option<Self>, Error> {
+        let mut byte = |sub| {
+            let value = optional(session.read_number(Address::new(DEVICE_STATE, sub)))?;
+            Ok(value.map(|value| value as u8))
+        };
+        let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
+        let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
+        let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
+        Ok(Some(Self { reason, program_reset, crash_resets }))
+    }
+
+    /// How the program ended, if that is known.
+    #[must_use]
+    pub fn ended_by(self) -> Option<&'static str> {
+        Some(match ResetCause::from_byte(self.program_reset) {
+            ResetCause::Unknown => return None,
+            ResetCause::PowerOn => "the power",
+            ResetCause::Pin => "the reset pin",
+            ResetCause::Software => "software",
+            ResetCause::IndependentWatchdog => "the independent watchdog",
+            ResetCause::WindowWatchdog => "the window watchdog",
+            ResetCause::LowPower => "a low-power mode that the option bytes forbid",
+            ResetCause::BrownOut => "a supply below the brown-out level",
+        })
+    }
+}
+
+/// Why a device stays in the bootloader, in words.
+#[must_use]
+pub fn reason(number: u8) -> String {
+    match Reason::from_byte(number) {
+        Some(Reason::Requested) => "it was called back",
+        Some(Reason::Strap) => "its entry strap is set",
+        Some(Reason::CrashLoop) => "its program has ended too often in a row by a reset that nobody requested",
+        Some(Reason::NoAutostart) => "no program starts by itself on this product",
+        Some(Reason::NodeId) => "its node-ID is outside the range with which a program may start",
+        Some(Reason::Unsigned) => "its program is not released for autostart",
+        Some(Reason::NoProgram) => "it has no program",
+        Some(Reason::Fault) => "the bootloader had a fault",
+        Some(Reason::Rescue) => "somebody spoke to it in its rescue window",
+        Some(Reason::Damaged) => "its program differs from the one that was downloaded",
+        Some(Reason::Vectors) => "the first two words of its program are no stack and entry for this board",
+        Some(Reason::Forbidden) => "the product forbids the start of its program at present",
+        None => return format!("for a reason that this tool does not know ({number})"),
+    }
+    .to_string()
+}
+
+impl fmt::Display for DeviceState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "stays in the bootloader: {}", reason(self.reason))?;
+        if let Some(how) = self.ended_by() {
+            write!(f, "; the program was ended by {how}")?;
+        }
+        match self.crash_resets {
+            0 => Ok(()),
+            1 => write!(f, "; 1 reset that nobody requested"),
+            255 => write!(f, "; 255 or more resets in a row that nobody requested"),
+            n => write!(f, "; {n} resets in a row that nobody requested"),
+        }
+    }
+}
+
+/// 2007h/10: the time within which a program must feed the watchdog that the bootloader starts; `None` if
+/// there is no such watchdog, or the device does not say.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn program_watchdog(session: &mut Session<'_>) -> Result<Option<Duration>, Error> {
+    let at = Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG);
+    let ms = optional(session.read_number(at))?.filter(|ms| *ms > 0);
+    Ok(ms.map(|ms| Duration::from_millis(ms.into())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_state_has_its_words() {
+        let state = |reason, program_reset, crash_resets| {
+            DeviceState { reason, program_reset, crash_resets }.to_string()
+        };
+        assert_eq!(
+            state(5, 4, 1),
+            "stays in the bootloader: its program is not released for autostart; the program was ended by the \
+             independent watchdog; 1 reset that nobody requested"
+        );
+        assert_eq!(state(6, 0, 0), "stays in the bootloader: it has no program");
+        assert_eq!(state(200, 200, 0), "stays in the bootloader: for a reason that this tool does not know (200)");
+        // No two reasons share their words.
+        let mut words: Vec<_> = (0..=12).map(reason).collect();
+        words.sort();
+        words.dedup();
+        assert_eq!(words.len(), 13);
+    }
+}
