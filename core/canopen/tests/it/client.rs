@@ -335,3 +335,96 @@ fn an_answer_about_another_object_is_no_answer() {
         }
     }
 }
+
+/// An abort names the object of the transfer that it ends (CiA 301 clause 7.2.4.3.17): one for
+/// another object does not end this transfer, wherever it comes.
+#[test]
+fn an_abort_for_another_object_is_no_answer() {
+    use canopen::sdo::client::Block;
+    const BLOCK: Block = Block { fallback: true, blksize: 127, pst: 0, repeat_ms: 300 };
+    let object = Address::new(0x2000, 3);
+    let nine: &[u8] = &[1, 2, 3, 4, 5, 6, 7, 8, 9];
+    let block_download = || Box::new(Download::as_blocks(node(), object, nine, CONFIG, BLOCK));
+    let block_upload = || Box::new(Upload::as_blocks(node(), object, Vec::new(), CONFIG, BLOCK));
+    /// A client, and the answers after which it waits.
+    type Case = (&'static str, Box<dyn Transfer>, Vec<[u8; 8]>);
+    let cases: Vec<Case> = vec![
+        ("expedited download", Box::new(download(&[1])), vec![]),
+        ("segmented download", Box::new(download(nine)), vec![[0x60, 0x00, 0x20, 3, 0, 0, 0, 0]]),
+        ("upload", Box::new(upload()), vec![]),
+        ("segmented upload", Box::new(upload()), vec![[0x41, 0x00, 0x20, 3, 9, 0, 0, 0]]),
+        ("block download, begun", block_download(), vec![]),
+        ("block download", block_download(), vec![[0xA4, 0x00, 0x20, 3, 127, 0, 0, 0]]),
+        (
+            "block download, ending",
+            block_download(),
+            vec![[0xA4, 0x00, 0x20, 3, 127, 0, 0, 0], [0xA2, 2, 127, 0, 0, 0, 0, 0]],
+        ),
+        ("block upload, begun", block_upload(), vec![]),
+        ("block upload", block_upload(), vec![[0xC6, 0x00, 0x20, 3, 9, 0, 0, 0]]),
+    ];
+    for (name, mut client, answers) in cases {
+        let until_it_waits = |client: &mut dyn Transfer| loop {
+            match client.poll(at(1)) {
+                Step::Send(_) => {}
+                step => return step,
+            }
+        };
+        until_it_waits(&mut *client);
+        for answer in answers {
+            client.handle(&response(answer), at(1));
+            until_it_waits(&mut *client);
+        }
+        for (index, sub) in [(0x1F50_u16, 1), (0x2000, 4), (0x2001, 3)] {
+            let [low, high] = index.to_le_bytes();
+            client.handle(&response([0x80, low, high, sub, 0x01, 0x00, 0x04, 0x05]), at(1));
+            assert!(matches!(until_it_waits(&mut *client), Step::Wait(_)), "{name}: {index:04X}h/{sub}");
+        }
+        client.handle(&response([0x80, 0x00, 0x20, 3, 0x30, 0x00, 0x09, 0x06]), at(2));
+        let refused = Err(SdoError::Server(AbortCode(0x0609_0030)));
+        assert_eq!(until_it_waits(&mut *client), Step::Done(refused), "{name}");
+    }
+    // Some servers name no object at all.
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    client.handle(&response([0x80, 0, 0, 0, 0, 0, 0x02, 0x06]), at(0));
+    ends(&mut client, 0, Err(SdoError::Server(AbortCode::NO_OBJECT)));
+}
+
+/// A server answers in the order of the requests: what it still sends of a transfer that this side
+/// has given up comes before its answer to the next initiate.
+#[test]
+fn answers_to_the_attempt_before_are_passed_over() {
+    // The first attempt was given up in its segments.
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    for late in [[0x00, 1, 2, 3, 4, 5, 6, 7], [0x1D, 1, 0, 0, 0, 0, 0, 0], [0x20, 0, 0, 0, 0, 0, 0, 0]] {
+        client.handle(&response(late), at(5));
+        assert_eq!(client.poll(at(5)), Step::Wait(at(1000)));
+    }
+    client.handle(&response([0x41, 0x00, 0x20, 3, 9, 0, 0, 0]), at(6));
+    sends(&mut client, 6, [0x60, 0, 0, 0, 0, 0, 0, 0]);
+    // It was given up at its initiate: that answer came first, and this one is the second.
+    client.handle(&response([0x41, 0x00, 0x20, 3, 9, 0, 0, 0]), at(7));
+    assert_eq!(client.poll(at(7)), Step::Wait(at(1006)));
+    client.handle(&response([0x00, 1, 2, 3, 4, 5, 6, 7]), at(8));
+    sends(&mut client, 8, [0x70, 0, 0, 0, 0, 0, 0, 0]);
+    client.handle(&response([0x1B, 8, 9, 0, 0, 0, 0, 0]), at(9));
+    ends(&mut client, 9, Ok(()));
+    assert_eq!(client.into_sink(), [1, 2, 3, 4, 5, 6, 7, 8, 9]);
+    // A download: the acknowledgement of a segment, and of a sub-block.
+    let mut client = download(&[1]);
+    sends(&mut client, 0, [0x2F, 0x00, 0x20, 3, 1, 0, 0, 0]);
+    for late in [[0x20, 0, 0, 0, 0, 0, 0, 0], [0xA2, 127, 127, 0, 0, 0, 0, 0]] {
+        client.handle(&response(late), at(5));
+        assert_eq!(client.poll(at(5)), Step::Wait(at(1000)));
+    }
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(6));
+    ends(&mut client, 6, Ok(()));
+    // If nothing else comes, the answer was wrong, and the server not silent.
+    let mut client = upload();
+    sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);
+    client.handle(&response([0xE0; 8]), at(5));
+    let command = [0x80, 0x00, 0x20, 3, 0x01, 0x00, 0x04, 0x05];
+    aborts(&mut client, 1000, command, SdoError::Client(AbortCode::COMMAND));
+}

@@ -215,6 +215,33 @@ fn a_device_that_refuses_is_named_with_its_reason() {
     }
 }
 
+/// A late abort for the object of an earlier transfer breaks nothing off.
+#[test]
+fn an_abort_for_another_object_concerns_no_device() {
+    let data = data(2000);
+    let mut group = Group::new(3);
+    let mut download = GroupDownload::new(id(0x6DF), group.all(), AT, &data, TIMEOUT);
+    let result = loop {
+        for (index, sub) in [(0x1F57_u16, 1), (0x1F50, 2)] {
+            let [low, high] = index.to_le_bytes();
+            let late = [0x80, low, high, sub, 0, 0, 4, 5];
+            assert_eq!(download.handle(1, &late, at(group.now)), Ok(()));
+        }
+        match download.poll(at(group.now)) {
+            GroupStep::Done(result) => break result,
+            GroupStep::Send(frame) => group.benches.iter_mut().for_each(|bench| bench.send(&frame)),
+            GroupStep::Wait(_) => group.now += 1,
+        }
+        for (number, bench) in group.benches.iter_mut().enumerate() {
+            bench.now = group.now;
+            for answer in bench.sent() {
+                download.handle(number, answer.exactly().unwrap(), at(group.now)).unwrap();
+            }
+        }
+    };
+    assert_eq!((result, group.who_has(&data)), (WHOLE, 0b111));
+}
+
 /// Answers that no server of the standard gives.
 #[test]
 fn hostile_answers_neither_hang_nor_panic() {

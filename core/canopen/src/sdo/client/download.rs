@@ -4,7 +4,7 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
-use crate::sdo::client::transfer::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::client::transfer::{concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use crate::time::Instant;
 
@@ -69,6 +69,13 @@ impl<D: AsRef<[u8]>> Download<D> {
         download
     }
 
+    /// Whether the transfer has ended because the server does not support block transfer, as far as
+    /// its abort of the initiate tells.
+    pub fn refuses_blocks(&self) -> bool {
+        let refused = matches!(self.link.result, Some(Err(SdoError::Server(code))) if means_unknown(code));
+        refused && matches!(self.state, State::InitiatingBlock { .. })
+    }
+
     fn answer(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
         let data = self.data.as_ref();
         match (Response::parse(bytes), &mut self.state) {
@@ -101,8 +108,8 @@ impl<D: AsRef<[u8]>> Download<D> {
                 self.state = State::Blocks(SubBlock::new(crc, blksize));
                 Ok(Next::Wait)
             }
-            (Some(Response::Abort(_, code)), State::InitiatingBlock { fallback: true })
-                if means_unknown(code) =>
+            (Some(Response::Abort(at, code)), State::InitiatingBlock { fallback: true })
+                if concerns(at, self.link.at) && means_unknown(code) =>
             {
                 self.state = State::Initiating;
                 Ok(Next::Send(initiate(self.link.at, data)))
@@ -117,6 +124,7 @@ impl<D: AsRef<[u8]>> Download<D> {
             // The server repeats its acknowledgement.
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
+            (response, State::Initiating | State::InitiatingBlock { .. }) => self.link.too_early(response),
             (response, _) => self.link.unexpected(response),
         }
     }
@@ -232,6 +240,10 @@ impl<D: AsRef<[u8]>> Transfer for Download<D> {
 
     fn progress(&self) -> u32 {
         self.link.progress
+    }
+
+    fn awaits_answer(&self) -> bool {
+        self.link.awaits_answer()
     }
 
     fn abort(&mut self, code: AbortCode) {

@@ -5,7 +5,7 @@ use crate::frame::{CobId, Frame};
 use crate::od::Address;
 use crate::sdo::block::check_blksize;
 use crate::sdo::client::download::SubBlock;
-use crate::sdo::client::transfer::Config;
+use crate::sdo::client::transfer::{concerns, Config};
 use crate::sdo::wire::{BlockAck, Request, Response};
 use crate::time::Instant;
 
@@ -131,7 +131,10 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
             return Ok(());
         }
         let response = Response::parse(bytes);
-        if let Some(Response::Abort(_, code)) = response {
+        if let Some(Response::Abort(at, code)) = response {
+            if !concerns(at, self.at) {
+                return Ok(());
+            }
             match &mut self.state {
                 // Its transfer has ended, so it must get no more segments.
                 State::Begun { .. } | State::Blocks(_) | State::End { .. } => self.break_off(server),

@@ -91,6 +91,9 @@ pub trait Transfer {
     /// The number of data bytes that the server has acknowledged, or that have arrived here.
     fn progress(&self) -> u32;
 
+    /// Whether the transfer waits for an answer: it has nothing to send, and has not ended.
+    fn awaits_answer(&self) -> bool;
+
     /// Ends the transfer: the server gets this abort.
     fn abort(&mut self, code: AbortCode);
 }
@@ -107,6 +110,8 @@ pub(super) struct Link {
     pub(super) moved: Instant,
     pub(super) result: Option<Result<(), SdoError>>,
     pub(super) progress: u32,
+    /// Whether an answer was ignored that no server gives to the initiate of this transfer.
+    odd: bool,
 }
 
 /// The consequence of an answer.
@@ -130,16 +135,20 @@ impl Link {
             moved: Instant::default(),
             result: None,
             progress: 0,
+            odd: false,
         }
     }
 
     /// The eight bytes of an answer, if the frame is one and the transfer waits for one.
     pub(super) fn answer<'f>(&self, frame: &'f Frame) -> Option<&'f [u8; 8]> {
-        let waiting = self.result.is_none() && self.request.is_none();
-        if !waiting || !frame.has_cob_id(CobId::sdo_response(self.node)) {
+        if !self.awaits_answer() || !frame.has_cob_id(CobId::sdo_response(self.node)) {
             return None;
         }
         frame.exactly()
+    }
+
+    pub(super) fn awaits_answer(&self) -> bool {
+        self.result.is_none() && self.request.is_none()
     }
 
     pub(super) fn deadline(&self) -> Instant {
@@ -153,8 +162,12 @@ impl Link {
         match self.result {
             Some(result) => Step::Done(result),
             None if now.has_reached(self.deadline()) => {
-                self.result = Some(Err(SdoError::NoAnswer));
-                self.send(Request::Abort(self.at, AbortCode::TIMEOUT).emit(), now)
+                let (error, code) = match self.odd {
+                    true => (SdoError::Client(AbortCode::COMMAND), AbortCode::COMMAND),
+                    false => (SdoError::NoAnswer, AbortCode::TIMEOUT),
+                };
+                self.result = Some(Err(error));
+                self.send(Request::Abort(self.at, code).emit(), now)
             }
             None => Step::Wait(self.deadline()),
         }
@@ -189,11 +202,12 @@ impl Link {
         }
     }
 
-    /// An answer that does not fit here. A late answer to the initiate of an earlier transfer is
-    /// ignored.
+    /// An answer that does not fit here. A late answer to the initiate of an earlier transfer, or
+    /// its abort, is ignored.
     pub(super) fn unexpected(&self, response: Option<Response>) -> Result<Next, SdoError> {
         match response {
-            Some(Response::Abort(_, code)) => Err(SdoError::Server(code)),
+            Some(Response::Abort(at, code)) if concerns(at, self.at) => Err(SdoError::Server(code)),
+            Some(Response::Abort(..)) => Ok(Next::Ignore),
             Some(
                 Response::InitiateDownload(at)
                 | Response::InitiateUpload(at, _)
@@ -203,6 +217,25 @@ impl Link {
             _ => Err(SdoError::Client(AbortCode::COMMAND)),
         }
     }
+
+    /// An answer before the server has answered the initiate. The server answers in the order of
+    /// the requests, so one that does not fit answers the transfer before, which this side has given
+    /// up. It is ignored; if nothing else comes, it is the error at the time-out.
+    pub(super) fn too_early(&mut self, response: Option<Response>) -> Result<Next, SdoError> {
+        match self.unexpected(response) {
+            Err(SdoError::Client(_)) => {
+                self.odd = true;
+                Ok(Next::Ignore)
+            }
+            next => next,
+        }
+    }
+}
+
+/// Whether an abort with this object ends the transfer of `at`: it names the object of the transfer
+/// that it ends (CiA 301 clause 7.2.4.3.17). Some servers name none (0000h), which may be any.
+pub(super) fn concerns(named: Address, at: Address) -> bool {
+    named == at || named.index == 0
 }
 
 /// Whether this is the abort of a server that does not support block transfer. Some servers use the

@@ -4,7 +4,7 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{Receiver, BLKSIZE_MAX};
-use crate::sdo::client::transfer::{means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::client::transfer::{concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
 use crate::sdo::fields;
 use crate::sdo::wire::{BlockAck, Payload, Request, Response};
 use crate::time::Instant;
@@ -174,12 +174,15 @@ impl<S: Sink> Upload<S> {
                 self.state = State::Blocks(receiver);
                 Ok(Next::Send(Request::StartBlockUpload))
             }
-            (Some(Response::Abort(_, code)), State::InitiatingBlock)
-                if self.block.fallback && means_unknown(code) =>
+            (Some(Response::Abort(at, code)), State::InitiatingBlock)
+                if self.block.fallback && concerns(at, self.link.at) && means_unknown(code) =>
             {
                 self.state = State::Initiating;
                 Ok(Next::Send(Request::InitiateUpload(self.link.at)))
             }
+            // The answer to the initiate of the same read before, which was given up.
+            (Some(Response::InitiateUpload(..)), State::Segments { .. }) => Ok(Next::Ignore),
+            (response, State::Initiating | State::InitiatingBlock) => self.link.too_early(response),
             (response, _) => self.link.unexpected(response),
         }
     }
@@ -189,7 +192,7 @@ impl<S: Sink> Upload<S> {
         let State::Blocks(receiver) = &mut self.state else { return Ok(Next::Ignore) };
         // No segment has the number 0, so an abort differs from all segments. Other answers do not.
         if bytes[0] == fields::ABORT {
-            return Err(SdoError::Server(AbortCode(fields::number(bytes))));
+            return self.link.unexpected(Response::parse(bytes));
         }
         let received = receiver.take(bytes, false).map_err(SdoError::Client)?;
         let next = match received.ackseq {
@@ -258,8 +261,7 @@ impl<S: Sink> Transfer for Upload<S> {
     fn poll(&mut self, now: Instant) -> Step {
         // A sub-block that stopped early: its end was lost.
         if let State::Blocks(receiver) = &mut self.state {
-            let idle = self.link.result.is_none() && self.link.request.is_none();
-            if idle && receiver.is_within() {
+            if self.link.awaits_answer() && receiver.is_within() {
                 let repeat = self.link.moved + self.block.repeat_ms.min(self.link.timeout_ms);
                 if !now.has_reached(repeat) {
                     return Step::Wait(repeat);
@@ -274,6 +276,10 @@ impl<S: Sink> Transfer for Upload<S> {
 
     fn progress(&self) -> u32 {
         self.link.progress
+    }
+
+    fn awaits_answer(&self) -> bool {
+        self.link.awaits_answer()
     }
 
     fn abort(&mut self, code: AbortCode) {
