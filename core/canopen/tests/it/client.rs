@@ -217,7 +217,7 @@ fn answers_that_break_the_protocol_abort() {
     let mut client = initiated(&[1, 2, 3, 4, 5]);
     client.handle(&response([0x30, 0, 0, 0, 0, 0, 0, 0]), at(0));
     aborts(&mut client, 0, toggle, SdoError::Client(AbortCode(0x0503_0000)));
-    for wrong in [[0x00; 8], [0xE0; 8], [0x60, 0x00, 0x20, 3, 0, 0, 0, 0]] {
+    for wrong in [[0x00; 8], [0xE0; 8]] {
         let mut client = initiated(&[1, 2, 3, 4, 5]);
         client.handle(&response(wrong), at(0));
         aborts(&mut client, 0, command, SdoError::Client(AbortCode(0x0504_0001)));
@@ -421,6 +421,22 @@ fn answers_to_the_attempt_before_are_passed_over() {
     }
     client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(6));
     ends(&mut client, 6, Ok(()));
+    // A download whose first initiate was answered late: the second answer comes in its segments.
+    let nine = [1, 2, 3, 4, 5, 6, 7, 8, 9];
+    let mut client = download(&nine);
+    sends(&mut client, 0, [0x21, 0x00, 0x20, 3, 9, 0, 0, 0]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(5));
+    sends(&mut client, 5, [0x00, 1, 2, 3, 4, 5, 6, 7]);
+    client.handle(&response([0x60, 0x00, 0x20, 3, 0, 0, 0, 0]), at(6));
+    assert_eq!(client.poll(at(6)), Step::Wait(at(1005)));
+    client.handle(&response([0x20, 0, 0, 0, 0, 0, 0, 0]), at(7));
+    sends(&mut client, 7, [0x1B, 8, 9, 0, 0, 0, 0, 0]);
+    let mut client = Download::as_blocks(node(), Address::new(0x2000, 3), &nine, CONFIG, Default::default());
+    sends(&mut client, 0, [0xC6, 0x00, 0x20, 3, 9, 0, 0, 0]);
+    client.handle(&response([0xA4, 0x00, 0x20, 3, 127, 0, 0, 0]), at(5));
+    assert_eq!(client.poll(at(5)), Step::Send(request([0x01, 1, 2, 3, 4, 5, 6, 7])));
+    client.handle(&response([0xA4, 0x00, 0x20, 3, 127, 0, 0, 0]), at(6));
+    sends(&mut client, 6, [0x82, 8, 9, 0, 0, 0, 0, 0]);
     // If nothing else comes, the answer was wrong, and the server not silent.
     let mut client = upload();
     sends(&mut client, 0, [0x40, 0x00, 0x20, 3, 0, 0, 0, 0]);

@@ -4,7 +4,9 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{check_blksize, Crc16, SEGMENT};
-use crate::sdo::client::transfer::{concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::client::transfer::{
+    concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer,
+};
 use crate::sdo::wire::{BlockAck, BlockEnd, BlockSegment, Chunk, Payload, Request, Response, Segment};
 use crate::time::Instant;
 
@@ -121,6 +123,9 @@ impl<D: AsRef<[u8]>> Download<D> {
                 self.state = State::EndingBlock;
                 Ok(Next::Send(Request::EndBlockDownload(SubBlock::end(crc, data))))
             }
+            // The answer to the initiate of the same write before, which was given up, came first.
+            (Some(Response::InitiateDownload(..)), State::Segments { .. })
+            | (Some(Response::InitiateBlockDownload { .. }), State::Blocks(_)) => Ok(Next::Ignore),
             // The server repeats its acknowledgement.
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),

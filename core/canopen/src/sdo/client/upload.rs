@@ -4,7 +4,9 @@ use crate::abort::AbortCode;
 use crate::frame::{Frame, NodeId};
 use crate::od::Address;
 use crate::sdo::block::{Receiver, BLKSIZE_MAX};
-use crate::sdo::client::transfer::{concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer};
+use crate::sdo::client::transfer::{
+    concerns, means_unknown, Block, Config, Link, Next, SdoError, Step, Transfer,
+};
 use crate::sdo::fields;
 use crate::sdo::wire::{BlockAck, Payload, Request, Response};
 use crate::time::Instant;
