@@ -1,10 +1,12 @@
 //! Whether the device takes sealed images, and whether it has keys and therefore accepts and starts no
 //! others.
 
+use seal::key_block::{COUNTER, EPOCH};
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-use crate::store::{Key, Parameters};
+use crate::policy::SealPolicy;
+use crate::store::{Key, Parameters, ProgramRecord};
 
 /// A proof that the code for sealed images is linked. Without the feature `sealed` this type has no value:
 /// then the compiler leaves out all code that needs one. No other line depends on the feature.
@@ -84,6 +86,34 @@ pub fn is_sealed<F: Flash>(flash: &F, parameters: &impl Parameters, layout: &Lay
     }
     let [_, opened, ..] = parameters.get(flash, Key::GRANTS).unwrap_or([0; 4]);
     opened == 0 && !flash.is_blank(layout.key_block())
+}
+
+/// The lowest security counter of an image for this program, and the lowest epoch of its key, that the
+/// device accepts.
+pub(crate) fn floor<F: Flash>(
+    flash: &F,
+    parameters: &impl Parameters,
+    layout: &Layout,
+    policy: &SealPolicy,
+    program: u8,
+) -> (u32, u32) {
+    let block = layout.key_block().base;
+    let is_sound = is_sound(flash, block);
+    let word = |at: usize| if is_sound { flash.read_word(block + at as u32) } else { 0 };
+    let counters = |program| parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
+    // The epoch is the device's: a key that is revoked for one program signs for none.
+    let programs = layout.programs.len() as u8;
+    let epoch = (1..=programs).fold(word(EPOCH), |epoch, program| {
+        let [_, proved, ..] = counters(program);
+        epoch.max(proved)
+    });
+    // A program that has proved itself has raised the counter, if the policy raises it at
+    // confirmation.
+    let [mut counter, _, installed, _] = counters(program);
+    if ProgramRecord::load(parameters, flash, program).is_some_and(|record| record.confirmed) {
+        counter = counter.max(installed);
+    }
+    (counter.max(word(COUNTER)).max(policy.counter), epoch)
 }
 
 /// Whether the key block is valid.

@@ -171,10 +171,11 @@ pub const ACCESS: u16 = 0x2002;
 /// The event log of a sealed device, an object of coboot: the last eight events.
 pub const EVENTS: u16 = 0x2003;
 /// The entries of both objects in a sealed device.
-pub const SEALED_ENTRIES: [Entry; 12] = [
-    Entry::record(ACCESS, "Access", 2),
+pub const SEALED_ENTRIES: [Entry; 13] = [
+    Entry::record(ACCESS, "Access", 3),
     Entry::sub(ACCESS, 1, "Unique ID, nonce, rights", DataType::OctetString, Access::Ro),
     Entry::sub(ACCESS, 2, "Request and signature", DataType::OctetString, Access::Wo),
+    Entry::sub(ACCESS, 3, "Roots, epoch, counters", DataType::OctetString, Access::Ro),
     Entry::array(EVENTS, "Events", 8),
     Entry::sub(EVENTS, 1, "Event 1", DataType::OctetString, Access::Ro),
     Entry::sub(EVENTS, 2, "Event 2", DataType::OctetString, Access::Ro),

@@ -1,6 +1,8 @@
 //! Access to a sealed device (objects 2002h and 2003h): the actions that need a root's signature,
 //! the request for them, and the device's event log.
 
+use crate::key_block::ROOT_COUNT;
+
 /// Rights, each a bit. They last until the next reset.
 pub mod right {
     /// Erase a program at once (a second CLEAR) without installing another one.
@@ -32,6 +34,11 @@ pub const SIGNED_CHALLENGE: usize = 44;
 pub const SIGNED_REQUEST: usize = 12;
 /// Bytes of 2002h/2: the request with its Ed25519 signature.
 pub const REQUEST: usize = SIGNED_REQUEST + 64;
+
+/// Words of 2002h/3 before the counters: the ids of the root keys (0 for none), and the lowest epoch
+/// that the device accepts. The lowest security counter of each program follows. All are as they were
+/// at the last reset.
+pub const FLOOR: usize = ROOT_COUNT + 1;
 
 /// The number of events in the log: 2003h/1 to 2003h/8.
 pub const EVENTS: usize = 8;

@@ -6,18 +6,22 @@
 use canopen::od::{put, Address};
 use canopen::program::{FlashError, ACCESS, EVENTS};
 use canopen::AbortCode;
-use seal::access::{event, right, CHALLENGE, DOMAIN, REQUEST, SEALED, SIGNED_CHALLENGE, SIGNED_REQUEST};
-use seal::key_block::{KEKS, KEY, ROOTS};
+use seal::access::{
+    event, right, CHALLENGE, DOMAIN, FLOOR, REQUEST, SEALED, SIGNED_CHALLENGE, SIGNED_REQUEST,
+};
+use seal::key_block::{KEKS, KEY, ROOTS, ROOT_COUNT};
 use seal::sha512::hash_256;
 use seal::wire::{array, word, Fault, HASH};
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-use crate::keys::{is_sealed, Images, Linked, OfSealed};
+use crate::keys::{floor, is_sealed, is_sound, Images, Linked, OfSealed};
 use crate::policy::{Policy, SealPolicy};
 use crate::store::{Key, Parameters, Value};
 use crate::unseal::{Label, News, Outcome, Request, Unsealer};
 
+/// The most programs of a layout whose counters are told.
+const PROGRAMS: usize = 2;
 /// The number of events in the log.
 const LAST: usize = seal::access::EVENTS;
 /// The number of them that may be refusals, without that of a wrong signature.
@@ -25,7 +29,7 @@ const MOST_REFUSALS: usize = seal::access::MOST_REFUSALS;
 
 // The constants that `seal`, `canopen` and `shared-abi` each define must agree.
 const _: () = {
-    assert!(canopen::program::SEALED_ENTRIES.len() == 4 + LAST);
+    assert!(canopen::program::SEALED_ENTRIES.len() == 5 + LAST);
     assert!(REQUEST <= canopen::sdo::server::VALUE_MAX);
     assert!(shared_abi::layout::KEY_BLOCK_SIZE as usize == seal::key_block::SIZE);
     assert!(FlashError::Signature.code() == Fault::Signature as u8);
@@ -43,6 +47,10 @@ pub(super) struct Access {
     key_block: u32,
     /// The device has keys and therefore accepts and starts only sealed programs.
     takes_no_other: bool,
+    /// 2002h/3, as it was at the reset: roots, epoch, and a counter for each program.
+    floor: [u32; FLOOR + PROGRAMS],
+    /// Bytes of it.
+    floor_len: usize,
     /// Rights granted since the reset, and the argument of the last grant.
     granted: u32,
     argument: u32,
@@ -98,6 +106,20 @@ impl<'b> Rights<'b> {
         access.key_block = layout.key_block().base;
         access.policy = Some(&policy.seal);
         access.takes_no_other = is_sealed(flash, parameters, layout);
+        if is_sound(flash, access.key_block) {
+            for (at, id) in
+                (access.key_block + ROOTS as u32..).step_by(KEY).zip(&mut access.floor[..ROOT_COUNT])
+            {
+                *id = flash.read_word(at);
+            }
+        }
+        let programs = layout.programs.len().min(PROGRAMS);
+        for number in 1..=programs {
+            let (counter, epoch) = floor(flash, parameters, layout, &policy.seal, number as u8);
+            access.floor[FLOOR + number - 1] = counter;
+            access.floor[ROOT_COUNT] = epoch;
+        }
+        access.floor_len = 4 * (FLOOR + programs);
     }
 
     /// Whether the device takes sealed images.
@@ -134,6 +156,13 @@ impl<'b> Rights<'b> {
     pub(crate) fn read(&mut self, at: Address, buf: &mut [u8]) -> Option<Result<usize, AbortCode>> {
         let access = self.0.get_mut()?;
         match at.index {
+            ACCESS if at.sub == 3 => {
+                let mut bytes = [0; 4 * (FLOOR + PROGRAMS)];
+                for (bytes, word) in bytes.chunks_exact_mut(4).zip(access.floor) {
+                    bytes.copy_from_slice(&word.to_le_bytes());
+                }
+                Some(put(buf, &bytes[..access.floor_len]))
+            }
             ACCESS => Some(put(buf, &access.challenge())),
             EVENTS => {
                 let mut bytes = [0; 16];
@@ -220,6 +249,8 @@ impl Access {
             policy: None,
             key_block: 0,
             takes_no_other: false,
+            floor: [0; FLOOR + PROGRAMS],
+            floor_len: 0,
             granted: 0,
             argument: 0,
             grants: Grants { count: 0, opened: 0, is_changed: false },

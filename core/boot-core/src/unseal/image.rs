@@ -1,7 +1,7 @@
 //! A sealed image from its first byte on: its head is received, checked against the device, and
 //! authenticated.
 
-use seal::key_block::{self, KEKS, KEK_COUNT, KEY};
+use seal::key_block::{KEKS, KEK_COUNT, KEY};
 use seal::sha512::{hmac, Sha512};
 use seal::wire::{array, flag, head_size, Fault, Head, Recipient, DOMAIN, WRAP_DOMAIN};
 use shared_abi::geometry::Region;
@@ -10,7 +10,7 @@ use shared_abi::layout::Layout;
 use super::buffers::{start, Buffers};
 use super::content::{Content, Verdict};
 use crate::flash::Flash;
-use crate::keys::is_sound;
+use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
 use crate::queue::{Piece, Queue};
 use crate::store::{Key, Parameters, ProgramRecord, Value};
@@ -188,22 +188,9 @@ impl Place {
                 flash.read(block + at as u32, &mut keys[at..at + 4]);
             }
         }
-        let word = |at| seal::wire::word(&keys, at);
         let record = ProgramRecord::load(parameters, flash, program);
-        let counters = |program| parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
-        let [mut counter, _, installed, _] = counters(program);
-        // The epoch is the device's: a key that is revoked for one program signs for none.
-        let programs = self.layout.programs.len() as u8;
-        let epoch = (1..=programs).fold(word(key_block::EPOCH), |epoch, program| {
-            let [_, proved, ..] = counters(program);
-            epoch.max(proved)
-        });
-        // A program that has proved itself has raised the counter, if the policy raises it at
-        // confirmation.
-        if record.is_some_and(|record| record.confirmed) {
-            counter = counter.max(installed);
-        }
-        counter = counter.max(word(key_block::COUNTER)).max(policy.counter);
+        let [_, _, installed, _] = parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
+        let (mut counter, epoch) = floor(flash, parameters, self.layout, policy, program);
         if let Some(lowered) = self.lowered_counter {
             counter = counter.min(lowered);
         }
