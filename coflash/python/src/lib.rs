@@ -140,7 +140,7 @@ fn scan<'py>(
     })?;
     let nodes = PyDict::new(py);
     for (node, found) in found {
-        let value = json!({ "state": found.state.map(state_words), "info": found.info });
+        let value = json!({ "state": found.state.map(state_words), "info": found.info, "but": found.but });
         nodes.set_item(node.get(), object(py, &value)?)?;
     }
     Ok(nodes)

@@ -497,6 +497,7 @@ impl From<Error> for Failure {
             Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,
             Error::Refused { .. }
             | Error::Protocol { .. }
+            | Error::ShortAnswer { .. }
             | Error::Failed { .. }
             | Error::Busy { .. }
             | Error::WrongCrc { .. }

@@ -100,7 +100,11 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
     let state = found.state.map_or_else(none, |state| state_words(state).to_string());
     let node = node.to_string();
     let Some(info) = &found.info else {
-        return [node, "no answer".to_string(), none(), none(), none(), none(), state];
+        let runs = match &found.but {
+            Some(but) => format!("answers, but {but}"),
+            None => "no answer".to_string(),
+        };
+        return [node, runs, none(), none(), none(), none(), state];
     };
     let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
     let text = |text: &Option<String>| text.clone().unwrap_or_else(none);
@@ -137,7 +141,8 @@ fn values(found: &BTreeMap<NodeId, Found>) -> Vec<Value> {
         json!({
             "node": node.get(),
             "state": found.state.map(state_words),
-            "answers": found.info.is_some(),
+            "answers": found.info.is_some() || found.but.is_some(),
+            "but": found.but,
             "info": found.info.as_ref().map(info::value),
         })
     };

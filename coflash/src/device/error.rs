@@ -31,6 +31,15 @@ pub enum Error {
         /// The action.
         doing: Doing,
     },
+    /// The device answers with frames that are too short for SDO.
+    ShortAnswer {
+        /// The device.
+        node: NodeId,
+        /// The action.
+        doing: Doing,
+        /// Bytes of the last such frame, 0 to 7; SDO has 8 (CiA 301 clause 7.2.4.3).
+        len: usize,
+    },
     /// The device answered with an SDO abort, and 1F57h gives no further reason.
     Refused {
         /// The device.
@@ -267,6 +276,11 @@ impl From<AdapterError> for Error {
 }
 
 impl Error {
+    /// The error of a value of another length than its type has.
+    pub(crate) const fn wrong_length(at: Address) -> Self {
+        Self::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH }
+    }
+
     /// Whether the device has refused the command at once with an abort, and so has not begun to
     /// carry it out.
     #[must_use]
@@ -310,7 +324,7 @@ impl Error {
             Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost, .. } => 0x6000_0010,
             Self::StartFailed { .. } | Self::TrialFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
-            Self::Refused { .. } | Self::Protocol { .. } => 0x6000_0025,
+            Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
         }
     }
 }
@@ -347,6 +361,9 @@ impl fmt::Display for Error {
             Self::Adapter(error) => error.fmt(f),
             Self::Cancelled => f.write_str("cancelled"),
             Self::NoAnswer { node, doing } => write!(f, "node {node} does not answer ({doing})"),
+            Self::ShortAnswer { node, doing, len } => {
+                write!(f, "node {node} answers, but with frames of {len} bytes where SDO has 8 ({doing})")
+            }
             Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
             Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
             Self::Failed { doing, error, detail, code } => {
@@ -493,6 +510,16 @@ pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
     match read {
         Ok(value) => Ok(Some(value)),
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// Turns any refusal, and a value of another length than its type has, into `None`: an object that
+/// a device need not have costs nothing else.
+pub(crate) fn told<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(value) => Ok(Some(value)),
+        Err(Error::Refused { .. } | Error::Protocol { code: AbortCode::LENGTH, .. }) => Ok(None),
         Err(error) => Err(error),
     }
 }

@@ -10,7 +10,7 @@ use shared_abi::block_file::ProgramVersion;
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
-use super::error::{optional, Error};
+use super::error::{told, Error};
 use super::recognise::recognise;
 use super::session::Session;
 use crate::json;
@@ -116,11 +116,12 @@ impl ProgramInfo {
 /// Reads all of a device's information.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] and others; a missing object is not an error.
+/// [`Error::NoAnswer`] and others. An object that the device refuses is not an error: it is not
+/// reported.
 pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let device_type = session.find()?;
     let Nameplate { name, hardware_version, software_version, identity } = nameplate(session)?;
-    let mut number = |index, sub| optional(session.read_number(Address::new(index, sub)));
+    let mut number = |index, sub| told(session.read_number(Address::new(index, sub)));
     let error_register = number(program::ERROR_REGISTER, 0)?;
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
@@ -150,7 +151,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
 /// # Errors
 /// As [`info`].
 pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
-    let mut text = |index| optional(session.read_text(Address::new(index, 0)));
+    let mut text = |index| told(session.read_text(Address::new(index, 0)));
     let name = text(program::DEVICE_NAME)?;
     let hardware_version = text(program::HARDWARE_VERSION)?;
     let software_version = text(program::SOFTWARE_VERSION)?;
@@ -164,7 +165,7 @@ pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
 pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
     let mut identity = [None; 4];
     for (sub, value) in (1..).zip(&mut identity) {
-        *value = optional(session.read_number(Address::new(program::IDENTITY, sub)))?;
+        *value = told(session.read_number(Address::new(program::IDENTITY, sub)))?;
     }
     Ok(identity)
 }
@@ -174,7 +175,7 @@ pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
 /// # Errors
 /// As [`info`].
 pub fn program_info(session: &mut Session<'_>, program: u8) -> Result<ProgramInfo, Error> {
-    let mut number = |index| optional(session.read_number(Address::new(index, program)));
+    let mut number = |index| told(session.read_number(Address::new(index, program)));
     let control = number(program::PROGRAM_CONTROL)?;
     let crc = number(program::PROGRAM_ID)?;
     let status = number(program::FLASH_STATUS)?.map(FlashStatus::from_word);

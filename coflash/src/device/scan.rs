@@ -9,7 +9,6 @@ use canopen::nmt::{parse_state_message, NmtState};
 use canopen::program::DEVICE_TYPE;
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address, CobId, Frame, NodeId};
-use embedded_can::Frame as _;
 
 use super::error::Error;
 use super::info::{info, DeviceInfo};
@@ -24,8 +23,10 @@ use crate::bus::Adapter;
 pub struct Found {
     /// The last boot-up or heartbeat message heard.
     pub state: Option<NmtState>,
-    /// Its SDO information, if it answers.
+    /// Its SDO information, if it gives it.
     pub info: Option<DeviceInfo>,
+    /// Why there is none of a node that answers, as the rest of a sentence after "answers, but".
+    pub but: Option<String>,
 }
 
 /// Options of a scan.
@@ -107,14 +108,13 @@ pub fn scan(
     for node in answered {
         let mut session = Session::new(adapter, node, options.timing);
         session.cancel_by(cancelled.clone());
-        let told = match info(&mut session) {
-            Ok(told) => Some(told),
+        let told = info(&mut session);
+        let found = found.entry(node).or_default();
+        match told {
+            Ok(told) => found.info = Some(told),
             Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error),
-            // The node has answered once, so it exists; information that it does not give is left
-            // out.
-            Err(_) => None,
-        };
-        found.entry(node).or_default().info = told;
+            Err(error) => found.but = Some(but(&error)),
+        }
     }
     Ok(found)
 }
@@ -122,9 +122,19 @@ pub fn scan(
 /// On a working bus, no node takes longer for the first answer.
 const AT_ONCE_LIMIT: Duration = Duration::from_millis(200);
 
-/// Whether the frame is an SDO answer of the node, including an abort.
+/// Whether the frame is an SDO answer of the node: also an abort, and also one that is too short.
 fn is_answer(frame: &Frame, node: NodeId) -> bool {
-    frame.cob_id() == Some(CobId::sdo_response(node)) && frame.dlc() == 8
+    frame.cob_id() == Some(CobId::sdo_response(node))
+}
+
+/// What is wrong with the answers of a node, as the rest of a sentence after "answers, but".
+fn but(error: &Error) -> String {
+    match error {
+        Error::NoAnswer { doing, .. } => format!("not to every request ({doing})"),
+        Error::ShortAnswer { len, .. } => format!("with frames of {len} bytes where SDO has 8"),
+        Error::Refused { doing, code, .. } => format!("refuses {doing}: abort {code}"),
+        error => error.to_string(),
+    }
 }
 
 fn note_state(found: &mut BTreeMap<NodeId, Found>, frame: &Frame) {

@@ -251,7 +251,9 @@ impl State {
             let device = match &found.info {
                 Some(info) => Device::of(info),
                 None => {
-                    Device { node: node.get(), runs: "no answer by SDO".to_string(), ..Device::default() }
+                    let no_answer = || "no answer by SDO".to_string();
+                    let runs = found.but.as_ref().map_or_else(no_answer, |but| format!("answers, but {but}"));
+                    Device { node: node.get(), runs, ..Device::default() }
                 }
             };
             (node.get(), Device { heartbeat: found.state.map(state_words), ..device })

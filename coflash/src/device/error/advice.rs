@@ -17,6 +17,9 @@ impl Error {
                 "check that node {node} is the right one, that the device has power, that both sides use the same bit \
                  rate and that the bus is terminated; a slow device may need a longer --sdo-timeout"
             ),
+            Self::ShortAnswer { .. } => "SDO frames have 8 bytes (CiA 301 clause 7.2.4.3): look for a setting of the \
+                                         device that fills them up, or ask its manufacturer"
+                .to_string(),
             Self::Refused { doing: Doing::Unlock, code, .. } => unlock_advice(*code).to_string(),
             Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
                 if at.index == canopen::debugger::DEBUGGER =>

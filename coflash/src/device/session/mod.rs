@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::program::{self, FlashStatus, ProgramControl};
-use canopen::{AbortCode, Address, Frame, NodeId};
+use canopen::{Address, Frame, NodeId};
 
 use super::device_type::DeviceType;
 use super::doing::Doing;
@@ -44,6 +44,8 @@ pub struct Session<'a> {
     node: NodeId,
     timing: Timing,
     transfers: Transfers,
+    /// Whether the node has taken a sub-block of a block transfer.
+    takes_blocks: bool,
     sharing: u32,
     cancelled: Option<Arc<AtomicBool>>,
     answer: Option<fn(&Frame) -> Option<Frame>>,
@@ -85,6 +87,7 @@ impl<'a> Session<'a> {
             node,
             timing,
             transfers: Transfers::default(),
+            takes_blocks: false,
             sharing: 1,
             cancelled: None,
             answer: None,
@@ -103,7 +106,8 @@ impl<'a> Session<'a> {
             Way::Gateway(gateway) => Way::Gateway(&mut **gateway),
         };
         let (watch, on_silence, sharing) = (self.watch.clone(), self.on_silence, self.sharing);
-        Session { way, node, timing, transfers, sharing, cancelled, answer, watch, on_silence }
+        let takes_blocks = self.takes_blocks;
+        Session { way, node, timing, transfers, takes_blocks, sharing, cancelled, answer, watch, on_silence }
     }
 
     /// Says that so many sessions share the bus: a long value may have to wait for those of all
@@ -136,6 +140,12 @@ impl<'a> Session<'a> {
     /// Sets the form of downloads from now on.
     pub fn transfer_by(&mut self, transfers: Transfers) {
         self.transfers = transfers;
+    }
+
+    /// Whether the node has taken a part of a value by block transfer in this conversation: the
+    /// failure of such a transfer does not mean that it cannot do them.
+    pub(crate) fn takes_blocks(&self) -> bool {
+        self.takes_blocks
     }
 
     /// The present form of downloads.
@@ -182,18 +192,10 @@ impl<'a> Session<'a> {
     /// Reads a value of up to 4096 bytes. A read without an answer is repeated.
     ///
     /// # Errors
-    /// [`Error::NoAnswer`], [`Error::Refused`], [`Error::Adapter`] or [`Error::Cancelled`].
+    /// [`Error::NoAnswer`], [`Error::ShortAnswer`], [`Error::Refused`], [`Error::Protocol`],
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
     pub fn read(&mut self, at: Address) -> Result<Vec<u8>, Error> {
-        let attempts = self.timing.attempts.max(1);
-        let mut attempt = 1;
-        loop {
-            match self.read_once(at) {
-                // A late answer to an earlier request can spoil the next one: repeat the read in
-                // this case, too.
-                Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < attempts => attempt += 1,
-                result => return result,
-            }
-        }
+        self.repeated(&mut |session| session.read_once(at))
     }
 
     /// Reads an unsigned number of up to 32 bits.
@@ -202,7 +204,7 @@ impl<'a> Session<'a> {
     /// As [`read`](Self::read), and [`Error::Protocol`] for a value of another length.
     pub fn read_number(&mut self, at: Address) -> Result<u32, Error> {
         let bytes = self.read(at)?;
-        number(&bytes).ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })
+        number(&bytes).ok_or(Error::wrong_length(at))
     }
 
     /// Reads a text. Characters outside ASCII and control characters are replaced.
@@ -246,14 +248,13 @@ impl<'a> Session<'a> {
         loop {
             match self.read_once(at) {
                 Ok(bytes) => {
-                    let word = self::number(&bytes)
-                        .ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
+                    let word = self::number(&bytes).ok_or(Error::wrong_length(at))?;
                     let status = FlashStatus::from_word(word);
                     if !status.busy {
                         return Ok(status);
                     }
                 }
-                Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+                Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => {}
                 Err(error) => return Err(error),
             }
             if self.silent_since(began) >= self.timing.silent {
@@ -269,38 +270,47 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Reads 1000h once; `None` if no answer comes.
+    /// Reads 1000h once; `None` if no valid answer comes.
     ///
     /// # Errors
-    /// The errors of [`read`](Self::read) except [`Error::NoAnswer`].
+    /// The errors of [`read`](Self::read) except [`Error::NoAnswer`], [`Error::ShortAnswer`] and
+    /// [`Error::Protocol`].
     pub fn device_type(&mut self) -> Result<Option<DeviceType>, Error> {
-        let at = Address::new(program::DEVICE_TYPE, 0);
-        match self.read_once(at) {
-            Ok(bytes) => {
-                let value = number(&bytes);
-                let value =
-                    value.ok_or(Error::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH })?;
-                Ok(Some(DeviceType(value)))
-            }
-            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => Ok(None),
+        match self.device_type_once() {
+            Ok(running) => Ok(Some(running)),
+            Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => Ok(None),
             Err(error) => Err(error),
         }
     }
 
+    fn device_type_once(&mut self) -> Result<DeviceType, Error> {
+        let at = Address::new(program::DEVICE_TYPE, 0);
+        let bytes = self.read_once(at)?;
+        number(&bytes).map(DeviceType).ok_or(Error::wrong_length(at))
+    }
+
     /// Returns what runs on the device. A device that was just reset misses a few requests, so the
-    /// request is repeated for as long as a restart may take.
+    /// request is repeated for as long as a restart may take. A device whose answers are invalid
+    /// gets as many attempts as any request.
     ///
     /// # Errors
     /// [`Error::NoAnswer`], and the errors of a [read](Self::read).
     pub fn find(&mut self) -> Result<DeviceType, Error> {
         let began = self.now();
         let doing = Doing::Read(Address::new(program::DEVICE_TYPE, 0));
+        let mut invalid = 0;
         loop {
-            if let Some(running) = self.device_type()? {
-                return Ok(running);
-            }
-            if self.now() >= began + self.timing.boot {
-                return Err(Error::NoAnswer { node: self.node, doing });
+            let error = match self.device_type_once() {
+                Ok(running) => return Ok(running),
+                Err(error @ (Error::ShortAnswer { .. } | Error::Protocol { .. })) => {
+                    invalid += 1;
+                    error
+                }
+                Err(error @ Error::NoAnswer { .. }) => error,
+                Err(error) => return Err(error),
+            };
+            if self.now() >= began + self.timing.boot || invalid >= self.timing.attempts.max(1) {
+                return Err(error);
             }
             self.note_silence(began, self.timing.boot, doing);
             let pause = self.timing.poll_first;

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use canopen::sdo::client::{Block, Buffer, Config, Sink};
 use canopen::sdo::{Download, SdoError, Step, Transfer, Upload};
-use canopen::{AbortCode, Address, CobId, Instant};
+use canopen::{AbortCode, Address, CobId, Frame, Instant, NodeId};
+use embedded_can::Frame as _;
 
 use super::listen::SLICE;
 use super::{Session, SILENCE, UPLOAD_MAX};
@@ -27,11 +28,13 @@ impl Sink for Grown {
     }
 }
 
-/// After this time without an abort, no more aborts come for the segments of a refused transfer. A
-/// frame on the slowest bus takes 13 ms.
+/// After this time without an answer, no more answers come to a transfer that has ended. A frame on
+/// the slowest bus takes 13 ms.
 const QUIET: Duration = Duration::from_millis(30);
 /// After this many frames in a row, the session checks for an answer of the node.
 const BURST: u32 = 8;
+/// The most frames that may have arrived unnoticed: what an adapter keeps while the host is held up.
+const ARRIVED_MAX: u32 = 1000;
 /// For fewer bytes, a block transfer needs more frames than it saves.
 pub(super) const WORTH_BLOCKS: usize = 4 * 7;
 
@@ -46,6 +49,33 @@ enum Patience {
 }
 
 impl Session<'_> {
+    /// Carries out a read, and repeats it if no answer comes or if the answers do not fit. The
+    /// answer to an attempt that was given up may come during the next one and spoil it. So what
+    /// still comes is then waited for, and one more attempt does not count.
+    pub(super) fn repeated<T>(
+        &mut self,
+        read: &mut dyn FnMut(&mut Self) -> Result<T, Error>,
+    ) -> Result<T, Error> {
+        let began = self.now();
+        let (mut left, mut spoilt) = (self.timing.attempts.max(1), false);
+        loop {
+            let error = match read(self) {
+                Err(error) if may_get_through(&error) => error,
+                result => return result,
+            };
+            left = left.saturating_sub(1);
+            let is_invalid = matches!(error, Error::Protocol { .. });
+            let again = left > 0 || (is_invalid && !spoilt);
+            if !again || self.now().saturating_sub(began) >= self.timing.command {
+                return Err(error);
+            }
+            if is_invalid {
+                spoilt |= left == 0;
+                self.await_no_answer()?;
+            }
+        }
+    }
+
     /// Reads a value without repetition; otherwise like [`read`](Self::read).
     ///
     /// # Errors
@@ -68,12 +98,17 @@ impl Session<'_> {
         }
     }
 
-    /// Reads a value of any length, by block transfer if the device supports it. Calls `progress`
-    /// with the number of bytes that have arrived.
+    /// Reads a value of any length, by block transfer if the device supports it. A read without an
+    /// answer is repeated from the start. Calls `progress` with the number of bytes that have
+    /// arrived.
     ///
     /// # Errors
     /// The errors of [`read`](Self::read); [`Error::Protocol`] for more than [`UPLOAD_MAX`] bytes.
     pub fn upload(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
+        self.repeated(&mut |session| session.upload_once(at, progress))
+    }
+
+    fn upload_once(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         if !self.hears_the_bus() {
             return self.upload_there(at, self.timing.command, progress);
         }
@@ -108,13 +143,16 @@ impl Session<'_> {
         if self.transfers == Transfers::Blocks && data.len() > WORTH_BLOCKS {
             let block = Block { fallback: false, ..Block::default() };
             let mut download = Download::as_blocks(self.node, at, data, config, block);
-            match self.run(&mut download, doing, Patience::ForEachStep, progress) {
+            let sent = self.run(&mut download, doing, Patience::ForEachStep, progress);
+            self.takes_blocks |= download.progress() > 0;
+            match sent {
                 // Later values are not tried by block transfer again.
-                Err(Error::Refused { code, .. }) if download.progress() == 0 && means_no_blocks(code) => {
+                Err(Error::Refused { .. }) if download.refuses_blocks() && !self.takes_blocks => {
                     self.transfers = Transfers::Segments;
                 }
+                // The segments that were under way when the node refused cause an abort each.
                 Err(error @ Error::Refused { .. }) => {
-                    self.settle_after_burst()?;
+                    self.await_no_answer()?;
                     return Err(error);
                 }
                 result => return result,
@@ -124,10 +162,9 @@ impl Session<'_> {
         self.run(&mut download, doing, Patience::ForEachStep, progress)
     }
 
-    /// Waits until the node has been silent for a while: the segments that were under way when it
-    /// refused a block transfer cause an abort each, and these aborts do not answer the next
-    /// request.
-    fn settle_after_burst(&mut self) -> Result<(), Error> {
+    /// Waits until the node has sent no answer for a while: what it still sends after the end of a
+    /// transfer does not answer the next request.
+    fn await_no_answer(&mut self) -> Result<(), Error> {
         let deadline = self.now() + self.timing.sdo;
         let response = CobId::sdo_response(self.node);
         while self.now() < deadline && self.listen(QUIET, |frame| frame.cob_id() == Some(response))? {}
@@ -149,7 +186,7 @@ impl Session<'_> {
         self.check_cancelled()?;
         // Answers to requests that were given up do not belong to this transfer.
         let mut stale = 0;
-        while stale < 1000 && self.receive(Duration::ZERO)?.is_some() {
+        while stale < ARRIVED_MAX && self.receive(Duration::ZERO)?.is_some() {
             stale += 1;
         }
         let began = self.now();
@@ -157,6 +194,7 @@ impl Session<'_> {
         let mut cancelled = false;
         let mut told = 0;
         let mut burst = 0;
+        let mut short = None;
         loop {
             if !cancelled && self.check_cancelled().is_err() {
                 cancelled = true;
@@ -185,9 +223,11 @@ impl Session<'_> {
                     if received.is_none() && self.timing.sdo > SILENCE {
                         self.note_silence(began, self.timing.sdo.max(self.timing.silent), doing);
                     }
-                    if let Some(frame) = received {
+                    let (mut next, mut arrived) = (received, 0);
+                    while let Some(frame) = next {
                         let now = self.instant();
                         transfer.handle(&frame, now);
+                        short = short_answer(&frame, self.node).or(short);
                         if transfer.progress() != told {
                             told = transfer.progress();
                             progress(told);
@@ -195,12 +235,24 @@ impl Session<'_> {
                                 deadline = self.now() + self.timing.command;
                             }
                         }
+                        // A host that was held up may find the answer behind other frames: it has
+                        // come in time, although the time is over.
+                        arrived += 1;
+                        let is_late = now.has_reached(until) && transfer.awaits_answer();
+                        next = match is_late && arrived < ARRIVED_MAX {
+                            true => self.receive(Duration::ZERO)?,
+                            false => None,
+                        };
                     }
                 }
                 Step::Done(_) if cancelled => return Err(Error::Cancelled),
                 Step::Done(Ok(())) => return Ok(()),
                 Step::Done(Err(SdoError::NoAnswer)) => {
-                    return Err(Error::NoAnswer { node: self.node, doing })
+                    let node = self.node;
+                    return Err(match (short, doing) {
+                        (Some(len), Doing::Read(_)) => Error::ShortAnswer { node, doing, len },
+                        _ => Error::NoAnswer { node, doing },
+                    });
                 }
                 Step::Done(Err(SdoError::Server(code))) => {
                     return Err(Error::Refused { node: self.node, doing, code })
@@ -217,8 +269,20 @@ impl Session<'_> {
     }
 }
 
-/// Whether a server refuses block transfer with this code. Some servers use the general error for
-/// it.
-fn means_no_blocks(code: AbortCode) -> bool {
-    matches!(code, AbortCode::COMMAND | AbortCode::UNSUPPORTED_ACCESS | AbortCode::GENERAL)
+/// Whether another attempt of a read may get through after this error. A server's time-out ends the
+/// transfer of a client that stopped in it.
+fn may_get_through(error: &Error) -> bool {
+    match error {
+        Error::NoAnswer { .. } | Error::ShortAnswer { .. } => true,
+        Error::Refused { code, .. } => *code == AbortCode::TIMEOUT,
+        Error::Protocol { code, .. } => *code != AbortCode::OUT_OF_MEMORY,
+        _ => false,
+    }
+}
+
+/// The length of an answer of the node that has fewer than the eight bytes of SDO (CiA 301 clause
+/// 7.2.4.3): no client may guess what is missing.
+fn short_answer(frame: &Frame, node: NodeId) -> Option<usize> {
+    let is_short = frame.cob_id() == Some(CobId::sdo_response(node)) && frame.dlc() < 8;
+    is_short.then(|| frame.dlc())
 }

@@ -115,7 +115,9 @@ fn send(
 pub(super) fn status(session: &mut Session<'_>, number: u8) -> Result<Said, Error> {
     match session.read(Address::new(program::FLASH_STATUS, number)) {
         Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
-        Ok(_) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => idle(session, number),
+        Ok(_) | Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => {
+            idle(session, number)
+        }
         Err(error) => Err(error),
     }
 }

@@ -1,3 +1,4 @@
 //! Sessions with a device.
 
+mod answers;
 mod lss;

@@ -97,11 +97,19 @@ pub struct Fake {
     pub starts: Option<u32>,
     /// How long an answer takes.
     pub latency: Duration,
+    /// How much longer each of the next answers takes.
+    pub delays: VecDeque<Duration>,
     pub on_block: Script<u32>,
     pub on_command: Script<u8>,
     pub knows_blocks: Blocks,
     /// Lost segments of block downloads, counted from the start.
     pub lost_segments: Vec<usize>,
+    /// Altered segments of block downloads, counted from the start: the CRC of the transfer finds
+    /// them.
+    pub altered_segments: Vec<usize>,
+    /// The largest value that 1F50h takes, as its announced size: a larger one is refused with
+    /// 06070012h.
+    pub room: usize,
     /// The segment of a block download at which the device aborts; from then on 1F57h has this
     /// value.
     pub refuses_segment: Option<(usize, u32)>,
@@ -155,10 +163,13 @@ impl Fake {
             leaves_at: None,
             starts: Some(APPLICATION),
             latency: Duration::from_micros(500),
+            delays: VecDeque::new(),
             on_block: Box::new(|_| Outcome::Accept),
             on_command: Box::new(|_| Outcome::Accept),
             knows_blocks: Blocks::Refused(0x0504_0001),
             lost_segments: Vec::new(),
+            altered_segments: Vec::new(),
+            room: usize::MAX,
             refuses_segment: None,
             segments: 0,
             block_downloads: 0,
@@ -188,7 +199,8 @@ impl Fake {
     fn answer(&mut self, data: [u8; 8]) {
         self.outbox.extend(self.noise.iter().map(|frame| (self.now, *frame)));
         let id = CobId::new(0x580 + u16::from(self.node)).unwrap();
-        self.outbox.push_back((self.now + self.latency, Frame::of(id, &data)));
+        let delay = self.delays.pop_front().unwrap_or_default();
+        self.outbox.push_back((self.now + self.latency + delay, Frame::of(id, &data)));
     }
 
     fn abort(&mut self, at: (u16, u8), code: u32) {
@@ -205,12 +217,12 @@ impl Fake {
         self.status = word;
     }
 
-    /// A frame that is on the bus already.
     /// A frame of somebody else's, so long from now.
     pub fn later(&mut self, after: Duration, frame: Frame) {
         self.outbox.push_back((self.now + after, frame));
     }
 
+    /// A frame that is on the bus already.
     pub fn inject(&mut self, frame: Frame) {
         self.outbox.push_back((self.now, frame));
     }
@@ -234,7 +246,7 @@ impl Fake {
     }
 
     /// Waits for its next frame, at most until `until`.
-    fn next_at(&self, until: Duration) -> Option<Duration> {
+    pub fn next_at(&self, until: Duration) -> Option<Duration> {
         let frame = self.outbox.front().map(|(at, _)| (*at).max(self.now));
         let boot_up = self.restart.filter(|(_, next)| next.is_some()).map(|(at, _)| at.max(self.now));
         [frame, boot_up].into_iter().flatten().min().filter(|at| *at <= until)
@@ -249,9 +261,11 @@ impl Fake {
     /// it was one.
     fn block_frame(&mut self, bytes: [u8; 8]) -> bool {
         let Blocks::Known(blksize) = self.knows_blocks else { return false };
-        let Some(Download { data, size, sub_block: Some((seqno, ended)), .. }) = &mut self.download else {
+        let Some(Download { at, data, size, sub_block: Some((seqno, ended)), .. }) = &mut self.download
+        else {
             return false;
         };
+        let download_at = *at;
         if !*ended {
             // An abort looks like a segment with number 0, which does not exist.
             if bytes[0] == 0x80 {
@@ -268,6 +282,9 @@ impl Fake {
                 *seqno = number;
                 *ended = last;
                 data.extend_from_slice(&bytes[1..]);
+                if self.altered_segments.contains(&self.segments) {
+                    *data.last_mut().unwrap() ^= 1;
+                }
             }
             // A sub-block ends with its last segment, even if segments are missing.
             if number == blksize || last {
@@ -281,7 +298,12 @@ impl Fake {
         }
         data.truncate(data.len() - usize::from(bytes[0] >> 2 & 7));
         assert_eq!(data.len(), *size);
-        assert_eq!(u16::from_le_bytes([bytes[1], bytes[2]]), crc16(data));
+        if u16::from_le_bytes([bytes[1], bytes[2]]) != crc16(data) {
+            assert!(!self.altered_segments.is_empty());
+            let at = download_at;
+            self.abort(at, 0x0504_0004);
+            return true;
+        }
         let Some(download) = self.download.take() else { return true };
         self.write(download.at, download.data, [0xA1, 0, 0, 0, 0, 0, 0, 0]);
         true
@@ -360,6 +382,10 @@ impl Fake {
                     Blocks::Known(_) if at.0 == 0x1F50 && self.busy() => {
                         self.status = 0x86;
                         self.abort(at, 0x0800_0022);
+                    }
+                    Blocks::Known(_) if at.0 == 0x1F50 && word as usize > self.room => {
+                        self.status = 0x04;
+                        self.abort(at, 0x0607_0012);
                     }
                     Blocks::Known(blksize) => {
                         let data = Vec::new();
