@@ -117,9 +117,6 @@ fn procedure(
     if dialect != Dialect::Block {
         session.leave_group();
     }
-    if options.alone {
-        session.still_alone()?;
-    }
     let Downloaded { repeats, took: transfer, released } = its.download(session, file, options, update)?;
     let running = if options.start {
         update.tell(Phase::Starting.into());

@@ -60,6 +60,8 @@ pub enum Phase {
     NotReleased,
     /// Step 15: the program starts.
     Starting,
+    /// The update does not take place: the program that was called back starts again.
+    StartingAgain,
     /// The program runs.
     Started(DeviceType),
     /// After the end of the procedure, the CRC still matches the file's.
@@ -178,6 +180,9 @@ impl fmt::Display for Phase {
                  program, coflash release releases it",
             ),
             Self::Starting => f.write_str("starting the program"),
+            Self::StartingAgain => {
+                f.write_str("nothing was changed: starting the program again that was called back")
+            }
             Self::Started(running) => write!(f, "running: {running}"),
             Self::VerifiedAgain { crc } => write!(f, "verified again: CRC {crc:08X}h"),
         }

@@ -1,5 +1,7 @@
 //! The search for a device and its bootloader.
 
+use canopen::NodeId;
+
 use super::admission::{admit, admit_to_bootloader};
 use super::catch::knock;
 use super::content::Content;
@@ -68,13 +70,43 @@ fn attempt(
         (true, false) => session.still_alone()?,
         (true, true) => session.ensure_alone()?,
     }
+    let (original, before) = (session.node(), session.now());
     let dialect = dialect::of(found).enter(session, running, options, update)?;
-    // The bootloader may have reported more than the application.
-    check_way(file, dialect, options)?;
-    if !admitted && !running.is_bootloader() {
-        admit_to_bootloader(session, file, dialect, options)?;
+    let is_ready = (|| {
+        // The bootloader may have reported more than the application.
+        check_way(file, dialect, options)?;
+        if !admitted && !running.is_bootloader() {
+            admit_to_bootloader(session, file, dialect, options)?;
+        }
+        match update.called {
+            _ if !options.alone => Ok(()),
+            Some(_) => session.await_peace(before),
+            None => session.still_alone(),
+        }
+    })();
+    if let (Err(error), Some(program)) = (&is_ready, update.called) {
+        let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
+        // The device belongs to the tool that commands it.
+        if !is_lost && !session.is_commanded_since(before) {
+            start_again(session, dialect, original, program, update);
+        }
     }
-    Ok(dialect)
+    is_ready.map(|()| dialect)
+}
+
+/// Starts the program again that was called back for an update which does not take place. The reason
+/// for that stays the result, whether the program starts or not.
+fn start_again(
+    session: &mut Session<'_>,
+    dialect: Dialect,
+    original: NodeId,
+    program: u8,
+    update: &mut RunningUpdate<'_>,
+) {
+    update.tell(Phase::StartingAgain.into());
+    if let Ok(running) = dialect::of(dialect).start(session, original, program) {
+        update.tell(Phase::Started(running).into());
+    }
 }
 
 /// Checks that the dialect supports the way in which the file is to be sent.

@@ -8,6 +8,8 @@ use crate::device::flying_master::Mastership;
 pub(super) struct RunningUpdate<'t> {
     /// The state of the device so far.
     pub(super) state: DeviceState,
+    /// The program that was called back to the bootloader for this update.
+    pub(super) called: Option<u8>,
     /// Whether any action may have changed the device.
     pub(super) touched: bool,
     /// The state before the erase.
@@ -28,6 +30,7 @@ impl<'t> RunningUpdate<'t> {
     pub(super) fn new(tell: &'t mut dyn FnMut(Event)) -> Self {
         Self {
             state: DeviceState::Untouched,
+            called: None,
             touched: false,
             resting: DeviceState::Untouched,
             before: None,

@@ -2,14 +2,14 @@
 
 use std::time::Duration;
 
-use canopen::program::{self, FlashError, ProgramControl};
+use canopen::program::{self, FlashError, ProgramControl, ProgramState};
 use canopen::{AbortCode, Address};
 use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
 use super::options::Target;
 use super::phase::PUT_OFF;
-use crate::device::error::{absent, Error, Mismatch};
+use crate::device::error::{absent, told, Error, Mismatch};
 use crate::device::{DeviceType, Doing, Session, Timing};
 
 /// How many times an application is called back. A program that was started directly after its
@@ -115,6 +115,18 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
         }
     }
     Err(Error::NoBootloader { node, running: seen, code: None })
+}
+
+/// The program that runs, as 1F51h reports it: `number`, or the one of [`CALL_BACK`]; `None` if
+/// neither runs, or the device does not say.
+pub(super) fn running_program(session: &mut Session<'_>, number: u8) -> Result<Option<u8>, Error> {
+    const RUNNING: u32 = ProgramState::Running as u32;
+    for number in [number, CALL_BACK] {
+        if told(session.read_number(Address::new(program::PROGRAM_CONTROL, number)))? == Some(RUNNING) {
+            return Ok(Some(number));
+        }
+    }
+    Ok(None)
 }
 
 /// Waits for a restarting device, at most [`Timing::boot`], until `wanted` accepts its device type;

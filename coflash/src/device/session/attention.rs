@@ -14,6 +14,9 @@ const FRESH: Duration = Duration::from_secs(2);
 /// Another tool that is working with a node sends requests at least this often: during the erase of
 /// a sector, four times a second.
 const LISTEN: Duration = Duration::from_millis(300);
+/// How long to wait for a moment without requests of others: the start-up procedure of a CANopen
+/// master (CiA 302-2) is some ten reads, each of which may take a few hundred milliseconds.
+const PEACE: Duration = Duration::from_secs(3);
 
 impl<'a> Session<'a> {
     /// Reports silence to `hook` while it lasts, once for each silence.
@@ -44,19 +47,55 @@ impl<'a> Session<'a> {
         hook(Silence { node: self.node, doing, silent, limit });
     }
 
-    /// Checks whether another tool is using the node: listens for a moment, and includes the
-    /// requests of the last seconds.
+    /// Checks whether another tool is using the node: listens for a moment, in which the time counts
+    /// that the session has listened already, and includes the requests of the last seconds.
     ///
     /// # Errors
     /// [`Error::NotAlone`], [`Error::Adapter`] or [`Error::Cancelled`].
     pub fn ensure_alone(&mut self) -> Result<(), Error> {
         if self.hears_the_bus() {
-            self.wait(LISTEN)?;
+            let now = self.now();
+            let heard = now.saturating_sub(self.watch().began.unwrap_or(now));
+            self.wait(LISTEN.saturating_sub(heard))?;
         }
         self.still_alone()
     }
 
-    /// The same check without listening any longer.
+    /// Waits until nobody else has sent a request to the node for a moment, counted from its boot-up
+    /// after `called`. A CANopen master reads 1000h and 1018h of each node that boots up (CiA 302-2),
+    /// and is then done; another tool goes on, or commands the bootloader.
+    ///
+    /// # Errors
+    /// [`Error::NotAlone`] at once after such a command, otherwise after some seconds; [`Error::Adapter`] or [`Error::Cancelled`].
+    pub(crate) fn await_peace(&mut self, called: Duration) -> Result<(), Error> {
+        if !self.hears_the_bus() {
+            return Ok(());
+        }
+        let began = self.now();
+        loop {
+            let (booted, foreign) = self.watch().boot_up_and_requests();
+            let booted = booted.filter(|at| *at >= called).unwrap_or(began);
+            let last = foreign.map_or(booted, |(at, _)| at.max(booted));
+            let left = (last + LISTEN).saturating_sub(self.now());
+            if left.is_zero() && !self.is_commanded_since(called) {
+                // What was asked for before is done.
+                self.watch().foreign = None;
+                return Ok(());
+            }
+            if self.is_commanded_since(called) || self.now() >= began + PEACE {
+                let what = foreign.and_then(|(_, what)| what);
+                return Err(Error::NotAlone { node: self.node, who: Intruder::Requests(what) });
+            }
+            self.wait(left)?;
+        }
+    }
+
+    /// Whether another tool has written a program or a command to the node since this time.
+    pub(crate) fn is_commanded_since(&self, time: Duration) -> bool {
+        self.watch().commanded.is_some_and(|at| at >= time)
+    }
+
+    /// The check of [`ensure_alone`](Self::ensure_alone) without listening any longer.
     ///
     /// # Errors
     /// [`Error::NotAlone`].

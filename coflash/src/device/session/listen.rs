@@ -110,12 +110,14 @@ impl Session<'_> {
                 return Ok(booted.map(|node| Frame::of(CobId::heartbeat(node), &[0])));
             }
         };
+        let began = adapter.now();
         let frame = adapter.receive(timeout)?;
         if let (Some(answer), Some(frame)) = (self.answer, &frame) {
             if let Some(answer) = answer(frame) {
                 adapter.send(&answer)?;
             }
         }
+        self.watch().began.get_or_insert(began);
         if let Some(frame) = &frame {
             self.watch().received(frame, self.node, self.now());
         }

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
 use crate::device::doing::Doing;
@@ -39,10 +40,24 @@ pub(super) struct Watch {
     /// Whether an echo has arrived since the last answer.
     echoed: bool,
     /// The time and the object of the last request of another tool.
-    pub(super) foreign: Option<(Duration, Option<Address>)>,
+    pub(super) foreign: Option<Foreign>,
+    /// The time of another tool's last request that changes a program.
+    pub(super) commanded: Option<Duration>,
+    /// The time of the node's last boot-up message.
+    pub(super) booted: Option<Duration>,
+    /// Since when the session hears the bus.
+    pub(super) began: Option<Duration>,
 }
 
+/// The time of the last request of another tool, and its object.
+pub(super) type Foreign = (Duration, Option<Address>);
+
 impl Watch {
+    /// The time of the node's last boot-up message, and the last request of another tool.
+    pub(super) const fn boot_up_and_requests(&self) -> (Option<Duration>, Option<Foreign>) {
+        (self.booted, self.foreign)
+    }
+
     pub(super) fn sent(&mut self, frame: &Frame, node: NodeId) {
         if frame.cob_id() == Some(CobId::sdo_request(node)) {
             if self.own.len() == OWN_MAX {
@@ -61,11 +76,17 @@ impl Watch {
                 self.echoed = true;
             } else {
                 self.foreign = Some((now, object_of(frame)));
+                if changes_program(frame) {
+                    self.commanded = Some(now);
+                }
             }
             return;
         }
         if [CobId::sdo_response(node), CobId::heartbeat(node), CobId::emcy(node)].contains(&id) {
             (self.heard, self.told) = (Some(now), false);
+        }
+        if *frame == Frame::of(CobId::heartbeat(node), &[0]) {
+            self.booted = Some(now);
         }
         if id == CobId::sdo_response(node) {
             // A request is on the bus before its answer, so an echo that has not arrived before the
@@ -84,6 +105,13 @@ fn object_of(frame: &Frame) -> Option<Address> {
     let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
     let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
     initiates.then(|| Address::new(u16::from_le_bytes([low, high]), sub))
+}
+
+/// Whether a request begins to write 1F50h or 1F51h, expedited, segmented or as blocks.
+fn changes_program(frame: &Frame) -> bool {
+    let writes = frame.exactly::<8>().is_some_and(|bytes| matches!(bytes[0] >> 5, 1 | 6));
+    let at = object_of(frame).map(|at| at.index);
+    writes && matches!(at, Some(PROGRAM_DATA | PROGRAM_CONTROL))
 }
 
 #[cfg(test)]

@@ -5,13 +5,13 @@ use canopen::Address;
 
 use super::procedure::Downloaded;
 use super::whole::{self, Whole};
-use crate::device::error::{absent, optional};
+use crate::device::error::absent;
 use crate::device::{DeviceType, Dialect, Error, Session};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
 use crate::update::options::FlashOptions;
 use crate::update::running::RunningUpdate;
-use crate::update::steps::{call_back, clear_and_wait, CALL_BACK};
+use crate::update::steps::{call_back, clear_and_wait, running_program};
 
 /// Makes the bootloader run.
 pub(super) fn enter(
@@ -52,20 +52,13 @@ pub(super) fn download(
 /// [`Error::NoBootloader`].
 fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdate<'_>) -> Result<(), Error> {
     const RUNNING: u32 = ProgramState::Running as u32;
-    let control = |number| Address::new(program::PROGRAM_CONTROL, number);
     // The running program may have another number than the program to be written.
-    let mut running = None;
-    for number in [number, CALL_BACK] {
-        if optional(session.read_number(control(number)))? == Some(RUNNING) {
-            running = Some(number);
-            break;
-        }
-    }
-    let Some(running) = running else {
+    let Some(running) = running_program(session, number)? else {
         // The bootloader is already running, or the device does not report it.
         return Ok(());
     };
-    let at = control(running);
+    update.called = Some(running);
+    let at = Address::new(program::PROGRAM_CONTROL, running);
     update.tell(Phase::CallingBack.into());
     match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
@@ -79,7 +72,8 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
     let deadline = session.now() + session.timing().boot;
     loop {
         match session.read_number(at) {
-            Ok(RUNNING) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+            Ok(RUNNING)
+            | Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => {}
             Ok(_) => break,
             Err(Error::Refused { code, .. }) if absent(code) => break,
             Err(error) => return Err(error),

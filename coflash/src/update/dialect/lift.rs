@@ -109,6 +109,7 @@ fn unlock_bootloader(
         unlock(session, password)?;
         update.tell(Note::Unlocked.into());
         update.state = DeviceState::Called;
+        update.called = Some(LIFT_PROGRAM);
         update.tell(Phase::CallingBack.into());
         reset_program(session, LIFT_PROGRAM)?;
         session.talk_to(lift);

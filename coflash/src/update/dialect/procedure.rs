@@ -71,7 +71,9 @@ pub(super) fn enter_by_call(
 ) -> Result<Dialect, Error> {
     let mut dialect = found;
     if !running.is_bootloader() {
+        let program = steps::running_program(session, options.program)?;
         update.state = DeviceState::Called;
+        update.called = Some(program.unwrap_or(steps::CALL_BACK));
         update.tell(Phase::CallingBack.into());
         let running = steps::call_back(session)?;
         update.tell(Phase::InBootloader.into());

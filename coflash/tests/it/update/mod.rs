@@ -5,6 +5,7 @@ mod aftermath;
 mod dialects;
 mod events;
 mod many;
+mod master;
 mod mastership;
 mod procedure;
 mod search;
