@@ -6,7 +6,7 @@ use std::{env, fs};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::{read, Firmware};
-use coflash::update::GROUP_BLOCKS;
+use coflash::update::JOINED_BLOCKS;
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::layout::{self, Layout};
@@ -110,7 +110,7 @@ pub fn blocks(name: &str) -> BlockFile {
 #[must_use]
 pub fn large_blocks(name: &str) -> BlockFile {
     let _ = elf(name);
-    blocks_with(&dir().join(name), Options::default().block_size(GROUP_BLOCKS))
+    blocks_with(&dir().join(name), Options::default().block_size(JOINED_BLOCKS))
 }
 
 /// The same for an ELF file anywhere.

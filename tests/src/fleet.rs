@@ -9,7 +9,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::DEFAULT_BLOCK_SIZE;
 use coflash::file::sealed::SealedFile;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::update::{Event, FlashOptions, Program, Report, GROUP_BLOCKS};
+use coflash::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;
@@ -194,12 +194,12 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
     let own = DEFAULT_BLOCK_SIZE;
     let rows = [
         (1, Way::OneByOne, own, 0),
-        (2, Way::Together, GROUP_BLOCKS, 0),
-        (4, Way::Together, GROUP_BLOCKS, 0),
-        (8, Way::Together, GROUP_BLOCKS, 0),
+        (2, Way::Together, JOINED_BLOCKS, 0),
+        (4, Way::Together, JOINED_BLOCKS, 0),
+        (8, Way::Together, JOINED_BLOCKS, 0),
         (8, Way::OneByOne, own, 0),
-        (8, Way::Together, GROUP_BLOCKS, 100_000),
-        (8, Way::Together, GROUP_BLOCKS, 1000),
+        (8, Way::Together, JOINED_BLOCKS, 100_000),
+        (8, Way::Together, JOINED_BLOCKS, 1000),
         (1, Way::OneByOne, own, 1000),
         (8, Way::Together, own, 0),
         (8, Way::Together, own, 1000),
@@ -211,7 +211,7 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
             fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
         }
         let options = ManyOptions::default().together(way == Way::Together);
-        let each = FlashOptions::default().group_blocks(Some(block_size));
+        let each = FlashOptions::default().joined_blocks(Some(block_size));
         let update = fleet.update_as(boards, &Program::Blocks(file.clone()), &each, &options, &mut |_| {});
         assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
         let (took, one) = (update.took, *one.get_or_insert(update.took));

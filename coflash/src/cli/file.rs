@@ -8,7 +8,7 @@ use coflash::file::block_file::{Checksum, LastBlock};
 use coflash::file::convert::{blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE};
 use coflash::file::read::{self, Firmware, Format};
 use coflash::file::{self, limit, AddressRange};
-use coflash::update::GROUP_BLOCKS;
+use coflash::update::JOINED_BLOCKS;
 use shared_abi::layout;
 
 use super::context::Context;
@@ -80,7 +80,7 @@ pub(super) struct Source {
     place: Place,
 
     /// The size of a block in bytes, including its 16 bytes of framing: at most the bootloader's
-    /// buffer. The default is 0x400; devices that are updated together get 0x1000.
+    /// buffer. The default is 0x400; an update joins them up to 0x1000 where the device takes that.
     #[arg(long, alias = "block_size", value_name = "BYTES", value_parser = number)]
     block_size: Option<u32>,
 
@@ -104,7 +104,7 @@ pub(super) struct Source {
     last_block_2008: bool,
 }
 
-const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400 && GROUP_BLOCKS == 0x1000, "the help text says so");
+const _: () = assert!(DEFAULT_BLOCK_SIZE == 0x400 && JOINED_BLOCKS == 0x1000, "the help text says so");
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum FormatName {
@@ -200,8 +200,8 @@ impl Source {
     }
 
     /// The size of a block for devices that are updated together; `None` for the file's blocks.
-    pub(super) fn group_blocks(&self) -> Option<usize> {
-        self.block_size.is_none().then_some(GROUP_BLOCKS)
+    pub(super) fn joined_blocks(&self) -> Option<usize> {
+        self.block_size.is_none().then_some(JOINED_BLOCKS)
     }
 
     /// Whether the user asked for another CRC than the file's CRC `kept`.

@@ -329,7 +329,7 @@ impl Flash {
             .alone(!self.not_alone)
             .mastership(!self.no_mastership)
             .blocks(self.in_blocks.then(|| self.source.block_size()))
-            .group_blocks(self.source.group_blocks())
+            .joined_blocks(self.source.joined_blocks())
             .from_start(self.from_start)
             .force(self.force))
     }

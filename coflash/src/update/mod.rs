@@ -32,5 +32,5 @@ pub use self::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen}
 pub use self::event::{Event, Report};
 pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
-pub use self::options::{FlashOptions, Target, GROUP_BLOCKS};
+pub use self::options::{FlashOptions, Target, JOINED_BLOCKS};
 pub use self::password::Password;

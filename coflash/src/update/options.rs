@@ -45,9 +45,9 @@ pub struct FlashOptions {
     /// Take the NMT mastership during the update of a lift device, and give it back (CiA 814-1
     /// clause 6.3).
     pub mastership: bool,
-    /// To the devices of a group, join blocks of the file up to this size, including framing: fewer
-    /// blocks need fewer answers of each device. `None` sends the file's own blocks.
-    pub group_blocks: Option<usize>,
+    /// Join blocks of the file up to this size, including framing, where the device takes them: fewer
+    /// blocks need fewer answers. `None` sends the file's own blocks.
+    pub joined_blocks: Option<usize>,
     /// Send a sealed image in blocks of at most this size, including framing, instead of in one
     /// download.
     pub blocks: Option<usize>,
@@ -60,9 +60,9 @@ pub struct FlashOptions {
     pub force: bool,
 }
 
-/// A block of a group, framing included. Every device with a second SDO server takes it; a device
-/// that refuses it is updated by itself, with the file's blocks.
-pub const GROUP_BLOCKS: usize = 0x1000;
+/// The size of joined blocks, framing included. A bootloader of coboot that has less room refuses
+/// the first of them by its header, and then gets the file's own blocks.
+pub const JOINED_BLOCKS: usize = 0x1000;
 
 impl FlashOptions {
     setters! {
@@ -79,7 +79,7 @@ impl FlashOptions {
         alone: bool,
         mastership: bool,
         blocks: Option<usize>,
-        group_blocks: Option<usize>,
+        joined_blocks: Option<usize>,
         together: bool,
         from_start: bool,
         force: bool,
@@ -142,7 +142,7 @@ impl Default for FlashOptions {
             alone: true,
             mastership: true,
             blocks: None,
-            group_blocks: Some(GROUP_BLOCKS),
+            joined_blocks: Some(JOINED_BLOCKS),
             together: false,
             from_start: false,
             force: false,

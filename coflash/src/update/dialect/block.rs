@@ -1,9 +1,10 @@
 //! The dialect `block` of SYS TEC and coboot: a block file, with one SDO download for each block.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::program::{self, FlashError};
-use canopen::Address;
+use canopen::{AbortCode, Address};
 use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
 use super::cia302;
@@ -76,8 +77,9 @@ impl Procedure for Block {
                 &cut
             }
         };
-        let larger = options.group_blocks.filter(|_| in_group).map(|size| file.joined(size));
-        let file = larger.as_ref().unwrap_or(file);
+        let joins = in_group || takes_joined(session, number)?;
+        let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size));
+        let file = Cut { own: file, joined: joined.as_ref() };
         let sent = send_verified(session, file, crcs, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
@@ -99,6 +101,49 @@ impl Procedure for Block {
         update.state = DeviceState::Released;
         Ok(Downloaded { repeats, took, released: Some(true) })
     }
+}
+
+/// After so many blocks in a row that got through in segments only, block transfer is given up: it is
+/// not a single frame that was damaged.
+const HOPELESS: u32 = 3;
+
+/// A file and the blocks in which it is sent.
+#[derive(Clone, Copy)]
+struct Cut<'f> {
+    /// The file with its own blocks.
+    own: &'f BlockFile,
+    /// The same with larger blocks, if the device takes them.
+    joined: Option<&'f BlockFile>,
+}
+
+impl<'f> Cut<'f> {
+    /// The file as it is sent.
+    fn file(self) -> &'f BlockFile {
+        self.joined.unwrap_or(self.own)
+    }
+
+    /// Whether this block, as it is sent, has joined several of the file.
+    fn has_joined(self, sent: &FileBlock) -> bool {
+        let is_same = |own: &FileBlock| own.flash_address == sent.flash_address && own.data == sent.data;
+        !self.own.blocks().iter().any(is_same)
+    }
+
+    /// The blocks of the file itself from `refused` on, which has joined some of them. Their numbers
+    /// follow those of the blocks before it.
+    fn own_from(self, refused: &FileBlock) -> Vec<FileBlock> {
+        let rest = self.own.blocks().iter().filter(|block| block.number != NUMBER_CONTROL);
+        let rest = rest.skip_while(|block| block.flash_address != refused.flash_address);
+        let number = |block: &FileBlock, at| if block.number == NUMBER_LAST { NUMBER_LAST } else { at };
+        rest.zip(refused.number..)
+            .map(|(block, at)| FileBlock { number: number(block, at), ..block.clone() })
+            .collect()
+    }
+}
+
+/// Whether the device takes larger blocks than those of a file, or refuses them without harm: a
+/// bootloader of coboot does, which the region of its program shows (2004h).
+fn takes_joined(session: &mut Session<'_>, program: u8) -> Result<bool, Error> {
+    Ok(program_region(session, program)?.is_some())
 }
 
 /// The blocks that carry a sealed image to the program's region of this device.
@@ -137,7 +182,7 @@ impl PartialDownload {
 /// device's part of it proves to be wrong, everything is sent.
 fn send_verified(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Cut<'_>,
     crcs: [u32; 2],
     in_group: &mut bool,
     options: &FlashOptions,
@@ -145,7 +190,7 @@ fn send_verified(
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
     let partial = if options.from_start { None } else { partial_download(session, number)? };
-    let partial = partial.filter(|partial| partial.is_of(file));
+    let partial = partial.filter(|partial| partial.is_of(file.own));
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, options, update)?;
         steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
@@ -166,7 +211,7 @@ fn send_verified(
 /// download; returns the number of repetitions and the duration.
 fn send(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Cut<'_>,
     partial: Option<PartialDownload>,
     in_group: &mut bool,
     options: &FlashOptions,
@@ -176,8 +221,8 @@ fn send(
     let before = steps::told_before(session, number)?;
     update.erases(before);
     if let Some(partial) = partial {
-        let total = file.program_size() as usize;
-        let done = partial.end.saturating_sub(file.program_start()) as usize;
+        let total = file.own.program_size() as usize;
+        let done = partial.end.saturating_sub(file.own.program_start()) as usize;
         update.tell(Phase::GoingOn { done: done.min(total), total }.into());
     } else if let Err(error) = steps::erase(session, number, &mut |event| update.tell(event)) {
         if error.is_refusal() {
@@ -191,24 +236,30 @@ fn send(
 }
 
 /// Steps 6 to 9: sends all blocks that are not in the begun download, those with data together with
-/// the other devices of a group; returns the number of repetitions.
+/// the other devices of a group; returns the number of repetitions. If the device refuses a joined
+/// block, the rest goes in the file's own blocks: they need less room, and a damaged frame costs less.
 fn send_blocks(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    file: Cut<'_>,
     partial: Option<PartialDownload>,
     in_group: &mut bool,
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
-    let blocks: Vec<(&FileBlock, Vec<u8>)> =
-        file.blocks().iter().map(|block| (block, block.emit_with(file.checksum()))).collect();
-    let total = blocks.iter().map(|(_, bytes)| bytes.len()).sum();
+    let checksum = file.own.checksum();
+    let size =
+        |blocks: &VecDeque<FileBlock>| blocks.iter().map(|block| block.emit_with(checksum).len()).sum();
+    let mut blocks: VecDeque<FileBlock> = file.file().blocks().iter().cloned().collect();
+    let mut total = size(&blocks);
+    let mut may_split = file.joined.is_some() && !*in_group;
     let mut done = 0;
     let mut repeats = 0;
+    let mut in_vain = 0;
     let (mut together, mut disturbed) = (0, false);
     update.tell(Event::Progress { done, total });
-    for (block, bytes) in &blocks {
-        if partial.is_some_and(|partial| partial.has(block)) {
+    while let Some(block) = blocks.pop_front() {
+        let bytes = block.emit_with(checksum);
+        if partial.is_some_and(|partial| partial.has(&block)) {
             done += bytes.len();
             continue;
         }
@@ -216,27 +267,43 @@ fn send_blocks(
             session.part_from_group()?;
             *in_group = false;
         }
-        let together_now = *in_group && block.number != NUMBER_CONTROL;
-        let sent =
-            send_block(session, block.number, bytes, together_now, options, &mut |event| match event {
-                Event::Progress { done: part, .. } => {
-                    update.tell(Event::Progress { done: done + part, total })
+        let one = One {
+            number: block.number,
+            bytes: &bytes,
+            in_group: *in_group && block.number != NUMBER_CONTROL,
+            may_split: may_split && file.has_joined(&block),
+        };
+        let form = session.transfers();
+        let sent = send_block(session, one, options, &mut |event| match event {
+            Event::Progress { done: part, .. } => update.tell(Event::Progress { done: done + part, total }),
+            Event::Note(Note::Together { devices }) if devices == together => {}
+            Event::Warning(Warning::GroupDisturbed) if disturbed => {}
+            event => {
+                match event {
+                    Event::Note(Note::Together { devices }) => together = devices,
+                    Event::Warning(Warning::GroupDisturbed) => disturbed = true,
+                    _ => {}
                 }
-                Event::Note(Note::Together { devices }) if devices == together => {}
-                Event::Warning(Warning::GroupDisturbed) if disturbed => {}
-                event => {
-                    match event {
-                        Event::Note(Note::Together { devices }) => together = devices,
-                        Event::Warning(Warning::GroupDisturbed) => disturbed = true,
-                        _ => {}
-                    }
-                    update.tell(event);
-                }
-            });
+                update.tell(event);
+            }
+        });
         // A device that postpones the erase starts it with the first good data: block 0 alone loses
         // nothing.
-        update.wrote |= block.number != 0 && !sent.as_ref().is_err_and(Error::refuses_first_blocks);
-        repeats += sent?;
+        let is_refused = sent.as_ref().is_err_and(Error::refuses_first_blocks);
+        let is_split = matches!(sent, Ok(Sent { split: true, .. }));
+        update.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
+        let sent = sent?;
+        repeats += sent.repeats;
+        in_vain = if session.transfers() == form { 0 } else { in_vain + 1 };
+        if session.takes_blocks() && in_vain < HOPELESS {
+            session.transfer_by(form);
+        }
+        if sent.split {
+            may_split = false;
+            blocks = file.own_from(&block).into();
+            total = done + size(&blocks);
+            continue;
+        }
         done += bytes.len();
         update.tell(Event::Progress { done, total });
     }
@@ -256,15 +323,31 @@ fn leave_after(session: &mut Session<'_>, error: &Error) {
     }
 }
 
-/// Steps 7 and 8 for one block, with repetition; returns the number of repetitions.
+/// A block to send.
+#[derive(Clone, Copy)]
+struct One<'b> {
+    number: u32,
+    bytes: &'b [u8],
+    /// It goes to the devices of a group.
+    in_group: bool,
+    /// It has joined several blocks of the file, which can go one by one.
+    may_split: bool,
+}
+
+/// The end of a block that the device has not refused for good.
+struct Sent {
+    repeats: u32,
+    /// The device has not taken it as it is; the blocks that it has joined may get through.
+    split: bool,
+}
+
+/// Steps 7 and 8 for one block, with repetition.
 fn send_block(
     session: &mut Session<'_>,
-    block: u32,
-    bytes: &[u8],
-    in_group: bool,
+    One { number: block, bytes, in_group, may_split }: One<'_>,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
-) -> Result<u32, Error> {
+) -> Result<Sent, Error> {
     let doing = Doing::Block(block);
     let at = Address::new(program::PROGRAM_DATA, options.program);
     let mut repeat = 0;
@@ -276,7 +359,7 @@ fn send_block(
             Met::Taken(devices) => {
                 tell(Note::Together { devices }.into());
                 // A block that the device cannot write is reported with the next one.
-                return Ok(repeat);
+                return Ok(Sent { repeats: repeat, split: false });
             }
             Met::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
             Met::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
@@ -296,12 +379,15 @@ fn send_block(
         // The earlier block had arrived, and the bootloader waits for the next one. If this is
         // wrong, the next block, or at the latest the program's CRC, shows it.
         if in_doubt && status.error == Some(FlashError::Sequence) {
-            return Ok(repeat);
+            return Ok(Sent { repeats: repeat, split: false });
         }
         let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
-            Judgement::Good => return Ok(repeat),
+            Judgement::Good => return Ok(Sent { repeats: repeat, split: false }),
             Judgement::Bad { why, error } => (why, error),
         };
+        if may_split && !in_doubt && is_too_long(&error) {
+            return Ok(Sent { repeats: repeat, split: true });
+        }
         in_doubt |= why == Some(RepeatReason::NoAnswer);
         match why {
             Some(why) if repeat < options.repeats => {
@@ -311,8 +397,17 @@ fn send_block(
                     session.transfer_by(Transfers::Segments);
                 }
                 tell(Event::Retry(Retry::block(block, repeat, options.repeats, why)));
+                if repeat > 1 && may_split && !in_doubt {
+                    return Ok(Sent { repeats: repeat, split: true });
+                }
             }
             _ => return Err(error),
         }
     }
+}
+
+/// Whether the device refuses a block because of its length.
+fn is_too_long(error: &Error) -> bool {
+    let (Error::Refused { code, .. } | Error::Failed { code: Some(code), .. }) = error else { return false };
+    matches!(*code, AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY)
 }

@@ -207,6 +207,96 @@ fn a_block_transfer_that_is_refused_in_the_middle_is_told_by_its_status() {
     }
 }
 
+/// A damaged frame costs its block, and not the form of those that follow.
+#[test]
+fn after_a_damaged_block_comes_block_transfer_again() {
+    // In the first block, whose transfer has 39 segments, and in the second one.
+    for altered in [vec![5, 45], vec![45, 85]] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.knows_blocks = Blocks::Known(127);
+        fake.altered_segments = altered.clone();
+        let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+        assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+        // Two attempts for the damaged block, which then came in segments; one for each other.
+        assert_eq!(fake.block_downloads, 1 + BLOCKS - 2, "{altered:?}");
+        assert_eq!((report.repeats, report.transfers), (2, Transfers::Blocks), "{altered:?}");
+    }
+    // If no block gets through, segments remain.
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Known(127);
+    fake.altered_segments = (1..10_000).step_by(10).collect();
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+    assert_eq!((fake.block_downloads, report.transfers), (2 * 3, Transfers::Segments));
+}
+
+/// A bootloader of coboot, which reports the region of its program.
+struct Coboot;
+
+impl crate::fake::Maker for Coboot {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        let region = [file().program_start().to_le_bytes(), 0x1_0000_u32.to_le_bytes()].concat();
+        (at == (0x2004, 1)).then_some(Ok(region))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<crate::fake::Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+fn coboot() -> Fake {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Known(127);
+    fake.maker = Some(Box::new(Coboot));
+    fake
+}
+
+#[test]
+fn blocks_are_joined_where_the_device_takes_them() {
+    let joined = |fake: &Fake| {
+        let file = BlockFile::parse(&fake.blocks.concat()).unwrap();
+        assert_eq!(file.flash_image(), self::file().flash_image());
+        assert_eq!(file.control(), self::file().control());
+        fake.blocks.len() < BLOCKS
+    };
+    let mut fake = coboot();
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert!(joined(&fake), "{:?}", fake.log);
+    assert!(fake.blocks.iter().all(|block| block.len() <= 4096));
+    assert_eq!(report.repeats, 0);
+    // The user has chosen the size.
+    let mut fake = coboot();
+    run(&mut fake, FlashOptions::default().joined_blocks(None)).0.unwrap();
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+    // A device with a smaller buffer gets the blocks of the file.
+    let mut fake = coboot();
+    fake.room = 300;
+    let (report, events) = run(&mut fake, FlashOptions::default());
+    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+    assert_eq!((report.unwrap().repeats, fake.count("command 03")), (0, 1));
+    let progress = events.iter().filter_map(|event| match event {
+        Event::Progress { done, total } => Some((*done, *total)),
+        _ => None,
+    });
+    let progress: Vec<_> = progress.collect();
+    assert!(progress.is_sorted_by_key(|(done, _)| *done), "{progress:?}");
+    assert!(progress.last().is_some_and(|(done, total)| done == total), "{progress:?}");
+    // One that is too long for the buffer fails as before if it is the file's own.
+    let mut fake = coboot();
+    fake.room = 200;
+    assert_eq!(run(&mut fake, FlashOptions::default()).0.unwrap_err().number(), 0x6000_0002);
+    // A damaged frame costs a large block twice, and then smaller ones.
+    let mut fake = coboot();
+    fake.altered_segments = vec![5, 110];
+    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
+    assert_eq!((report.repeats, report.transfers), (2, Transfers::Blocks));
+    joined(&fake);
+}
+
 #[test]
 fn a_file_for_another_device_erases_nothing() {
     let target = Target::of(&file()).unwrap();
