@@ -22,6 +22,11 @@ pub(crate) fn hex<S: Serializer>(number: &u32, serializer: S) -> Result<S::Ok, S
     serializer.collect_str(&format_args!("{number:#010x}"))
 }
 
+/// Ids in the form of the messages: `89ABCDEFh`.
+pub(crate) fn ids<S: Serializer>(ids: &[u32], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(ids.iter().map(|id| format!("{id:08X}h")))
+}
+
 /// The status in 1F57h.
 pub(crate) fn status<S: Serializer>(status: &Option<FlashStatus>, serializer: S) -> Result<S::Ok, S::Error> {
     let Some(status) = status else { return None::<()>.serialize(serializer) };

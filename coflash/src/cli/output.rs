@@ -498,6 +498,7 @@ impl From<Error> for Failure {
             Error::Refused { .. }
             | Error::Protocol { .. }
             | Error::ShortAnswer { .. }
+            | Error::SealedOnly { .. }
             | Error::Failed { .. }
             | Error::Busy { .. }
             | Error::WrongCrc { .. }

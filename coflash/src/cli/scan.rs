@@ -106,7 +106,9 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
         };
         return [node, runs, none(), none(), none(), none(), state];
     };
-    let runs = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
+    let who = if info.device_type.is_bootloader() { "bootloader" } else { "application" };
+    let is_sealed = info.security.as_ref().is_some_and(|told| told.sealed);
+    let runs = if is_sealed { format!("{who}, sealed") } else { who.to_string() };
     let text = |text: &Option<String>| text.clone().unwrap_or_else(none);
     let serial = info.identity[3].map_or_else(none, |serial| format!("{serial:08X}h"));
     let program = match info.programs.as_slice() {
@@ -117,7 +119,7 @@ fn row((node, found): (&NodeId, &Found)) -> [String; 7] {
             cells.collect::<Vec<_>>().join("; ")
         }
     };
-    [node, runs.to_string(), text(&info.name), text(&info.software_version), serial, program, state]
+    [node, runs, text(&info.name), text(&info.software_version), serial, program, state]
 }
 
 /// A program in one cell: the state from 1F51h, the CRC from 1F56h, and its version.

@@ -7,9 +7,14 @@ use std::time::Duration;
 use canopen::program::{ACCESS, EVENTS};
 use canopen::Address;
 use seal::access::{event, CHALLENGE, DOMAIN, SEALED, SIGNED_CHALLENGE};
+use seal::key_block::ROOT_COUNT;
 use seal::wire::{array, word};
 
+use serde::Serialize;
+
+use super::error::told;
 use super::{Doing, Error, Session};
+use crate::json;
 
 /// How long a device may take to check a signature.
 const VERDICT: Duration = Duration::from_secs(2);
@@ -62,8 +67,9 @@ fn request(rights: u32, argument: u32, key_id: u32) -> impl Iterator<Item = u8> 
 /// The errors of a [read](Session::read). A device without support for sealed images does not have
 /// this object.
 pub fn challenge(session: &mut Session<'_>) -> Result<Challenge, Error> {
-    let bytes = session.read(Address::new(ACCESS, 1))?;
-    Ok(Challenge(array(&bytes, 0)))
+    let at = Address::new(ACCESS, 1);
+    let bytes = session.read(at)?.try_into().map_err(|_| Error::wrong_length(at))?;
+    Ok(Challenge(bytes))
 }
 
 /// Reads the challenge of a device that may not have this object. `None` if the object is missing
@@ -77,6 +83,69 @@ pub fn told_challenge(session: &mut Session<'_>) -> Result<Option<Challenge>, Er
         Err(Error::Refused { .. }) => Ok(None),
         Err(error) => Err(error),
     }
+}
+
+/// What a device reports about the images that it takes. `Display` shows it in one line.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Security {
+    /// The device has keys, and takes only sealed images.
+    pub sealed: bool,
+    /// The ids of its root keys.
+    #[serde(serialize_with = "json::ids")]
+    pub roots: Vec<u32>,
+    /// The lowest security counter of an image that the device accepts, for each program from number
+    /// 1 on.
+    pub counters: Vec<u32>,
+    /// The lowest epoch of a key that the device accepts.
+    pub epoch: Option<u32>,
+}
+
+/// Reads what a device reports about the images that it takes; `None` if it has no such objects.
+///
+/// # Errors
+/// The errors of a [read](Session::read), except a refusal.
+pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
+    let Some(challenge) = told_challenge(session)? else { return Ok(None) };
+    let bytes = told(session.read(Address::new(ACCESS, 3)))?.unwrap_or_default();
+    let mut words = bytes.chunks_exact(4).map(|bytes| word(bytes, 0));
+    Ok(Some(Security {
+        sealed: challenge.is_sealed(),
+        roots: words.by_ref().take(ROOT_COUNT).filter(|id| *id != 0).collect(),
+        epoch: words.next(),
+        counters: words.collect(),
+    }))
+}
+
+impl fmt::Display for Security {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if !self.sealed {
+            return f.write_str("no, it has no keys");
+        }
+        f.write_str("yes")?;
+        if !self.roots.is_empty() {
+            write!(f, ", {}", roots_words(&self.roots))?;
+        }
+        match self.counters.as_slice() {
+            [] => {}
+            [counter] => write!(f, ", counter {counter}")?,
+            counters => {
+                let counters: Vec<String> = counters.iter().map(u32::to_string).collect();
+                write!(f, ", counters {}", counters.join(", "))?;
+            }
+        }
+        match self.epoch {
+            Some(epoch) => write!(f, ", epoch {epoch}"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The ids of root keys in words.
+pub(crate) fn roots_words(roots: &[u32]) -> String {
+    let ids: Vec<String> = roots.iter().map(|id| format!("{id:08X}h")).collect();
+    let noun = if ids.len() == 1 { "root" } else { "roots" };
+    format!("{noun} {}", ids.join(", "))
 }
 
 /// Asks for rights with the signature of a root over [`Challenge::tbs`]. Returns whether the device
@@ -147,7 +216,8 @@ impl fmt::Display for Event {
 pub fn events(session: &mut Session<'_>) -> Result<Vec<Event>, Error> {
     let mut events = Vec::new();
     for place in 1..=seal::access::EVENTS as u8 {
-        let bytes = session.read(Address::new(EVENTS, place))?;
+        let at = Address::new(EVENTS, place);
+        let bytes: [u8; 16] = session.read(at)?.try_into().map_err(|_| Error::wrong_length(at))?;
         let [number, what, counter, version] = [0, 4, 8, 12].map(|at| word(&bytes, at));
         if number > 0 {
             events.push(Event { number, what, counter, version });

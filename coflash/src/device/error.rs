@@ -7,6 +7,7 @@ use canopen::program::{FlashError, FlashStatus};
 use canopen::AbortCode;
 use canopen::{Address, NodeId};
 
+use super::access::roots_words;
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
@@ -86,6 +87,13 @@ pub enum Error {
         device: u32,
         /// The file's value.
         file: u32,
+    },
+    /// The device takes sealed images only, and the file is none.
+    SealedOnly {
+        /// The device.
+        node: NodeId,
+        /// The ids of its root keys, as far as it reports them.
+        roots: Vec<u32>,
     },
     /// The image cannot be a program.
     NoProgram {
@@ -312,6 +320,7 @@ impl Error {
             // The numbers of the same errors in a firmware file, found without a device.
             Self::OtherRegion { .. } => 0x6000_0015,
             Self::NoProgram { .. } => 0x6000_0021,
+            Self::SealedOnly { .. } => flash_error_number(FlashError::NoAccess),
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
             Self::NotAlone { .. } => 0x6000_0012,
@@ -385,6 +394,13 @@ impl fmt::Display for Error {
                     Mismatch::ProductCode => "product code",
                 };
                 write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
+            }
+            Self::SealedOnly { node, roots } => {
+                write!(f, "node {node} takes sealed images only")?;
+                match roots.as_slice() {
+                    [] => Ok(()),
+                    roots => write!(f, " ({})", roots_words(roots)),
+                }
             }
             Self::NoProgram { why, .. } => write!(f, "the image {why}"),
             Self::OtherRegion { node, program, image: (first, last), region: (from, to) } => {

@@ -8,6 +8,7 @@ use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 use shared_abi::block_file::ProgramVersion;
 
+use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::error::{told, Error};
@@ -41,6 +42,8 @@ pub struct DeviceInfo {
     pub dialect: Option<Dialect>,
     /// Its programs, from number 1 on.
     pub programs: Vec<ProgramInfo>,
+    /// What it reports about sealed images (2002h, 2003h). An application need not have these objects.
+    pub security: Option<Security>,
 }
 
 /// The data that the user sees before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah and
@@ -133,6 +136,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         0 => Dialect::of_bootloader(device_type, session.node()),
         _ => Some(recognise(session, device_type, 1)?),
     };
+    let security = security(session)?;
     Ok(DeviceInfo {
         node: session.node(),
         device_type,
@@ -143,6 +147,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         identity,
         dialect,
         programs,
+        security,
     })
 }
 
@@ -209,6 +214,9 @@ impl fmt::Display for DeviceInfo {
             ("dialect", self.dialect.map_or(ABSENT.to_string(), |dialect| dialect.to_string())),
         ] {
             writeln!(f, "  {name:<17} {value}")?;
+        }
+        if let Some(security) = &self.security {
+            writeln!(f, "  {:<17} {security}", "sealed")?;
         }
         self.programs.iter().try_for_each(|program| write!(f, "{program}"))
     }

@@ -96,6 +96,8 @@ pub(super) struct Device {
     /// NMT state of the last heartbeat.
     pub(super) heartbeat: Option<&'static str>,
     pub(super) dialect: Option<&'static str>,
+    /// What it reports about sealed images, in words.
+    pub(super) sealed: Option<String>,
     pub(super) programs: Vec<Program>,
     /// The comparison of the firmware file's label with this device.
     pub(super) verdict: Option<Verdict>,
@@ -317,6 +319,7 @@ impl Device {
             identity: info.identity,
             heartbeat: None,
             dialect: info.dialect.map(|dialect| dialect.name()),
+            sealed: info.security.as_ref().map(ToString::to_string),
             programs: info.programs.iter().map(Program::of).collect(),
             verdict: None,
         }

@@ -9,8 +9,8 @@ use super::content::Content;
 use super::dialect::is_data;
 use super::options::{FlashOptions, Target};
 use super::steps::compare_target;
-use crate::device::access::told_challenge;
-use crate::device::error::{optional, Error, Mismatch};
+use crate::device::access::{security, told_challenge};
+use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
 use crate::file::image::Image;
@@ -37,6 +37,7 @@ pub(super) fn admit(
         Content::Blocks(file) => file,
         Content::Sealed(file) => return admit_sealed(session, file, options.program),
     };
+    let says = admit_open(session)?;
     let image = file.image();
     let mut is_judged = true;
     if !is_data(dialect, options.program) {
@@ -46,10 +47,11 @@ pub(super) fn admit(
             check_identity(session, target)?;
         }
     }
-    Ok(admit_place(session, file, &image, dialect, options.program)? && is_judged)
+    Ok(admit_place(session, file, &image, dialect, options.program)? && is_judged && says)
 }
 
-/// Checks stack and region; returns whether the device has reported its region.
+/// Checks what an application may not know: the stack, the region, and which images the device takes;
+/// returns whether the device has reported its region.
 ///
 /// # Errors
 /// As [`admit`].
@@ -62,6 +64,7 @@ pub(super) fn admit_to_bootloader(
     match file {
         _ if options.force => Ok(true),
         Content::Blocks(file) => {
+            admit_open(session)?;
             let image = file.image();
             if !is_data(dialect, options.program) {
                 admit_stack(session, file, &image)?;
@@ -69,6 +72,17 @@ pub(super) fn admit_to_bootloader(
             admit_place(session, file, &image, dialect, options.program)
         }
         Content::Sealed(file) => admit_capable(session, file, options.program),
+    }
+}
+
+/// Checks that a device takes images that are not sealed; returns whether it has said so.
+fn admit_open(session: &mut Session<'_>) -> Result<bool, Error> {
+    match told_challenge(session)? {
+        Some(challenge) if challenge.is_sealed() => {
+            let roots = security(session)?.map(|told| told.roots).unwrap_or_default();
+            Err(Error::SealedOnly { node: session.node(), roots })
+        }
+        challenge => Ok(challenge.is_some()),
     }
 }
 
@@ -181,7 +195,7 @@ fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(
 }
 
 fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {
-    match optional(session.read_number(Address::new(IDENTITY, sub)))? {
+    match told(session.read_number(Address::new(IDENTITY, sub)))? {
         Some(device) if device != file => {
             Err(Error::WrongTarget { node: session.node(), what, device, file })
         }

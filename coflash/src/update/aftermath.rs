@@ -3,12 +3,12 @@
 
 use std::time::Duration;
 
-use canopen::program;
+use canopen::program::{self, FlashError};
 use canopen::{Address, NodeId};
 
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen};
 use super::running::RunningUpdate;
-use crate::device::error::{optional, Error};
+use crate::device::error::{told, Error};
 use crate::device::{DeviceType, Session, Timing};
 
 /// How long the device may take for its answer; there are two attempts.
@@ -38,7 +38,7 @@ pub(super) fn look(
         match ask(&mut asked, number) {
             Ok(seen) => {
                 return DeviceAfterUpdate {
-                    state: judge(update, &seen, crc),
+                    state: judge(update, &seen, crc, error),
                     answer: DeviceAnswer::Seen(seen),
                 }
             }
@@ -51,25 +51,29 @@ pub(super) fn look(
 
 fn ask(session: &mut Session<'_>, number: u8) -> Result<Seen, Error> {
     let running = DeviceType(session.read_number(Address::new(program::DEVICE_TYPE, 0))?);
-    let mut object = |index| match optional(session.read_number(Address::new(index, number))) {
-        // Any other refusal, or a value of another length, counts as not reported.
-        Err(Error::Refused { .. } | Error::Protocol { .. }) => Ok(None),
-        told => told,
-    };
+    let mut object = |index| told(session.read_number(Address::new(index, number)));
     let control = object(program::PROGRAM_CONTROL)?;
     let crc = object(program::PROGRAM_ID)?;
     Ok(Seen { running, control, crc })
 }
 
-/// The state of a device, from the course of the update and the device's answers.
-fn judge(update: &RunningUpdate<'_>, seen: &Seen, crc: u32) -> DeviceState {
+/// Whether a sealed image was refused as not authentic, too old, or for other keys: a device erases
+/// nothing before that is judged. One that refuses a later part has erased, and then says so.
+fn is_not_admitted(error: &Error) -> bool {
+    let Error::Failed { error, .. } = error else { return false };
+    matches!(*error, FlashError::Signature | FlashError::Rollback | FlashError::Key)
+}
+
+/// The state of a device, from the course of the update, its error and the device's answers.
+fn judge(update: &RunningUpdate<'_>, seen: &Seen, crc: u32, error: &Error) -> DeviceState {
+    let wrote = update.wrote && !is_not_admitted(error);
     match update.state {
         // The application was called and has stayed, or is back.
         DeviceState::Called if !seen.running.is_bootloader() => DeviceState::Untouched,
         DeviceState::Erased if !seen.empty() => match seen.crc {
             // A device that erases with the first good block has received none.
-            told @ Some(_) if !update.wrote && told == update.before => update.resting,
-            Some(told) if update.wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
+            told @ Some(_) if !wrote && told == update.before => update.resting,
+            Some(told) if wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
             _ => DeviceState::Erased,
         },
         state => state,

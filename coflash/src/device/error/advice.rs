@@ -45,6 +45,9 @@ impl Error {
             }
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
+            Self::SealedOnly { .. } => "seal the program with a key that a root of the device has certified (coflash seal), and \
+                                        flash the sealed image"
+                .to_string(),
             Self::NoProgram { advice, .. } => (*advice).to_string(),
             Self::OtherRegion { .. } => "link the program for that address, or check --program and --board; \
                                          --force leaves that to the device"

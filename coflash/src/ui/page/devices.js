@@ -97,6 +97,7 @@ function open(node) {
     ["Name", device.name ?? "unknown"],
     ["Hardware", device.hardware ?? "unknown"],
     ["Software", device.software ?? "unknown"],
+    ["Sealed", device.sealed ?? "not reported"],
     ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],
     ["Dialect", device.dialect ?? "unknown"],
     ...device.programs.map((one) => [`Program ${one.number}`, `${one.words}${one.crc ? `, CRC ${hex(one.crc)}` : ""}`]),

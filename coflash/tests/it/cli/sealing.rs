@@ -657,7 +657,9 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         let (done, kept, _) = flashed(&file, 0x10000, status, &[]);
         assert_eq!(done.exit, 6, "{}", done.out);
         assert!(kept == bytes, "it is sent once, and not again");
-        for words in [number, words, advice] {
+        // Nothing was erased.
+        let unchanged = "its program is unchanged (CRC 12345678h)";
+        for words in [number, words, advice, unchanged] {
             assert!(done.err.contains(words), "{words}: {}", done.err);
         }
     }
@@ -821,7 +823,8 @@ fn a_device_without_keys_gets_no_sealed_image() {
     // An application does not report it; the bootloader does, before anything is erased.
     let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
     assert!(done.exit == 6 && done.err.contains("the device is not sealed"), "{}", done.err);
-    assert_eq!(fake.writes(), ["command 80"]);
+    assert!(done.err.contains("its application is running; it was not changed"), "{}", done.err);
+    assert_eq!(fake.writes(), ["command 80", "command 01"]);
 }
 
 #[test]

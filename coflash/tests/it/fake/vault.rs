@@ -21,6 +21,8 @@ impl Maker for Vault {
         let kept = self.kept.lock().unwrap();
         match at {
             (0x2004, 1) => Some(Ok([self.start.to_le_bytes(), self.room.to_le_bytes()].concat())),
+            // Nothing was erased for an image that is refused.
+            (0x1F56, 1) if self.status != 0 => Some(Ok(vec![0x78, 0x56, 0x34, 0x12])),
             (0x1F56, 1) => Some(Ok(kept.get(32..36).unwrap_or(&[0; 4]).to_vec())),
             (0x1F57, 1) if !kept.is_empty() && self.status != 0 => {
                 Some(Ok(self.status.to_le_bytes().to_vec()))

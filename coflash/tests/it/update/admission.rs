@@ -3,6 +3,7 @@
 
 use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::NodeId;
+use coflash::device::info::info;
 use coflash::device::{Dialect, Error, Session, Timing};
 use coflash::file::convert::{blocks_of, Label as Told, Options};
 use coflash::file::{raw, BlockFile, Firmware};
@@ -301,14 +302,81 @@ fn the_bootloader_is_asked_where_the_application_does_not_know() {
     let mut fake = at(START + 0x1_0000, 0x1_0000, APPLICATION, &[BOOTLOADER]);
     let (result, events) = run(&mut fake, &file, FlashOptions::default());
     assert_eq!(result.unwrap_err().number(), 0x6000_0015);
-    assert_eq!(fake.writes(), ["command 80"]);
-    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Called));
+    // The application was called back in vain: it starts again.
+    assert_eq!(fake.writes(), ["command 80", "command 01"]);
+    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
     // What is no place in the flash of such a device is something else of another maker.
     for (base, size) in [(0x2000_0000, 0x1_0000), (START + 0x1_0000, 0), (START + 0x1_0000, u32::MAX)] {
         run(&mut at(base, size, APPLICATION, &[APPLICATION, BOOTLOADER]), &file, FlashOptions::default())
             .0
             .unwrap();
     }
+}
+
+/// A device that reports its keys while one of these device types runs.
+struct Sealed(Vec<u32>);
+
+impl Maker for Sealed {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let words = |words: &[u32]| words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<u8>>();
+        let value = match at {
+            (0x2002, 1) => [vec![0x5A; 44], words(&[1 << 31])].concat(),
+            (0x2002, 3) => words(&[0x1234_5678, 0x9ABC_DEF0, 4, 7]),
+            (0x2004, 1) => words(&[START, 0x1_0000]),
+            _ => return None,
+        };
+        (self.0.contains(&running) || at.0 == 0x2004).then_some(Ok(value))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+#[test]
+fn what_a_sealed_device_takes_is_shown() {
+    let mut fake = Fake::new(APPLICATION);
+    fake.maker = Some(Box::new(Sealed(vec![APPLICATION])));
+    let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
+    let told = info(&mut session).unwrap();
+    let line = "  sealed            yes, roots 12345678h, 9ABCDEF0h, counter 7, epoch 4\n";
+    assert!(told.to_string().contains(line), "{told}");
+    let json = serde_json::to_value(&told).unwrap();
+    let security = serde_json::json!({
+        "sealed": true, "roots": ["12345678h", "9ABCDEF0h"], "counters": [7], "epoch": 4
+    });
+    assert_eq!(json["security"], security);
+    // One without keys takes any program, and one without the object says nothing.
+    fake.maker = Some(Box::new(Sealed(vec![BOOTLOADER])));
+    let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
+    assert!(!info(&mut session).unwrap().to_string().contains("sealed"));
+}
+
+/// A program that is not sealed is refused before the call back; where the application does not know,
+/// before the erase, and the application starts again.
+#[test]
+fn a_sealed_device_gets_sealed_images_only() {
+    let file = file(&labelled(VENDOR, PRODUCT), START, Told::default());
+    let words = "node 5 takes sealed images only (roots 12345678h, 9ABCDEF0h)";
+    for dialect in [Dialect::Block, Dialect::Raw, Dialect::Hex] {
+        for running in [APPLICATION, BOOTLOADER] {
+            let mut fake = Fake::new(running);
+            fake.maker = Some(Box::new(Sealed(vec![APPLICATION, BOOTLOADER])));
+            let error = refused(&mut fake, &file, speaks(dialect));
+            assert_eq!((error.to_string().as_str(), error.number()), (words, 0x6000_0184));
+            assert!(error.advice().contains("coflash seal"), "{}", error.advice());
+        }
+    }
+    let mut fake = Fake::new(APPLICATION);
+    fake.maker = Some(Box::new(Sealed(vec![BOOTLOADER])));
+    let (result, events) = run(&mut fake, &file, FlashOptions::default());
+    assert_eq!(result.unwrap_err().to_string(), words);
+    assert_eq!(fake.writes(), ["command 80", "command 01"]);
+    assert_eq!(events.last().and_then(Event::left).map(|left| left.state), Some(DeviceState::Untouched));
 }
 
 /// An image without addresses is checked against its target region.
