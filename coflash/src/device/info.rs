@@ -119,12 +119,12 @@ impl ProgramInfo {
 /// Reads all of a device's information.
 ///
 /// # Errors
-/// [`Error::NoAnswer`] and others. An object that the device refuses is not an error: it is not
-/// reported.
+/// [`Error::NoAnswer`] and others. An object that the device refuses, or about which it says nothing,
+/// is not an error: it is not reported.
 pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let device_type = session.find()?;
     let Nameplate { name, hardware_version, software_version, identity } = nameplate(session)?;
-    let mut number = |index, sub| told(session.read_number(Address::new(index, sub)));
+    let mut number = |index, sub| cell(session, |session| session.read_number(Address::new(index, sub)));
     let error_register = number(program::ERROR_REGISTER, 0)?;
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
@@ -134,9 +134,9 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     }
     let dialect = match count {
         0 => Dialect::of_bootloader(device_type, session.node()),
-        _ => Some(recognise(session, device_type, 1)?),
+        _ => cell(session, |session| recognise(session, device_type, 1))?,
     };
-    let security = security(session)?;
+    let security = cell(session, security)?.flatten();
     Ok(DeviceInfo {
         node: session.node(),
         device_type,
@@ -151,12 +151,27 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     })
 }
 
+/// Reads what a device need not have. Some devices do not answer at all for an object that they do not
+/// have: one that then still answers for its device type does not report it.
+fn cell<T>(
+    session: &mut Session<'_>,
+    read: impl FnOnce(&mut Session<'_>) -> Result<T, Error>,
+) -> Result<Option<T>, Error> {
+    match told(read(session)) {
+        Err(error @ Error::NoAnswer { .. }) => match session.device_type()? {
+            Some(_) => Ok(None),
+            None => Err(error),
+        },
+        told => told,
+    }
+}
+
 /// Reads a device's name, versions and identity.
 ///
 /// # Errors
 /// As [`info`].
 pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
-    let mut text = |index| told(session.read_text(Address::new(index, 0)));
+    let mut text = |index| cell(session, |session| session.read_text(Address::new(index, 0)));
     let name = text(program::DEVICE_NAME)?;
     let hardware_version = text(program::HARDWARE_VERSION)?;
     let software_version = text(program::SOFTWARE_VERSION)?;
@@ -170,7 +185,8 @@ pub fn nameplate(session: &mut Session<'_>) -> Result<Nameplate, Error> {
 pub fn identity(session: &mut Session<'_>) -> Result<Identity, Error> {
     let mut identity = [None; 4];
     for (sub, value) in (1..).zip(&mut identity) {
-        *value = told(session.read_number(Address::new(program::IDENTITY, sub)))?;
+        let at = Address::new(program::IDENTITY, sub);
+        *value = cell(session, |session| session.read_number(at))?;
     }
     Ok(identity)
 }

@@ -14,7 +14,7 @@ use serde::Serialize;
 use shared_abi::block_file::ProgramVersion;
 
 use crate::device::access::{events, told_challenge};
-use crate::device::error::{optional, Error};
+use crate::device::error::{told, Error};
 use crate::device::{DeviceType, Session};
 use crate::file::sealed::show::digits;
 use crate::file::sealed::SealedFile;
@@ -123,11 +123,11 @@ pub fn compare_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<Co
     let running = session.find()?;
     let mut comparison = Comparison { running, runs: false, differences: Vec::new(), untold: Vec::new() };
     let mut number = |comparison: &mut Comparison, at: Address| -> Result<Option<u32>, Error> {
-        let told = optional(session.read_number(at))?;
-        if told.is_none() {
+        let value = told(session.read_number(at))?;
+        if value.is_none() {
             comparison.untold.push(at);
         }
-        Ok(told)
+        Ok(value)
     };
 
     for (sub, what, said) in

@@ -11,7 +11,7 @@ use coflash::device::{Session, Timing, Transfers};
 use coflash::{Adapter, Error};
 use embedded_can::Frame as _;
 
-use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
 
 const NAME: Address = Address::new(0x1008, 0);
 const TYPE: Address = Address::new(0x1000, 0);
@@ -168,6 +168,21 @@ impl Maker for Peculiar {
     fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
         None
     }
+}
+
+/// A device that says nothing about an object that it does not have still answers.
+#[test]
+fn silence_about_an_object_costs_its_own_cell() {
+    for at in [(0x1001, 0), (0x1009, 0), (0x1018, 4), (0x1F51, 0), (0x2002, 1), (0x6005, 1)] {
+        let mut fake = Fake::new(APPLICATION);
+        fake.maker = Some(Box::new(Peculiar(at, Err(SILENT))));
+        let told = info(&mut session(&mut fake)).unwrap_or_else(|error| panic!("{at:X?}: {error}"));
+        assert_eq!((told.identity[0], told.identity[3]), (Some(0x3F), None), "{at:X?}");
+    }
+    // One that falls silent is gone.
+    let mut fake = Fake::new(APPLICATION);
+    fake.maker = Some(Box::new(Peculiar((0x1000, 0), Err(SILENT))));
+    assert!(matches!(info(&mut session(&mut fake)), Err(Error::NoAnswer { .. })));
 }
 
 /// One object that cannot be read costs its own cell, and nothing else.

@@ -19,6 +19,8 @@ pub fn left(events: &[Event]) -> DeviceState {
 
 pub mod vault;
 
+/// In place of the abort code for an object: no answer at all.
+pub const SILENT: u32 = 0;
 pub const NODE: u8 = 5;
 pub const APPLICATION: u32 = 0x0002_0192;
 pub const BOOTLOADER: u32 = 0x1000_0000;
@@ -330,6 +332,7 @@ impl Fake {
                         self.answer(initiate(0x41, at, value.len() as u32));
                         self.upload = Some((value, 0));
                     }
+                    Err(SILENT) => {}
                     Err(code) => self.abort(at, code),
                 }
             }
