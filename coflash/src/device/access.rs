@@ -12,7 +12,7 @@ use seal::wire::{array, word};
 
 use serde::Serialize;
 
-use super::error::told;
+use super::error::{roots_words, told};
 use super::{Doing, Error, Session};
 use crate::json;
 
@@ -139,13 +139,6 @@ impl fmt::Display for Security {
             None => Ok(()),
         }
     }
-}
-
-/// The ids of root keys in words.
-pub(crate) fn roots_words(roots: &[u32]) -> String {
-    let ids: Vec<String> = roots.iter().map(|id| format!("{id:08X}h")).collect();
-    let noun = if ids.len() == 1 { "root" } else { "roots" };
-    format!("{noun} {}", ids.join(", "))
 }
 
 /// Asks for rights with the signature of a root over [`Challenge::tbs`]. Returns whether the device

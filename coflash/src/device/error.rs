@@ -7,7 +7,6 @@ use canopen::program::{FlashError, FlashStatus};
 use canopen::AbortCode;
 use canopen::{Address, NodeId};
 
-use super::access::roots_words;
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
@@ -519,6 +518,13 @@ pub(crate) fn of_gateway(error: GatewayError, node: NodeId, doing: Doing) -> Err
         GatewayError::Abort(code) => Error::Refused { node, doing, code },
         GatewayError::Cancelled => Error::Cancelled,
     }
+}
+
+/// The ids of root keys in words.
+pub(crate) fn roots_words(roots: &[u32]) -> String {
+    let ids: Vec<String> = roots.iter().map(|id| format!("{id:08X}h")).collect();
+    let noun = if ids.len() == 1 { "root" } else { "roots" };
+    format!("{noun} {}", ids.join(", "))
 }
 
 /// Turns the error "no such object" into `None`.
