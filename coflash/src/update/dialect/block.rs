@@ -78,7 +78,8 @@ impl Procedure for Block {
             }
         };
         let joins = in_group || takes_joined(session, number)?;
-        let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size));
+        let most = if in_group { usize::MAX } else { file.program_size() as usize / JOINED_PARTS };
+        let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size.min(most)));
         let file = Cut { own: file, joined: joined.as_ref() };
         let sent = send_verified(session, file, crcs, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
@@ -106,6 +107,10 @@ impl Procedure for Block {
 /// After so many blocks in a row that got through in segments only, block transfer is given up: it is
 /// not a single frame that was damaged.
 const HOPELESS: u32 = 3;
+
+/// A joined block is at most this part of a program: so little more comes twice if an update is cut.
+/// (The device itself keeps its progress in steps of a sixteenth.)
+const JOINED_PARTS: usize = 64;
 
 /// A file and the blocks in which it is sent.
 #[derive(Clone, Copy)]

@@ -9,6 +9,8 @@ use canopen::{CobId, Frame, NodeId};
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::{raw, Firmware};
 use coflash::update::event::{Phase, RepeatReason, Retry, Warning};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::Adapter;
@@ -235,7 +237,7 @@ struct Coboot;
 
 impl crate::fake::Maker for Coboot {
     fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
-        let region = [file().program_start().to_le_bytes(), 0x1_0000_u32.to_le_bytes()].concat();
+        let region = [LARGE_AT.to_le_bytes(), 0x6_0000_u32.to_le_bytes()].concat();
         (at == (0x2004, 1)).then_some(Ok(region))
     }
 
@@ -248,36 +250,54 @@ impl crate::fake::Maker for Coboot {
     }
 }
 
-fn coboot() -> Fake {
+const LARGE_AT: u32 = 0x0802_0000;
+
+/// A program of so many KiB, in blocks of 1 KiB.
+fn large(kib: usize) -> BlockFile {
+    let mut bytes: Vec<u8> = (0..kib * 1024).map(|at| (at * 7 + at / 256) as u8).collect();
+    bytes[..8].copy_from_slice(&[0, 0, 1, 0x20, 1, 2, 2, 8]);
+    let image = raw::read(&bytes, Some(LARGE_AT)).unwrap();
+    blocks_of(Firmware::Image(image), &Options::default()).unwrap().file
+}
+
+/// Flashes a file into a bootloader of coboot, which must then have its program.
+fn into_coboot(
+    file: &BlockFile,
+    options: FlashOptions,
+    change: impl FnOnce(&mut Fake),
+) -> (Result<Report, Error>, Vec<Event>, Fake) {
     let mut fake = Fake::new(BOOTLOADER);
     fake.knows_blocks = Blocks::Known(127);
     fake.maker = Some(Box::new(Coboot));
-    fake
+    change(&mut fake);
+    let mut events = Vec::new();
+    let mut session = Session::new(&mut fake, node(), Timing::default());
+    let result = flash(&mut session, file, &options, &mut |event| events.push(event));
+    if result.is_ok() {
+        let taken = BlockFile::parse(&fake.blocks.concat()).unwrap();
+        assert_eq!((taken.flash_image(), taken.control()), (file.flash_image(), file.control()));
+    }
+    (result, events, fake)
 }
 
 #[test]
 fn blocks_are_joined_where_the_device_takes_them() {
-    let joined = |fake: &Fake| {
-        let file = BlockFile::parse(&fake.blocks.concat()).unwrap();
-        assert_eq!(file.flash_image(), self::file().flash_image());
-        assert_eq!(file.control(), self::file().control());
-        fake.blocks.len() < BLOCKS
-    };
-    let mut fake = coboot();
-    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert!(joined(&fake), "{:?}", fake.log);
+    let file = large(256);
+    let own = file.blocks().len();
+    // 256 KiB in pieces of 4 times 1008 bytes, and two blocks more.
+    let (report, _, fake) = into_coboot(&file, FlashOptions::default(), |_| {});
+    assert_eq!((report.unwrap().repeats, fake.blocks.len()), (0, (256 * 1024_usize).div_ceil(4 * 1008) + 2));
     assert!(fake.blocks.iter().all(|block| block.len() <= 4096));
-    assert_eq!(report.repeats, 0);
-    // The user has chosen the size.
-    let mut fake = coboot();
-    run(&mut fake, FlashOptions::default().joined_blocks(None)).0.unwrap();
-    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
+    // The user has chosen the size; a small program, of which a cut would cost much.
+    let (_, _, fake) = into_coboot(&file, FlashOptions::default().joined_blocks(None), |_| {});
+    assert_eq!(fake.blocks.len(), own);
+    let small = large(64);
+    let (_, _, fake) = into_coboot(&small, FlashOptions::default(), |_| {});
+    assert_eq!(fake.blocks.len(), small.blocks().len());
     // A device with a smaller buffer gets the blocks of the file.
-    let mut fake = coboot();
-    fake.room = 300;
-    let (report, events) = run(&mut fake, FlashOptions::default());
-    assert_eq!(fake.blocks.concat(), data!("identity-110.blk"));
-    assert_eq!((report.unwrap().repeats, fake.count("command 03")), (0, 1));
+    let (report, events, fake) = into_coboot(&file, FlashOptions::default(), |fake| fake.room = 1100);
+    assert_eq!((fake.blocks.len(), fake.count("command 03")), (own, 1));
+    assert_eq!(report.unwrap().repeats, 0);
     let progress = events.iter().filter_map(|event| match event {
         Event::Progress { done, total } => Some((*done, *total)),
         _ => None,
@@ -286,15 +306,13 @@ fn blocks_are_joined_where_the_device_takes_them() {
     assert!(progress.is_sorted_by_key(|(done, _)| *done), "{progress:?}");
     assert!(progress.last().is_some_and(|(done, total)| done == total), "{progress:?}");
     // One that is too long for the buffer fails as before if it is the file's own.
-    let mut fake = coboot();
-    fake.room = 200;
-    assert_eq!(run(&mut fake, FlashOptions::default()).0.unwrap_err().number(), 0x6000_0002);
+    let (result, _, _) = into_coboot(&file, FlashOptions::default(), |fake| fake.room = 900);
+    assert_eq!(result.unwrap_err().number(), 0x6000_0002);
     // A damaged frame costs a large block twice, and then smaller ones.
-    let mut fake = coboot();
-    fake.altered_segments = vec![5, 110];
-    let report = run(&mut fake, FlashOptions::default()).0.unwrap();
-    assert_eq!((report.repeats, report.transfers), (2, Transfers::Blocks));
-    joined(&fake);
+    let damage = |fake: &mut Fake| fake.altered_segments = vec![5, 600];
+    let (report, _, fake) = into_coboot(&file, FlashOptions::default(), damage);
+    let report = report.unwrap();
+    assert_eq!((report.repeats, report.transfers, fake.blocks.len()), (2, Transfers::Blocks, own));
 }
 
 #[test]
