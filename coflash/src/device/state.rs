@@ -11,7 +11,7 @@ use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
-use super::error::{optional, Error};
+use super::error::{told, Error};
 use super::session::Session;
 
 /// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
@@ -32,8 +32,8 @@ impl DeviceState {
     /// # Errors
     /// Those of a [read](Session::read).
     pub fn read(session: &mut Session<'_>) -> Result<Option<Self>, Error> {
-        let mut byte = |sub| {
-            let value = optional(session.read_number(Address::new(DEVICE_STATE, sub)))?;
+        let mut byte = |sub| -> Result<Option<u8>, Error> {
+            let value = told(session.read_number(Address::new(DEVICE_STATE, sub)))?;
             Ok(value.map(|value| value as u8))
         };
         let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
@@ -64,7 +64,9 @@ pub fn reason(number: u8) -> String {
     match Reason::from_byte(number) {
         Some(Reason::Requested) => "it was called back",
         Some(Reason::Strap) => "its entry strap is set",
-        Some(Reason::CrashLoop) => "its program has ended too often in a row by a reset that nobody requested",
+        Some(Reason::CrashLoop) => {
+            "its program has ended too often in a row by a reset that nobody requested"
+        }
         Some(Reason::NoAutostart) => "no program starts by itself on this product",
         Some(Reason::NodeId) => "its node-ID is outside the range with which a program may start",
         Some(Reason::Unsigned) => "its program is not released for autostart",
@@ -101,7 +103,7 @@ impl fmt::Display for DeviceState {
 /// Those of a [read](Session::read).
 pub fn program_watchdog(session: &mut Session<'_>) -> Result<Option<Duration>, Error> {
     let at = Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG);
-    let ms = optional(session.read_number(at))?.filter(|ms| *ms > 0);
+    let ms = told(session.read_number(at))?.filter(|ms| *ms > 0);
     Ok(ms.map(|ms| Duration::from_millis(ms.into())))
 }
 
@@ -120,7 +122,10 @@ mod tests {
              independent watchdog; 1 reset that nobody requested"
         );
         assert_eq!(state(6, 0, 0), "stays in the bootloader: it has no program");
-        assert_eq!(state(200, 200, 0), "stays in the bootloader: for a reason that this tool does not know (200)");
+        assert_eq!(
+            state(200, 200, 0),
+            "stays in the bootloader: for a reason that this tool does not know (200)"
+        );
         // No two reasons share their words.
         let mut words: Vec<_> = (0..=12).map(reason).collect();
         words.sort();

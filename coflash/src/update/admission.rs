@@ -139,7 +139,7 @@ fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Re
     if StackAtEnd::of(image, start).is_none() {
         return Ok(true);
     }
-    let Some(name) = optional(session.read_text(Address::new(DEVICE_NAME, 0)))? else { return Ok(false) };
+    let Some(name) = told(session.read_text(Address::new(DEVICE_NAME, 0)))? else { return Ok(false) };
     let board = name.strip_prefix("coboot ").and_then(|name| layout::by_name(&name.to_lowercase()));
     judge(image, start, board).map_err(no_program)?;
     Ok(true)
@@ -189,7 +189,7 @@ fn admit_place(
 /// does not report cannot differ.
 fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
     match target {
-        Some(target) => compare_target(session, target, |session, at| optional(session.read_number(at))),
+        Some(target) => compare_target(session, target, |session, at| told(session.read_number(at))),
         None => Ok(()),
     }
 }
