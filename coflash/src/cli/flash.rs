@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use canopen::NodeId;
 use clap::{Args, ValueEnum};
@@ -31,7 +32,7 @@ use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
-use super::values::{nodes, number, program_number};
+use super::values::{nodes, number, program_number, watch_time};
 use super::verify::{self, is_sealed};
 
 /// When devices get the same program together.
@@ -111,6 +112,12 @@ pub(super) struct Flash {
     /// bootloader's, and it is called back.
     #[arg(long)]
     no_trial: bool,
+
+    /// Watch the program for this time after each start, in milliseconds; 0 does not watch. By default
+    /// 1000, or twice the time of the watchdog that the bootloader starts for it. A second boot-up, an
+    /// emergency 6000h or the bootloader ends the update: exit status 7.
+    #[arg(long, value_parser = watch_time, value_name = "MS")]
+    watch: Option<Duration>,
 
     /// The trial in the manual's spelling; it is the default.
     #[arg(long = "chk_run", hide = true)]
@@ -321,6 +328,7 @@ impl Flash {
             .repeats(self.block_repeats)
             .check_target(check_target)
             .trial_run(settings.trial_run.unwrap_or(!self.no_trial))
+            .watch(self.watch)
             .start(settings.start.unwrap_or(!self.no_start))
             .verify(settings.verify.unwrap_or(self.verify))
             .dialect(self.access.dialect())

@@ -510,6 +510,7 @@ impl From<Error> for Failure {
             Error::NoBootloader { .. }
             | Error::Occupied { .. }
             | Error::StartFailed { .. }
+            | Error::ProgramEnded { .. }
             | Error::TrialFailed { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };

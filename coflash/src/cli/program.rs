@@ -4,6 +4,7 @@
 use canopen::program::ProgramState;
 use clap::Args;
 use coflash::device::info::{program_info, ProgramInfo};
+use coflash::device::state::DeviceState;
 use coflash::device::Session;
 use coflash::update::event::{Event, Phase};
 use coflash::update::steps::{
@@ -11,6 +12,7 @@ use coflash::update::steps::{
 };
 use coflash::Error;
 use serde_json::{json, Value};
+use shared_abi::boot_report::Reason;
 
 use super::catch::{self, Limit};
 use super::context::Context;
@@ -46,7 +48,8 @@ pub(super) struct Erase {
     program: Program,
 }
 
-/// Releases the program for autostart (83h of 1F51h): it then starts by itself after a reset.
+/// Releases the program for autostart (83h of 1F51h): on a product on which it does, it
+/// then starts by itself after a reset.
 #[derive(Debug, Args)]
 pub(super) struct Release {
     #[command(flatten)]
@@ -156,8 +159,7 @@ impl Release {
             // the command.
             tell(Event::Found(session.find()?));
             release(session, number, tell)?;
-            let words =
-                format!("program {number} is released for autostart: it starts by itself after a reset");
+            let words = format!("program {number} is released for autostart{}", autostart_words(session)?);
             Ok((words, json!({})))
         })
     }
@@ -202,6 +204,13 @@ impl Status {
 fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
     let info = program_info(session, number)?;
     Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))
+}
+
+/// What the device says of programs that start by themselves.
+fn autostart_words(session: &mut Session<'_>) -> Result<&'static str, Error> {
+    let is_off = |state: DeviceState| state.reason == Reason::NoAutostart as u8;
+    let state = DeviceState::read(session)?;
+    Ok(if state.is_some_and(is_off) { "; no program starts by itself on this product" } else { "" })
 }
 
 fn info_words(info: &ProgramInfo) -> String {

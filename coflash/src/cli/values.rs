@@ -52,6 +52,11 @@ pub(super) fn milliseconds(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// The time for which a program is watched: milliseconds, 0 for not at all.
+pub(super) fn watch_time(text: &str) -> Result<Duration, String> {
+    Ok(Duration::from_millis(number(text)?.into()))
+}
+
 /// A COB-ID to which a node-ID can be added.
 pub(super) fn base_id(text: &str) -> Result<u16, String> {
     match u16::try_from(number(text)?) {

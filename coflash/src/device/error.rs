@@ -6,10 +6,12 @@ use std::time::Duration;
 use canopen::program::{FlashError, FlashStatus};
 use canopen::AbortCode;
 use canopen::{Address, NodeId};
+use shared_abi::handoff::ResetCause;
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
+use super::state::{reason, source, DeviceState};
 use crate::bus::gateway::GatewayError;
 use crate::bus::AdapterError;
 
@@ -186,6 +188,15 @@ pub enum Error {
         running: Option<DeviceType>,
         /// The status in 1F57h, if it could be read.
         status: Option<FlashStatus>,
+        /// The state in 2007h, if the device has it.
+        state: Option<DeviceState>,
+    },
+    /// The program has started, and ended soon after.
+    ProgramEnded {
+        /// The device.
+        node: NodeId,
+        /// Its end.
+        ended: Ended,
     },
 }
 
@@ -200,6 +211,24 @@ pub enum TrialFailure {
     Stays(Option<AbortCode>),
     /// The program was called back, and nothing answers any more.
     Lost,
+    /// The program ran for a while and then ended by a reset.
+    Ended(Ended),
+}
+
+/// The end of a program that ran for a while.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ended {
+    /// The time from its first frame on.
+    pub ran: Duration,
+    /// The reset that ended it, if the device has told it.
+    pub by: Option<ResetCause>,
+}
+
+impl fmt::Display for Ended {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "it ran for {} ms and was reset by ", self.ran.as_millis())?;
+        f.write_str(self.by.map_or("itself or by a watchdog", source))
+    }
 }
 
 /// How the tool noticed another tool.
@@ -330,7 +359,10 @@ impl Error {
             Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
             Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost, .. } => 0x6000_0010,
-            Self::StartFailed { .. } | Self::TrialFailed { .. } | Self::OtherIdentity { .. } => 0x6000_0014,
+            Self::StartFailed { .. }
+            | Self::ProgramEnded { .. }
+            | Self::TrialFailed { .. }
+            | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
         }
@@ -485,15 +517,21 @@ impl fmt::Display for Error {
                     TrialFailure::Lost => {
                         write!(f, "node {node} has not answered since the program was called back")
                     }
+                    TrialFailure::Ended(ended) => write!(f, "{ended} (node {node})"),
                 }
             }
-            Self::StartFailed { node, running, status } => {
+            Self::ProgramEnded { node, ended } => write!(f, "the program of node {node} has ended: {ended}"),
+            Self::StartFailed { node, running, status, state } => {
                 match running {
                     Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
                     None => write!(f, "the program does not start: node {node} does not answer")?,
                 }
                 match status.and_then(|status| status.error) {
                     Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                    None => Ok(()),
+                }?;
+                match state {
+                    Some(state) => write!(f, "; why: {}", reason(state.reason)),
                     None => Ok(()),
                 }
             }

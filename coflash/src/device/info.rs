@@ -14,6 +14,7 @@ use super::dialect::Dialect;
 use super::error::{told, Error};
 use super::recognise::recognise;
 use super::session::Session;
+use super::state::DeviceState;
 use crate::json;
 
 /// What a device reports about itself; `None` for an object that it does not have.
@@ -44,6 +45,8 @@ pub struct DeviceInfo {
     pub programs: Vec<ProgramInfo>,
     /// What it reports about sealed images (2002h, 2003h). An application need not have these objects.
     pub security: Option<Security>,
+    /// 2007h: why it stays in its bootloader; `None` for an application.
+    pub state: Option<DeviceState>,
 }
 
 /// The data that the user sees before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah and
@@ -137,6 +140,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         _ => cell(session, |session| recognise(session, device_type, 1))?,
     };
     let security = cell(session, security)?.flatten();
+    let state = if device_type.is_bootloader() { cell(session, DeviceState::read)?.flatten() } else { None };
     Ok(DeviceInfo {
         node: session.node(),
         device_type,
@@ -148,6 +152,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         dialect,
         programs,
         security,
+        state,
     })
 }
 
@@ -233,6 +238,9 @@ impl fmt::Display for DeviceInfo {
         }
         if let Some(security) = &self.security {
             writeln!(f, "  {:<17} {security}", "sealed")?;
+        }
+        if let Some(state) = &self.state {
+            writeln!(f, "  {:<17} {state}", "state")?;
         }
         self.programs.iter().try_for_each(|program| write!(f, "{program}"))
     }

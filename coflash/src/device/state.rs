@@ -42,19 +42,31 @@ impl DeviceState {
         Ok(Some(Self { reason, program_reset, crash_resets }))
     }
 
-    /// How the program ended, if that is known.
+    /// The state of a device that is in trouble already: an error of the read is no news.
+    pub(crate) fn after_failure(session: &mut Session<'_>) -> Option<Self> {
+        Self::read(session).ok().flatten()
+    }
+
+    /// The reset by which the program ended, if it is known.
     #[must_use]
-    pub fn ended_by(self) -> Option<&'static str> {
-        Some(match ResetCause::from_byte(self.program_reset) {
-            ResetCause::Unknown => return None,
-            ResetCause::PowerOn => "the power",
-            ResetCause::Pin => "the reset pin",
-            ResetCause::Software => "software",
-            ResetCause::IndependentWatchdog => "the independent watchdog",
-            ResetCause::WindowWatchdog => "the window watchdog",
-            ResetCause::LowPower => "a low-power mode that the option bytes forbid",
-            ResetCause::BrownOut => "a supply below the brown-out level",
-        })
+    pub fn ended_by(self) -> Option<ResetCause> {
+        let cause = ResetCause::from_byte(self.program_reset);
+        (cause != ResetCause::Unknown).then_some(cause)
+    }
+}
+
+/// The source of a reset, in words.
+#[must_use]
+pub const fn source(cause: ResetCause) -> &'static str {
+    match cause {
+        ResetCause::Unknown => "an unknown source",
+        ResetCause::PowerOn => "the power",
+        ResetCause::Pin => "the reset pin",
+        ResetCause::Software => "software",
+        ResetCause::IndependentWatchdog => "the independent watchdog",
+        ResetCause::WindowWatchdog => "the window watchdog",
+        ResetCause::LowPower => "a low-power mode that the option bytes forbid",
+        ResetCause::BrownOut => "a supply below the brown-out level",
     }
 }
 
@@ -85,7 +97,7 @@ impl fmt::Display for DeviceState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "stays in the bootloader: {}", reason(self.reason))?;
         if let Some(how) = self.ended_by() {
-            write!(f, "; the program was ended by {how}")?;
+            write!(f, "; the program was ended by {}", source(how))?;
         }
         match self.crash_resets {
             0 => Ok(()),

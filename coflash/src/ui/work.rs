@@ -100,7 +100,7 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
         Step::Release => {
             tell(Event::Found(session.find()?));
             steps::release(session, number, &mut tell)?;
-            format!("program {number} is released for autostart: it starts by itself after a reset")
+            format!("program {number} is released for autostart")
         }
         Step::Withhold => {
             tell(Event::Found(session.find()?));

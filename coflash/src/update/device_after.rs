@@ -56,7 +56,7 @@ impl fmt::Display for DeviceState {
             Self::Unreleased => {
                 "it contains the new program, not released for autostart: after a reset the bootloader waits for the next attempt"
             }
-            Self::Released => "it contains the new program, released for autostart: it starts after a reset",
+            Self::Released => "it contains the new program, released for autostart",
         })
     }
 }

@@ -15,6 +15,7 @@ use super::options::FlashOptions;
 use super::reach::reach;
 use super::running::RunningUpdate;
 use super::steps::compare_crc;
+use super::watch;
 use crate::device::session::Silence;
 use crate::device::{flying_master, Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
@@ -119,8 +120,11 @@ fn procedure(
     }
     let Downloaded { repeats, took: transfer, released } = its.download(session, file, options, update)?;
     let running = if options.start {
+        let time = watch::time(session, dialect, options)?;
         update.tell(Phase::Starting.into());
+        let starts = session.now();
         let running = its.start(session, original, options.program)?;
+        watch::watch(session, starts, time)?;
         update.tell(Phase::Started(running).into());
         Some(running)
     } else {

@@ -24,6 +24,7 @@ mod running;
 pub mod steps;
 mod toml_line;
 mod trial;
+mod watch;
 
 pub use self::catch::{catch, CatchOptions, Caught};
 pub use self::comparison::{compare_sealed, Comparison, Difference, Part};

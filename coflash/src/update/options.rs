@@ -1,5 +1,7 @@
 //! The options of an update.
 
+use std::time::Duration;
+
 use serde::Serialize;
 use shared_abi::block_file::Control;
 use shared_abi::label::Label;
@@ -25,6 +27,9 @@ pub struct FlashOptions {
     /// Start the program once and call it back before it is released for autostart (steps 10 to
     /// 13), if the dialect has such a release and `start` is set.
     pub trial_run: bool,
+    /// How long a program is watched after each start, from its first frame on; `None` for a second, or
+    /// twice the time of the watchdog that the device starts for it.
+    pub watch: Option<Duration>,
     /// Start the program at the end (step 15). If this is off, the program is neither tried nor
     /// released for autostart.
     pub start: bool,
@@ -70,6 +75,7 @@ impl FlashOptions {
         repeats: u32,
         check_target: Option<Target>,
         trial_run: bool,
+        watch: Option<Duration>,
         start: bool,
         verify: bool,
         dialect: Option<Dialect>,
@@ -133,6 +139,7 @@ impl Default for FlashOptions {
             repeats: 3,
             check_target: None,
             trial_run: true,
+            watch: None,
             start: true,
             verify: false,
             dialect: None,

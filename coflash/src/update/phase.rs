@@ -172,9 +172,7 @@ impl fmt::Display for Phase {
             Self::TrialPassed(running) => {
                 write!(f, "the trial was successful: {running} started and returned to the bootloader")
             }
-            Self::Released => {
-                f.write_str("released for autostart (83h): the program starts by itself after a reset")
-            }
+            Self::Released => f.write_str("released for autostart (83h)"),
             Self::NotReleased => f.write_str(
                 "not released for autostart: the device stays in the bootloader; coflash start tries the \
                  program, coflash release releases it",

@@ -10,6 +10,7 @@ use super::event::{Event, Phase};
 use super::options::Target;
 use super::phase::PUT_OFF;
 use crate::device::error::{absent, told, Error, Mismatch};
+use crate::device::state::DeviceState;
 use crate::device::{DeviceType, Doing, Session, Timing};
 
 /// How many times an application is called back. A program that was started directly after its
@@ -197,7 +198,7 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
     Ok(())
 }
 
-/// Step 14: releases the program for autostart (83h): it then starts by itself after a reset.
+/// Step 14: releases the program for autostart (83h).
 ///
 /// # Errors
 /// As [`erase`].
@@ -314,20 +315,23 @@ pub(super) fn compare_crc(session: &mut Session<'_>, number: u8, crcs: [u32; 2])
 /// [`Error::StartFailed`].
 pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
     let node = session.node();
-    let failed = |running, status| Error::StartFailed { node, running, status };
+    let failed = |session: &mut Session<'_>, running| {
+        let status = session.status(number).ok();
+        Error::StartFailed { node, running, status, state: DeviceState::after_failure(session) }
+    };
     match session.command(number, ProgramControl::Start) {
         // A device that resets at once may not send its answer.
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
             let running = session.device_type()?;
-            return Err(failed(running, session.status(number).ok()));
+            return Err(failed(session, running));
         }
         Err(error) => return Err(error),
     }
     match settle(session, |running| !running.is_bootloader())? {
         Some(running) if !running.is_bootloader() => Ok(running),
-        Some(running) => Err(failed(Some(running), session.status(number).ok())),
-        None => Err(failed(None, None)),
+        Some(running) => Err(failed(session, Some(running))),
+        None => Err(Error::StartFailed { node, running: None, status: None, state: None }),
     }
 }
 

@@ -4,9 +4,10 @@ use super::event::Phase;
 use super::options::FlashOptions;
 use super::running::RunningUpdate;
 use super::steps::{call_back, check_target, start};
+use super::watch;
 use crate::device::error::{Error, IdentityPart, TrialFailure};
 use crate::device::info::{identity, Identity};
-use crate::device::Session;
+use crate::device::{Dialect, Session};
 
 /// Steps 10 to 13: starts the program for a trial, compares identities, and calls it back.
 pub(super) fn run(
@@ -15,8 +16,11 @@ pub(super) fn run(
     update: &mut RunningUpdate<'_>,
 ) -> Result<(), Error> {
     let bootloader = identity(session)?;
+    let time = watch::time(session, Dialect::Block, options)?;
     update.tell(Phase::TrialStarting.into());
+    let began = session.now();
     let running = start(session, options.program).map_err(failed)?;
+    watch::watch(session, began, time).map_err(failed)?;
     let right = same_identity(session, bootloader).and_then(|()| match options.check_target {
         Some(target) => check_target(session, target),
         None => Ok(()),
@@ -32,8 +36,9 @@ pub(super) fn run(
 /// The same error, in the form for a program on trial.
 fn failed(error: Error) -> Error {
     let (node, how) = match error {
-        Error::StartFailed { node, running: Some(_), status } => (node, TrialFailure::NotStarted(status)),
+        Error::StartFailed { node, running: Some(_), status, .. } => (node, TrialFailure::NotStarted(status)),
         Error::StartFailed { node, running: None, .. } => (node, TrialFailure::Silent),
+        Error::ProgramEnded { node, ended } => (node, TrialFailure::Ended(ended)),
         Error::NoBootloader { node, running: Some(_), code } => (node, TrialFailure::Stays(code)),
         Error::NoBootloader { node, running: None, .. } => (node, TrialFailure::Lost),
         error => return error,

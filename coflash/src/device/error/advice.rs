@@ -3,6 +3,8 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
+use shared_abi::handoff::ResetCause;
+
 use super::{Error, LssFailure, TrialFailure};
 use crate::device::doing::{Doing, LssDoing};
 
@@ -102,6 +104,9 @@ impl Error {
                 "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
                  --node {node} waits for it); a program that cannot be called back is flashed with --no-trial"
             ),
+            Self::ProgramEnded { ended, .. } | Self::TrialFailed { how: TrialFailure::Ended(ended), .. } => {
+                ended_advice(ended.by).to_string()
+            }
             Self::StartFailed { running: Some(running), .. } if running.is_bootloader() => {
                 "check that the program was linked for this board and program number; the device waits in the \
                  bootloader for another one"
@@ -111,6 +116,27 @@ impl Error {
                 "the program may not speak CANopen, use another node-ID or bit rate, or crash: run coflash catch --node \
                  {node}, switch the device off and on, and flash another one; if it is not caught, use its entry strap"
             ),
+        }
+    }
+}
+
+/// The advice for a program that ran for a while.
+fn ended_advice(by: Option<ResetCause>) -> &'static str {
+    match by {
+        Some(ResetCause::IndependentWatchdog | ResetCause::WindowWatchdog) => {
+            "the program does not feed its watchdog in time: feed it from its first instructions on \
+             (docs/application.md), or watch it for as long as it needs with --watch; --watch 0 does not watch"
+        }
+        Some(ResetCause::Software) => {
+            "the program resets itself, as the handler of a panic or a fault does: read its log, or run it under a \
+             debugger; a program that restarts on purpose is flashed with --watch 0"
+        }
+        Some(ResetCause::PowerOn | ResetCause::BrownOut) => {
+            "check the supply of the device: it lost its power while the program ran"
+        }
+        _ => {
+            "the program ends by itself: read its log, or run it under a debugger; coflash info says why the device \
+             stays in the bootloader; a program that restarts on purpose is flashed with --watch 0"
         }
     }
 }

@@ -5,6 +5,7 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::{CobId, Frame, NodeId};
 
+use super::watch::Watch;
 use super::{Session, Way};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
@@ -53,6 +54,32 @@ impl Session<'_> {
     pub fn await_boot_up(&mut self, time: Duration) -> Result<bool, Error> {
         let boot_up = Frame::of(CobId::heartbeat(self.node), &[0]);
         self.listen(time, |frame| *frame == boot_up)
+    }
+
+    /// The time of the node's last boot-up message, if it came at `began` or later.
+    pub(crate) fn booted_since(&mut self, began: Duration) -> Option<Duration> {
+        self.watch().boot_up_and_requests().0.filter(|at| *at >= began)
+    }
+
+    /// Waits for the end of a program that has started at `first`, for at most `time`: another boot-up
+    /// message of the node, or an emergency for its software; returns whether it came.
+    ///
+    /// # Errors
+    /// [`Error::Adapter`] or [`Error::Cancelled`].
+    pub(crate) fn await_end(&mut self, first: Duration, time: Duration) -> Result<bool, Error> {
+        let deadline = self.now() + time;
+        loop {
+            let Watch { booted, failed, .. } = *self.watch();
+            if booted.is_some_and(|at| at > first) || failed.is_some_and(|at| at >= first) {
+                return Ok(true);
+            }
+            let left = deadline.saturating_sub(self.now());
+            if left.is_zero() {
+                return Ok(false);
+            }
+            // A frame may be the end.
+            self.listen(left, |_| true)?;
+        }
     }
 
     /// Waits for the boot-up message of any other node for at most `time`; returns the node.

@@ -4,6 +4,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use canopen::emcy::code;
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
@@ -45,6 +46,8 @@ pub(super) struct Watch {
     pub(super) commanded: Option<Duration>,
     /// The time of the node's last boot-up message.
     pub(super) booted: Option<Duration>,
+    /// The time of the node's last emergency for its software (6000h).
+    pub(super) failed: Option<Duration>,
     /// Since when the session hears the bus.
     pub(super) began: Option<Duration>,
 }
@@ -88,6 +91,9 @@ impl Watch {
         if *frame == Frame::of(CobId::heartbeat(node), &[0]) {
             self.booted = Some(now);
         }
+        if is_failure(frame, node) {
+            self.failed = Some(now);
+        }
         if id == CobId::sdo_response(node) {
             // A request is on the bus before its answer, so an echo that has not arrived before the
             // answer will not arrive. If echoes do arrive, echoes of frames sent after that request
@@ -105,6 +111,12 @@ fn object_of(frame: &Frame) -> Option<Address> {
     let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
     let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
     initiates.then(|| Address::new(u16::from_le_bytes([low, high]), sub))
+}
+
+/// Whether a node reports an error of its software, by an emergency 6000h.
+fn is_failure(frame: &Frame, node: NodeId) -> bool {
+    let is_of_software = |bytes: &[u8; 8]| bytes.starts_with(&code::SOFTWARE.to_le_bytes());
+    frame.cob_id() == Some(CobId::emcy(node)) && frame.exactly().is_some_and(is_of_software)
 }
 
 /// Whether a request begins to write 1F50h or 1F51h, expedited, segmented or as blocks.

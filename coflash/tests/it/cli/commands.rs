@@ -58,7 +58,7 @@ fn the_steps_of_an_update_one_by_one() {
     assert_eq!(fake.writes(), ["command 03"; 2]);
 
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["release"]);
-    assert_eq!(said.out, "node 5: program 1 is released for autostart: it starts by itself after a reset\n");
+    assert_eq!(said.out, "node 5: program 1 is released for autostart\n");
     assert_eq!(fake.writes(), ["command 83"]);
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["withdraw"]);
     assert!(said.out.contains("is no longer released for autostart"), "{}", said.out);

@@ -72,6 +72,15 @@ pub enum Deed {
     Restart(u8, u32),
 }
 
+/// The end of a program that the fake has started.
+#[derive(Clone, Copy, Debug)]
+pub enum End {
+    /// A reset, after which this device type runs.
+    Reset { after: Duration, into: u32 },
+    /// It sends an emergency 6000h, and goes on.
+    Panic { after: Duration },
+}
+
 type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
@@ -97,6 +106,12 @@ pub struct Fake {
     leaves_at: Option<Duration>,
     /// What START starts.
     pub starts: Option<u32>,
+    /// The ends of the next programs that it starts; `None` for one that goes on.
+    pub ends: VecDeque<Option<End>>,
+    /// 2007h/2 to 4, if the device has them.
+    pub state: Option<[u8; 3]>,
+    /// 2007h/10, if the device has it.
+    pub watchdog_ms: Option<u16>,
     /// How long an answer takes.
     pub latency: Duration,
     /// How much longer each of the next answers takes.
@@ -130,6 +145,7 @@ pub struct Fake {
     download: Option<Download>,
     upload: Option<(Vec<u8>, u8)>,
     outbox: VecDeque<(Duration, Frame)>,
+    emergency: Option<(Duration, Frame)>,
     pub sent: Vec<Frame>,
     /// The other manufacturer's objects, if there are any.
     pub maker: Option<Box<dyn Maker>>,
@@ -164,6 +180,9 @@ impl Fake {
             leave_time: Duration::ZERO,
             leaves_at: None,
             starts: Some(APPLICATION),
+            ends: VecDeque::new(),
+            state: None,
+            watchdog_ms: None,
             latency: Duration::from_micros(500),
             delays: VecDeque::new(),
             on_block: Box::new(|_| Outcome::Accept),
@@ -183,6 +202,7 @@ impl Fake {
             download: None,
             upload: None,
             outbox: VecDeque::new(),
+            emergency: None,
             sent: Vec::new(),
             maker: None,
             next_node: NODE,
@@ -230,6 +250,9 @@ impl Fake {
     }
 
     fn tick(&mut self) {
+        if let Some((at, frame)) = self.emergency.take_if(|(at, _)| *at <= self.now) {
+            self.outbox.push_back((at, frame));
+        }
         if self.leaves_at.is_some_and(|at| at <= self.now) {
             self.leaves_at = None;
             self.running = None;
@@ -243,6 +266,22 @@ impl Fake {
             if next.is_some() {
                 let id = CobId::new(0x700 + u16::from(self.node)).unwrap();
                 self.outbox.push_back((at, Frame::of(id, &[0])));
+            }
+            if next == Some(APPLICATION) {
+                if let Some(Some(end)) = self.ends.pop_front() {
+                    self.end_later(at, end);
+                }
+            }
+        }
+    }
+
+    /// A program that started at this time ends.
+    fn end_later(&mut self, at: Duration, end: End) {
+        match end {
+            End::Reset { after, into } => self.restart = Some((at + after, Some(into))),
+            End::Panic { after } => {
+                let id = CobId::new(0x80 + u16::from(self.node)).unwrap();
+                self.emergency = Some((at + after, Frame::of(id, &[0x00, 0x60, 0x01, 0, 0, 0, 0, 0])));
             }
         }
     }
@@ -437,6 +476,10 @@ impl Fake {
                 let application = self.crc_of_application.filter(|_| self.running == Some(APPLICATION));
                 number(application.or(self.crc).unwrap_or(crc))
             }
+            (0x2007, sub @ 2..=4) => {
+                self.state.map(|state| vec![state[usize::from(sub) - 2]]).ok_or(0x0602_0000)
+            }
+            (0x2007, 10) => self.watchdog_ms.map(|ms| ms.to_le_bytes().to_vec()).ok_or(0x0602_0000),
             (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
             (0x1F50, 1) => self.readable.clone().ok_or(0x0601_0001),
             (0x1018 | 0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),

@@ -185,11 +185,11 @@ fn a_stack_over_the_handoff_is_refused_before_anything_is_erased() {
     let words = "its stack begins at 20020000h, over the handoff (2001FFC0h)";
     assert!(error.to_string().contains(words), "{error}");
     assert!(error.advice().contains("LENGTH = 128K - 64"), "{}", error.advice());
-    // Only the bootloader tells its name: the program was stopped, and is still there.
+    // Only the bootloader tells its name: the program was stopped, and is started again.
     let mut fake = other(F446, Some(BOOTLOADER));
     let error = run(&mut fake, &file, FlashOptions::default()).0.unwrap_err();
     assert!(error.to_string().contains(words), "{error}");
-    assert_eq!(fake.writes(), ["command 80"]);
+    assert_eq!(fake.writes(), ["command 80", "command 01"]);
     // 192 KiB of SRAM, or nobody knows: the device judges.
     for objects in [F429, FOREIGN] {
         run(&mut other(objects, None), &file, FlashOptions::default()).0.unwrap();

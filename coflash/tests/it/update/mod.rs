@@ -9,3 +9,4 @@ mod master;
 mod mastership;
 mod procedure;
 mod search;
+mod watch;

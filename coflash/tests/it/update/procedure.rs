@@ -106,7 +106,7 @@ fn the_whole_procedure_from_a_running_application() {
         [
             "starting the program for a trial",
             "the trial was successful: an application (device type 00020192h) started and returned to the bootloader",
-            "released for autostart (83h): the program starts by itself after a reset",
+            "released for autostart (83h)",
             "starting the program",
             "running: an application (device type 00020192h)",
             report.to_string().as_str()

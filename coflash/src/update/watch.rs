@@ -1,0 +1,66 @@
+//! The watch over a program that has just started: a program may answer once and die a moment later, by a
+//! panic or by a watchdog that it does not feed.
+
+use std::time::Duration;
+
+use shared_abi::handoff::ResetCause;
+
+use super::options::FlashOptions;
+use crate::device::error::{Ended, Error};
+use crate::device::state::{program_watchdog, DeviceState};
+use crate::device::{DeviceType, Dialect, Session};
+
+/// How long a program is watched at least.
+const WATCH: Duration = Duration::from_secs(1);
+
+/// How long the program will be watched: as asked for; otherwise a second, or twice the time of the
+/// watchdog that the bootloader starts for it. The device must be in its bootloader.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub(super) fn time(
+    session: &mut Session<'_>,
+    dialect: Dialect,
+    options: &FlashOptions,
+) -> Result<Duration, Error> {
+    match options.watch {
+        Some(time) => Ok(time),
+        None if dialect == Dialect::Block => {
+            Ok(program_watchdog(session)?.map_or(WATCH, |watchdog| WATCH.max(2 * watchdog)))
+        }
+        None => Ok(WATCH),
+    }
+}
+
+/// Watches the program that was started at `began`, for `time` from its first frame on: a second boot-up
+/// message, an emergency 6000h or the bootloader's device type shows that it has ended.
+///
+/// # Errors
+/// [`Error::ProgramEnded`], [`Error::StartFailed`] for a device that is silent at the end, and the errors of
+/// a [read](Session::read).
+pub(super) fn watch(session: &mut Session<'_>, began: Duration, time: Duration) -> Result<(), Error> {
+    if time.is_zero() {
+        return Ok(());
+    }
+    let node = session.node();
+    let first = session.booted_since(began).unwrap_or_else(|| session.now());
+    let left = (first + time).saturating_sub(session.now());
+    let has_ended = session.await_end(first, left)?;
+    let ran = session.now().saturating_sub(first);
+    let running = session.device_type()?;
+    if !has_ended && running.is_some_and(|running| !running.is_bootloader()) {
+        return Ok(());
+    }
+    let Some(running) = running else {
+        return Err(Error::StartFailed { node, running: None, status: None, state: None });
+    };
+    Err(Error::ProgramEnded { node, ended: Ended { ran, by: ended_by(session, running)? } })
+}
+
+/// How the program ended, as the bootloader reports it.
+fn ended_by(session: &mut Session<'_>, running: DeviceType) -> Result<Option<ResetCause>, Error> {
+    if !running.is_bootloader() {
+        return Ok(None);
+    }
+    Ok(DeviceState::read(session)?.and_then(DeviceState::ended_by))
+}
