@@ -160,8 +160,8 @@ const fn yes() -> bool {
 const NAME_MOST: usize = 256;
 /// The longest token.
 const TOKEN_MOST: usize = 1024;
-/// The longest poll interval that can be set: a day.
-const POLL_MOST: u64 = 24 * 3600;
+/// The longest poll interval that can be set: 30 days. Servers ask for more than a day.
+const POLL_MOST: u64 = 30 * 24 * 3600;
 
 /// The places of a token, as the file names them.
 struct Source<'s> {

@@ -161,6 +161,8 @@ pub(super) struct Rules {
 
 /// The pause between polls if the server names none: hawkBit's default.
 const SLEEP: Duration = Duration::from_secs(300);
+/// How many polls may come early in a pause: after a download, and after the update.
+const EARLY_MOST: u32 = 2;
 /// The longest pause that a server can ask for with `Retry-After`.
 const RETRY_MOST: Duration = Duration::from_secs(3600);
 /// How many attempts in a row may fetch nothing.
@@ -289,6 +291,11 @@ pub(super) struct Controller {
     /// No request before this time.
     hold: Duration,
     poll_at: Duration,
+    /// How many polls came early since the last one in its time, and whether the next one does.
+    early: u32,
+    is_early: bool,
+    /// The last pause of the server, if it was none: it is said once.
+    wrong_sleep: Option<String>,
     failures: u32,
     /// Whether the server has answered a poll.
     polled: bool,
@@ -309,6 +316,9 @@ impl Controller {
             asked: None,
             hold: Duration::ZERO,
             poll_at: Duration::ZERO,
+            early: 0,
+            is_early: false,
+            wrong_sleep: None,
             failures: 0,
             polled: false,
             said: Vec::new(),
@@ -530,8 +540,10 @@ impl Controller {
 
     fn base(&mut self, now: Duration, base: Base) {
         self.polled = true;
-        let (least, most) = self.rules.poll;
-        let sleep = base.sleep.unwrap_or(SLEEP).clamp(least, most);
+        if !std::mem::take(&mut self.is_early) {
+            self.early = 0;
+        }
+        let sleep = self.sleep(base.sleep);
         self.poll_at = now + self.jitter.longer(sleep);
         let nothing = base.deployment.is_none() && base.cancel.is_none();
         if let Some(link) = base.cancel {
@@ -560,6 +572,25 @@ impl Controller {
                 self.unsaved = true;
             }
         }
+    }
+
+    /// The pause until the next poll. A value that is no pause gets the default, and is said once.
+    fn sleep(&mut self, asked: Option<Result<Duration, String>>) -> Duration {
+        let (least, most) = self.rules.poll;
+        let wrong = asked.as_ref().and_then(|asked| asked.as_ref().err().cloned());
+        let sleep = asked.and_then(Result::ok).unwrap_or(SLEEP).clamp(least, most);
+        if let Some(value) = wrong.as_ref().filter(|_| wrong != self.wrong_sleep) {
+            self.say(
+                Kind::Note,
+                format!(
+                    "the server asks for the pause {value}, which is neither HH:MM:SS nor an ISO 8601 duration: it is \
+                     polled every {} s. Set the polling time of the server",
+                    sleep.as_secs()
+                ),
+            );
+        }
+        self.wrong_sleep = wrong;
+        sleep
     }
 
     fn cancel(&mut self, cancel: Cancel) {
@@ -690,7 +721,7 @@ impl Controller {
                 let task = task.clone();
                 self.work = Work::Ready { task, at: now, fresh: false, told: false, tries: 0 };
                 // The deployment may have been cancelled or closed meanwhile.
-                self.poll_at = now;
+                self.poll_early(now);
             }
             Piece::More => *failures = 0,
             Piece::Cut { more, why, retry_after } => {
@@ -798,18 +829,29 @@ impl Controller {
 
     /// The server knows the end of an action.
     fn reported(&mut self, now: Duration, action: &str) {
-        if let Some(finish) = self.record.ended.iter_mut().find(|finish| finish.action == action) {
-            if !finish.reported {
-                finish.reported = true;
-                self.unsaved = true;
-                // The server may want the new attributes, or have more to do.
-                self.poll_at = now;
+        let mut ended = self.record.ended.iter_mut();
+        if let Some(finish) = ended.find(|finish| finish.action == action && !finish.reported) {
+            finish.reported = true;
+            self.unsaved = true;
+            // After an update the server may want the new attributes, or have more to do.
+            if finish.ok {
+                self.poll_early(now);
             }
         }
         self.work = match self.record.ended.iter().find(|finish| !finish.reported) {
             Some(finish) => Work::Ended { action: finish.action.clone() },
             None => Work::None,
         };
+    }
+
+    /// Polls before the pause that the server asks for is over, unless it did so before in this
+    /// pause: a server that always has something new must not make the agent spin.
+    fn poll_early(&mut self, now: Duration) {
+        if self.early < EARLY_MOST {
+            self.early += 1;
+            self.poll_at = now;
+            self.is_early = true;
+        }
     }
 
     /// Puts a message on an action before the next requests.

@@ -8,11 +8,15 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::pause;
+
 /// The most deployments' chunks and artifacts that are looked at.
 const PARTS_MOST: usize = 64;
 /// The longest id of an action, and the longest name of a file.
 const ID_MOST: usize = 64;
 const NAME_MOST: usize = 255;
+/// The longest part of a wrong value that is shown, in characters.
+const SHOWN_MOST: usize = 40;
 /// The longest line of feedback, in characters: hawkBit keeps 512.
 const LINE_MOST: usize = 500;
 /// The longest key and value of an attribute: hawkBit keeps 32 and 128.
@@ -22,8 +26,8 @@ const VALUE_MOST: usize = 128;
 /// The answer of a device's root resource.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Base {
-    /// The pause that the server asks for.
-    pub(super) sleep: Option<Duration>,
+    /// The pause that the server asks for; the error is its text, if it is none.
+    pub(super) sleep: Option<Result<Duration, String>>,
     pub(super) deployment: Option<String>,
     pub(super) cancel: Option<String>,
     pub(super) config: bool,
@@ -45,23 +49,17 @@ fn link(links: &Links, name: &str) -> Option<String> {
 impl Base {
     pub(super) fn parse(body: &[u8]) -> Result<Self, String> {
         #[derive(Deserialize)]
-        struct Polling {
-            sleep: Option<String>,
-        }
-        #[derive(Deserialize)]
-        struct Settings {
-            polling: Option<Polling>,
-        }
-        #[derive(Deserialize)]
         struct Body {
-            config: Option<Settings>,
+            config: Option<serde_json::Value>,
             #[serde(default, rename = "_links")]
             links: Links,
         }
         let Body { config, links } = read(body)?;
-        let sleep = config.and_then(|config| config.polling).and_then(|polling| polling.sleep);
+        let sleep = config.as_ref().and_then(|config| config.pointer("/polling/sleep"));
+        let sleep = sleep.filter(|sleep| !sleep.is_null());
+        let parsed = |sleep: &serde_json::Value| sleep.as_str().and_then(pause::parse);
         Ok(Self {
-            sleep: sleep.as_deref().and_then(clock),
+            sleep: sleep.map(|sleep| parsed(sleep).ok_or_else(|| visible(&sleep.to_string(), SHOWN_MOST))),
             deployment: link(&links, "deploymentBase"),
             cancel: link(&links, "cancelAction"),
             config: link(&links, "configData").is_some(),
@@ -70,14 +68,10 @@ impl Base {
     }
 }
 
-/// A time of the form HH:MM:SS.
-fn clock(text: &str) -> Option<Duration> {
-    let parts: Vec<u64> =
-        text.split(':').map(|part| part.parse().ok().filter(|part| *part < 100)).collect::<Option<_>>()?;
-    match parts.as_slice() {
-        [hours, minutes, seconds] => Some(Duration::from_secs(hours * 3600 + minutes * 60 + seconds)),
-        _ => None,
-    }
+/// A text of the server as safe text of limited length.
+fn visible(text: &str, most: usize) -> String {
+    let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
+    text.chars().take(most).map(visible).collect()
 }
 
 /// How urgent a part of a deployment is.
@@ -143,8 +137,7 @@ impl Artifact {
 
     /// The file's name as safe text.
     pub(super) fn name(&self) -> String {
-        let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
-        self.filename.chars().take(NAME_MOST).map(visible).collect()
+        visible(&self.filename, NAME_MOST)
     }
 }
 
@@ -292,11 +285,12 @@ mod tests {
                 "new":["what nobody knows"]}}"#,
         )
         .unwrap();
-        assert_eq!(base.sleep, Some(Duration::from_secs(12 * 3600 + 90)));
+        assert_eq!(base.sleep, Some(Ok(Duration::from_secs(12 * 3600 + 90))));
         assert!(base.deployment.unwrap().ends_with("/3?c=-21") && base.config && base.cancel.is_none());
-        assert_eq!(Base::parse(b"{}").unwrap(), Base::default());
-        for sleep in ["", "1:2", "-1:00:00", "00:00:00:00", "99999999999999999999:00:00", "aa:bb:cc"] {
-            assert_eq!(clock(sleep), None, "{sleep}");
+        for body in
+            ["{}", r#"{"config":null}"#, r#"{"config":5}"#, r#"{"config":{"polling":{"sleep":null}}}"#]
+        {
+            assert_eq!(Base::parse(body.as_bytes()).unwrap(), Base::default(), "{body}");
         }
         for body in [&b""[..], b"[]", b"null", b"<html>", b"{\"_links\":5}", &[0xFF, 0xFE]] {
             assert!(Base::parse(body).is_err(), "{body:?}");

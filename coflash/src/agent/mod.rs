@@ -6,6 +6,7 @@
 //! | `config` | the devices and the server, from a TOML file |
 //! | `url` | which URLs belong to the server, and get its token |
 //! | `ddi` | the messages of the interface |
+//! | `pause` | the pause between two polls, in the forms that a server sends |
 //! | `backoff` | pauses that grow, with jitter |
 //! | `record` | what an agent must know after a restart |
 //! | `controller` | what one device does next: a state machine without I/O |
@@ -25,6 +26,7 @@ mod ddi;
 mod download;
 mod firmware;
 mod http;
+mod pause;
 mod record;
 mod run;
 mod url;

@@ -448,12 +448,77 @@ fn trouble_with_the_server_makes_pauses_that_grow_to_their_limit() {
 
 #[test]
 fn a_pause_that_the_server_asks_for_is_kept_within_its_limits() {
-    for (sleep, least, most) in [("00:00:00", 10, 11), ("23:59:59", 3600, 3960), ("00:02:00", 120, 132)] {
+    for (sleep, least, most) in [
+        ("00:00:00", 10, 11),
+        ("23:59:59", 3600, 3960),
+        ("00:02:00", 120, 132),
+        ("PT2M", 120, 132),
+        ("P1DT2H", 3600, 3960),
+        ("PT36H", 3600, 3960),
+        ("PT0.5S", 10, 11),
+    ] {
         let mut drive = Drive::new();
         drive.asks();
         drive.answer(200, &json!({ "config": { "polling": { "sleep": sleep } } }));
         drive.asks();
         assert!(drive.now >= seconds(least) && drive.now <= seconds(most), "{sleep}: {:?}", drive.now);
+        assert!(!drive.says("pause"), "{sleep}");
+    }
+}
+
+/// The default is hawkBit's own, 5 minutes.
+#[test]
+fn a_pause_that_is_none_gets_the_default_and_is_said_once() {
+    for sleep in [json!("-PT5M"), json!("PT"), json!("soon\u{1b}[2J"), json!(5), json!("x".repeat(100_000))] {
+        let mut drive = Drive::new();
+        drive.asks();
+        let body = json!({ "config": { "polling": { "sleep": sleep } } });
+        drive.answer(200, &body);
+        drive.asks();
+        assert!(drive.now >= seconds(300) && drive.now <= seconds(330), "{:?}", drive.now);
+        let said = drive.controller.said();
+        let [said] = said.as_slice() else { panic!("{said:?}") };
+        assert!(said.text.contains("300 s") && said.text.contains("HH:MM:SS"), "{}", said.text);
+        assert!(said.text.len() < 300 && !said.text.contains('\u{1b}'), "{}", said.text);
+        drive.answer(200, &body);
+        drive.asks();
+        assert_eq!(drive.controller.said(), [], "it is the same value");
+    }
+}
+
+/// Whatever a server gives, it is polled a few times in the pause that it asks for, and no more.
+#[test]
+fn a_new_action_at_each_poll_does_not_make_the_agent_spin() {
+    let mut without_file = deployment("0", "forced");
+    without_file["deployment"]["chunks"] = json!([]);
+    for (fetched, flashed) in [(false, false), (true, false), (true, true)] {
+        let mut drive = Drive::new();
+        let (mut polls, mut actions) = (0, 0);
+        for _ in 0..2000 {
+            match drive.next() {
+                Step::Ask(Request::Get(link)) if link.is_empty() => {
+                    polls += 1;
+                    let links = json!({ "deploymentBase": { "href": "/d" } });
+                    let polling = json!({ "polling": { "sleep": "00:01:00" } });
+                    drive.answer(200, &json!({ "config": polling, "_links": links }));
+                }
+                Step::Ask(Request::Get(_)) => {
+                    // The same action twice in a row: the second time it is flashed.
+                    let number = if flashed { actions / 2 } else { actions };
+                    let given = if fetched { deployment("0", "forced") } else { without_file.clone() };
+                    actions += 1;
+                    let mut given = given;
+                    given["id"] = number.to_string().into();
+                    drive.answer(200, &given);
+                }
+                Step::Ask(_) => drive.answer(200, &json!({})),
+                Step::Fetch(_) => drive.controller.fetched(drive.now, Piece::Whole),
+                Step::Flash(_) => drive.controller.flashed(drive.now, Flashed::Done(vec![])),
+                step => panic!("{step:?}"),
+            }
+        }
+        let pauses = drive.now.as_secs() / 60;
+        assert!(polls > 100 && polls <= 3 * (pauses + 1), "{polls} polls in {pauses} pauses");
     }
 }
 
