@@ -1,5 +1,6 @@
 //! What an agent must know about a device after a restart, in a file that is always whole.
 
+use std::fmt::Display;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
@@ -94,18 +95,23 @@ impl Store {
     /// The record of a device. A missing file, or one of another server, is an empty record.
     ///
     /// # Errors
-    /// In words, for a file that cannot be read or is none of ours.
+    /// In words, with the path and what to do, for a file that cannot be read or is none of ours.
     pub(super) fn load(&self, controller: &str, of: &str) -> Result<Record, String> {
         let path = self.path(controller, "json");
+        let damaged = |what: &dyn Display| {
+            format!(
+                "{}: {what}: delete it, and the agent asks the server anew for this device",
+                path.display()
+            )
+        };
         let text = match crate::file::limit::read_text(&path) {
             Ok(text) if text.len() <= SIZE_MOST => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Record::new(of)),
-            Ok(_) => return Err(format!("{}: it is too large for a state file", path.display())),
-            Err(error) => return Err(format!("{}: {error}", path.display())),
+            Ok(_) => return Err(damaged(&"it is too large for a state file")),
+            Err(error) => return Err(damaged(&error)),
         };
-        let record: Record = serde_json::from_str(&text).map_err(|error| {
-            format!("{}: it is no state file ({error}): delete it, and the agent asks again", path.display())
-        })?;
+        let record: Record = serde_json::from_str(&text)
+            .map_err(|error| damaged(&format!("it is no state file ({error})")))?;
         Ok(if record.of == of { record } else { Record::new(of) })
     }
 

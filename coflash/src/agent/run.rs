@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use crc::{Crc, CRC_64_XZ};
 
+use super::backoff::Jitter;
 use super::config::{Config, Device};
 use super::controller::{Controller, Flash, Flashed, Kind, News, Rules, Said, Step, Wanted};
 use super::download::{self, Pause};
@@ -118,8 +119,8 @@ pub struct Ended {
     pub updated: usize,
     /// How many updates have failed.
     pub failed: usize,
-    /// How many devices were not served: the server did not answer as it should, or their bus was
-    /// in use or absent.
+    /// How many devices were not served: the server did not answer as it should, their bus was in
+    /// use or absent, or their state file was damaged.
     pub unserved: usize,
 }
 
@@ -170,17 +171,11 @@ pub fn run(
     let limits = Limits { silent, request };
     let client =
         Client::new(config.server.clone(), config.ca_file.as_deref(), limits).map_err(CannotStart)?;
-    let mut controllers = Vec::new();
-    for device in &config.devices {
-        let root = config.server.controller(&config.tenant, &device.controller);
-        let record = store.load(&device.controller, &root).map_err(CannotStart)?;
-        controllers.push((device, root, record));
-    }
     let shared = Shared { config, options, devices, tell, client, limits, store, began: Instant::now() };
     let shared = &shared;
     let results: Vec<Ended> = thread::scope(|scope| {
-        let serve = |(device, root, record)| scope.spawn(move || serve(shared, device, root, record));
-        let threads: Vec<_> = controllers.into_iter().map(serve).collect();
+        let threads: Vec<_> =
+            config.devices.iter().map(|device| scope.spawn(move || serve(shared, device))).collect();
         // A thread that panicked has served nobody.
         let lost = Ended { unserved: 1, ..Ended::default() };
         threads.into_iter().map(|thread| thread.join().unwrap_or(lost)).collect()
@@ -204,9 +199,36 @@ fn lock(path: PathBuf) -> Result<File, String> {
     }
 }
 
+/// The record of a device. A damaged one is said, and read again after a pause: it may be put right.
+/// `None` if the run ends before that.
+fn record(shared: &Shared<'_>, device: &Device, root: &str, seed: u64) -> Option<Record> {
+    let Options { once, times, cancelled, .. } = shared.options;
+    let mut jitter = Jitter::new(seed);
+    for failures in 1.. {
+        let why = match shared.store.load(&device.controller, root) {
+            Ok(record) => return Some(record),
+            Err(why) => why,
+        };
+        (shared.tell)(&Said { controller: device.controller.clone(), kind: Kind::Trouble, text: why });
+        let until = shared.began.elapsed() + jitter.after(failures, times.backoff_first, times.backoff_most);
+        while !once && shared.began.elapsed() < until && !cancelled.load(Ordering::Relaxed) {
+            thread::sleep(TICK.min(until.saturating_sub(shared.began.elapsed())));
+        }
+        if *once || cancelled.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    None
+}
+
 /// Serves one device.
-fn serve(shared: &Shared<'_>, device: &Device, root: String, record: Record) -> Ended {
+fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
     let Shared { config, options, .. } = *shared;
+    let root = config.server.controller(&config.tenant, &device.controller);
+    let seed = options.seed ^ Crc::<u64>::new(&CRC_64_XZ).checksum(device.controller.as_bytes());
+    let Some(record) = record(shared, device, &root, seed) else {
+        return Ended { unserved: 1, ..Ended::default() };
+    };
     let Times { backoff_first, backoff_most, tell, .. } = options.times;
     let rules = Rules {
         part: device.part.clone(),
@@ -218,7 +240,6 @@ fn serve(shared: &Shared<'_>, device: &Device, root: String, record: Record) -> 
         backoff: (backoff_first, backoff_most),
         tell,
     };
-    let seed = options.seed ^ Crc::<u64>::new(&CRC_64_XZ).checksum(device.controller.as_bytes());
     let mut controller = Controller::new(&device.controller, rules, record, seed);
     let path = shared.store.path(&device.controller, "part");
     let (sender, heard) = channel();

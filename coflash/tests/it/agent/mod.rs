@@ -512,15 +512,59 @@ fn two_agents_do_not_share_a_folder() {
     });
 }
 
+/// What may have happened to a state file: it is cut off, another's, no text, too large, or a folder.
 #[test]
-fn a_damaged_state_file_is_named() {
-    let (server, folder, fake) = (Server::start(&[ID]), folder("damaged"), Fake::default());
-    server.assign(ID, Action::new(3, &file()));
-    once(&server, &folder, &fake, &[ID]);
+fn a_damaged_state_file_stops_its_device_alone_and_is_named() {
+    let ids = ["one", "two"];
+    let (server, folder) = (Server::start(&ids), folder("damaged"));
+    server.assign("one", Action::new(1, &file()));
+    once(&server, &folder, &Fake::default(), &["one"]);
     let state = folder.join("agent-state");
     let record = std::fs::read_dir(&state).unwrap().flatten().map(|file| file.path());
     let record = record.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
+    let good = std::fs::read(&record).unwrap();
+    let damages: [&[u8]; 6] = [b"", b"{", b"[1, 2]", b"\xFF\xFE{}", &[b' '; 300_000], b"a folder"];
+    for (number, damage) in damages.into_iter().enumerate() {
+        std::fs::remove_file(&record).unwrap();
+        match damage {
+            b"a folder" => std::fs::create_dir(&record).unwrap(),
+            damage => std::fs::write(&record, damage).unwrap(),
+        }
+        ids.iter().for_each(|id| server.assign(id, Action::new(10 + number as u64, &file())));
+        let fake = Fake::default();
+        let (ended, said) = once(&server, &folder, &fake, &ids);
+        assert_eq!((ended.updated, ended.unserved), (1, 1), "{number}: {said}");
+        assert_eq!(fake.given(), [("two".to_string(), crc())], "{number}: {said}");
+        let line = said.lines().find(|line| line.contains(&record.display().to_string()));
+        let line = line.unwrap_or_else(|| panic!("{number}: {said}"));
+        assert!(line.starts_with("one: ") && line.contains("delete"), "{number}: {line}");
+        assert!(server.seen("v1/one").iter().all(|seen| !seen.path.contains(&format!("/1{number}"))));
+    }
+    // When it is whole again, or gone, the device is served.
+    std::fs::remove_dir(&record).unwrap();
+    std::fs::write(&record, good).unwrap();
+    let fake = Fake::default();
+    once(&server, &folder, &fake, &ids);
+    assert_eq!(fake.given(), [("one".to_string(), crc())]);
+}
+
+/// A device whose state file is deleted while the agent runs is served without a restart.
+#[test]
+fn a_state_file_that_is_put_right_is_read_while_the_agent_runs() {
+    let (server, folder, fake) = (Server::start(&[ID]), folder("repaired"), Fake::default());
+    server.assign(ID, Action::new(3, &file()));
+    once(&server, &folder, &Fake::default(), &[ID]);
+    let files = std::fs::read_dir(folder.join("agent-state")).unwrap().flatten().map(|file| file.path());
+    let record = files.into_iter().find(|path| path.extension().is_some_and(|end| end == "json")).unwrap();
     std::fs::write(&record, "{").unwrap();
-    let why = run(&config(&server, &folder, &[ID]), &options(), &fake, &|_| {}).unwrap_err().to_string();
-    assert!(why.contains(&record.display().to_string()) && why.contains("delete it"), "{why}");
+    server.assign(ID, Action::new(4, &file()));
+    while_it_runs(&server, &folder, &fake, || {
+        thread::sleep(Duration::from_millis(50));
+        assert!(fake.given().is_empty());
+        std::fs::remove_file(&record).unwrap();
+        server.wait("the end", |state| {
+            state.targets[ID].action.as_ref().is_some_and(|action| action.result.is_some())
+        });
+    });
+    assert_eq!(fake.given().len(), 1);
 }
