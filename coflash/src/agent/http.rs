@@ -12,7 +12,7 @@ use ureq::{Agent, Body};
 
 use super::config::Token;
 use super::controller::{Reply, Request};
-use super::url::Server;
+use super::url::{redirected, Server};
 
 /// The largest answer that is read, apart from files.
 const ANSWER_MOST: u64 = 256 * 1024;
@@ -130,10 +130,9 @@ impl Client {
         own: bool,
         limit: Option<Duration>,
     ) -> Result<Opened, String> {
-        let mut link = link.to_string();
+        const NONE: &str = "the server gives a link that is none";
+        let (mut url, mut is_own) = self.server.resolve(link).ok_or(NONE)?;
         for _ in 0..=REDIRECTS_MOST {
-            let resolved = self.server.resolve(&link);
-            let (url, is_own) = resolved.ok_or("the server gives a link that is none")?;
             if own && !is_own {
                 let advice =
                     "set url to the address under which the server knows itself, or let its proxy pass \
@@ -156,11 +155,7 @@ impl Client {
                 return Ok(opened);
             }
             let location = opened.header("location").ok_or("the server redirects to nowhere")?;
-            link = if location.starts_with('/') && !location.starts_with("//") {
-                format!("{}{location}", origin(&url))
-            } else {
-                location.to_string()
-            };
+            (url, is_own) = self.server.resolve(&redirected(&url, location)?).ok_or(NONE)?;
         }
         Err(format!("the server redirects more than {REDIRECTS_MOST} times"))
     }
@@ -180,13 +175,6 @@ impl Opened {
 fn opened(response: Response<Body>) -> Opened {
     let (parts, body) = response.into_parts();
     Opened { status: parts.status.as_u16(), headers: parts.headers, body }
-}
-
-/// Scheme, host and port of an absolute URL.
-fn origin(url: &str) -> &str {
-    let host = url.find("://").map_or(0, |at| at + 3);
-    let end = url[host..].find(['/', '?']).map_or(url.len(), |at| host + at);
-    &url[..end]
 }
 
 /// A URL without its query, which may be a secret of its own.

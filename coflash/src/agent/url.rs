@@ -1,4 +1,5 @@
-//! The URLs of the server: whether a link belongs to it, and so may get the token.
+//! The URLs of the server: whether a link belongs to it, and so may get the token; and where a
+//! redirect leads.
 
 use std::net::Ipv4Addr;
 
@@ -65,6 +66,80 @@ impl Server {
         let own = split(link)?.origin == self.origin;
         Some((link.split('#').next().unwrap_or(link).to_string(), own))
     }
+}
+
+/// Where a redirect leads: its `Location` is a reference relative to the URL that was asked for
+/// (RFC 9110 section 10.2.2).
+///
+/// # Errors
+/// In words, for what is no URL that can be requested, and for a way from https to http.
+pub(super) fn redirected(from: &str, location: &str) -> Result<String, &'static str> {
+    let to = join(from, location)
+        .ok_or("the server redirects to what is no URL of a server: check its address and its proxy")?;
+    let is_tls = |url: &str| split(url).is_some_and(|parts| parts.origin.starts_with("https:"));
+    match is_tls(from) && !is_tls(&to) {
+        true => Err("the server redirects from https to http, which is not followed: \
+                     let it, or the proxy before it, redirect to https"),
+        false => Ok(to),
+    }
+}
+
+/// The URL that a reference names where `base` was asked for (RFC 3986 section 5.2), without a
+/// fragment. `None` if it is none that can be requested.
+fn join(base: &str, reference: &str) -> Option<String> {
+    let reference = reference.split('#').next().unwrap_or(reference);
+    let (origin, rest) = cut(base)?;
+    let (path, _) = query_of(rest);
+    let absolute = match reference.as_bytes() {
+        [] => base.to_string(),
+        [b'/', b'/', ..] => format!("{}{reference}", &origin[..=origin.find(':')?]),
+        [b'/', ..] => format!("{origin}{reference}"),
+        [b'?', ..] => format!("{origin}{path}{reference}"),
+        _ if has_scheme(reference) => reference.to_string(),
+        _ => {
+            let folder = path.rfind('/').map_or("/", |at| &path[..=at]);
+            format!("{origin}{folder}{reference}")
+        }
+    };
+    let (origin, rest) = cut(&absolute)?;
+    let (path, query) = query_of(rest);
+    Some(format!("{origin}{}{query}", without_dots(path)))
+}
+
+/// An absolute URL in two: up to the host, and from its path on.
+fn cut(url: &str) -> Option<(&str, &str)> {
+    let rest = split(url)?.rest.len();
+    Some(url.split_at(url.len() - rest))
+}
+
+/// A path, and the query after it.
+fn query_of(rest: &str) -> (&str, &str) {
+    rest.split_at(rest.find('?').unwrap_or(rest.len()))
+}
+
+/// Whether a reference begins with a scheme (RFC 3986 section 3.1).
+fn has_scheme(reference: &str) -> bool {
+    reference.split_once(':').is_some_and(|(scheme, _)| {
+        scheme.starts_with(|c: char| c.is_ascii_alphabetic())
+            && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"+-.".contains(&byte))
+    })
+}
+
+/// A path without the segments `.` and `..` (RFC 3986 section 5.2.4).
+fn without_dots(path: &str) -> String {
+    let mut kept = Vec::new();
+    let mut segments = path.strip_prefix('/').unwrap_or(path).split('/').peekable();
+    while let Some(segment) = segments.next() {
+        match segment {
+            "." => {}
+            ".." => drop(kept.pop()),
+            segment => kept.push(segment),
+        }
+        if segments.peek().is_none() && matches!(segment, "." | "..") {
+            kept.push("");
+        }
+    }
+    format!("/{}", kept.join("/"))
 }
 
 /// Whether a text has only characters that a URL may have.
@@ -147,6 +222,77 @@ mod tests {
             assert_eq!(server.resolve(link).map(|(_, own)| own), own, "{link}");
         }
         assert!(Server::parse("https://h/x?y").is_err());
+    }
+
+    /// The examples of RFC 3986 sections 5.4.1 and 5.4.2.
+    #[test]
+    fn a_reference_is_resolved_as_the_standard_does() {
+        for (reference, url) in [
+            ("g", "http://a/b/c/g"),
+            ("./g", "http://a/b/c/g"),
+            ("g/", "http://a/b/c/g/"),
+            ("/g", "http://a/g"),
+            ("//g", "http://g/"),
+            ("?y", "http://a/b/c/d;p?y"),
+            ("g?y", "http://a/b/c/g?y"),
+            ("#s", "http://a/b/c/d;p?q"),
+            ("g#s", "http://a/b/c/g"),
+            ("g?y#s", "http://a/b/c/g?y"),
+            (";x", "http://a/b/c/;x"),
+            ("g;x?y#s", "http://a/b/c/g;x?y"),
+            ("", "http://a/b/c/d;p?q"),
+            (".", "http://a/b/c/"),
+            ("./", "http://a/b/c/"),
+            ("..", "http://a/b/"),
+            ("../", "http://a/b/"),
+            ("../g", "http://a/b/g"),
+            ("../..", "http://a/"),
+            ("../../g", "http://a/g"),
+            ("../../../g", "http://a/g"),
+            ("/./g", "http://a/g"),
+            ("/../g", "http://a/g"),
+            ("g.", "http://a/b/c/g."),
+            ("..g", "http://a/b/c/..g"),
+            ("./g/.", "http://a/b/c/g/"),
+            ("g/./h", "http://a/b/c/g/h"),
+            ("g/../h", "http://a/b/c/h"),
+            ("g;x=1/../y", "http://a/b/c/y"),
+            ("g?y/../x", "http://a/b/c/g?y/../x"),
+            ("https://h", "https://h/"),
+            ("HTTP://h:80/x?y", "HTTP://h:80/x?y"),
+        ] {
+            assert_eq!(redirected("http://a/b/c/d;p?q", reference).as_deref(), Ok(url), "{reference}");
+        }
+        assert_eq!(redirected("http://a", "g").as_deref(), Ok("http://a/g"));
+        assert_eq!(redirected("http://a?x=/y/", "g").as_deref(), Ok("http://a/g"));
+        let long = "x/".repeat(MOST);
+        for reference in [
+            "g:h",
+            "http:g",
+            "http://",
+            "http:///x",
+            "//",
+            "//u@g/",
+            "ftp://g",
+            "mailto:x",
+            "a b",
+            "\u{e4}",
+            &long,
+        ] {
+            let why = redirected("http://a/b/c/d;p?q", reference).unwrap_err();
+            assert!(why.contains("no URL of a server"), "{reference}: {why}");
+        }
+    }
+
+    #[test]
+    fn no_redirect_leads_from_https_to_http() {
+        for location in ["http://h/x", "HTTP://h/x", "http://h:443/x", "http://other/"] {
+            assert!(redirected("https://h/y", location).unwrap_err().contains("https to http"), "{location}");
+        }
+        for location in ["x", "//other/x", "https://other/x"] {
+            assert!(redirected("https://h/y", location).unwrap().starts_with("https://"), "{location}");
+        }
+        assert_eq!(redirected("http://h/y", "https://h/y").as_deref(), Ok("https://h/y"));
     }
 
     #[test]

@@ -568,3 +568,57 @@ fn a_state_file_that_is_put_right_is_read_while_the_agent_runs() {
     });
     assert_eq!(fake.given().len(), 1);
 }
+
+/// `Location` is a reference to a URI, relative to the one that was asked for (RFC 9110 section
+/// 10.2.2, RFC 3986 section 5).
+#[test]
+fn a_redirect_may_be_relative() {
+    let (folder, fake) = (folder("relative"), Fake::default());
+    let server = Server::start(&[ID]);
+    let host = server.url.strip_prefix("http:").unwrap();
+    let (network, absolute) =
+        (format!("{host}/files/program.blk"), format!("{}/files/./x/../program.blk?a=/../b", server.url));
+    let artifacts = "/DEFAULT/controller/v1/door/softwaremodules/1/artifacts";
+    let own = |rest: &str| format!("{artifacts}/{rest}");
+    let elsewhere = "/files/program.blk".to_string();
+    for (number, (location, asked)) in [
+        ("program.blk?2", own("program.blk?2")),
+        ("./program.blk?3", own("program.blk?3")),
+        ("../artifacts/program.blk?4#here", own("program.blk?4")),
+        ("../../../../../../../../../files/program.blk", elsewhere.clone()),
+        ("?again", own("program.blk?again")),
+        ("/files/program.blk", elsewhere.clone()),
+        (&network, elsewhere.clone()),
+        (&absolute, format!("{elsewhere}?a=/../b")),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        server.assign(ID, Action::new(number as u64, &file()));
+        server.fault("artifacts", 1, Fault::Redirect(location.to_string()));
+        let before = server.seen("program.blk").len();
+        let (ended, said) = once(&server, &folder, &fake, &[ID]);
+        assert_eq!((ended.updated, ended.failed), (1, 0), "{location}: {said}");
+        let seen: Vec<String> = server.seen("program.blk").into_iter().map(|seen| seen.path).collect();
+        assert_eq!(seen[before..], [own("program.blk"), asked], "{location}: {said}");
+    }
+    // The root resource may move within the server, too.
+    server.assign(ID, Action::new(100, &file()));
+    server.fault("v1/door", 1, Fault::Redirect("../v1/door".to_string()));
+    let (ended, said) = once(&server, &folder, &fake, &[ID]);
+    assert_eq!(ended.updated, 1, "{said}");
+    assert!(!said.contains("again in") && !said.contains("URL"), "{said}");
+    assert!(server.seen("/").iter().all(|seen| !seen.path.split('?').next().unwrap().contains("..")));
+}
+
+#[test]
+fn a_redirect_to_what_is_no_url_is_said_with_what_to_do() {
+    let (server, folder, fake) = (Server::start(&[ID]), folder("no-url"), Fake::default());
+    for location in ["ftp://h/x", "http://", "http://user@127.0.0.1/x", "file:///etc/passwd", "a b", "http:x"]
+    {
+        server.fault("v1/door", 4, Fault::Redirect(location.to_string()));
+        let (ended, said) = once(&server, &folder, &fake, &[ID]);
+        assert_eq!(ended.unserved, 1, "{location}: {said}");
+        assert!(said.contains("redirects to what is no URL of a server"), "{location}: {said}");
+    }
+}

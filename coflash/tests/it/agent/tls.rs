@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use coflash::agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
-use kit::hawkbit::{Action, File, Server};
+use kit::hawkbit::{Action, Fault, File, Server};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::{ServerConfig, ServerConnection, StreamOwned};
@@ -123,5 +123,30 @@ fn a_server_with_another_certificate_gets_no_request() {
         let (ended, said) = once(&url.replace("127.0.0.1", "localhost"), Some("authority.pem"), test);
         assert_eq!(ended.unserved, 1, "{said}");
         assert!(server.seen("/").is_empty(), "{said}");
+    }
+}
+
+/// A file over http would be checked like any other; but who asks for it would be seen, and the
+/// server promised https.
+#[test]
+fn a_redirect_from_https_to_http_is_not_followed() {
+    let (server, plain) = (Server::start(&["door"]), Server::start(&["cdn"]));
+    let url = before(&server);
+    let action = Action::new(1, &File::new("a.blk", data!("identity-110.blk")));
+    plain.assign("cdn", action.clone());
+    server.assign("door", action);
+    server.fault("artifacts", 100, Fault::Redirect(format!("{}/files/a.blk", plain.url)));
+    let (ended, said) = once(&url, Some("authority.pem"), "downgrade");
+    assert_eq!((ended.updated, ended.failed), (0, 1), "{said}");
+    assert!(said.contains("redirects from https to http"), "{said}");
+    assert!(plain.seen("/").is_empty());
+    // Within https it may lead anywhere, in any form.
+    let host = url.strip_prefix("https:").unwrap();
+    for (number, to) in ["a.blk?2".to_string(), format!("{host}/files/a.blk")].into_iter().enumerate() {
+        server.state().faults.clear();
+        server.assign("door", Action::new(2 + number as u64, &File::new("a.blk", data!("identity-110.blk"))));
+        server.fault("artifacts", 1, Fault::Redirect(to.clone()));
+        let (ended, said) = once(&url, Some("authority.pem"), "downgrade");
+        assert_eq!(ended.updated, 1, "{to}: {said}");
     }
 }
