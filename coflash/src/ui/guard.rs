@@ -39,21 +39,28 @@ impl Guard {
         headers: &HeaderMap,
     ) -> Option<(StatusCode, &'static str)> {
         let hosts = [format!("127.0.0.1:{}", self.port), format!("localhost:{}", self.port)];
-        let text = |name| headers.get(name).map(|value: &HeaderValue| value.to_str().unwrap_or_default());
-        // A foreign name that resolves to 127.0.0.1 is refused.
-        let host = text(header::HOST).or(uri.authority().map(|authority| authority.as_str()));
-        if !host.is_some_and(|host| hosts.iter().any(|own| own == host)) {
+        let values = |name| headers.get_all(name).iter().map(|value| value.to_str().unwrap_or_default());
+        if values(header::HOST).count() > 1 {
+            return Some((
+                StatusCode::BAD_REQUEST,
+                "a request must have one Host header, and this one has several",
+            ));
+        }
+        // A foreign name that resolves to 127.0.0.1 is refused, in the header and in the request line.
+        let mut names =
+            values(header::HOST).chain(uri.authority().map(|authority| authority.as_str())).peekable();
+        if names.peek().is_none() || !names.all(|name| hosts.iter().any(|own| own == name)) {
             return Some((StatusCode::FORBIDDEN, "this server is only available as 127.0.0.1"));
         }
         let own_origin = |origin: &str| {
             origin.strip_prefix("http://").is_some_and(|origin| hosts.iter().any(|own| own == origin))
         };
-        if text(header::ORIGIN).is_some_and(|origin| !own_origin(origin)) {
+        if !values(header::ORIGIN).all(own_origin) {
             return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
         // Browsers name the origin of a request: this page, or (none) the user.
-        let site = headers.get("sec-fetch-site").map(|value| value.as_bytes());
-        if site.is_some_and(|site| !matches!(site, b"same-origin" | b"none")) {
+        let mut sites = headers.get_all("sec-fetch-site").iter().map(HeaderValue::as_bytes);
+        if !sites.all(|site| matches!(site, b"same-origin" | b"none")) {
             return Some((StatusCode::FORBIDDEN, "requests from pages of another origin are refused"));
         }
         let shown = uri.path().strip_prefix('/').and_then(|path| path.split('/').next()).unwrap_or_default();
@@ -64,8 +71,8 @@ impl Guard {
             ));
         }
         // A body with an announced length that is too large is refused before it is read.
-        let long = text(header::CONTENT_LENGTH).and_then(|len| len.parse::<u64>().ok());
-        if long.is_some_and(|len| len > FILE_MAX as u64) {
+        let mut lengths = values(header::CONTENT_LENGTH).filter_map(|len| len.parse::<u64>().ok());
+        if lengths.any(|len| len > FILE_MAX as u64) {
             return Some((StatusCode::PAYLOAD_TOO_LARGE, "the file is larger than any program"));
         }
         if !matches!(*method, Method::GET | Method::POST) {
