@@ -12,6 +12,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 
 use super::firmware::FILE_MAX;
+use super::guests::Guest;
 
 /// How long a request with a body may take until it is answered.
 const WITHIN: Duration = Duration::from_secs(60);
@@ -91,6 +92,9 @@ fn same(one: &[u8], other: &[u8]) -> bool {
 /// protect the page to each answer.
 pub(super) async fn guard(State(guard): State<Guard>, request: Request, next: Next) -> Response {
     let objection = guard.objection(request.method(), request.uri(), request.headers());
+    if let (None, Some(guest)) = (objection, request.extensions().get::<Guest>()) {
+        guest.admit();
+    }
     let mut response = match objection {
         Some((status, words)) => (status, words).into_response(),
         None if request.method() == Method::GET => next.run(request).await,

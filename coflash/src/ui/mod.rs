@@ -9,6 +9,7 @@
 //! | module | what it does |
 //! |---|---|
 //! | `server` | connections, and their limits |
+//! | `guests` | which connection gives way when there are too many |
 //! | `guard` | who may ask |
 //! | `http` | what is answered to which request |
 //! | `events` | the stream of events to a page |
@@ -27,6 +28,7 @@ mod events;
 mod firmware;
 mod frames;
 mod guard;
+mod guests;
 mod http;
 mod job;
 mod load;

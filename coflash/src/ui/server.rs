@@ -8,7 +8,10 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::{service_fn, Service as _};
+use hyper::Request;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpSocket, TcpStream};
@@ -17,6 +20,7 @@ use tokio_io_timeout::TimeoutStream;
 
 use super::events::Readers;
 use super::guard::Guard;
+use super::guests::{Guest, Guests};
 use super::http::{router, Site};
 use super::shared::{Order, Shared};
 use super::worker;
@@ -26,8 +30,6 @@ use crate::bus::Kind;
 const CONNECTIONS: usize = 64;
 /// The send buffer of a connection, which limits the data for a slow reader.
 const SEND_BUFFER: u32 = 128 * 1024;
-/// How long the header of a request may take to arrive.
-const HEAD: Duration = Duration::from_secs(10);
 /// How often the server checks whether it must end.
 const LOOK: Duration = Duration::from_millis(100);
 /// How long a cancelled task may take to end.
@@ -48,6 +50,8 @@ pub struct Options {
     pub kinds: Vec<Kind>,
     /// How long a reader may accept no data before it is dropped.
     pub write_timeout: Duration,
+    /// How long the header of a request may take to arrive.
+    pub head_timeout: Duration,
 }
 
 impl Default for Options {
@@ -58,6 +62,7 @@ impl Default for Options {
             sdo_ids: None,
             kinds: Kind::ALL.to_vec(),
             write_timeout: Duration::from_secs(10),
+            head_timeout: Duration::from_secs(10),
         }
     }
 }
@@ -148,10 +153,11 @@ impl Server {
             reading: Arc::new(Semaphore::new(1)),
         };
         let app = router(site, self.guard);
-        let (listener, write_timeout) = (self.listener, self.options.write_timeout);
+        let Options { write_timeout, head_timeout, .. } = self.options;
+        let (listener, times) = (self.listener, Times { write_timeout, head_timeout });
         let left = self.runtime.block_on(async {
             tokio::select! {
-                () = accept(listener, app, write_timeout) => {}
+                () = accept(listener, app, times) => {}
                 () = set(end) => {}
             }
             end_in_order(&shared).await
@@ -192,34 +198,52 @@ async fn set(flag: &AtomicBool) {
     }
 }
 
-/// Accepts connections without end.
-async fn accept(listener: TcpListener, app: axum::Router, write_timeout: Duration) {
+/// The limits of time of a connection.
+#[derive(Clone, Copy)]
+struct Times {
+    write_timeout: Duration,
+    head_timeout: Duration,
+}
+
+/// Accepts connections without end. If there are too many, the oldest without the token gives way.
+async fn accept(listener: TcpListener, app: axum::Router, times: Times) {
     let places = Arc::new(Semaphore::new(CONNECTIONS));
+    let mut guests = Guests::default();
     loop {
-        // The semaphore is never closed.
-        let Ok(place) = places.clone().acquire_owned().await else { return };
         let Ok((stream, _)) = listener.accept().await else {
             // The error may be temporary, for example if no descriptor is free.
             tokio::time::sleep(LOOK).await;
             continue;
         };
-        let app = app.clone();
-        tokio::spawn(async move {
-            serve(stream, app, write_timeout).await;
+        if places.available_permits() == 0 {
+            guests.dismiss_oldest();
+        }
+        // The semaphore is never closed.
+        let Ok(place) = places.clone().acquire_owned().await else { return };
+        let (app, guest) = (app.clone(), Guest::default());
+        let served = guest.clone();
+        let task = tokio::spawn(async move {
+            serve(stream, app, served, times).await;
             drop(place);
         });
+        guests.add(guest, task.abort_handle());
     }
 }
 
 /// Serves one connection. An error of the connection is the browser's concern.
-async fn serve(stream: TcpStream, app: axum::Router, write_timeout: Duration) {
+async fn serve(stream: TcpStream, app: axum::Router, guest: Guest, times: Times) {
     let _ = stream.set_nodelay(true);
     let mut stream = TimeoutStream::new(stream);
-    stream.set_write_timeout(Some(write_timeout));
+    stream.set_write_timeout(Some(times.write_timeout));
+    let app = TowerToHyperService::new(app);
+    let service = service_fn(move |mut request: Request<Incoming>| {
+        request.extensions_mut().insert(guest.clone());
+        app.call(request)
+    });
     let _ = http1::Builder::new()
         .timer(TokioTimer::new())
-        .header_read_timeout(HEAD)
+        .header_read_timeout(times.head_timeout)
         .max_buf_size(64 * 1024)
-        .serve_connection(TokioIo::new(Box::pin(stream)), TowerToHyperService::new(app))
+        .serve_connection(TokioIo::new(Box::pin(stream)), service)
         .await;
 }

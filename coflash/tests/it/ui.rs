@@ -45,8 +45,12 @@ impl Answer {
 
 impl Ui {
     fn new(bus: Option<String>) -> Self {
+        Self::with(|options| options.bus = bus)
+    }
+
+    fn with(change: impl FnOnce(&mut Options)) -> Self {
         let mut options = Options::default();
-        options.bus = bus;
+        change(&mut options);
         options.write_timeout = Duration::from_millis(200);
         // A test touches no adapter of this machine.
         options.kinds = Vec::new();
@@ -243,10 +247,6 @@ fn other_names_and_other_origins_are_turned_away() {
             assert_eq!(ui.request("GET", &path, &lines, b"").status, 403, "{lines:?}");
         }
     }
-#[test]
-fn the_page_keeps_to_itself() {
-    let ui = Ui::new(None);
-    for what in ["", "app.js", "style.css", "uPlot.js", "adapters", "trace", "nowhere"] {
     let absolute = format!("http://evil.example{path}");
     // The name in the request line counts as well as the header.
     assert_eq!(ui.request("GET", &absolute, &[&host], b"").status, 403);
@@ -254,6 +254,10 @@ fn the_page_keeps_to_itself() {
     assert_eq!(ui.request("GET", &absolute, &["Host: evil.example"], b"").status, 403);
 }
 
+#[test]
+fn the_page_keeps_to_itself() {
+    let ui = Ui::new(None);
+    for what in ["", "app.js", "style.css", "uPlot.js", "adapters", "trace", "nowhere"] {
         let answer = ui.get(what);
         for line in [
             "content-security-policy: default-src 'none'; script-src 'self';",
@@ -363,6 +367,35 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     );
     assert_eq!(ui.raw(head.as_bytes()).status, 413);
     assert_eq!(ui.get("").status, 200);
+}
+
+/// More connections than there are places, that send nothing, or half a request: the page comes at
+/// once, because a place is taken from them and not waited for.
+#[test]
+fn connections_that_send_nothing_do_not_keep_the_page_away() {
+    // No time-out of an idle connection can help within this test.
+    let ui = Ui::with(|options| options.head_timeout = Duration::from_secs(3600));
+    let (path, host) = (&ui.path, ui.host_line());
+    let known = format!("GET {path}events HTTP/1.1\r\n{host}\r\n\r\n");
+    let mut page = ui.stream();
+    page.write_all(known.as_bytes()).unwrap();
+    let mut head = [0; 12];
+    page.read_exact(&mut head).unwrap();
+    for sent in ["", "G", "GET / HTTP/1.1\r\nHost: ", "GET / HTTP/1.1\r\nHost: x\r\n\r\n"] {
+        let idle: Vec<TcpStream> = (0..200)
+            .map(|_| {
+                let mut stream = ui.stream();
+                stream.write_all(sent.as_bytes()).unwrap();
+                stream
+            })
+            .collect();
+        for what in ["", "app.js", "adapters"] {
+            assert_eq!(ui.get(what).status, 200, "{sent:?} {what}");
+        }
+        drop(idle);
+    }
+    // The page that was there first keeps its events.
+    assert_eq!((ui.readers)(), 1);
 }
 
 /// A sealed image for the fake device, of 1000 bytes.
