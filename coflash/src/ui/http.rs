@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use axum::body::Bytes;
+use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Query, State};
 use axum::http::{header, HeaderMap, StatusCode};
 use axum::middleware;
@@ -24,6 +24,7 @@ use super::guard::{guard, Guard};
 use super::job::{Job, Step};
 use super::shared::{lock, Order, Refusal, Shared};
 use super::state::{Fits, Notice, Settings};
+use super::upload::{self, Room, Upload};
 
 use crate::bus::Kind;
 use crate::device::lss::{BitRate, LssAddress};
@@ -39,7 +40,9 @@ pub(super) struct Site {
     pub(super) readers: Readers,
     /// The kinds of adapters on offer.
     pub(super) kinds: Vec<Kind>,
-    /// Only one file is read at a time: it may be large.
+    /// The room for files that are being sent.
+    pub(super) room: Room,
+    /// Only one file is judged at a time: it may be large.
     pub(super) reading: Arc<Semaphore>,
 }
 
@@ -64,6 +67,12 @@ fn done() -> Answer {
 
 fn bad(words: impl Into<String>, advice: &str) -> Refused {
     Refused(StatusCode::BAD_REQUEST, Notice::failed(words, advice))
+}
+
+impl From<upload::Refused> for Refused {
+    fn from((status, notice): upload::Refused) -> Self {
+        Self(status, notice)
+    }
 }
 
 impl From<Refusal> for Refused {
@@ -109,11 +118,11 @@ pub(super) fn router(site: Site, who: Guard) -> Router {
         router =
             router.route(&at(name), get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }));
     }
-    let files = Router::new().route(&at("firmware"), post(take_file)).layer(DefaultBodyLimit::max(FILE_MAX));
     router
         .route(&at("events"), get(take_events))
         .route(&at("adapters"), get(list))
         .route(&at("trace"), get(trace))
+        .route(&at("firmware"), post(take_file))
         .route(&at("readback"), get(readback))
         .route(&at("open"), post(open))
         .route(&at("close"), post(close))
@@ -125,7 +134,6 @@ pub(super) fn router(site: Site, who: Guard) -> Router {
         .route(&at("assign"), post(assign))
         .route(&at("cancel"), post(cancel))
         .layer(DefaultBodyLimit::max(BODY_MAX))
-        .merge(files)
         .layer(middleware::from_fn_with_state(who, guard))
         .with_state(site)
 }
@@ -229,10 +237,18 @@ struct Named {
     name: String,
 }
 
-async fn take_file(State(site): State<Site>, Query(named): Query<Named>, bytes: Bytes) -> Answer {
+async fn take_file(
+    State(site): State<Site>,
+    Query(named): Query<Named>,
+    headers: HeaderMap,
+    body: Body,
+) -> Answer {
     idle(&site)?;
+    let Upload { bytes, room } = site.room.read(&headers, body).await?;
     let settings = site.shared.look(|state| state.settings.clone());
-    load(&site, Arc::new(bytes.to_vec()), named.name, settings).await
+    let answer = load(&site, Arc::new(bytes), named.name, settings).await;
+    drop(room);
+    answer
 }
 
 #[derive(Deserialize)]

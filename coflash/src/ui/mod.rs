@@ -12,6 +12,7 @@
 //! | `guests` | which connection gives way when there are too many |
 //! | `guard` | who may ask |
 //! | `http` | what is answered to which request |
+//! | `upload` | the body of a file, with its limits |
 //! | `events` | the stream of events to a page |
 //! | `state` | what all pages show |
 //! | `shared` | what server and bus thread share |
@@ -35,6 +36,7 @@ mod load;
 mod server;
 mod shared;
 mod state;
+mod upload;
 mod work;
 mod worker;
 

@@ -23,6 +23,7 @@ use super::guard::Guard;
 use super::guests::{Guest, Guests};
 use super::http::{router, Site};
 use super::shared::{Order, Shared};
+use super::upload::Room;
 use super::worker;
 use crate::bus::Kind;
 
@@ -52,6 +53,8 @@ pub struct Options {
     pub write_timeout: Duration,
     /// How long the header of a request may take to arrive.
     pub head_timeout: Duration,
+    /// How long an upload may send nothing.
+    pub body_timeout: Duration,
 }
 
 impl Default for Options {
@@ -63,6 +66,7 @@ impl Default for Options {
             kinds: Kind::ALL.to_vec(),
             write_timeout: Duration::from_secs(10),
             head_timeout: Duration::from_secs(10),
+            body_timeout: Duration::from_secs(10),
         }
     }
 }
@@ -150,6 +154,7 @@ impl Server {
             shared: shared.clone(),
             readers: self.readers,
             kinds: self.options.kinds.clone(),
+            room: Room::new(self.options.body_timeout),
             reading: Arc::new(Semaphore::new(1)),
         };
         let app = router(site, self.guard);

@@ -369,6 +369,80 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     assert_eq!(ui.get("").status, 200);
 }
 
+/// The first lines of an upload that announces this many bytes.
+fn upload(ui: &Ui, announced: usize) -> String {
+    let (path, host) = (&ui.path, ui.host_line());
+    format!(
+        "POST {path}firmware?name=a.hex HTTP/1.1\r\n{host}\r\nConnection: close\r\nContent-Length: {announced}\r\n\r\n"
+    )
+}
+
+/// Forty uploads of 32 MiB that never end take the room of two: the others are refused before they
+/// are read, with words, and the page goes on.
+#[test]
+fn uploads_are_limited_together_and_before_they_are_read() {
+    let ui = Ui::new(None);
+    let head = upload(&ui, 32 << 20);
+    let mut open = Vec::new();
+    for _ in 0..40 {
+        let mut stream = ui.stream();
+        stream.write_all(head.as_bytes()).unwrap();
+        open.push(stream);
+    }
+    let mut refused = 0;
+    for stream in &mut open {
+        stream.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
+        let mut answer = [0; 2048];
+        // Those that wait for their bytes say nothing yet.
+        let Ok(len) = stream.read(&mut answer) else { continue };
+        let answer = String::from_utf8_lossy(&answer[..len]).into_owned();
+        assert!(answer.starts_with("HTTP/1.1 503") && answer.contains("advice"), "{answer}");
+        refused += 1;
+    }
+    assert_eq!(refused, 38);
+    assert_eq!(ui.get("adapters").status, 200);
+    // A client that sends all before it reads learns why, too.
+    let whole = ui.file("large.hex", &vec![b'x'; 32 << 20]);
+    assert_eq!(whole.status, 503);
+    assert!(whole.json()["words"].as_str().unwrap().contains("no room"), "{}", whole.body);
+    // A small file has no room either, and has it when the large ones are gone.
+    assert_eq!(ui.file("app.hex", HEX).status, 503);
+    drop(open);
+    let began = std::time::Instant::now();
+    while ui.file("app.hex", HEX).status != 200 {
+        assert!(began.elapsed() < PATIENCE, "the room is never given back");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// An upload without a length counts as the largest one, and ends at that size.
+#[test]
+fn an_upload_without_a_length_has_the_same_limit() {
+    let ui = Ui::new(None);
+    let head = upload(&ui, 0).replace("Content-Length: 0", "Transfer-Encoding: chunked");
+    let chunk = |bytes: &[u8]| [format!("{:x}\r\n", bytes.len()).as_bytes(), bytes, b"\r\n"].concat();
+    let small = [head.as_bytes(), &chunk(HEX), b"0\r\n\r\n"].concat();
+    assert_eq!(ui.raw(&small).status, 200);
+    let mut stream = ui.stream();
+    stream.write_all(head.as_bytes()).unwrap();
+    let chunk = chunk(&[b'x'; 1 << 20]);
+    for _ in 0..33 {
+        stream.write_all(&chunk).unwrap();
+    }
+    let mut answer = [0; 12];
+    stream.read_exact(&mut answer).unwrap();
+    assert_eq!(&answer, b"HTTP/1.1 413");
+}
+
+/// An upload that stops sending gives its room back.
+#[test]
+fn an_upload_that_stops_is_ended_with_words() {
+    let ui = Ui::with(|options| options.body_timeout = Duration::from_millis(200));
+    let answer = ui.raw(upload(&ui, 32 << 20).as_bytes());
+    assert_eq!(answer.status, 408, "{}", answer.body);
+    assert!(answer.json()["advice"].is_string(), "{}", answer.body);
+}
+
 /// More connections than there are places, that send nothing, or half a request: the page comes at
 /// once, because a place is taken from them and not waited for.
 #[test]
