@@ -80,6 +80,11 @@ fn a_reload_a_second_tab_and_a_closed_tab_do_no_harm_in_mid_update() {
 }
 
 #[test]
+fn a_reload_keeps_the_chosen_devices_the_file_and_the_options() {
+    with_nodes("reload_keeps_the_choice");
+}
+
+#[test]
 fn single_steps_and_lss_by_keys_alone() {
     with_nodes("single_steps");
 }

@@ -299,6 +299,47 @@ def refused(bench):
 
 
 @scenario
+def reload_keeps_the_choice(bench):
+    """The chosen devices, the file and the options are those of before a reload, in this tab alone."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    scan(page, 2)
+    drop(page, bench.image("app"))
+    expect(page.locator("#file-facts")).to_contain_text("app.blk")
+    page.get_by_label("Choose node 6").check()
+    trial = page.get_by_label("Trial run first").is_checked()
+    page.get_by_label("Trial run first").set_checked(not trial)
+    page.get_by_label("Start the program at the end").uncheck()
+    page.get_by_label("Show frames with").fill("node 6")
+    page.get_by_label("Board").select_option("stm32f407g-disc1")
+    page.reload()
+    expect(page.get_by_role("button", name="Update node 6")).to_be_enabled()
+    expect(page.get_by_label("Choose node 6")).to_be_checked()
+    expect(page.get_by_label("Choose node 5")).not_to_be_checked()
+    expect(page.locator("#file-facts")).to_contain_text("app.blk")
+    expect(page.locator("#version")).to_contain_text("version")
+    expect(page.get_by_label("Trial run first")).to_be_checked(checked=not trial)
+    expect(page.get_by_label("Start the program at the end")).not_to_be_checked()
+    expect(page.get_by_label("Show frames with")).to_have_value("node 6")
+    expect(page.get_by_label("Board")).to_have_value("stm32f407g-disc1")
+    # Another tab begins with nothing chosen.
+    second = bench.page(url)
+    expect(second.locator("#rows tr")).to_have_count(2)
+    expect(second.get_by_label("Choose node 6")).not_to_be_checked()
+    expect(second.get_by_label("Trial run first")).to_be_checked(checked=trial)
+    # What is no longer chosen stays so.
+    page.get_by_label("Choose node 6").uncheck()
+    page.reload()
+    expect(page.locator("#rows tr")).to_have_count(2)
+    expect(page.get_by_label("Choose node 6")).not_to_be_checked()
+    second.close()
+    page.close()
+
+
+@scenario
 def reload_in_mid_update(bench):
     """A reload of the page, a second tab and a closed tab do not disturb a running update."""
     port = bench.free_port()

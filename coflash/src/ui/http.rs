@@ -93,7 +93,7 @@ impl From<Refusal> for Refused {
 }
 
 /// The files of the page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 11] = [
+const FILES: [(&str, &str, &str); 12] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("style.css", CSS, include_str!("page/style.css")),
@@ -102,6 +102,7 @@ const FILES: [(&str, &str, &str); 11] = [
     ("bus.js", SCRIPT, include_str!("page/bus.js")),
     ("devices.js", SCRIPT, include_str!("page/devices.js")),
     ("dom.js", SCRIPT, include_str!("page/dom.js")),
+    ("kept.js", SCRIPT, include_str!("page/kept.js")),
     ("reports.js", SCRIPT, include_str!("page/reports.js")),
     ("uPlot.css", CSS, include_str!("page/uPlot.min.css")),
     ("uPlot.js", SCRIPT, include_str!("page/uPlot.iife.min.js")),

@@ -4,6 +4,7 @@ import { ask, listen, sendFile } from "./api.js";
 import * as bus from "./bus.js";
 import * as devices from "./devices.js";
 import { $, el, facts, hex, notice, number, text } from "./dom.js";
+import { keepField, kept } from "./kept.js";
 import * as reports from "./reports.js";
 
 let fileMax = 32 * 1024 * 1024;
@@ -127,7 +128,7 @@ function dropping() {
 async function adapters() {
   const found = await (await fetch("adapters")).json();
   fileMax = found.file_max;
-  $("trial").checked = found.trial;
+  if (kept("trial") === undefined) $("trial").checked = found.trial;
   text($("version"), `version ${found.version}`);
   $("adapter-list").append(...found.adapters.map((one) => el("option", { value: one.url }, one.words)));
   $("board").append(...found.boards.map((board) => el("option", { value: board }, board)));
@@ -163,6 +164,7 @@ function forms() {
   });
 }
 
+["trial", "start", "bit-rate", "filter"].forEach(keepField);
 bus.start();
 devices.start();
 reports.start();

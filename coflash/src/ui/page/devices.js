@@ -2,9 +2,10 @@
 
 import { ask } from "./api.js";
 import { $, el, facts, hex, text } from "./dom.js";
+import { keep, kept } from "./kept.js";
 
 /** Nodes that the user has chosen. */
-const chosen = new Set();
+const chosen = new Set(kept("chosen"));
 let shown = "";
 let state = null;
 
@@ -68,6 +69,7 @@ function row(device) {
 
 /** What can be pressed now, and why not. */
 function buttons() {
+  keep("chosen", [...chosen]);
   const list = devices();
   const busy = state.task !== null;
   const ready = state.adapter.state === "open" && !busy;
