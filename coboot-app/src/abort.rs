@@ -5,6 +5,8 @@
 pub struct Abort(pub u32);
 
 impl Abort {
+    /// The toggle bit of a segment is not alternated.
+    pub const TOGGLE: Self = Self(0x0503_0000);
     /// Command specifier not valid or unknown.
     pub const COMMAND: Self = Self(0x0504_0001);
     /// Attempt to write a read-only object.

@@ -3,6 +3,19 @@
 
 pub use shared_abi::label::{Label, OFFSET, SIZE};
 
+/// The label of the program that runs, at its place after the vectors; `None` for a program without
+/// one. The linker's block of the board names the place (`coboot_linker::Application`).
+#[cfg(target_arch = "arm")]
+#[must_use]
+pub fn own() -> Option<Label> {
+    extern "C" {
+        static __label: [u8; SIZE];
+    }
+    // SAFETY: 32 bytes of the program's own flash, which nobody writes while it runs. Without a label
+    // they are code, which `parse` tells from one.
+    Label::parse(&unsafe { core::ptr::read_volatile(&raw const __label) })
+}
+
 /// Puts the label of the program at its place in the image, after the vector table: vendor-ID
 /// (1018h/1), product code (1018h/2) and the version of the program, a number of the maker's own.
 /// Once in a program, outside of functions.

@@ -1,15 +1,19 @@
 //! A CANopen device as small as an update needs it, for applications without a CANopen stack: boot-up,
-//! heartbeat, NMT slave, and an SDO server with expedited transfers (CiA 301).
+//! heartbeat, NMT slave, and an SDO server with expedited transfers, and segmented ones for texts
+//! (CiA 301).
 //!
 //! | object | access | what it is |
 //! |---|---|---|
 //! | 1000h | ro | device type: anything but the bootloader's |
 //! | 1001h | ro | error register: 0 |
+//! | 1008h | const | device name, if it has one |
+//! | 100Ah | const | software version: that of the program's label, if it has one |
 //! | 1017h | rw | heartbeat time in ms, until the next reset |
 //! | 1018h/1–4 | ro | vendor-ID, product code, revision, serial number |
 //! | 1F51h/n | rw | program control |
 //! | 1F56h/n | ro | CRC of the program |
 //! | 1F57h/n | ro | flash status: 0 |
+//! | 2005h/n | ro | version of the program: that of its record, or of its label where a debugger wrote it |
 //!
 //! Every other request gets the SDO abort that CiA 301 has for it, or nothing where it is no request.
 //!
@@ -20,6 +24,10 @@
 //! - after that, and every few milliseconds, [`poll`](Responder::poll) until it gives no frame;
 //! - then [`proceed`](Responder::proceed), which says when to leave.
 
+use core::fmt::{self, Write as _};
+
+use shared_abi::block_file::ProgramVersion;
+use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
 use crate::abort::Abort;
@@ -27,6 +35,10 @@ use crate::bootloader::Services;
 use crate::departure::has_reached;
 use crate::departure::Next;
 use crate::program_control::{Answer, ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+
+const DEVICE_NAME: u16 = 0x1008;
+const SOFTWARE_VERSION: u16 = 0x100A;
+const PROGRAM_VERSION: u16 = 0x2005;
 
 /// A CAN data frame with an identifier of 11 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,6 +76,11 @@ pub struct Device {
     /// 1000h: 0 for a device without a standardised profile. Not 10000000h, by which a host recognises
     /// the bootloader.
     pub device_type: u32,
+    /// 1008h: that of the bootloader, by which a host finds the board. Without a text the object does
+    /// not exist.
+    pub name: &'static str,
+    /// The label of this program (`label::own`), which gives 100Ah and 2005h.
+    pub label: Option<Label>,
     /// 1018h/1, assigned by CiA; that of the bootloader.
     pub vendor_id: u32,
     /// 1018h/2; that of the bootloader.
@@ -97,25 +114,69 @@ pub struct Responder {
     node_id: u8,
     control: ProgramControl,
     nmt: Nmt,
+    /// 100Ah; empty without a label.
+    version: VersionText,
+    sending: Option<Sending>,
     /// The time of the last heartbeat.
     beaten: u32,
     /// No frame is taken or sent any more.
     silent: bool,
 }
 
-/// A value of an object, 1 to 4 bytes, little-endian.
-struct Value {
-    bytes: [u8; 4],
-    len: u8,
+/// The value of an object.
+enum Value<'v> {
+    /// 1 to 4 bytes, little-endian.
+    Number {
+        bytes: [u8; 4],
+        len: u8,
+    },
+    Text(&'v [u8]),
 }
 
-impl Value {
+impl Value<'_> {
     const fn byte(value: u8) -> Self {
-        Self { bytes: [value, 0, 0, 0], len: 1 }
+        Self::Number { bytes: [value, 0, 0, 0], len: 1 }
     }
 
     const fn word(value: u32) -> Self {
-        Self { bytes: value.to_le_bytes(), len: 4 }
+        Self::Number { bytes: value.to_le_bytes(), len: 4 }
+    }
+}
+
+/// A text that is being sent in segments.
+#[derive(Clone, Copy, Debug)]
+struct Sending {
+    index: u16,
+    /// How many of its bytes were sent.
+    sent: usize,
+    /// [`TOGGLE`] or 0, as in the next request.
+    toggle: u8,
+}
+
+const TOGGLE: u8 = 1 << 4;
+
+/// The text of 100Ah, at most `V255.255r65535`.
+#[derive(Clone, Copy, Debug, Default)]
+struct VersionText {
+    bytes: [u8; 14],
+    len: usize,
+}
+
+impl VersionText {
+    fn new(version: u32) -> Self {
+        let mut text = Self::default();
+        // It has room for the longest.
+        let _ = write!(text, "{}", ProgramVersion(version));
+        text
+    }
+}
+
+impl fmt::Write for VersionText {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        let room = self.bytes[self.len..].get_mut(..text.len()).ok_or(fmt::Error)?;
+        room.copy_from_slice(text.as_bytes());
+        self.len += text.len();
+        Ok(())
     }
 }
 
@@ -129,6 +190,8 @@ impl Responder {
             node_id,
             control,
             nmt: Nmt::BootUp,
+            version: device.label.map_or_else(VersionText::default, |label| VersionText::new(label.version)),
+            sending: None,
             beaten: 0,
             silent: false,
         })
@@ -205,6 +268,7 @@ impl Responder {
 
     /// A command of the NMT master (CiA 301 section 7.2.8.3.1).
     fn command(&mut self, command: u8, now: u32) {
+        self.sending = None;
         self.nmt = match command {
             0x01 => Nmt::Operational,
             0x02 => Nmt::Stopped,
@@ -219,17 +283,21 @@ impl Responder {
     fn request(&mut self, bytes: [u8; 8], now: u32, services: &mut impl Services) -> Option<[u8; 8]> {
         let [command, low, high, sub, data @ ..] = bytes;
         let index = u16::from_le_bytes([low, high]);
+        // Whatever is no request for the next segment ends the transfer.
+        let sending = self.sending.take();
         let answered = match command >> 5 {
             1 => self.download(command, index, sub, &data, now, services),
-            2 => self
-                .upload(index, sub, services)
-                .map(|Value { bytes, len }| Some((0x43 | (4 - len) << 2, bytes))),
-            // The client ends a transfer; there is none, and no answer to that.
+            2 => self.initiate_upload(index, sub, services).map(Some),
+            3 => match sending {
+                Some(sending) => return Some(self.segment(command, sending)),
+                None => Err(Abort::COMMAND),
+            },
+            // The client ends a transfer; there is no answer to that.
             4 => return None,
-            // No segmented and no block transfer.
+            // No segmented download and no block transfer.
             _ => Err(Abort::COMMAND),
         };
-        let (command, [a, b, c, d]) = match answered {
+        let (command, data) = match answered {
             Ok(answer) => answer?,
             Err(Abort(code)) => (0x80, code.to_le_bytes()),
         };
@@ -240,8 +308,44 @@ impl Responder {
             6 => bytes[0] & 1 == 0,
             _ => false,
         };
-        let [low, high, sub] = if names_object { [low, high, sub] } else { [0; 3] };
-        Some([command, low, high, sub, a, b, c, d])
+        let (index, sub) = if names_object { (index, sub) } else { (0, 0) };
+        Some(answer(command, index, sub, data))
+    }
+
+    /// An initiate upload; the command and data of its answer: the value, or the size of a text that
+    /// comes in segments.
+    fn initiate_upload(
+        &mut self,
+        index: u16,
+        sub: u8,
+        services: &mut impl Services,
+    ) -> Result<(u8, [u8; 4]), Abort> {
+        match self.value(index, sub, services)? {
+            Value::Number { bytes, len } => Ok((0x43 | (4 - len) << 2, bytes)),
+            Value::Text(text) => {
+                let size = text.len() as u32;
+                self.sending = Some(Sending { index, sent: 0, toggle: 0 });
+                Ok((0x41, size.to_le_bytes()))
+            }
+        }
+    }
+
+    /// The next segment of a text (CiA 301 section 7.2.4.3.7).
+    fn segment(&mut self, command: u8, sending: Sending) -> [u8; 8] {
+        let Sending { index, sent, toggle } = sending;
+        if command & TOGGLE != toggle {
+            let Abort(code) = Abort::TOGGLE;
+            return answer(0x80, index, 0, code.to_le_bytes());
+        }
+        let rest = self.text(index).and_then(|text| text.get(sent..)).unwrap_or_default();
+        let part = &rest[..rest.len().min(7)];
+        let is_last = part.len() == rest.len();
+        let mut answer = [0; 8];
+        answer[0] = toggle | (7 - part.len() as u8) << 1 | u8::from(is_last);
+        answer[1..=part.len()].copy_from_slice(part);
+        let sent = sent + part.len();
+        self.sending = (!is_last).then_some(Sending { index, sent, toggle: toggle ^ TOGGLE });
+        answer
     }
 
     /// An initiate download; the command and data of its answer, `None` where it is withheld.
@@ -255,7 +359,10 @@ impl Responder {
         services: &mut impl Services,
     ) -> Result<Option<(u8, [u8; 4])>, Abort> {
         // An object that cannot be read does not exist.
-        let own_len = self.upload(index, sub, services)?.len;
+        let own_len = match self.value(index, sub, services)? {
+            Value::Number { len, .. } => len,
+            Value::Text(_) => return Err(Abort::READ_ONLY),
+        };
         if !matches!((index, sub), (0x1017, 0) | (PROGRAM_CONTROL, 1..)) {
             return Err(Abort::READ_ONLY);
         }
@@ -289,26 +396,62 @@ impl Responder {
     }
 
     /// The value of an object.
-    fn upload(&self, index: u16, sub: u8, services: &mut impl Services) -> Result<Value, Abort> {
-        let Device { device_type, vendor_id, product_code, revision, serial_number, heartbeat_ms } =
+    fn value(&self, index: u16, sub: u8, services: &mut impl Services) -> Result<Value<'_>, Abort> {
+        let Device { device_type, vendor_id, product_code, revision, serial_number, heartbeat_ms, .. } =
             self.device;
         Ok(match (index, sub) {
             (0x1000, 0) => Value::word(device_type),
             (0x1001, 0) => Value::byte(0),
-            (0x1017, 0) => Value { len: 2, ..Value::word(heartbeat_ms.into()) },
+            (DEVICE_NAME | SOFTWARE_VERSION, 0) => Value::Text(self.text(index).ok_or(Abort::NO_OBJECT)?),
+            (0x1017, 0) => {
+                let [low, high] = heartbeat_ms.to_le_bytes();
+                Value::Number { bytes: [low, high, 0, 0], len: 2 }
+            }
             (0x1018, 0) => Value::byte(4),
             (0x1018, 1) => Value::word(vendor_id),
             (0x1018, 2) => Value::word(product_code),
             (0x1018, 3) => Value::word(revision),
             (0x1018, 4) => Value::word(serial_number),
-            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => Value::byte(self.control.programs()),
+            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS | PROGRAM_VERSION, 0) => {
+                Value::byte(self.control.programs())
+            }
             (PROGRAM_CONTROL, sub) => Value::byte(self.control.state(sub, services)?),
             (PROGRAM_ID, sub) => Value::word(self.control.identification(sub, services)?),
             (FLASH_STATUS, sub) => Value::word(self.control.flash_status(sub)?),
+            (PROGRAM_VERSION, sub) => Value::word(self.program_version(sub, services)?),
             (0x1000 | 0x1001 | 0x1017 | 0x1018, _) => return Err(Abort::NO_SUB_INDEX),
+            (DEVICE_NAME | SOFTWARE_VERSION, _) if self.text(index).is_some() => {
+                return Err(Abort::NO_SUB_INDEX)
+            }
             _ => return Err(Abort::NO_OBJECT),
         })
     }
+
+    /// The text of 1008h or 100Ah, if it has one.
+    fn text(&self, index: u16) -> Option<&[u8]> {
+        let text = match index {
+            DEVICE_NAME => self.device.name.as_bytes(),
+            SOFTWARE_VERSION => &self.version.bytes[..self.version.len],
+            _ => return None,
+        };
+        (!text.is_empty()).then_some(text)
+    }
+
+    /// 2005h: the bootloader's record of a program has its version. A program that a debugger wrote has
+    /// no record, but a label.
+    fn program_version(&self, sub: u8, services: &mut impl Services) -> Result<u32, Abort> {
+        // It exists for the same programs.
+        self.control.flash_status(sub)?;
+        let own = self.device.label.filter(|_| sub == self.control.program());
+        let of_label = own.map_or(0, |label| label.version);
+        Ok(services.program_info(sub).map_or(of_label, |info| info.version))
+    }
+}
+
+/// An answer that names an object.
+fn answer(command: u8, index: u16, sub: u8, [a, b, c, d]: [u8; 4]) -> [u8; 8] {
+    let [low, high] = index.to_le_bytes();
+    [command, low, high, sub, a, b, c, d]
 }
 
 #[cfg(test)]
@@ -336,6 +479,8 @@ mod tests {
 
     const DEVICE: Device = Device {
         device_type: 0x0002_0192,
+        name: "coboot STM32F407G-DISC1",
+        label: Some(Label::new(0x11, 0x22, 0x0064_0A01)),
         vendor_id: 0x11,
         product_code: 0x22,
         revision: 0x0001_0003,
@@ -380,9 +525,101 @@ mod tests {
             ([0x51, 0x1F, 2], [0x4F, 0x51, 0x1F, 2, 3, 0, 0, 0]),
             ([0x56, 0x1F, 1], [0x43, 0x56, 0x1F, 1, 0x78, 0x56, 0x34, 0x12]),
             ([0x57, 0x1F, 1], [0x43, 0x57, 0x1F, 1, 0, 0, 0, 0]),
+            ([0x05, 0x20, 0], [0x4F, 0x05, 0x20, 0, 2, 0, 0, 0]),
+            // The bootloader has no record of this program: its label counts.
+            ([0x05, 0x20, 1], [0x43, 0x05, 0x20, 1, 0x01, 0x0A, 0x64, 0x00]),
+            ([0x05, 0x20, 2], [0x43, 0x05, 0x20, 2, 0, 0, 0, 0]),
         ] {
             let [low, high, sub] = object;
             assert_eq!(ask(&mut responder, [0x40, low, high, sub, 0, 0, 0, 0]), Some(answer), "{object:X?}");
+        }
+    }
+
+    /// CiA 301 sections 7.2.4.3.6 and 7.2.4.3.7: the size, then seven bytes in each segment, with the
+    /// toggle bit, the number of bytes without data, and the mark of the last one. V1.10r100 is how the
+    /// SYS TEC manual writes 00640A01h.
+    #[test]
+    fn texts_are_read_in_segments() {
+        let mut responder = responder();
+        for (request, answer) in [
+            ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], *b"\x41\x08\x10\0\x17\0\0\0"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x00coboot "),
+            ([0x70, 0, 0, 0, 0, 0, 0, 0], *b"\x10STM32F4"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x0007G-DIS"),
+            ([0x70, 0, 0, 0, 0, 0, 0, 0], *b"\x1BC1\0\0\0\0\0"),
+            // It is over.
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x80\0\0\0\x01\0\x04\x05"),
+            ([0x40, 0x0A, 0x10, 0, 0, 0, 0, 0], *b"\x41\x0A\x10\0\x09\0\0\0"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x00V1.10r1"),
+            ([0x70, 0, 0, 0, 0, 0, 0, 0], *b"\x1B00\0\0\0\0\0"),
+            // The same toggle bit twice: 05030000h, and the transfer has ended.
+            ([0x40, 0x0A, 0x10, 0, 0, 0, 0, 0], *b"\x41\x0A\x10\0\x09\0\0\0"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x00V1.10r1"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x80\x0A\x10\0\0\0\x03\x05"),
+            ([0x70, 0, 0, 0, 0, 0, 0, 0], *b"\x80\0\0\0\x01\0\x04\x05"),
+            // Another request ends it, too.
+            ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], *b"\x41\x08\x10\0\x17\0\0\0"),
+            ([0x40, 0x01, 0x10, 0, 0, 0, 0, 0], *b"\x4F\x01\x10\0\0\0\0\0"),
+            ([0x60, 0, 0, 0, 0, 0, 0, 0], *b"\x80\0\0\0\x01\0\x04\x05"),
+            // Read-only, and without further sub-indices.
+            ([0x23, 0x0A, 0x10, 0, 1, 0, 0, 0], *b"\x80\x0A\x10\0\x02\0\x01\x06"),
+            ([0x40, 0x08, 0x10, 1, 0, 0, 0, 0], *b"\x80\x08\x10\x01\x11\0\x09\x06"),
+        ] {
+            assert_eq!(ask(&mut responder, request), Some(answer), "{request:X?}");
+        }
+        // The client ends it, or the NMT master restarts the communication.
+        for (id, data) in [(0x605, &[0x80, 0, 0, 0, 0, 0, 4, 5][..]), (0, &[0x82, 5])] {
+            ask(&mut responder, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]);
+            assert_eq!(responder.handle(&Frame::new(id, data).unwrap(), 0, &mut Fake), None);
+            responder.poll(0);
+            let answer = ask(&mut responder, [0x60, 0, 0, 0, 0, 0, 0, 0]);
+            assert_eq!(answer, Some([0x80, 0, 0, 0, 1, 0, 4, 5]));
+        }
+    }
+
+    #[test]
+    fn the_longest_version_has_room() {
+        let text = VersionText::new(u32::MAX);
+        assert_eq!(&text.bytes[..text.len], b"V255.255r65535");
+    }
+
+    /// 06020000h: there is no text without a name, and no version without a label.
+    #[test]
+    fn without_name_and_label_the_texts_do_not_exist() {
+        let device = Device { name: "", label: None, ..DEVICE };
+        let mut responder = Responder { device, version: VersionText::default(), ..responder() };
+        for low in [0x08, 0x0A] {
+            let answer = ask(&mut responder, [0x40, low, 0x10, 0, 0, 0, 0, 0]);
+            assert_eq!(answer, Some([0x80, low, 0x10, 0, 0, 0, 2, 6]));
+        }
+        let answer = ask(&mut responder, [0x40, 0x05, 0x20, 1, 0, 0, 0, 0]);
+        assert_eq!(answer, Some([0x43, 0x05, 0x20, 1, 0, 0, 0, 0]));
+    }
+
+    /// The version in the record, as the bootloader reports it, comes before the label's.
+    #[test]
+    fn the_record_of_a_program_has_its_version() {
+        struct Recorded;
+        impl Services for Recorded {
+            fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
+                Ok(ProgramArgs {
+                    number: number.into(),
+                    size: 9,
+                    crc: 9,
+                    version: 7 + u32::from(number),
+                    flags: 1,
+                })
+            }
+
+            fn confirm(&mut self, _: u8) -> Result<Confirmed, CallgateError> {
+                Ok(Confirmed::Now)
+            }
+        }
+        let mut responder = responder();
+        for (number, version) in [(1, 8), (2, 9)] {
+            let request = Frame::new(0x605, &[0x40, 0x05, 0x20, number, 0, 0, 0, 0]).unwrap();
+            let answer = responder.handle(&request, 0, &mut Recorded).unwrap();
+            assert_eq!(answer.data(), [0x43, 0x05, 0x20, number, version, 0, 0, 0]);
         }
     }
 
@@ -391,12 +628,13 @@ mod tests {
     fn every_other_request_gets_the_abort_that_the_standard_has_for_it() {
         for (request, code) in [
             // 06020000h: the object does not exist.
-            ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], [0, 0, 2, 6]),
+            ([0x40, 0x09, 0x10, 0, 0, 0, 0, 0], [0, 0, 2, 6]),
             ([0x2F, 0x50, 0x1F, 1, 0, 0, 0, 0], [0, 0, 2, 6]),
             // 06090011h: the sub-index does not exist.
             ([0x40, 0x18, 0x10, 5, 0, 0, 0, 0], [0x11, 0, 9, 6]),
             ([0x40, 0x51, 0x1F, 3, 0, 0, 0, 0], [0x11, 0, 9, 6]),
             ([0x2F, 0x51, 0x1F, 3, 0x80, 0, 0, 0], [0x11, 0, 9, 6]),
+            ([0x40, 0x05, 0x20, 3, 0, 0, 0, 0], [0x11, 0, 9, 6]),
             // 06010002h: read-only.
             ([0x23, 0x00, 0x10, 0, 1, 0, 0, 0], [2, 0, 1, 6]),
             ([0x2F, 0x51, 0x1F, 0, 1, 0, 0, 0], [2, 0, 1, 6]),
@@ -539,12 +777,13 @@ mod tests {
                 (prop_oneof![Just(0x605_u16), Just(0), 0..0x800_u16], prop::collection::vec(any::<u8>(), 0..=8)),
                 1..40,
             ),
-            on_objects: bool,
+            on_objects in prop_oneof![Just(0), Just(0x1F51_u16), Just(0x1008)],
         ) {
             let mut responder = responder();
             for (at, (id, mut data)) in frames.into_iter().enumerate() {
-                if let (true, [_, low, high, ..]) = (on_objects, &mut data[..]) {
-                    (*low, *high) = (0x51, 0x1F);
+                if let (1.., [_, low, high, sub, ..]) = (on_objects, &mut data[..]) {
+                    [*low, *high] = on_objects.to_le_bytes();
+                    *sub %= 2;
                 }
                 let frame = Frame::new(id, &data).unwrap();
                 let stopped = responder.nmt == Nmt::Stopped;
@@ -557,7 +796,7 @@ mod tests {
                 } else if let Some(answer) = answer {
                     prop_assert_eq!((answer.id(), answer.data().len()), (0x585, 8));
                     match (data[0] >> 5, answer.data()[0]) {
-                        (1, 0x60) | (2, 0x43 | 0x4B | 0x4F) | (_, 0x80) => {}
+                        (1, 0x60) | (2, 0x41 | 0x43 | 0x4B | 0x4F) | (3, 0..0x20) | (_, 0x80) => {}
                         other => prop_assert!(false, "{other:X?}"),
                     }
                 } else {

@@ -123,6 +123,10 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
         assert_eq!(number(&mut bench, 0x1F56, 1), blocks.program_crc());
         assert_eq!(number(&mut bench, 0x1F57, 1), 0);
         assert_eq!(number(&mut bench, 0x1018, 2), bsp::IDENTITY.product_code);
+        // The label's version is 1.
+        assert_eq!(number(&mut bench, 0x2005, 1), 1);
+        let mut text = |index| bench.session().read_text(Address::new(index, 0)).unwrap();
+        assert_eq!([text(0x1008), text(0x100A)], [bsp::IDENTITY.device_name, "V1.0r0"]);
     }
     // Step 5: resets by the NMT master are no crashes: five of them exceed the limit of three.
     for _ in 0..5 {

@@ -8,7 +8,7 @@ use core::panic::PanicInfo;
 use coboot_app::layout::Layout;
 use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
-use coboot_app::{Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
+use coboot_app::{label, Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{exception, ExceptionFrame};
 use embassy_executor::Spawner;
@@ -24,7 +24,8 @@ use embassy_stm32::time::Hertz;
 use embassy_stm32::{bind_interrupts, rcc, Config};
 use embassy_time::{with_timeout, Duration, Instant, Timer};
 
-/// 1018h/1 to 3: those of the bootloader.
+/// 1008h, and 1018h/1 to 3: those of the bootloader.
+const NAME: &str = "coboot STM32F407G-DISC1";
 const VENDOR_ID: u32 = 0;
 const PRODUCT_CODE: u32 = 0x4007_D151;
 const REVISION: u32 = 0x0001_0000;
@@ -56,6 +57,8 @@ async fn main(spawner: Spawner) {
     let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc);
     let device = Device {
         device_type: 0,
+        name: NAME,
+        label: label::own(),
         vendor_id: VENDOR_ID,
         product_code: PRODUCT_CODE,
         revision: REVISION,

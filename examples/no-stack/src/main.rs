@@ -11,7 +11,7 @@ use bxcan::{Can, Fifo, Frame, Id, StandardId};
 use coboot_app::layout::Layout;
 use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
-use coboot_app::{BitTiming, Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
+use coboot_app::{label, BitTiming, Bootloader, Defaults, Next, ProgramControl, ReentryPath, Start};
 use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{entry, exception, ExceptionFrame};
@@ -22,7 +22,7 @@ use stm32f4xx_hal::rcc::Config;
 
 mod identity;
 
-use identity::{PRODUCT_CODE, REVISION, VENDOR_ID};
+use identity::{NAME, PRODUCT_CODE, REVISION, VENDOR_ID};
 
 /// Which version of the program this is: the last number of its label.
 const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
@@ -57,6 +57,8 @@ fn main() -> ! {
     let control = ProgramControl::new(&start, LAYOUT.programs.len() as u8, crc);
     let device = Device {
         device_type: 0,
+        name: NAME,
+        label: label::own(),
         vendor_id: VENDOR_ID,
         product_code: PRODUCT_CODE,
         revision: REVISION,
