@@ -887,8 +887,7 @@ fn same(one: &Task, other: &Task) -> bool {
 fn last_part(link: &str) -> Option<String> {
     let path = link.split(['?', '#']).next()?;
     let id = path.rsplit('/').next()?;
-    let fits = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
-    (!id.is_empty() && id.len() <= 64 && id.bytes().all(fits)).then(|| id.to_string())
+    ddi::is_id(id).then(|| id.to_string())
 }
 
 #[cfg(test)]

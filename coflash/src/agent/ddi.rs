@@ -169,6 +169,12 @@ impl Deployment {
     }
 }
 
+/// Whether a text can be the id of an action, which becomes a part of URLs.
+pub(super) fn is_id(text: &str) -> bool {
+    let fits = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
+    !text.is_empty() && text.len() <= ID_MOST && text.bytes().all(fits)
+}
+
 /// An id, which is a text or a number.
 #[derive(Deserialize)]
 #[serde(untagged)]
@@ -178,14 +184,12 @@ enum Id {
 }
 
 impl Id {
-    /// The id, which becomes a part of URLs.
     fn checked(self) -> Result<String, String> {
         let id = match self {
             Self::Text(text) => text,
             Self::Number(number) => number.to_string(),
         };
-        let fits = |byte: u8| byte.is_ascii_alphanumeric() || byte == b'-' || byte == b'_';
-        match !id.is_empty() && id.len() <= ID_MOST && id.bytes().all(fits) {
+        match is_id(&id) {
             true => Ok(id),
             false => Err("an action with an impossible id".to_string()),
         }

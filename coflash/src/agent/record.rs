@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use super::ddi::is_id;
 use crate::file::sealed::show::digits;
 
 /// The number of ended actions that are kept.
@@ -112,11 +113,24 @@ impl Store {
         };
         let record: Record = serde_json::from_str(&text)
             .map_err(|error| damaged(&format!("it is no state file ({error})")))?;
+        let mut actions = record.begun.iter().map(|begun| &begun.action);
+        let mut ended = record.ended.iter().map(|finish| &finish.action);
+        if !actions.all(|action| is_id(action)) || !ended.all(|action| is_id(action)) {
+            return Err(damaged(&"it is no state file (an action with an impossible id)"));
+        }
         Ok(if record.of == of { record } else { Record::new(of) })
     }
 
     /// Replaces the record of a device: after a loss of power the file is the old or the new one.
-    pub(super) fn save(&self, controller: &str, record: &Record) -> io::Result<()> {
+    ///
+    /// # Errors
+    /// In words, with the path.
+    pub(super) fn save(&self, controller: &str, record: &Record) -> Result<(), String> {
+        let path = self.path(controller, "json");
+        self.replace(controller, record).map_err(|error| format!("{}: {error}", path.display()))
+    }
+
+    fn replace(&self, controller: &str, record: &Record) -> io::Result<()> {
         let (path, new) = (self.path(controller, "json"), self.path(controller, "new"));
         let text = serde_json::to_vec_pretty(record).map_err(io::Error::other)?;
         let mut file = File::create(&new)?;
@@ -157,8 +171,15 @@ mod tests {
         assert_eq!(store.load("door", "another server").unwrap(), Record::new("another server"));
         fs::write(store.path("door", "json"), "{\"of\":").unwrap();
         assert!(store.load("door", "here").unwrap_err().contains("delete it"));
+        let strange = r#"{"of":"here","begun":{"action":"../../x","kept":false},"ended":[]}"#;
+        fs::write(store.path("door", "json"), strange).unwrap();
+        assert!(store.load("door", "here").unwrap_err().contains("impossible id"));
         fs::write(store.path("door", "json"), "[".repeat(SIZE_MOST + 1)).unwrap();
         assert!(store.load("door", "here").unwrap_err().contains("too large"));
+        fs::remove_file(store.path("door", "new")).unwrap();
+        fs::create_dir(store.path("door", "new")).unwrap();
+        let why = store.save("door", &record).unwrap_err();
+        assert!(why.contains(&store.path("door", "json").display().to_string()), "{why}");
         assert!(!store.path("../../etc/passwd", "json").display().to_string().contains(".."));
         fs::remove_dir_all(&folder).unwrap();
     }

@@ -269,7 +269,7 @@ fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
                         // Without the file the next download begins anew, which is no harm.
                         let _ = fs::remove_file(&path);
                     }
-                    controller.saved(shared.began.elapsed(), result.map_err(|error| error.to_string()));
+                    controller.saved(shared.began.elapsed(), result);
                 }
                 // While the agent is being ended, only the end of an update is waited for.
                 _ if over && !flashing => return,
