@@ -14,7 +14,7 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBBR");
 /// accepts every version from 1 on.
 pub const VERSION: u16 = 1;
 
-/// Why a device stays in the bootloader: 2007h/2, and the last byte of the emergency behind the boot-up
+/// Why a device stays in the bootloader: 2007h/2, and the last byte of the emergency after the boot-up
 /// message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]

@@ -450,7 +450,7 @@ fn coflash_calls_a_fresh_program_back() {
     }
 }
 
-/// A program that is damaged in flash is refused behind the reset of its START, and so it is at the start
+/// A program that is damaged in flash is refused after the reset of its START, and so it is at the start
 /// by itself: 1F57h says NOVALPROG, 1F51h and 1F56h that there is none, and 2007h why.
 #[test]
 fn a_start_of_a_damaged_program_is_refused_and_says_why() {

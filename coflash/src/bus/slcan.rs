@@ -13,9 +13,11 @@ use super::health::{Controller, Health};
 use super::hex::{hex_bytes, hex_number};
 use super::ports;
 use super::tcp::{connect, PATIENCE};
-use opening::ANSWER;
 
 mod opening;
+
+/// How long an adapter may take to answer a command. Some adapters never answer, but work.
+const ANSWER: Duration = Duration::from_millis(300);
 
 /// Longer than any message of the protocol. The rest of a longer line is dropped.
 const LONGEST_MESSAGE: usize = 64;

@@ -12,8 +12,10 @@ use seal::wire::{array, word};
 
 use serde::Serialize;
 
+use super::doing::Doing;
+use super::error::Error;
 use super::error::{roots_words, told};
-use super::{Doing, Error, Session};
+use super::session::Session;
 use crate::json;
 
 /// How long a device may take to check a signature.

@@ -12,6 +12,7 @@ use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::error::{told, Error};
+use super::read_state::read_state;
 use super::recognise::recognise;
 use super::session::Session;
 use super::state::DeviceState;
@@ -140,7 +141,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         _ => cell(session, |session| recognise(session, device_type, 1))?,
     };
     let security = cell(session, security)?.flatten();
-    let state = if device_type.is_bootloader() { cell(session, DeviceState::read)?.flatten() } else { None };
+    let state = if device_type.is_bootloader() { cell(session, read_state)?.flatten() } else { None };
     Ok(DeviceInfo {
         node: session.node(),
         device_type,

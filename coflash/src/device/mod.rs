@@ -16,6 +16,7 @@ mod listen;
 pub mod lock;
 pub mod lss;
 pub mod partial_download;
+pub mod read_state;
 pub(crate) mod recognise;
 pub mod region;
 pub mod scan;

@@ -1,18 +1,10 @@
 //! The state of a device in its own words: object 2007h of coboot.
 
 use std::fmt;
-use std::time::Duration;
 
-use canopen::program::{
-    DEVICE_STATE, STATE_CRASH_RESETS, STATE_PROGRAM_RESET, STATE_PROGRAM_WATCHDOG, STATE_REASON,
-};
-use canopen::Address;
 use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
-
-use super::error::{told, Error};
-use super::session::Session;
 
 /// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -27,26 +19,6 @@ pub struct DeviceState {
 }
 
 impl DeviceState {
-    /// Reads the state; `None` from a device without the object, such as an application.
-    ///
-    /// # Errors
-    /// Those of a [read](Session::read).
-    pub fn read(session: &mut Session<'_>) -> Result<Option<Self>, Error> {
-        let mut byte = |sub| -> Result<Option<u8>, Error> {
-            let value = told(session.read_number(Address::new(DEVICE_STATE, sub)))?;
-            Ok(value.map(|value| value as u8))
-        };
-        let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
-        let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
-        let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
-        Ok(Some(Self { reason, program_reset, crash_resets }))
-    }
-
-    /// The state of a device that is in trouble already: an error of the read is no news.
-    pub(crate) fn after_failure(session: &mut Session<'_>) -> Option<Self> {
-        Self::read(session).ok().flatten()
-    }
-
     /// The reset by which the program ended, if it is known.
     #[must_use]
     pub fn ended_by(self) -> Option<ResetCause> {
@@ -106,17 +78,6 @@ impl fmt::Display for DeviceState {
             n => write!(f, "; {n} resets in a row that nobody requested"),
         }
     }
-}
-
-/// 2007h/10: the time within which a program must feed the watchdog that the bootloader starts; `None` if
-/// there is no such watchdog, or the device does not say.
-///
-/// # Errors
-/// Those of a [read](Session::read).
-pub fn program_watchdog(session: &mut Session<'_>) -> Result<Option<Duration>, Error> {
-    let at = Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG);
-    let ms = told(session.read_number(at))?.filter(|ms| *ms > 0);
-    Ok(ms.map(|ms| Duration::from_millis(ms.into())))
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use super::event::{Event, Phase};
 use super::options::Target;
 use super::phase::PUT_OFF;
 use crate::device::error::{absent, told, Error, Mismatch};
-use crate::device::state::DeviceState;
+use crate::device::read_state::state_after_failure;
 use crate::device::{DeviceType, Doing, Session, Timing};
 
 /// How many times an application is called back. A program that was started directly after its
@@ -317,7 +317,7 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
     let node = session.node();
     let failed = |session: &mut Session<'_>, running| {
         let status = session.status(number).ok();
-        Error::StartFailed { node, running, status, state: DeviceState::after_failure(session) }
+        Error::StartFailed { node, running, status, state: state_after_failure(session) }
     };
     match session.command(number, ProgramControl::Start) {
         // A device that resets at once may not send its answer.

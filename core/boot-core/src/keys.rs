@@ -5,7 +5,6 @@ use seal::key_block::{COUNTER, EPOCH};
 use shared_abi::layout::Layout;
 
 use crate::flash::Flash;
-use crate::policy::SealPolicy;
 use crate::store::{Key, Parameters, ProgramRecord};
 
 /// A proof that the code for sealed images is linked. Without the feature `sealed` this type has no value:
@@ -94,7 +93,7 @@ pub(crate) fn floor<F: Flash>(
     flash: &F,
     parameters: &impl Parameters,
     layout: &Layout,
-    policy: &SealPolicy,
+    lowest: u32,
     program: u8,
 ) -> (u32, u32) {
     let block = layout.key_block().base;
@@ -113,7 +112,7 @@ pub(crate) fn floor<F: Flash>(
     if ProgramRecord::load(parameters, flash, program).is_some_and(|record| record.confirmed) {
         counter = counter.max(installed);
     }
-    (counter.max(word(COUNTER)).max(policy.counter), epoch)
+    (counter.max(word(COUNTER)).max(lowest), epoch)
 }
 
 /// Whether the key block is valid.

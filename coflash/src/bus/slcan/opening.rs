@@ -18,13 +18,11 @@
 
 use std::time::Duration;
 
-use super::{Line, Message, Slcan};
+use super::{Line, Message, Slcan, ANSWER};
 use crate::bus::adapter::AdapterError;
 use crate::bus::found::shown;
 use crate::bus::ports;
 
-/// How long an adapter may take to answer a command. Some adapters never answer, but work.
-pub(super) const ANSWER: Duration = Duration::from_millis(300);
 /// The same for an adapter that answers, but too late for the order of the commands.
 const LATE_ANSWER: Duration = Duration::from_secs(1);
 /// How long the line must be silent until a late adapter has answered all commands.

@@ -4,7 +4,7 @@ use canopen::program::{self, ProgramControl};
 use canopen::Address;
 
 use crate::device::error::absent;
-use crate::device::state::DeviceState;
+use crate::device::read_state::state_after_failure;
 use crate::device::{DeviceType, Doing, Error, Session};
 use crate::update::steps::await_application;
 
@@ -26,6 +26,6 @@ pub(super) fn arrived(session: &mut Session<'_>, number: u8) -> Result<DeviceTyp
         return Ok(running);
     }
     let (node, running) = (session.node(), session.device_type()?);
-    let (status, state) = (session.status(number).ok(), DeviceState::after_failure(session));
+    let (status, state) = (session.status(number).ok(), state_after_failure(session));
     Err(Error::StartFailed { node, running, status, state })
 }

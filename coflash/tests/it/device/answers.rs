@@ -106,7 +106,7 @@ impl Adapter for HeldUp {
     }
 }
 
-/// The answer has come in time; it only lies behind the frames of others.
+/// The answer has come in time; it only lies after the frames of others.
 #[test]
 fn a_host_that_is_held_up_finds_the_answer_that_is_there() {
     let mut fake = Fake::new(APPLICATION);

@@ -115,7 +115,7 @@ impl<'b> Rights<'b> {
         }
         let programs = layout.programs.len().min(PROGRAMS);
         for number in 1..=programs {
-            let (counter, epoch) = floor(flash, parameters, layout, &policy.seal, number as u8);
+            let (counter, epoch) = floor(flash, parameters, layout, policy.seal.counter, number as u8);
             access.floor[FLOOR + number - 1] = counter;
             access.floor[ROOT_COUNT] = epoch;
         }

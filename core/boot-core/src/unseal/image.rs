@@ -190,7 +190,7 @@ impl Place {
         }
         let record = ProgramRecord::load(parameters, flash, program);
         let [_, _, installed, _] = parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
-        let (mut counter, epoch) = floor(flash, parameters, self.layout, policy, program);
+        let (mut counter, epoch) = floor(flash, parameters, self.layout, policy.counter, program);
         if let Some(lowered) = self.lowered_counter {
             counter = counter.min(lowered);
         }

@@ -492,7 +492,7 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
     assert_eq!(word, [0, 0]);
 }
 
-/// A START that came to nothing behind the reset: 1F57h is 02h for that program. A damaged program is
+/// A START that came to nothing after the reset: 1F57h is 02h for that program. A damaged program is
 /// none any more; a sound one that may not start at present stays.
 #[test]
 fn a_start_that_the_boot_stage_refused_is_no_valid_program() {

@@ -291,6 +291,24 @@ impl SdoServer {
         }
     }
 
+    /// Whether a frame continues an aborted sub-block.
+    fn is_under_way(
+        &mut self,
+        bytes: &[u8; 8],
+        response: CobId,
+        now: Instant,
+        objects: &impl Objects,
+    ) -> bool {
+        let gap_ms = self.pace().gap_ms;
+        self.under_way.take_if(|segments| segments.is_over(now, gap_ms));
+        let is_next = |segments: UnderWay| segments.is_next(bytes, response, objects);
+        let is_under_way = self.under_way.is_some_and(is_next);
+        if is_under_way {
+            self.under_way = UnderWay::behind(bytes, response, now);
+        }
+        is_under_way
+    }
+
     /// Carries out a request.
     fn serve(&mut self, bytes: &[u8; 8], now: Instant, objects: &mut impl Objects) {
         if self.repeats_last_segment(bytes) {

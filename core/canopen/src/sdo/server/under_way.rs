@@ -14,8 +14,6 @@ use crate::sdo::block::BLKSIZE_MAX;
 use crate::sdo::fields::{self, ccs};
 use crate::time::Instant;
 
-use super::SdoServer;
-
 /// A pause of this many frames is the end of the aborted sub-block.
 pub(super) const FRAMES: u32 = 8;
 
@@ -37,28 +35,16 @@ impl UnderWay {
         let next = (segment[0] & !fields::LAST_OF_BLOCKS) + 1;
         (!last && next <= BLKSIZE_MAX).then_some(Self { response, next, heard })
     }
-}
 
-impl SdoServer {
-    /// Whether a frame continues the aborted sub-block.
-    pub(super) fn is_under_way(
-        &mut self,
-        bytes: &[u8; 8],
-        response: CobId,
-        now: Instant,
-        objects: &impl Objects,
-    ) -> bool {
-        let Some(due) = self.under_way else { return false };
-        if now.has_reached(due.heard + u32::from(self.pace().gap_ms)) {
-            self.under_way = None;
-            return false;
-        }
-        let is_due = bytes[0] & !fields::LAST_OF_BLOCKS == due.next && response == due.response;
-        if !is_due || is_read(bytes, objects) {
-            return false;
-        }
-        self.under_way = UnderWay::behind(bytes, response, now);
-        true
+    /// Whether a pause of this length has passed.
+    pub fn is_over(&self, now: Instant, gap_ms: u8) -> bool {
+        now.has_reached(self.heard + u32::from(gap_ms))
+    }
+
+    /// Whether a frame is the segment that is due.
+    pub fn is_next(&self, bytes: &[u8; 8], response: CobId, objects: &impl Objects) -> bool {
+        let is_due = bytes[0] & !fields::LAST_OF_BLOCKS == self.next && response == self.response;
+        is_due && !is_read(bytes, objects)
     }
 }
 
