@@ -30,6 +30,9 @@ pub enum Area {
     External,
 }
 
+/// Main flash of the STM32F4: at most 2 MiB.
+pub(crate) const FLASH: AddressRange = AddressRange { first: 0x0800_0000, last: 0x081F_FFFF };
+
 /// RM0090 rev 19, sections 2.3 (memory map) and 3.4 to 3.6 (system memory, OTP, option bytes);
 /// section 3.4 of RM0390 for QUADSPI. The first one that has an address counts.
 const AREAS: [(AddressRange, Area); 13] = [

@@ -4,8 +4,7 @@ use std::fmt;
 
 use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
-use super::area::Area;
-use super::judge::FLASH;
+use super::area::{Area, FLASH};
 use super::range::AddressRange;
 
 /// A place in a file.

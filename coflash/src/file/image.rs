@@ -1,8 +1,7 @@
 //! The memory contents in a firmware file, with gaps.
 
-use super::area::Area;
+use super::area::{Area, FLASH};
 use super::fault::{Cause, Place, ReadError};
-use super::judge::FLASH;
 use super::note::Note;
 use super::range::AddressRange;
 

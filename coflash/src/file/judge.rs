@@ -10,12 +10,10 @@ use shared_abi::geometry::{Region, CHIPS};
 use shared_abi::layout::Layout;
 use shared_abi::vectors::{Memory, VectorFault};
 
-use super::area::Area;
+use super::area::{Area, FLASH};
 use super::image::Image;
 use super::range::AddressRange;
 
-/// Main flash of the STM32F4: at most 2 MiB.
-pub(crate) const FLASH: AddressRange = AddressRange { first: 0x0800_0000, last: 0x081F_FFFF };
 /// Its first sector, which has 16 KiB on every chip. No program can have it, because the CPU starts
 /// there after a reset.
 const FIRST_SECTOR: AddressRange = AddressRange { first: 0x0800_0000, last: 0x0800_3FFF };

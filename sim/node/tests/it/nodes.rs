@@ -32,7 +32,7 @@ fn folder(test: &str) -> Folder {
 fn the_file_holds_the_program_and_nothing_else() {
     let folder = folder("holds");
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant"]);
-    nodes.await_line("serial 1, node 5: bootloader (Program(Absent))");
+    nodes.await_line("serial 1, node 5: bootloader (NoProgram)");
     let flash = folder.read("1.flash");
     assert_eq!(flash, vec![0xFF; 1 << 20], "erased by default");
 
@@ -153,7 +153,7 @@ fn the_power_is_cut_in_the_middle_and_the_program_is_none() {
     drop(nodes);
     assert_eq!(flashing.wait().exit, 4, "the adapter is gone");
     let nodes = Nodes::start(&folder, &["--node", "5", "--stand-in"]);
-    nodes.await_line("serial 1, node 5: bootloader (Program(Absent))");
+    nodes.await_line("serial 1, node 5: bootloader (NoProgram)");
     Coflash::new(&folder, &nodes).done(&[FLASH, &["-N", "5"]].concat());
     assert!(folder.read("1.flash")[0x2_0000..] == flashed());
 }
@@ -223,8 +223,8 @@ fn nodes_are_commissioned_by_layer_setting_services() {
     assert_eq!(coflash.json(&["read", "1018/2", "-N", "41"])["number"], 0x1234);
     drop(nodes);
     let nodes = start(&folder);
-    nodes.await_line("serial 77, node 40: bootloader (Program(Absent))");
-    nodes.await_line("serial 78, node 41: bootloader (Program(Absent))");
+    nodes.await_line("serial 77, node 40: bootloader (NoProgram)");
+    nodes.await_line("serial 78, node 41: bootloader (NoProgram)");
     let coflash = Coflash::new(&folder, &nodes);
     let device = ["--vendor", "0", "--product", "0x1234", "--revision", "0x10000", "--serial", "78"];
     let said = coflash.done(&[&["lss", "bit-rate", "500", "--store"][..], &device].concat());
@@ -293,7 +293,7 @@ fn another_product_among_the_devices_of_a_group_refuses_alone() {
     let nodes = Nodes::start(&folder, &wanted);
     let other = ["--node", "3", "--serial", "3", "--product-code", "99", "--flash", "instant"];
     let other = Nodes::join(&folder, nodes.url(), &other);
-    other.await_line("serial 3, node 3: bootloader (Program(Absent))");
+    other.await_line("serial 3, node 3: bootloader (NoProgram)");
     let coflash = Coflash::new(&folder, &nodes);
     let flash = ["-N", "1-3", "--together=always", "--no-start", "--vid", "0", "--pid", "98"];
     let said = coflash.run(&[FLASH, &flash].concat());
@@ -367,7 +367,7 @@ fn nodes_join_a_bus() {
     let folder = folder("join");
     let hosts = Nodes::start(&folder, &["--node", "1"]);
     let guests = Nodes::join(&folder, hosts.url(), &["--node", "2", "--serial", "2", "--flash", "instant"]);
-    guests.await_line("serial 2, node 2: bootloader (Program(Absent))");
+    guests.await_line("serial 2, node 2: bootloader (NoProgram)");
     let coflash = Coflash::new(&folder, &hosts);
     coflash.done(&[FLASH, &["-N", "2", "--no-start"]].concat());
     assert!(folder.read("2.flash")[0x2_0000..] == flashed());
