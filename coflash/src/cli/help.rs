@@ -187,7 +187,7 @@ Examples:
         "provision",
         "\
 Examples:
-  coflash provision bootloader.elf --board stm32f407g-disc1 --root root.pub -o production.hex",
+  coflash provision bootloader-sealed.elf --board stm32f407g-disc1 --root root.pub -o production.hex",
     ),
     (
         "scan",
