@@ -320,6 +320,37 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.program_crc(), "it is still there");
 }
 
+/// Each example in Rust can take the memory map of a board of one's own, as its page says: its
+/// manifest has what the build script needs for that.
+#[test]
+fn each_example_in_rust_takes_a_memory_map_from_a_file() {
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples");
+    let examples = examples.canonicalize().expect("the examples");
+    for example in ["embassy", "no-stack", "rtic"] {
+        let manifest = fs::read_to_string(examples.join(example).join("Cargo.toml")).expect("a manifest");
+        let line = manifest.lines().find(|line| line.starts_with("coboot-linker =")).expect("the helper");
+        let line = line.replace("../..", &format!("{}/..", examples.display()));
+        let project = kit::folder!("of-file");
+        let package =
+            "[workspace]\n[package]\nname = \"of-file\"\nedition = \"2021\"\n[[bin]]\nname = \"of-file\"\n\
+                       path = \"main.rs\"\n[build-dependencies]\n";
+        project.write("Cargo.toml", format!("{package}{line}\n"));
+        project.write("main.rs", "fn main() {}\n");
+        project.write(
+            "build.rs",
+            "fn main() {\n    coboot_linker::Application::of_file(\"board.toml\").emit();\n}\n",
+        );
+        fs::copy(examples.join("no-stack/board.toml"), project.join("board.toml")).expect("a map");
+        fs::copy(examples.join(example).join("Cargo.lock"), project.join("Cargo.lock")).expect("versions");
+        let cargo = env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let target = Path::new(env!("CARGO_TARGET_TMPDIR")).join("of-file-target");
+        let mut check = Command::new(cargo);
+        check.args(["check", "--quiet"]).current_dir(&*project).env("CARGO_TARGET_DIR", target);
+        let output = check.output().expect("cargo starts");
+        assert!(output.status.success(), "{example}: {}", text(&output));
+    }
+}
+
 /// The first block of a page in this language.
 fn block<'p>(page: &'p str, language: &str) -> &'p str {
     let (_, behind) = page.split_once(&format!("```{language}\n")).expect("a block");
