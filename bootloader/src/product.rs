@@ -65,7 +65,7 @@ pub struct Product {
     /// Whether an emergency follows each boot-up. It shows a master that the bootloader runs, and
     /// not the application.
     pub boot_up_emergency: bool,
-    /// Period of the heartbeat until a master changes it (1017h), in ms; 0 for none.
+    /// Period of the heartbeat (1017h, which is constant), in ms; 0 for none.
     pub heartbeat_ms: u16,
     /// Whether the device supports layer setting services (LSS, CiA 305).
     pub lss: bool,

@@ -6,6 +6,8 @@ mod eds;
 mod examples;
 #[cfg(unix)]
 mod gdb_door;
+#[cfg(target_os = "linux")]
+mod pages;
 mod peers;
 mod python_package;
 mod second_board;

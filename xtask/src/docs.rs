@@ -51,9 +51,9 @@ fn missing(quote: &[String], source: &str) -> Option<String> {
 
 #[test]
 fn the_guides_show_code_as_it_is() {
-    for (document, least) in [("docs/application.md", 10), ("docs/first-hour.md", 1)] {
+    for document in ["docs/application.md", "docs/first-hour.md", "docs/porting.md", "docs/product.md"] {
         let found = quotes(&files::ours(document).unwrap());
-        assert!(found.len() >= least, "{document}: {} quotes", found.len());
+        assert!(!found.is_empty(), "{document}: no quotes");
         for Quote { file, lines } in found {
             let gone = missing(&lines, &files::ours(&file).unwrap());
             assert_eq!(gone, None, "{document} quotes what {file} does not have: copy it from there");

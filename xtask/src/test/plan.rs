@@ -57,6 +57,7 @@ pub const LATER: &[Later] = &[
     later("foreign", "eds::", Tier::Ci, OTHERS),
     later("foreign", "examples::", Tier::All, "builds a project of each tool chain"),
     later("foreign", "gdb_door::", Tier::Ci, "gdb"),
+    later("foreign", "pages::", Tier::All, "types each page, 3 minutes"),
     later("foreign", "peers::", Tier::Ci, OTHERS),
     later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
     later("foreign", "ui::", Tier::Ci, "Chromium"),
