@@ -515,6 +515,32 @@ const MISTAKES: &[Mistake] = &[
     },
 ];
 
+/// The lines of the guide for a chip whose flash has two banks, and for CAN2: they compile as printed.
+#[test]
+fn the_lines_for_two_banks_and_for_can2_compile() {
+    let copy = Copy::new();
+    copy.xtask(&["new-board", "two-banks", "--chip", "STM32F429ZGT6"]);
+    let page = fs::read_to_string(copy.root.join("docs/porting.md")).expect("the guide");
+    let block = |words: &str| {
+        let blocks = page.split("```rust\n").skip(1).filter_map(|rest| rest.split("```").next());
+        blocks.into_iter().find(|block| block.contains(words)).expect(words)
+    };
+    let map = "shared-abi/src/layout/boards/two_banks.rs";
+    let imports = "use crate::geometry::{Region, STM32F429ZG};\nuse crate::layout::Layout;\n";
+    copy.edit(map, imports, block("in_two_banks"));
+    copy.edit(map, "chip: &STM32F429ZG,", "chip: &CHIP,");
+    let checked = copy.cargo(&["check", "-p", "coboot-abi"]);
+    assert!(checked.status.success(), "{}", text(&checked));
+
+    let board = "bsp/src/boards/two_banks.rs";
+    let (pins, controller) = block("can_controller!").split_once("// …\n").expect("two places");
+    copy.edit(board, "    can_pins: Pins { transmit: ('B', 9), receive: ('B', 8) },\n", pins);
+    copy.edit(board, "can_controller!(CAN1);\n", controller);
+    let words = ["check", "-p", "bsp", "--features=chip-stm32f429", "--target", TARGET, "--profile=firmware"];
+    let checked = copy.cargo_for("two-banks", None, &words);
+    assert!(checked.status.success(), "{}", text(&checked));
+}
+
 #[test]
 fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let copy = Copy::new();
