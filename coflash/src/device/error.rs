@@ -205,8 +205,9 @@ pub enum Error {
 pub enum TrialFailure {
     /// The program was started, and nothing answers.
     Silent,
-    /// The device stays in its bootloader; with the status in 1F57h, if it could be read.
-    NotStarted(Option<FlashStatus>),
+    /// The device stays in its bootloader; with the status in 1F57h and the state in 2007h, if they could
+    /// be read.
+    NotStarted(Option<FlashStatus>, Option<DeviceState>),
     /// The program runs and does not return to the bootloader; with the abort code, if it refused.
     Stays(Option<AbortCode>),
     /// The program was called back, and nothing answers any more.
@@ -501,12 +502,13 @@ impl fmt::Display for Error {
                     TrialFailure::Silent => {
                         write!(f, "node {node} has not answered since the program was started")
                     }
-                    TrialFailure::NotStarted(status) => {
+                    TrialFailure::NotStarted(status, state) => {
                         write!(f, "it does not start, node {node} stays in the bootloader")?;
                         match status.and_then(|status| status.error) {
                             Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
                             None => Ok(()),
-                        }
+                        }?;
+                        write_why(f, *state)
                     }
                     TrialFailure::Stays(None) => {
                         write!(f, "it runs in node {node} and does not return to the bootloader when called")
@@ -530,12 +532,19 @@ impl fmt::Display for Error {
                     Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
                     None => Ok(()),
                 }?;
-                match state {
-                    Some(state) => write!(f, "; why: {}", reason(state.reason)),
-                    None => Ok(()),
-                }
+                write_why(f, *state)
             }
         }
+    }
+}
+
+/// Why a device stays in its bootloader, and how its program ended.
+fn write_why(f: &mut fmt::Formatter<'_>, state: Option<DeviceState>) -> fmt::Result {
+    let Some(state) = state else { return Ok(()) };
+    write!(f, "; {}", reason(state.reason))?;
+    match state.ended_by() {
+        Some(by) => write!(f, ", which was ended by {}", source(by)),
+        None => Ok(()),
     }
 }
 

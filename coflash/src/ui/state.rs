@@ -98,6 +98,8 @@ pub(super) struct Device {
     pub(super) dialect: Option<&'static str>,
     /// What it reports about sealed images, in words.
     pub(super) sealed: Option<String>,
+    /// Why it stays in its bootloader, in words (2007h).
+    pub(super) state: Option<String>,
     pub(super) programs: Vec<Program>,
     /// The comparison of the firmware file's label with this device.
     pub(super) verdict: Option<Verdict>,
@@ -320,6 +322,7 @@ impl Device {
             heartbeat: None,
             dialect: info.dialect.map(|dialect| dialect.name()),
             sealed: info.security.as_ref().map(ToString::to_string),
+            state: info.state.map(|state| state.to_string()),
             programs: info.programs.iter().map(Program::of).collect(),
             verdict: None,
         }

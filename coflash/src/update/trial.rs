@@ -36,7 +36,9 @@ pub(super) fn run(
 /// The same error, in the form for a program on trial.
 fn failed(error: Error) -> Error {
     let (node, how) = match error {
-        Error::StartFailed { node, running: Some(_), status, .. } => (node, TrialFailure::NotStarted(status)),
+        Error::StartFailed { node, running: Some(_), status, state } => {
+            (node, TrialFailure::NotStarted(status, state))
+        }
         Error::StartFailed { node, running: None, .. } => (node, TrialFailure::Silent),
         Error::ProgramEnded { node, ended } => (node, TrialFailure::Ended(ended)),
         Error::NoBootloader { node, running: Some(_), code } => (node, TrialFailure::Stays(code)),

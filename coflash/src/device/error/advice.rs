@@ -3,10 +3,12 @@
 use canopen::program::FlashError;
 use canopen::AbortCode;
 
+use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
 use super::{Error, LssFailure, TrialFailure};
 use crate::device::doing::{Doing, LssDoing};
+use crate::device::state::DeviceState;
 
 impl Error {
     /// What to do next.
@@ -90,10 +92,8 @@ impl Error {
                 "check that the file was made for this board and this program number, and run the command again"
                     .to_string()
             }
-            Self::TrialFailed { how: TrialFailure::NotStarted(_), .. } => {
-                "check that the program was linked for this board and program number; the device waits in the \
-                 bootloader for another one"
-                    .to_string()
+            Self::TrialFailed { how: TrialFailure::NotStarted(_, state), .. } => {
+                not_started_advice(*state).to_string()
             }
             Self::TrialFailed { node, how: TrialFailure::Silent | TrialFailure::Lost } => format!(
                 "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
@@ -101,21 +101,43 @@ impl Error {
                  under another node-ID than its bootloader there is --no-trial"
             ),
             Self::TrialFailed { node, how: TrialFailure::Stays(_) } => format!(
-                "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
-                 --node {node} waits for it); a program that cannot be called back is flashed with --no-trial"
+                "give the program 1F51h = 80h, the way back into the bootloader (docs/application.md): without it the \
+                 device can never be updated over the bus. Reset the device (coflash reset --node {node}), or switch it \
+                 off and on: it comes up in the bootloader, ready for another program (coflash catch --node {node} \
+                 waits for it)"
             ),
             Self::ProgramEnded { ended, .. } | Self::TrialFailed { how: TrialFailure::Ended(ended), .. } => {
                 ended_advice(ended.by).to_string()
             }
-            Self::StartFailed { running: Some(running), .. } if running.is_bootloader() => {
-                "check that the program was linked for this board and program number; the device waits in the \
-                 bootloader for another one"
-                    .to_string()
+            Self::StartFailed { running: Some(running), state, .. } if running.is_bootloader() => {
+                not_started_advice(*state).to_string()
             }
             Self::StartFailed { node, .. } => format!(
                 "the program may not speak CANopen, use another node-ID or bit rate, or crash: run coflash catch --node \
                  {node}, switch the device off and on, and flash another one; if it is not caught, use its entry strap"
             ),
+        }
+    }
+}
+
+/// The advice for a program after whose start the bootloader runs, by what the device says.
+fn not_started_advice(state: Option<DeviceState>) -> &'static str {
+    let reason = state.and_then(|state| Reason::from_byte(state.reason));
+    let ended_by = state.and_then(DeviceState::ended_by);
+    match (reason, ended_by) {
+        (Some(Reason::Damaged), _) => {
+            "flash the program again: what is in the flash is not what was sent; if it happens again, the flash is worn out"
+        }
+        (Some(Reason::NodeId), _) => {
+            "give the device a node-ID in the range of its product (coflash lss assign); the program stays as it is"
+        }
+        (Some(Reason::Forbidden), _) => {
+            "the product forbids the start at present: ask its manufacturer what allows it; the program stays as it is"
+        }
+        (Some(Reason::Unsigned | Reason::CrashLoop), Some(by)) => ended_advice(Some(by)),
+        _ => {
+            "check that the program was linked for this board and program number; the device waits in the bootloader \
+             for another one"
         }
     }
 }

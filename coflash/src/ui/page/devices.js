@@ -100,6 +100,7 @@ function open(node) {
     ["Hardware", device.hardware ?? "unknown"],
     ["Software", device.software ?? "unknown"],
     ["Sealed", device.sealed ?? "not reported"],
+    ...(device.state ? [["State", device.state]] : []),
     ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],
     ["Dialect", device.dialect ?? "unknown"],
     ...device.programs.map((one) => [`Program ${one.number}`, `${one.words}${one.crc ? `, CRC ${hex(one.crc)}` : ""}`]),
