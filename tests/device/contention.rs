@@ -52,14 +52,14 @@ fn said(bench: &Bench, from: Time) -> Vec<(Span, Vec<u8>)> {
     frames.map(|(at, _, data)| (at - from, data)).collect()
 }
 
-/// A block download of 1000h bytes is granted, and its first segments are sent. Returns the time of
-/// the last one on the bus.
-fn abandon(bench: &mut Bench, at: Address, segments: u8) -> Time {
+/// A block download is granted in sub-blocks of `blksize`, and its first segments are sent. Returns the
+/// time of the last one on the bus.
+fn abandon(bench: &mut Bench, at: Address, blksize: u8, segments: u8) -> Time {
     // Earlier frames were already checked.
     while bench.receive(Duration::ZERO).is_ok_and(|frame| frame.is_some()) {}
     let [low, high] = at.index.to_le_bytes();
     let granted = bench.ask(REQUEST, &[0xC0, low, high, at.sub, 0, 0, 0, 0], RESPONSE).expect("an answer");
-    assert_eq!(granted, [0xA4, low, high, at.sub, 127, 0, 0, 0]);
+    assert_eq!(granted, [0xA4, low, high, at.sub, blksize, 0, 0, 0]);
     let from = bench.time();
     for seqno in 1..=segments {
         bench.post(REQUEST, &[seqno, 0, 0, 0, 0, 0, 0, 0]);
@@ -81,20 +81,21 @@ fn abandon(bench: &mut Bench, at: Address, segments: u8) -> Time {
 /// Default clients wait 0.3 s (python-canopen) to 0.5 s for an acknowledgement.
 #[test]
 fn a_lost_last_segment_is_acknowledged_before_clients_give_up() {
-    for (rate, least, most) in [
-        (BitRate::K1000, 49, 54),
-        (BitRate::K125, 49, 55),
-        (BitRate::K50, 49, 60),
+    // As many segments as fit into 80 ms, with 135 bits each.
+    for (rate, blksize, least, most) in [
+        (BitRate::K1000, 127, 49, 54),
+        (BitRate::K125, 74, 49, 55),
+        (BitRate::K50, 29, 49, 60),
         // Twice as long, and the acknowledgement itself takes 6 and 13 ms.
-        (BitRate::K20, 99, 112),
-        (BitRate::K10, 99, 120),
+        (BitRate::K20, 11, 99, 112),
+        (BitRate::K10, 5, 99, 120),
     ] {
         let mut bench = board(rate);
-        let end = abandon(&mut bench, DATA, 126);
+        let end = abandon(&mut bench, DATA, blksize, blksize - 1);
         bench.run_ms(300);
         let said = said(&bench, end);
         let [(after, answer)] = &said[..] else { panic!("{rate:?}: {said:?}") };
-        assert_eq!(answer[..], [0xA2, 126, 127, 0, 0, 0, 0, 0]);
+        assert_eq!(answer[..], [0xA2, blksize - 1, blksize, 0, 0, 0, 0, 0]);
         assert!(
             *after >= Span::from_millis(least) && *after <= Span::from_millis(most),
             "{rate:?}: {after:?}"
@@ -112,7 +113,7 @@ fn an_abandoned_block_download_locks_nobody_out() {
         let device_type = bench.ask(REQUEST, &READ_1000, RESPONSE).expect("an answer");
         for every in [100, 700, 2200] {
             for segments in [0, 3] {
-                abandon(bench, at, segments);
+                abandon(bench, at, 74, segments);
                 bench.run_ms(5);
                 let asked = bench.time();
                 for _ in 0..3 {
@@ -127,7 +128,7 @@ fn an_abandoned_block_download_locks_nobody_out() {
             }
         }
         // With an abort before it, the answer comes at once.
-        abandon(bench, at, 3);
+        abandon(bench, at, 74, 3);
         bench.post(REQUEST, &[0x80, 0, 0, 0, 0, 0, 0, 8]);
         let asked = bench.time();
         assert_eq!(bench.ask(REQUEST, &READ_1000, RESPONSE).expect("an answer"), device_type);

@@ -44,7 +44,9 @@ fn bootloader_with_a_program(bench: &mut Bench) {
     bench.power_on();
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_V1);
-    flash(&mut bench.session(), &file, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    // This program does not feed a watchdog: it would not live through the watch of the tool.
+    let options = FlashOptions::default().trial_run(false).watch(Some(std::time::Duration::ZERO));
+    flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     bench.run_ms(20);
