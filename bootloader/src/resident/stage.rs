@@ -161,9 +161,10 @@ fn boot_report(decision: &BootDecision, request: Option<BootRequest>, cause: Res
     let (returned, program_reset) = match request {
         // An application that requests the bootloader has shown that it can be called back. The handoff
         // has its number; nothing has written it since.
-        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
         Some(BootRequest::Stay | BootRequest::Owed(_)) => {
-            (unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) }, cause as u8)
+            // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image.
+            let program = unsafe { Handoff::read_program(LAYOUT.handoff.base as *const Handoff) };
+            (program, cause as u8)
         }
         None => (0, cause as u8),
         // The bootloader itself left these requests.

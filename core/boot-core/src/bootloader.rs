@@ -147,7 +147,7 @@ pub struct Config {
     /// Whether an emergency follows each boot-up message. It shows a master that this is the
     /// bootloader and not the application. Its code is FF00h (device specific, CiA 301 table 26);
     /// its data are "BOOT" and the reason why the device stayed
-    /// ([`Reason`](shared_abi::boot_report::Reason)).
+    /// ([`Reason`]).
     pub boot_up_emergency: bool,
     /// Whether layer setting services may store node-ID and bit rate.
     pub lss_store: bool,
