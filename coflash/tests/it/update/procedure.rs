@@ -420,7 +420,11 @@ fn a_program_that_fails_its_trial_is_not_released() {
         words.starts_with("it runs in node 5, and refuses the call to the bootloader with abort 06020000h"),
         "{words}"
     );
-    assert!(advice.contains("--no-trial"), "{advice}");
+    // Not --no-trial: that would install what can never be updated.
+    assert!(!advice.contains("--no-trial"), "{advice}");
+    for words in ["docs/application.md", "coflash reset --node 5", "coflash catch --node 5"] {
+        assert!(advice.contains(words), "{advice}");
+    }
 }
 
 #[test]
