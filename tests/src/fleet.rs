@@ -64,6 +64,11 @@ impl Adapter for Eventful<'_> {
     }
 }
 
+/// The options of an update that ends with the start: the tests compare the times of downloads.
+fn unwatched() -> FlashOptions {
+    FlashOptions::default().watch(Some(std::time::Duration::ZERO))
+}
+
 impl Fleet {
     /// `boards` running boards at this bit rate, which share a bus.
     ///
@@ -116,7 +121,7 @@ impl Fleet {
         happens: Happens<'_>,
     ) -> Update {
         let program = Program::Blocks(file.clone());
-        self.update_as(devices, &program, &FlashOptions::default(), options, happens)
+        self.update_as(devices, &program, &unwatched(), options, happens)
     }
 
     /// The same with a sealed image, and everything else by default.
@@ -125,7 +130,7 @@ impl Fleet {
     /// As [`update`](Self::update).
     pub fn update_sealed(&mut self, devices: u8, file: &Arc<SealedFile>) -> Update {
         let program = Program::Sealed(file.clone());
-        let (each, options) = (FlashOptions::default(), ManyOptions::default());
+        let (each, options) = (unwatched(), ManyOptions::default());
         self.update_as(devices, &program, &each, &options, &mut |_| {})
     }
 
@@ -211,7 +216,7 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
             fleet.to_one_in(lost_one_in, 1, FaultAction::Drop);
         }
         let options = ManyOptions::default().together(way == Way::Together);
-        let each = FlashOptions::default().joined_blocks(Some(block_size));
+        let each = unwatched().joined_blocks(Some(block_size));
         let update = fleet.update_as(boards, &Program::Blocks(file.clone()), &each, &options, &mut |_| {});
         assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
         let (took, one) = (update.took, *one.get_or_insert(update.took));
