@@ -113,6 +113,12 @@ mod app {
         password: PRODUCT.profile.password,
     };
 
+    // The record has no types of CANopen.
+    const _: () = {
+        assert!(BootReport::NONE.node_id == product::NO_NODE_ID);
+        assert!(BootReport::NONE.bit_rate == BitRate::Auto as u8);
+    };
+
     /// What the product does without.
     pub struct Chosen;
 

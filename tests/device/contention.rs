@@ -13,6 +13,8 @@ use coflash::device::{Doing, Transfers};
 use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
+/// The segments of a sub-block at 125 kbit/s: as many as fit into 80 ms, with 135 bits each.
+const BLKSIZE: u8 = 74;
 const DATA: Address = Address::new(0x1F50, 1);
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 const READ_1008: [u8; 8] = [0x40, 0x08, 0x10, 0, 0, 0, 0, 0];
@@ -84,7 +86,7 @@ fn a_lost_last_segment_is_acknowledged_before_clients_give_up() {
     // As many segments as fit into 80 ms, with 135 bits each.
     for (rate, blksize, least, most) in [
         (BitRate::K1000, 127, 49, 54),
-        (BitRate::K125, 74, 49, 55),
+        (BitRate::K125, BLKSIZE, 49, 55),
         (BitRate::K50, 29, 49, 60),
         // Twice as long, and the acknowledgement itself takes 6 and 13 ms.
         (BitRate::K20, 11, 99, 112),
@@ -113,7 +115,7 @@ fn an_abandoned_block_download_locks_nobody_out() {
         let device_type = bench.ask(REQUEST, &READ_1000, RESPONSE).expect("an answer");
         for every in [100, 700, 2200] {
             for segments in [0, 3] {
-                abandon(bench, at, 74, segments);
+                abandon(bench, at, BLKSIZE, segments);
                 bench.run_ms(5);
                 let asked = bench.time();
                 for _ in 0..3 {
@@ -128,7 +130,7 @@ fn an_abandoned_block_download_locks_nobody_out() {
             }
         }
         // With an abort before it, the answer comes at once.
-        abandon(bench, at, 74, 3);
+        abandon(bench, at, BLKSIZE, 3);
         bench.post(REQUEST, &[0x80, 0, 0, 0, 0, 0, 0, 8]);
         let asked = bench.time();
         assert_eq!(bench.ask(REQUEST, &READ_1000, RESPONSE).expect("an answer"), device_type);

@@ -158,6 +158,17 @@ def sending(page, node=5):
         " return bar && bar.value > 0.02 && bar.value < 0.95 }", arg=node)
 
 
+def page_with_two_nodes(bench):
+    """A page that has found two nodes; with its address, the port of the bus, the nodes and the tool."""
+    port = bench.free_port()
+    node = bench.nodes(port, *TWO)
+    program, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
+    page = bench.page(url)
+    connected(page)
+    scan(page, 2)
+    return page, url, port, node, program
+
+
 @scenario
 def two_nodes(bench):
     """Two nodes get a program from a dropped file; the report has their serial numbers."""
@@ -225,12 +236,7 @@ def two_nodes(bench):
 @scenario
 def unplugged(bench):
     """The server of the adapter ends in the middle of an update, and comes back."""
-    port = bench.free_port()
-    node = bench.nodes(port, *TWO)
-    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
-    page = bench.page(url)
-    connected(page)
-    scan(page, 2)
+    page, _, port, node, _ = page_with_two_nodes(bench)
     drop(page, bench.image("app", size=300 * 1024))
     page.get_by_label("Choose node 5").check()
     page.get_by_role("button", name="Update node 5").click()
@@ -255,12 +261,7 @@ def unplugged(bench):
 @scenario
 def refused(bench):
     """An image for another product is refused by its label, other files by their contents."""
-    port = bench.free_port()
-    bench.nodes(port, *TWO)
-    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
-    page = bench.page(url)
-    connected(page)
-    scan(page, 2)
+    page, url, _, _, _ = page_with_two_nodes(bench)
     drop(page, bench.image("other", product=0x43))
     expect(page.locator(".verdict.no").first).to_contain_text("made for product code 00000043h, this device has 00000042h")
     page.get_by_label("Choose node 5").check()
@@ -301,12 +302,7 @@ def refused(bench):
 @scenario
 def reload_keeps_the_choice(bench):
     """The chosen devices, the file and the options are those of before a reload, in this tab alone."""
-    port = bench.free_port()
-    bench.nodes(port, *TWO)
-    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
-    page = bench.page(url)
-    connected(page)
-    scan(page, 2)
+    page, url, _, _, _ = page_with_two_nodes(bench)
     drop(page, bench.image("app"))
     expect(page.locator("#file-facts")).to_contain_text("app.blk")
     page.get_by_label("Choose node 6").check()
@@ -342,12 +338,7 @@ def reload_keeps_the_choice(bench):
 @scenario
 def reload_in_mid_update(bench):
     """A reload of the page, a second tab and a closed tab do not disturb a running update."""
-    port = bench.free_port()
-    bench.nodes(port, *TWO)
-    program, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
-    page = bench.page(url)
-    connected(page)
-    scan(page, 2)
+    page, url, _, _, program = page_with_two_nodes(bench)
     drop(page, bench.image("app", size=500 * 1024))
     page.get_by_label("Choose node 5").check()
     page.get_by_role("button", name="Update node 5").click()
@@ -448,12 +439,7 @@ def single_steps(bench):
 @scenario
 def looks(bench):
     """No part is cut off at 1280 and 390 pixels, light and dark; fields have names; no key trap."""
-    port = bench.free_port()
-    bench.nodes(port, *TWO)
-    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0")
-    first = bench.page(url)
-    connected(first)
-    scan(first, 2)
+    first, url, _, _, _ = page_with_two_nodes(bench)
     drop(first, bench.image("app"))
     first.get_by_label("Choose all devices").check()
     first.get_by_role("button", name="Update 2 devices").click()

@@ -24,7 +24,7 @@ of each.
 ";
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
-/// the feature [`SEALED`]. The first value is the default.
+/// the feature [`SEALED`]. The first value is the default (that of the split map).
 const FIELDS: [(&str, &[&str]); 35] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Some(1)", "None"]),

@@ -5,7 +5,7 @@ use canopen::program::ProgramState;
 use clap::Args;
 use coflash::device::info::{program_info, ProgramInfo};
 use coflash::device::read_state::read_state;
-use coflash::device::state::DeviceState;
+use coflash::device::state::BootloaderState;
 use coflash::device::Session;
 use coflash::update::event::{Event, Phase};
 use coflash::update::steps::{
@@ -209,7 +209,7 @@ fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
 
 /// What the device says of programs that start by themselves.
 fn autostart_words(session: &mut Session<'_>) -> Result<&'static str, Error> {
-    let is_off = |state: DeviceState| state.reason == Reason::NoAutostart as u8;
+    let is_off = |state: BootloaderState| state.reason == Reason::NoAutostart as u8;
     let state = read_state(session)?;
     Ok(if state.is_some_and(is_off) { "; no program starts by itself on this product" } else { "" })
 }

@@ -9,12 +9,10 @@ use canopen::Address;
 use seal::access::{event, CHALLENGE, DOMAIN, SEALED, SIGNED_CHALLENGE};
 use seal::key_block::ROOT_COUNT;
 use seal::wire::{array, word};
-
 use serde::Serialize;
 
 use super::doing::Doing;
-use super::error::Error;
-use super::error::{roots_words, told};
+use super::error::{roots_words, told, Error};
 use super::session::Session;
 use crate::json;
 

@@ -11,7 +11,7 @@ use shared_abi::handoff::ResetCause;
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
-use super::state::{reason, source, DeviceState};
+use super::state::{reason, source, BootloaderState};
 use crate::bus::gateway::GatewayError;
 use crate::bus::AdapterError;
 
@@ -189,7 +189,7 @@ pub enum Error {
         /// The status in 1F57h, if it could be read.
         status: Option<FlashStatus>,
         /// The state in 2007h, if the device has it.
-        state: Option<DeviceState>,
+        state: Option<BootloaderState>,
     },
     /// The program has started, and ended soon after.
     ProgramEnded {
@@ -207,7 +207,7 @@ pub enum TrialFailure {
     Silent,
     /// The device stays in its bootloader; with the status in 1F57h and the state in 2007h, if they could
     /// be read.
-    NotStarted(Option<FlashStatus>, Option<DeviceState>),
+    NotStarted(Option<FlashStatus>, Option<BootloaderState>),
     /// The program runs and does not return to the bootloader; with the abort code, if it refused.
     Stays(Option<AbortCode>),
     /// The program was called back, and nothing answers any more.
@@ -539,7 +539,7 @@ impl fmt::Display for Error {
 }
 
 /// Why a device stays in its bootloader, and how its program ended.
-fn write_why(f: &mut fmt::Formatter<'_>, state: Option<DeviceState>) -> fmt::Result {
+fn write_why(f: &mut fmt::Formatter<'_>, state: Option<BootloaderState>) -> fmt::Result {
     let Some(state) = state else { return Ok(()) };
     write!(f, "; {}", reason(state.reason))?;
     match state.ended_by() {

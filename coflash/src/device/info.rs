@@ -15,7 +15,7 @@ use super::error::{told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
 use super::session::Session;
-use super::state::DeviceState;
+use super::state::BootloaderState;
 use crate::json;
 
 /// What a device reports about itself; `None` for an object that it does not have.
@@ -47,7 +47,7 @@ pub struct DeviceInfo {
     /// What it reports about sealed images (2002h, 2003h). An application need not have these objects.
     pub security: Option<Security>,
     /// 2007h: why it stays in its bootloader; `None` for an application.
-    pub state: Option<DeviceState>,
+    pub state: Option<BootloaderState>,
 }
 
 /// The data that the user sees before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah and

@@ -9,13 +9,13 @@ use canopen::Address;
 
 use super::error::{told, Error};
 use super::session::Session;
-use super::state::DeviceState;
+use super::state::BootloaderState;
 
 /// Reads the state; `None` from a device without the object, such as an application.
 ///
 /// # Errors
 /// Those of a [read](Session::read).
-pub fn read_state(session: &mut Session<'_>) -> Result<Option<DeviceState>, Error> {
+pub fn read_state(session: &mut Session<'_>) -> Result<Option<BootloaderState>, Error> {
     let mut byte = |sub| -> Result<Option<u8>, Error> {
         let value = told(session.read_number(Address::new(DEVICE_STATE, sub)))?;
         Ok(value.map(|value| value as u8))
@@ -23,11 +23,11 @@ pub fn read_state(session: &mut Session<'_>) -> Result<Option<DeviceState>, Erro
     let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
     let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
     let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
-    Ok(Some(DeviceState { reason, program_reset, crash_resets }))
+    Ok(Some(BootloaderState { reason, program_reset, crash_resets }))
 }
 
 /// The state of a device that is in trouble already: an error of the read is no news.
-pub(crate) fn state_after_failure(session: &mut Session<'_>) -> Option<DeviceState> {
+pub(crate) fn state_after_failure(session: &mut Session<'_>) -> Option<BootloaderState> {
     read_state(session).ok().flatten()
 }
 

@@ -9,7 +9,7 @@ use shared_abi::handoff::ResetCause;
 /// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[non_exhaustive]
-pub struct DeviceState {
+pub struct BootloaderState {
     /// 2007h/2: the number of a [`Reason`].
     pub reason: u8,
     /// 2007h/3: the number of a [`ResetCause`]; 0 if it is not known.
@@ -18,7 +18,7 @@ pub struct DeviceState {
     pub crash_resets: u8,
 }
 
-impl DeviceState {
+impl BootloaderState {
     /// The reset by which the program ended, if it is known.
     #[must_use]
     pub fn ended_by(self) -> Option<ResetCause> {
@@ -65,7 +65,7 @@ pub fn reason(number: u8) -> String {
     .to_string()
 }
 
-impl fmt::Display for DeviceState {
+impl fmt::Display for BootloaderState {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "stays in the bootloader: {}", reason(self.reason))?;
         if let Some(how) = self.ended_by() {
@@ -87,7 +87,7 @@ mod tests {
     #[test]
     fn each_state_has_its_words() {
         let state = |reason, program_reset, crash_resets| {
-            DeviceState { reason, program_reset, crash_resets }.to_string()
+            BootloaderState { reason, program_reset, crash_resets }.to_string()
         };
         assert_eq!(
             state(5, 4, 1),

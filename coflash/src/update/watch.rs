@@ -8,7 +8,7 @@ use shared_abi::handoff::ResetCause;
 use super::options::FlashOptions;
 use crate::device::error::{Ended, Error};
 use crate::device::read_state::{program_watchdog, read_state};
-use crate::device::state::DeviceState;
+use crate::device::state::BootloaderState;
 use crate::device::{DeviceType, Dialect, Session};
 
 /// How long a program is watched at least.
@@ -63,5 +63,5 @@ fn ended_by(session: &mut Session<'_>, running: DeviceType) -> Result<Option<Res
     if !running.is_bootloader() {
         return Ok(None);
     }
-    Ok(read_state(session)?.and_then(DeviceState::ended_by))
+    Ok(read_state(session)?.and_then(BootloaderState::ended_by))
 }

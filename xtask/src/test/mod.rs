@@ -237,7 +237,7 @@ fn board_programs(board: &Layout, tier: Tier) -> Outcome<Vec<Program>> {
 fn programs_of_ours() -> Outcome {
     let mut cargo = process::cargo("build");
     cargo.current_dir(workspace::root()).args(on_host());
-    process::run(cargo.args(["--bin=coflash", "--bin=coboot-node"]))
+    process::run(cargo.args(["--bin=coflash", "--bin=coboot-node", "--bin=emulate"]))
 }
 
 /// Builds the images of a tier, and of those before it.

@@ -8,7 +8,7 @@ use shared_abi::handoff::ResetCause;
 
 use super::{Error, LssFailure, TrialFailure};
 use crate::device::doing::{Doing, LssDoing};
-use crate::device::state::DeviceState;
+use crate::device::state::BootloaderState;
 
 impl Error {
     /// What to do next.
@@ -121,9 +121,9 @@ impl Error {
 }
 
 /// The advice for a program after whose start the bootloader runs, by what the device says.
-fn not_started_advice(state: Option<DeviceState>) -> &'static str {
+fn not_started_advice(state: Option<BootloaderState>) -> &'static str {
     let reason = state.and_then(|state| Reason::from_byte(state.reason));
-    let ended_by = state.and_then(DeviceState::ended_by);
+    let ended_by = state.and_then(BootloaderState::ended_by);
     match (reason, ended_by) {
         (Some(Reason::Damaged), _) => {
             "flash the program again: what is in the flash is not what was sent; if it happens again, the flash is worn out"
