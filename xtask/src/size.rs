@@ -25,7 +25,7 @@ it is over the budget on any board.
 
 /// The largest permitted sizes in bytes: of resident part, header and RAM image together in the
 /// compact map, and of the two in the split map (of 16 and 64 KiB).
-const COMPACT: u32 = 32_512;
+const COMPACT: u32 = 32_256;
 const RESIDENT: u32 = 12 * 1024;
 const RAM_IMAGE: u32 = 56 * 1024;
 

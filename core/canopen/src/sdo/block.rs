@@ -126,6 +126,23 @@ impl Receiver {
         self.seen != 0 && self.blksize != 0
     }
 
+    /// The number that follows the last received segment of this sub-block, or of the previous one.
+    fn successor(&self) -> u8 {
+        if self.seen == 0 {
+            self.old.0
+        } else {
+            self.seen + 1
+        }
+    }
+
+    /// The number of the segment that the other side sends next, if none was lost; `None` after the last
+    /// one of the transfer. A new sub-block begins if the previous one came to its end.
+    pub fn due(&self) -> Option<u8> {
+        let is_new = self.seen == 0 && self.old.0 == self.old.1;
+        let next = if is_new || self.is_doubtful { self.ackseq + 1 } else { self.successor() };
+        (!self.is_complete).then_some(next)
+    }
+
     /// Whether no segment is missing before the last received one.
     pub fn is_in_order(&self) -> bool {
         self.ackseq == self.seen
@@ -168,8 +185,7 @@ impl Receiver {
             return Ok(Received::NOTHING);
         }
         self.frame = *frame;
-        let next = if self.seen == 0 { self.old.0 } else { self.seen + 1 };
-        let in_row = in_order || seqno == next || seqno == self.blksize;
+        let in_row = in_order || seqno == self.successor() || seqno == self.blksize;
         self.is_doubtful = doubtful && !in_row && fields::may_initiate(frame[0]);
         if self.is_doubtful {
             if self.seen != 0 {

@@ -195,6 +195,50 @@ fn any_other_frame_after_an_abort_is_a_request_at_once() {
     }
 }
 
+/// The time-out ends the download of a client that stopped for seconds, or another client's request ends
+/// that of one that stopped for 50 ms; then the client sends the rest of its sub-block. Its first segment
+/// may be a request; the others are none.
+#[test]
+fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
+    // Not 2Ah: the other client's request would have the number that is due.
+    for place in (1..126).filter(|place| *place != 0x2A) {
+        for is_timed_out in [true, false] {
+            let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+            bench.begin(place);
+            if is_timed_out {
+                let said = bench.wait(2300);
+                assert_eq!(said.last(), Some(&(2250, response(TIMED_OUT))), "{place}");
+            } else {
+                bench.wait(5);
+                assert_eq!(bench.ask([0x2B, 0x17, 0x10, 0, 100, 0, 0, 0]), []);
+                let said = bench.wait(60);
+                assert_eq!(said, [(55, response([0x60, 0x17, 0x10, 0, 0, 0, 0, 0]))], "{place}");
+            }
+            let first = bench.ask([place + 1, 9, 9, 9, 9, 9, 9, 9]);
+            assert_eq!(first.len(), 1, "{place}: {first:?}");
+            for seqno in place + 2..=126 {
+                // CLEAR, if it were a request.
+                assert_eq!(bench.ask([seqno, 0x51, 0x1F, 1, 3, 0, 0, 0]), [], "{seqno} after {place}");
+            }
+            assert_eq!(bench.device.control, 0, "after {place}");
+            // Any other frame, and any frame after a pause, is a request.
+            assert_eq!(bench.ask(READ_1000), [response(IS_1000)]);
+            bench.now += 3;
+            let cleared = [0x60, 0x51, 0x1F, 1, 0, 0, 0, 0];
+            assert_eq!(bench.ask([0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0]), [response(cleared)]);
+        }
+    }
+    // A request with the number that is due, and the next one with its successor's.
+    let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+    bench.begin(0x21);
+    bench.wait(2300);
+    for (asked, at) in [(0x22, 0x2002), (0x23, 0x2002)] {
+        let [low, high] = u16::to_le_bytes(at);
+        let answer = bench.ask([asked, low, high, 0, 1, 2, 3, 4]);
+        assert_eq!(answer.len(), 1, "{asked:02X}: {answer:?}");
+    }
+}
+
 /// A client on a busy machine stops for up to 200 ms anywhere in a sub-block, and goes on as if nothing
 /// had happened.
 #[test]

@@ -13,5 +13,6 @@ mod properties;
 mod second_server;
 mod server;
 mod slave;
+mod stalled_host;
 mod values;
 mod wire;

@@ -3,13 +3,29 @@
 use crate::abort::AbortCode;
 use crate::od::Objects;
 use crate::sdo::block::check_blksize;
-use crate::sdo::fields::{self, scs};
+use crate::sdo::fields::{self, ccs, scs};
 
 use super::sender::{Phase, Sender};
 use super::{SdoServer, State};
 
 impl SdoServer {
-    pub(super) fn initiate_block_upload(
+    /// A request of a block upload, with this command specifier.
+    pub(super) fn block_upload(
+        &mut self,
+        specifier: u8,
+        bytes: &[u8; 8],
+        objects: &mut impl Objects,
+    ) -> Result<(), AbortCode> {
+        match specifier {
+            ccs::INITIATE_BLOCK_UPLOAD => self.initiate_block_upload(bytes, objects),
+            ccs::START_BLOCK_UPLOAD => self.start_block_upload(),
+            ccs::ACK_BLOCK_UPLOAD => self.ack_block_upload(bytes),
+            ccs::END_BLOCK_UPLOAD => self.end_block_upload(),
+            _ => Err(self.config.unknown_request),
+        }
+    }
+
+    fn initiate_block_upload(
         &mut self,
         bytes: &[u8; 8],
         objects: &mut impl Objects,
@@ -30,7 +46,7 @@ impl SdoServer {
         Ok(())
     }
 
-    pub(super) fn start_block_upload(&mut self) -> Result<(), AbortCode> {
+    fn start_block_upload(&mut self) -> Result<(), AbortCode> {
         match &mut self.state {
             State::BlockUpload { sender, .. } if sender.phase == Phase::Initiated => {
                 sender.phase = Phase::Sending;
@@ -40,7 +56,7 @@ impl SdoServer {
         }
     }
 
-    pub(super) fn ack_block_upload(&mut self, bytes: &[u8; 8]) -> Result<(), AbortCode> {
+    fn ack_block_upload(&mut self, bytes: &[u8; 8]) -> Result<(), AbortCode> {
         match &mut self.state {
             State::BlockUpload { outgoing, sender } if sender.phase != Phase::Initiated => {
                 if let Some(end) = sender.acknowledged(bytes[1], bytes[2], outgoing)? {
@@ -52,7 +68,7 @@ impl SdoServer {
         }
     }
 
-    pub(super) fn end_block_upload(&mut self) -> Result<(), AbortCode> {
+    fn end_block_upload(&mut self) -> Result<(), AbortCode> {
         match &self.state {
             State::BlockUpload { sender, .. } if sender.phase == Phase::Ended => {
                 self.state = State::Idle;

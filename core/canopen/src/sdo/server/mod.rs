@@ -9,7 +9,7 @@
 //!   download the time-out counts from the last accepted segment, whatever else arrives.
 //! - If a sub-block of a block download stops early, the received segments are acknowledged, and
 //!   the client repeats the rest.
-//! - After an abort in the middle of a sub-block, the segments that are still on their way are no
+//! - After the end of a download in the middle of a sub-block, the segments that still come are no
 //!   requests, see `under_way.rs`.
 
 use crate::abort::AbortCode;
@@ -109,7 +109,7 @@ impl Config {
 struct Pace {
     /// The segments that take [`SUB_BLOCK_MS`] at most.
     segments: u8,
-    /// The time after which no segment follows an aborted sub-block, in milliseconds.
+    /// The longest time between two segments of a sub-block whose download has ended, in milliseconds.
     gap_ms: u8,
 }
 
@@ -163,7 +163,7 @@ pub struct SdoServer {
     heard: Instant,
     /// The answer that waits to be fetched by [`SdoServer::poll`].
     answer: Option<[u8; 8]>,
-    /// Segments of an aborted sub-block that may still arrive.
+    /// Segments that may still arrive of a sub-block whose download has ended.
     under_way: Option<UnderWay>,
     /// The value of the transferred variable or string.
     value: [u8; VALUE_MAX],
@@ -261,6 +261,7 @@ impl SdoServer {
     /// Ends the transfer without a message to the client, and drops a waiting answer.
     pub fn reset(&mut self, objects: &mut impl Objects) {
         self.end(objects);
+        self.under_way = None;
         self.answer = None;
     }
 
@@ -275,38 +276,31 @@ impl SdoServer {
             response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
-        if self.is_under_way(bytes, response, now, objects) {
+        let due = self.under_way.filter(|segments| segments.is_next(bytes, response, objects));
+        if due.is_some_and(|segments| !segments.is_over(now, self.pace().gap_ms)) {
+            self.under_way = UnderWay::behind(bytes, response, now);
             return;
         }
-        let is_other = O::has_second_server() && core::mem::replace(&mut self.response, response) != response;
-        match &self.state {
-            // A frame of the other server is no segment.
-            State::BlockDownload { receiver, .. } if !receiver.is_complete() && !is_other => {
+        // A frame of the other server is no segment, and ends its transfer.
+        if O::has_second_server() && self.response != response {
+            self.end(objects);
+            self.response = response;
+        }
+        let is_segment = match &self.state {
+            State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
-                    self.under_way = UnderWay::behind(bytes, response, now);
                     self.abort(code, objects);
                 }
+                true
             }
-            _ => self.serve(bytes, now, objects),
-        }
-    }
-
-    /// Whether a frame continues an aborted sub-block.
-    fn is_under_way(
-        &mut self,
-        bytes: &[u8; 8],
-        response: CobId,
-        now: Instant,
-        objects: &impl Objects,
-    ) -> bool {
-        let gap_ms = self.pace().gap_ms;
-        self.under_way.take_if(|segments| segments.is_over(now, gap_ms));
-        let is_next = |segments: UnderWay| segments.is_next(bytes, response, objects);
-        let is_under_way = self.under_way.is_some_and(is_next);
-        if is_under_way {
+            _ => {
+                self.serve(bytes, now, objects);
+                due.is_some()
+            }
+        };
+        if is_segment && self.answer.is_some_and(|answer| answer[0] == fields::ABORT) {
             self.under_way = UnderWay::behind(bytes, response, now);
         }
-        is_under_way
     }
 
     /// Carries out a request.
@@ -324,7 +318,7 @@ impl SdoServer {
     /// calls again later.
     pub fn poll<O: Objects>(&mut self, now: Instant, objects: &mut O) -> Option<Frame> {
         self.check_time(now, objects);
-        if self.answer.is_none() {
+        if O::has_block_upload() && self.answer.is_none() {
             if let Err(code) = self.next_block_segment(objects) {
                 self.abort(code, objects);
             }
@@ -382,14 +376,11 @@ impl SdoServer {
             ccs::UPLOAD_SEGMENT => self.upload_segment(bytes, objects),
             ccs::INITIATE_BLOCK_DOWNLOAD => self.initiate_block_download(bytes, objects),
             ccs::END_BLOCK_DOWNLOAD => self.end_block_download(bytes, objects),
-            ccs::INITIATE_BLOCK_UPLOAD if O::has_block_upload() => self.initiate_block_upload(bytes, objects),
-            ccs::START_BLOCK_UPLOAD => self.start_block_upload(),
-            ccs::ACK_BLOCK_UPLOAD => self.ack_block_upload(bytes),
-            ccs::END_BLOCK_UPLOAD => self.end_block_upload(),
             fields::ABORT => {
                 self.reset(objects);
                 Ok(())
             }
+            specifier if O::has_block_upload() => self.block_upload(specifier, bytes, objects),
             _ => Err(self.config.unknown_request),
         }
     }
@@ -418,6 +409,10 @@ impl SdoServer {
 
     /// Returns to idle, and informs the receiver of an unfinished domain.
     fn end(&mut self, objects: &mut impl Objects) {
+        if let State::BlockDownload { receiver, .. } = &self.state {
+            self.under_way =
+                receiver.due().map(|next| UnderWay { response: self.response, next, heard: self.heard });
+        }
         if self.state.incoming().is_some_and(|incoming| incoming.is_domain()) {
             objects.download_cancel(self.at);
         }

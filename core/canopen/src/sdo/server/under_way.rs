@@ -1,9 +1,11 @@
-//! Segments that arrive after the abort of their block download.
+//! Segments that arrive after the end of their block download: the server has aborted it, or has taken a
+//! client that stopped for one that is gone.
 //!
-//! A client reads an abort only after it has sent more segments. They are no requests: number 2Fh with
-//! the data 51h 1Fh 01h 03h would be a CLEAR. What continues the aborted sub-block is therefore
+//! A client reads this only after it has sent more segments. They are no requests: number 2Fh with
+//! the data 51h 1Fh 01h 03h would be a CLEAR. What continues the sub-block is therefore
 //! ignored: the next numbers in order, without a pause, until another block download begins. Every
-//! other frame is a request at once.
+//! other frame is a request at once. So is the next number after a pause; if it is refused, its
+//! successors continue the sub-block.
 //!
 //! The number of a segment and the command specifier of a request have the same place. Where a read
 //! (40h) has the number that is due, it is answered: an answer that nobody asked for changes nothing.
@@ -14,18 +16,18 @@ use crate::sdo::block::BLKSIZE_MAX;
 use crate::sdo::fields::{self, ccs};
 use crate::time::Instant;
 
-/// A pause of this many frames is the end of the aborted sub-block.
+/// A frame after a pause of this many frames is a request.
 pub(super) const FRAMES: u32 = 8;
 
-/// The segments that continue an aborted sub-block.
+/// The segments that continue a sub-block whose download has ended.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct UnderWay {
     /// The COB-ID of the answers to their client.
-    response: CobId,
+    pub response: CobId,
     /// The number of the next one.
-    next: u8,
+    pub next: u8,
     /// The time of the last one.
-    heard: Instant,
+    pub heard: Instant,
 }
 
 impl UnderWay {
