@@ -2,8 +2,19 @@
 
 #include "registers.h"
 
-/* The register value of a bit timing with the sample point near 87.5 % (CiA 301) and as many quanta
- * as possible (section 32.7.7), or 0.
+/* How often the controller is asked whether it has entered initialisation. It does so within a frame; the
+ * clock of the controller may be off or wrong.
+ */
+#define CAN_PATIENCE 1000000U
+
+static uint32_t distance(uint32_t a, uint32_t b)
+{
+    return a > b ? a - b : b - a;
+}
+
+/* The register value of the bit timing with the sample point nearest to 87.5 % (CiA 301), and of those the
+ * one with the most quanta (section 32.7.7), or 0. An edge may move the sample point by as many quanta as
+ * segment 2 has, four at most.
  */
 static uint32_t bit_timing(uint32_t clock, uint32_t bit_rate)
 {
@@ -11,14 +22,22 @@ static uint32_t bit_timing(uint32_t clock, uint32_t bit_rate)
         return 0;
     }
     const uint32_t cycles = clock / bit_rate;
+    uint32_t best = 0;
+    uint32_t best_quanta = 1;
+    uint32_t best_distance = 1;
     for (uint32_t quanta = 25; quanta >= 8; quanta--) {
         const uint32_t segment_2 = (quanta + 4) / 8;
         const uint32_t segment_1 = quanta - 1 - segment_2;
-        if (cycles % quanta == 0 && cycles / quanta <= 1024 && segment_1 <= 16) {
-            return (cycles / quanta - 1) | (segment_1 - 1) << 16 | (segment_2 - 1) << 20;
+        const uint32_t from_87_5 = distance(8 * segment_2, quanta);
+        if (cycles % quanta == 0 && cycles / quanta <= 1024 && segment_1 <= 16
+            && from_87_5 * best_quanta < best_distance * quanta) {
+            best_quanta = quanta;
+            best_distance = from_87_5;
+            best = (cycles / quanta - 1) | (segment_1 - 1) << 16 | (segment_2 - 1) << 20
+                   | (segment_2 - 1) << 24;
         }
     }
-    return 0;
+    return best;
 }
 
 /* An identifier in a filter bank with 16-bit lists: data frames with 11 bits. */
@@ -37,7 +56,10 @@ bool can_start(uint32_t clock, uint32_t bit_rate, uint16_t hear_1, uint16_t hear
     (void)RCC_APB1ENR;
     /* Leaves sleep mode and enters initialisation. */
     CAN_MCR = CAN_MCR_INRQ | CAN_MCR_ABOM;
-    while ((CAN_MSR & CAN_MSR_INAK) == 0) {
+    for (uint32_t patience = CAN_PATIENCE; (CAN_MSR & CAN_MSR_INAK) == 0; patience--) {
+        if (patience == 0) {
+            return false;
+        }
     }
     CAN_BTR = timing;
     CAN_FMR |= CAN_FMR_FINIT;
