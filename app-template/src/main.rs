@@ -47,6 +47,7 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
     use app_template::objects::{Application, HEARTBEAT_MS};
+    use bsp::clock::Source;
     use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
     use canopen::node::{self, NmtPolicy};
     use canopen::slave::{self, Slave};
@@ -89,7 +90,7 @@ mod app {
     fn init(cx: init::Context) -> (Shared, Local) {
         let mut rcc = bsp::clocks(cx.device.RCC);
         let board = bsp::init(&mut rcc, cx.device.CAN1);
-        let can = CanPort::new(board.can);
+        let can = CanPort::new(board.can, Source::Crystal);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on

@@ -10,6 +10,7 @@ pub const PRODUCT: Product = Product {
     boot_up_emergency: false,
     watchdog_ms: None,
     lss: false,
+    crystal_failure: CrystalFailure::RunFromHsi,
     block_upload: false,
     second_server: false,
     resume: false,

@@ -46,6 +46,7 @@ mod app {
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::Entry;
+    use boot_core::canopen::program::ClockSource;
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
@@ -64,7 +65,7 @@ mod app {
 
     use super::{product, start, Mono};
     use crate::log::{self, log};
-    use crate::product::PRODUCT;
+    use crate::product::{CrystalFailure, PRODUCT};
     use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;
@@ -77,12 +78,7 @@ mod app {
     const TICK_MS: u32 = 2;
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
-    const EXTRAS: Extras = Extras {
-        sealed: product::SEALED,
-        second_server: PRODUCT.second_server,
-        resume: PRODUCT.resume,
-        ..PRODUCT.profile.extras
-    };
+    const EXTRAS: Extras = PRODUCT.extras();
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
     static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
 
@@ -119,11 +115,11 @@ mod app {
         assert!(BootReport::NONE.bit_rate == BitRate::Auto as u8);
     };
 
-    /// What the product does without.
+    /// What the product has.
     pub struct Chosen;
 
     impl Choices for Chosen {
-        const SECOND_SERVER: bool = PRODUCT.second_server;
+        const EXTRAS: Extras = EXTRAS;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
     }
 
@@ -158,13 +154,15 @@ mod app {
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
+        // First: whatever the chip does not do from here on ends in a reset.
+        let watchdog = Watchdog::new(cx.device.IWDG);
+        let clock = CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
         let flash = unsafe { BootFlash::steal() };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
         #[cfg(feature = "log-uart")]
         log::uart::open(board.uart);
-        Mono::start(cx.core.SYST, bsp::SYSCLK);
+        Mono::start(cx.core.SYST, clock.tree().sysclk());
 
         let parameters = Store::open(cx.local.store);
         let report = start::boot_report().unwrap_or(BootReport::NONE);
@@ -189,6 +187,7 @@ mod app {
                 start_in_configuration: PRODUCT.lss_start_in_configuration,
                 announce: PRODUCT.lss_announce,
             }),
+            is_silent: clock == Source::Internal && PRODUCT.crystal_failure == CrystalFailure::Silent,
         };
         let mut bootloader = Bootloader::new(
             &CONFIG,
@@ -201,14 +200,18 @@ mod app {
             cx.local.room.first_mut().map_or(Sealed::NONE, Room::sealed),
         );
         bootloader.confirm(report.returned);
+        bootloader.set_clock_source(match clock {
+            Source::Crystal => ClockSource::Crystal,
+            Source::Internal => ClockSource::Internal,
+        });
         let slave = Slave::new(bootloader.lss_address(), bootloader.node_id(), node.bit_rate, slave_config);
         let (received, to_handle) = cx.local.queue.split();
         tick::spawn().ok();
         log!("stayed in the bootloader; why", report.reason.into());
         #[cfg(not(feature = "virtual-can"))]
-        let can = CanPort::new(board.can);
+        let can = CanPort::new(board.can, clock);
         #[cfg(feature = "virtual-can")]
-        let can = CanPort::new(board.uart);
+        let can = CanPort::new(board.uart, clock);
         (
             Shared { can, bootloader },
             Local {
@@ -219,7 +222,7 @@ mod app {
                 owed: report.owed,
                 held: (report.held_program > 0).then_some((report.held_program, report.window_ms)),
                 pending_reset: PendingReset { wanted: false, request: BootRequest::PowerOn, at: None },
-                watchdog: Watchdog::new(cx.device.IWDG),
+                watchdog,
                 led: board.led,
             },
         )

@@ -7,6 +7,7 @@
 
 use core::ops::RangeInclusive;
 
+use boot_core::bootloader::Extras;
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::control::{Erase, Policy, Verdict};
 use boot_core::crc::CrcKind;
@@ -27,6 +28,17 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 
 /// Whether the bootloader takes sealed images.
 pub const SEALED: bool = cfg!(feature = "sealed");
+
+/// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % (DS8626
+/// table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CrystalFailure {
+    /// It listens, until a request of the layer setting services (LSS) arrives without an error: then its
+    /// clock is good enough, and it takes part.
+    Silent,
+    /// It takes part at once. Bit 7 of the reason in its emergency says so.
+    RunFromHsi,
+}
 
 /// The choices of a product.
 #[derive(Clone, Debug)]
@@ -54,6 +66,8 @@ pub struct Product {
     pub node_source: NodeSource,
     /// Whether the node sends a boot-up message (`BLCOP_SEND_BOOTUP`).
     pub boot_up_message: bool,
+    /// What the device does when its crystal fails, and the clock of its CAN controller may be wrong.
+    pub crystal_failure: CrystalFailure,
     /// Base of the COB-ID of SDO requests; the node-ID is added. At most 780h
     /// (`BLCOP_BASE_REQUEST`).
     pub sdo_request_base: u16,
@@ -84,6 +98,9 @@ pub struct Product {
     /// Whether a download of block files that was cut off can go on where it stopped (2006h); on boards
     /// with the split map alone.
     pub resume: bool,
+    /// Whether programs can be read where the dialect says so, and 100Ah is the version of the stored
+    /// program; on boards with the split map alone.
+    pub read_back: bool,
     /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
@@ -139,6 +156,7 @@ impl Product {
         bit_rates: 0..=8,
         node_source: NodeSource::Stored,
         boot_up_message: true,
+        crystal_failure: CrystalFailure::Silent,
         sdo_request_base: 0x600,
         sdo_response_base: 0x580,
         auto_bit_rate: true,
@@ -151,6 +169,7 @@ impl Product {
         block_upload: LAYOUT.home.is_some(),
         second_server: LAYOUT.home.is_some(),
         resume: LAYOUT.home.is_some(),
+        read_back: LAYOUT.home.is_some(),
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -179,9 +198,14 @@ impl Product {
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(
-            LAYOUT.home.is_some() || !(self.block_upload || self.second_server || self.resume),
-            "product: block_upload, second_server and resume need the split map: the compact one has no room \
-             for them"
+            LAYOUT.home.is_some()
+                || !(self.block_upload || self.second_server || self.resume || self.read_back),
+            "product: block_upload, second_server, resume and read_back need the split map: the compact one \
+             has no room for them"
+        );
+        assert!(
+            self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),
+            "product: a device without lss cannot wait for it: crystal_failure must be RunFromHsi"
         );
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
@@ -272,8 +296,24 @@ impl Product {
             crc: self.crc,
             crc_step: self.crc_step,
             seal: if SEALED { self.seal() } else { SealPolicy::NONE },
+            read_back: self.reads_back(),
             ..self.profile.download
         }
+    }
+
+    /// The objects beyond those of every product.
+    pub const fn extras(&self) -> Extras {
+        Extras {
+            sealed: SEALED,
+            second_server: self.second_server,
+            resume: self.resume,
+            read_back: self.reads_back(),
+            ..self.profile.extras
+        }
+    }
+
+    const fn reads_back(&self) -> bool {
+        self.read_back && self.profile.extras.read_back
     }
 
     /// The values with which sealed images are checked.

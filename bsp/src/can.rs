@@ -5,6 +5,9 @@ use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, Standa
 use embedded_can::Frame;
 pub use shared_abi::bit_timing::BitTiming;
 
+use crate::can_modes::Modes;
+use crate::clock::Source;
+
 /// The controller's mode on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
@@ -29,23 +32,13 @@ pub struct Errors {
 }
 
 /// Offsets of registers that `bxcan` does not make public, in bytes (RM0090 section 32.9.5).
-const MCR: usize = 0x00;
-const MSR: usize = 0x04;
-const TSR: usize = 0x08;
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
-/// `CAN_MCR`: the controller leaves bus-off without a command.
-const ABOM: u32 = 1 << 6;
-/// `CAN_MSR`: initialisation and sleep mode end with the first 11 recessive bits.
-const INAK_SLAK: u32 = 0b11;
-/// `CAN_TSR`: requests to drop the frames of the three mailboxes; each bit is set until that is
-/// done.
-const ABRQ: u32 = 1 << 7 | 1 << 15 | 1 << 23;
 /// `CAN_RF0R`: a frame was lost because the FIFO was full; writing 1 clears it.
 const FOVR0: u32 = 1 << 4;
 const EPVF: u32 = 1 << 1;
 const BOFF: u32 = 1 << 2;
-/// The last error code: only software writes 7; 0 is a good frame.
+/// The last error code: only software writes 7; 0 is a good frame, and the state after a reset.
 const LEC: u32 = 7 << 4;
 
 /// Offsets of the filter registers. The master has the filters for itself and for the slave.
@@ -75,6 +68,10 @@ pub unsafe trait Controller: Instance {
 /// A bxCAN controller and one frame that may wait for a mailbox.
 pub struct Port<I: Controller> {
     can: Can<I>,
+    /// The source of the controller's clock.
+    clock: Source,
+    /// The last error code was 7 since the bit timing was set: what it says now has been heard since.
+    listens: bool,
     waiting: Option<bxcan::Frame>,
     /// If a frame waits, it is a heartbeat: it waits for the one before, on a bus that is full
     /// with frames of higher priority. It must not hold up an answer, which takes its place.
@@ -98,12 +95,33 @@ pub struct Lost {
 }
 
 impl<I: Controller> Port<I> {
-    /// Takes the controller. It receives and sends nothing before [`configure`](Self::configure)
-    /// and [`accept`](Self::accept). Interrupts of receive FIFO 0 and of the mailboxes are on.
-    pub fn new(controller: I) -> Self {
-        let mut can = Can::builder(controller).leave_disabled();
-        can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
-        Self { can, waiting: None, heartbeat_waits: false, boot_up: false, lost: Lost::default() }
+    /// Takes the controller, and the source of its clock. It receives and sends nothing before
+    /// [`configure`](Self::configure) and [`accept`](Self::accept). Interrupts of receive FIFO 0 and of
+    /// the mailboxes are on.
+    pub fn new(controller: I, clock: Source) -> Self {
+        // SAFETY: `REGISTERS` is the base of the controller that this function has taken.
+        unsafe { Modes::of(I::REGISTERS) }.initialise();
+        // It finds the controller in initialisation, and does not wait.
+        let can = Can::builder(controller).leave_disabled();
+        let (waiting, lost) = (None, Lost::default());
+        let mut port =
+            Self { can, clock, listens: false, waiting, heartbeat_waits: false, boot_up: false, lost };
+        port.enable_interrupts();
+        port
+    }
+
+    fn enable_interrupts(&mut self) {
+        self.can.enable_interrupts(Interrupts::FIFO0_MESSAGE_PENDING | Interrupts::TRANSMIT_MAILBOX_EMPTY);
+    }
+
+    /// The source of the controller's clock.
+    pub fn clock(&self) -> Source {
+        self.clock
+    }
+
+    fn modes(&mut self) -> Modes {
+        // SAFETY: `REGISTERS` is the base of the controller that this port owns.
+        unsafe { Modes::of(I::REGISTERS) }
     }
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
@@ -111,27 +129,26 @@ impl<I: Controller> Port<I> {
     /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself; this
     /// function does not wait.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
-        let config = self.can.modify_config();
-        config.set_bit_timing(timing.register()).set_silent(mode == Mode::Silent).leave_disabled();
-        // The abort comes now, after the controller has left the bus: before, it would wait for a
-        // frame that no other node acknowledges.
+        self.leave_bus();
         self.waiting = None;
-        self.write(TSR, ABRQ);
-        while self.read(TSR) & ABRQ != 0 {}
-        self.join();
+        self.modes().set_bit_timing(timing, mode);
+        self.modes().abort_all();
+        self.listens = self.forget_last_error();
+        self.modes().join();
     }
 
     /// Starts the recovery from bus-off: it ends when the bus was idle for 128 × 11 bits.
     pub fn recover_from_bus_off(&mut self) {
-        self.can.modify_config().leave_disabled();
-        self.join();
+        self.leave_bus();
+        self.modes().join();
     }
 
-    fn join(&mut self) {
-        // WouldBlock means that the bus was not idle yet; the controller waits, not this code.
-        let _: nb::Result<(), _> = self.can.enable_non_blocking();
-        // `recover_from_bus_off` decides when to leave bus-off.
-        self.write(MCR, self.read(MCR) & !ABOM);
+    /// Enters initialisation. A controller that had to be reset for it may have lost frames.
+    fn leave_bus(&mut self) {
+        if !self.modes().initialise() {
+            self.lost.in_controller = true;
+            self.enable_interrupts();
+        }
     }
 
     /// Sets the acceptance filters to exactly these identifiers (data frames, 11 bits), all into
@@ -205,8 +222,11 @@ impl<I: Controller> Port<I> {
         self.put_waiting();
     }
 
-    /// Moves the waiting frame, if any, into a mailbox if one is free.
+    /// Moves the waiting frame, if any, into a mailbox if one is free and the controller is on the bus.
     fn put_waiting(&mut self) {
+        if !self.modes().is_on_bus() {
+            return;
+        }
         if let Some(Ok(status)) = self.waiting.as_ref().map(|frame| self.can.transmit(frame)) {
             // A frame of lower priority may have been removed from its mailbox: it is sent next.
             self.waiting = status.dequeued_frame().cloned();
@@ -224,14 +244,21 @@ impl<I: Controller> Port<I> {
     /// Reads the controller's error state.
     pub fn errors(&mut self) -> Errors {
         let status = self.read(ESR);
-        self.write(ESR, LEC);
         let last = match status & LEC {
+            _ if !self.listens => None,
             LEC => None,
             0 => Some(Ok(())),
             _ => Some(Err(())),
         };
-        let joined = self.read(MSR) & INAK_SLAK == 0;
+        self.listens |= self.forget_last_error();
+        let joined = self.modes().is_on_bus();
         Errors { off: status & BOFF != 0, passive: status & EPVF != 0, joined, last }
+    }
+
+    /// Sets the last error code to "none"; returns whether it is.
+    fn forget_last_error(&mut self) -> bool {
+        self.write(ESR, LEC);
+        self.read(ESR) & LEC == LEC
     }
 
     /// The places where frames were lost since the previous call.

@@ -2,6 +2,8 @@
 //! same). It is for code that must be small and must be able to restore the reset state. An
 //! application uses the HAL's way, [`crate::clocks`].
 
+use canopen::BitRate;
+use shared_abi::bit_timing::BitTiming;
 use shared_abi::geometry::Limits;
 
 /// How a board makes its clocks from its crystal.
@@ -28,7 +30,8 @@ pub struct ClockTree {
 /// The input of the PLL.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The internal oscillator: it needs no start-up time, and is exact to 1 %.
+    /// The internal oscillator (HSI): it needs no start-up time, and is exact to 4 % over the
+    /// temperature (DS8626 table 41), which is too little for CAN.
     Internal,
     /// The crystal: it is exact, and needs some milliseconds to start.
     Crystal,
@@ -38,6 +41,30 @@ pub enum Source {
 pub const HSI: u32 = 16_000_000;
 
 impl ClockTree {
+    /// The tree with HSI in place of the crystal. The core is slower, so that it stays within its limits
+    /// when HSI is 5 % too fast, and the CAN controller can be set to the same bit rates.
+    #[must_use]
+    pub const fn internal(self) -> Self {
+        let mut internal = Self { hse: HSI, pll_n: self.pll_n * 20 / 21, ..self };
+        while !internal.makes_the_bit_rates_of(&self) && internal.pll_n > 50 {
+            internal.pll_n -= 1;
+        }
+        internal
+    }
+
+    /// Whether the CAN controller can be set to each bit rate to which it can be set with the other tree.
+    const fn makes_the_bit_rates_of(&self, other: &Self) -> bool {
+        let (mut i, rates) = (0, BitRate::TABLE);
+        while i < rates.len() {
+            let has = BitTiming::new(self.apb1_clock(), rates[i]).is_some();
+            if !has && BitTiming::new(other.apb1_clock(), rates[i]).is_some() {
+                return false;
+            }
+            i += 1;
+        }
+        true
+    }
+
     /// The core's clock in Hz.
     #[must_use]
     pub const fn sysclk(&self) -> u32 {
@@ -65,9 +92,19 @@ impl ClockTree {
     /// Whether a chip with these limits can run with the tree.
     ///
     /// # Errors
-    /// The broken rule, in words (RM0090 sections 7.3.2 and 7.3.3;
+    /// The broken rule, in words (RM0090 sections 7.3.2 and 7.3.3; DS8626 tables 38 and 39;
     /// [`Line::limits`](shared_abi::geometry::Line::limits)).
     pub const fn check(&self, limits: &Limits) -> Result<(), &'static str> {
+        let (lowest, highest) =
+            if self.hse_bypass { (1_000_000, 50_000_000) } else { (4_000_000, 26_000_000) };
+        if self.hse < lowest || self.hse > highest {
+            return Err(if self.hse_bypass {
+                "board: a clock on OSC_IN (hse_bypass) has 1 to 50 MHz"
+            } else {
+                "board: hse must be a crystal of 4 to 26 MHz; a board without one cannot have coboot: HSI is \
+                 too inexact for CAN"
+            });
+        }
         if self.pll_input == 0
             || !self.hse.is_multiple_of(self.pll_input)
             || !HSI.is_multiple_of(self.pll_input)
@@ -76,6 +113,9 @@ impl ClockTree {
         }
         if self.pll_input < 1_000_000 || self.pll_input > 2_000_000 {
             return Err("board: the PLL's input must be 1 to 2 MHz");
+        }
+        if self.hse / self.pll_input < 2 || self.hse / self.pll_input > 63 {
+            return Err("board: the crystal is divided by 2 to 63 for the PLL (PLLM)");
         }
         if self.pll_n < 50 || self.pll_n > 432 {
             return Err("board: the PLL's multiplier must be 50 to 432");
@@ -191,9 +231,34 @@ mod tests {
         assert!(tree.check(&Line::F413.limits()).unwrap_err().contains("every 25 MHz"));
     }
 
+    /// With HSI 5 % too fast the core must not be above 168 or 100 MHz; by hand: 40 MHz make all bit rates
+    /// that 42 MHz make, and so do 36 and 45 MHz those of 40 and 50.
+    #[test]
+    fn with_hsi_the_core_stays_within_its_limits_and_the_bit_rates_stay() {
+        for (line, tree, core, apb1) in [
+            (Line::F407, FAST, 160, 40),
+            (Line::F446, ClockTree { pll_n: 160, ..FAST }, 144, 36),
+            (Line::F412, SLOW, 90, 45),
+        ] {
+            let internal = tree.internal();
+            assert_eq!(internal.sysclk(), core * 1_000_000);
+            assert_eq!(internal.apb1_clock(), apb1 * 1_000_000);
+            assert_eq!(internal.check(&line.limits()), Ok(()));
+            assert!(internal.sysclk() / 20 * 21 <= tree.sysclk());
+        }
+    }
+
     #[test]
     fn numbers_that_no_tree_has_are_refused() {
         for wrong in [
+            ClockTree { hse: 0, ..FAST },
+            ClockTree { hse: 2_000_000, ..FAST },
+            ClockTree { hse: 3_999_999, pll_input: 1_333_333, ..FAST },
+            ClockTree { hse: 28_000_000, ..FAST },
+            ClockTree { hse: 80_000_000, ..FAST },
+            ClockTree { hse: 52_000_000, hse_bypass: true, ..FAST },
+            // By 1 for the PLL.
+            ClockTree { hse: 2_000_000, hse_bypass: true, ..FAST },
             ClockTree { pll_input: 0, ..FAST },
             ClockTree { pll_input: 3_000_000, ..FAST },
             ClockTree { pll_input: 4_000_000, ..FAST },
@@ -206,6 +271,13 @@ mod tests {
             ClockTree { wait_states: 16, ..FAST },
         ] {
             assert!(wrong.check(&Line::F407.limits()).is_err(), "{wrong:?}");
+        }
+        for right in [
+            ClockTree { hse: 4_000_000, ..FAST },
+            ClockTree { hse: 26_000_000, ..FAST },
+            ClockTree { hse: 50_000_000, hse_bypass: true, ..FAST },
+        ] {
+            assert_eq!(right.check(&Line::F407.limits()), Ok(()), "{right:?}");
         }
     }
 }

@@ -143,6 +143,8 @@ pub const NODE_ID: u8 = FACTS.node_id;
 pub const BIT_RATE: u32 = FACTS.bit_rate;
 /// How the clocks are made; the chip can run with them.
 pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&CHIP.line.limits());
+/// The same with HSI in place of the crystal.
+pub const INTERNAL: ClockTree = CLOCK_TREE.internal().checked(&CHIP.line.limits());
 /// The pin that asks for the bootloader after a reset.
 pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
 
@@ -169,6 +171,52 @@ const _: () = assert!(
     BIT_RATE == 0 || BitTiming::new(CAN_CLOCK, BIT_RATE).is_some(),
     "board: the clock of the CAN controller (APB1) cannot make bit_rate"
 );
+const _: () = assert!(
+    matches!(NODE_ID, 1..=127 | 255),
+    "board: node_id must be 1 to 127, or 255 for a device that waits for layer setting services"
+);
+const _: () = {
+    let led = FACTS.led;
+    assert!(exists(led), "board: the chip has no such pin as led names");
+    assert!(!is_debug(led), "board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)");
+    assert!(
+        exists(FACTS.can_pins.transmit) && exists(FACTS.can_pins.receive),
+        "board: the chip has no such pins as can_pins names"
+    );
+    assert!(!is_can(led), "board: led is a pin of the CAN controller");
+    if let Some(Strap { port, pin, .. }) = ENTRY_STRAP {
+        let strap = (port, pin);
+        assert!(!is_debug(strap), "board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)");
+        assert!(!is_can(strap), "board: entry_strap is a pin of the CAN controller");
+        assert!(!is_same(strap, led), "board: entry_strap is the pin of the LED");
+    }
+    if let Some((standby, _)) = FACTS.can_standby {
+        assert!(exists(standby), "board: the chip has no such pin as can_standby names");
+        assert!(!is_debug(standby), "board: can_standby is a pin of the debugger (PA13 to PA15, PB3, PB4)");
+        assert!(!is_can(standby), "board: can_standby is a pin of the CAN controller");
+        assert!(!is_same(standby, led), "board: can_standby is the pin of the LED");
+    }
+};
+
+const fn is_same(a: Pin, b: Pin) -> bool {
+    a.0 == b.0 && a.1 == b.1
+}
+
+/// Whether the chip has this pin.
+const fn exists(pin: Pin) -> bool {
+    (pin.0 as u32).wrapping_sub('A' as u32) < CHIP.ports as u32 && pin.1 < 16
+}
+
+/// Whether the debugger has this pin after a reset (RM0090 section 38.4.1).
+const fn is_debug(pin: Pin) -> bool {
+    matches!(pin, ('A', 13..=15) | ('B', 3..=4))
+}
+
+/// Whether the CAN controller has this pin.
+const fn is_can(pin: Pin) -> bool {
+    is_same(pin, FACTS.can_pins.transmit) || is_same(pin, FACTS.can_pins.receive)
+}
+
 const _: () = assert!(
     match ENTRY_STRAP {
         Some(strap) => strap.is_possible(CHIP.ports),

@@ -15,6 +15,7 @@
 //! | `pll.rs` | the clock tree in the registers of the chip, and the regulator |
 //! | `drivers.rs` | the set-up that is the same for every board: clocks, pins, entry strap |
 //! | [`can`] | bxCAN: bit timing, filters, send, receive, errors |
+//! | `can_modes.rs` | bxCAN's operating modes, register by register |
 //! | `can_controllers.rs` | the use of CAN2 in place of CAN1 |
 //! | [`uart`] | a UART without waiting |
 //! | [`ring`], [`slcan`], `virtual_can.rs` | CAN over the UART, in the SLCAN protocol (feature `virtual-can`) |
@@ -28,6 +29,7 @@
 pub mod can;
 #[cfg(target_arch = "arm")]
 pub mod can_controllers;
+mod can_modes;
 pub mod clock;
 #[cfg(target_arch = "arm")]
 #[cfg_attr(not(feature = "debugger"), path = "no_debugger.rs")]

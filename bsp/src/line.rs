@@ -8,7 +8,6 @@ use crate::facts::CAN_CLOCK;
 
 /// The bit timing of the board's CAN controller for each bit rate; `None` if there is none.
 pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
-
 /// Whether the board's CAN controller can run at this bit rate; true for a bit rate that must be
 /// detected.
 #[must_use]
@@ -30,8 +29,13 @@ mod port {
     use canopen::{BitRate, CobId, Frame};
 
     use super::TIMINGS;
-    use crate::can::{Errors, Mode};
+    use crate::can::{BitTiming, Errors, Mode};
+    use crate::clock::Source;
+    use crate::facts::INTERNAL;
     use crate::port::CanPort;
+
+    /// The timings while the core runs from HSI.
+    const INTERNAL_TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(INTERNAL.apb1_clock(), BitRate::TABLE);
 
     /// Empties the controller's FIFO, which holds three frames. `take` returns whether there was
     /// room for a frame; without room the frame is lost. The client repeats it after its time-out,
@@ -58,8 +62,12 @@ mod port {
     }
 
     fn configure(can: &mut CanPort, rate: BitRate, mode: Mode) {
+        let timings = match can.clock() {
+            Source::Crystal => &TIMINGS,
+            Source::Internal => &INTERNAL_TIMINGS,
+        };
         // No other bit rate is requested: `supports` refuses it.
-        if let Some(Some(timing)) = TIMINGS.get(rate as usize) {
+        if let Some(Some(timing)) = timings.get(rate as usize) {
             can.configure(*timing, mode);
         }
     }

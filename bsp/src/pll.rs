@@ -4,8 +4,8 @@ use cortex_m::peripheral::SCB;
 use shared_abi::reset;
 use stm32f4xx_hal::pac;
 
-use crate::clock::{ClockTree, Source, HSI};
-use crate::facts::{CHIP, SYSCLK};
+use crate::clock::{ClockTree, Source};
+use crate::facts::{CHIP, CLOCK_TREE, INTERNAL, SYSCLK};
 
 const HSEON: u32 = 1 << 16;
 const HSERDY: u32 = 1 << 17;
@@ -15,14 +15,24 @@ const PLLRDY: u32 = 1 << 25;
 /// RCC_CFGR: the system clock in use, as the chip reports it.
 const SWS_PLL: u32 = 0b10 << 2;
 const SWS: u32 = 0b11 << 2;
-/// Number of checks of a crystal or of the regulator before it is given up: at 16 MHz and 8
-/// cycles a check this is 50 ms, ten times the start-up time of a crystal.
+/// Number of checks of a crystal, of the PLL or of the regulator before it is given up: at 16 MHz and
+/// 8 cycles a check this is 50 ms, ten times the start-up time of a crystal.
 const PATIENCE: u32 = 100_000;
 
+impl Source {
+    /// The clock tree with this source.
+    #[must_use]
+    pub const fn tree(self) -> &'static ClockTree {
+        match self {
+            Self::Internal => &INTERNAL,
+            Self::Crystal => &CLOCK_TREE,
+        }
+    }
+}
+
 impl ClockTree {
-    /// Runs the core from the PLL. If the crystal does not start, the PLL uses the internal
-    /// oscillator until the next reset: a device that is hard to reach is better than an
-    /// unreachable one.
+    /// Runs the core from the PLL, and returns its source: if the crystal does not start, that is the
+    /// internal oscillator, until the next reset.
     pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
         // The PLL cannot be changed while it runs (section 7.3.2).
         if rcc.cr().read().bits() & PLLON != 0 {
@@ -35,27 +45,28 @@ impl ClockTree {
                 set(rcc, HSEBYP);
             }
             set(rcc, HSEON);
-            if (0..PATIENCE).any(|_| rcc.cr().read().bits() & HSERDY != 0) {
+            if reaches(rcc.cr().as_ptr(), HSERDY, HSERDY) {
                 source = Source::Crystal;
             }
         }
-        let (from, bit) = match source {
-            Source::Internal => (HSI, 0),
-            Source::Crystal => (self.hse, 1 << 22),
-        };
-        let pll = (from / self.pll_input) | (self.pll_n << 6) | ((self.pll_p / 2 - 1) << 16) | bit;
+        let tree = source.tree();
+        let bit = if source == Source::Crystal { 1 << 22 } else { 0 };
+        let pll = (tree.hse / tree.pll_input) | (tree.pll_n << 6) | ((tree.pll_p / 2 - 1) << 16) | bit;
         // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
         // keep their reset values.
         rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
         raise_voltage(rcc);
         set(rcc, PLLON);
         latency(self.wait_states);
-        while rcc.cr().read().bits() & PLLRDY == 0 {}
+        wait(rcc.cr().as_ptr(), PLLRDY, PLLRDY);
         await_voltage();
-        // SAFETY: valid dividers of the buses, and the PLL as system clock.
-        rcc.cfgr()
-            .write(|w| unsafe { w.bits((prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13) | 0b10) });
-        while rcc.cfgr().read().bits() & SWS != SWS_PLL {}
+        // The buses are divided before the clock rises.
+        let dividers = (prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13);
+        // SAFETY: valid dividers of the buses.
+        rcc.cfgr().write(|w| unsafe { w.bits(dividers) });
+        // SAFETY: the same, and the PLL as system clock.
+        rcc.cfgr().write(|w| unsafe { w.bits(dividers | 0b10) });
+        wait(rcc.cfgr().as_ptr(), SWS, SWS_PLL);
         source
     }
 
@@ -63,10 +74,10 @@ impl ClockTree {
     pub fn slow_down(&self, rcc: &pac::RCC) {
         // SAFETY: the reset value.
         rcc.cfgr().write(|w| unsafe { w.bits(0) });
-        while rcc.cfgr().read().bits() & SWS != 0 {}
+        wait(rcc.cfgr().as_ptr(), SWS, 0);
         // SAFETY: the reset values; nothing uses the PLL or the crystal any more.
         rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
-        while rcc.cr().read().bits() & PLLRDY != 0 {}
+        wait(rcc.cr().as_ptr(), PLLRDY, 0);
         // SAFETY: the reset value.
         rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
         lower_voltage(rcc);
@@ -89,17 +100,29 @@ pub(crate) fn raise_voltage(rcc: &pac::RCC) {
     }
 }
 
-/// Waits until the regulator has reached its scale; that happens when the PLL runs. If it does
-/// not reach it, the chip resets: the core must not run faster than the scale allows, and a
-/// supply that was too weak can be better after the reset.
+/// Waits until the regulator has reached its scale; that happens when the PLL runs. The core must not
+/// run faster than the scale allows.
 fn await_voltage() {
     /// PWR_CSR.
     const VOSRDY: u32 = 1 << 14;
-    // SAFETY: reading this register changes nothing.
-    let is_ready = || unsafe { pac::PWR::steal() }.csr().read().bits() & VOSRDY != 0;
-    if NEEDS_SCALE_1 && !(0..PATIENCE).any(|_| is_ready()) {
+    if NEEDS_SCALE_1 {
+        // SAFETY: only its address is taken.
+        wait(unsafe { pac::PWR::steal() }.csr().as_ptr(), VOSRDY, VOSRDY);
+    }
+}
+
+/// Waits until the chip has done what it was told. If it never does, it is reset: a clock or a supply
+/// that was too weak can be better after it, and nothing hangs.
+fn wait(register: *const u32, bits: u32, value: u32) {
+    if !reaches(register, bits, value) {
         SCB::sys_reset();
     }
+}
+
+/// Whether bits of a register have a value before they are given up.
+fn reaches(register: *const u32, bits: u32, value: u32) -> bool {
+    // SAFETY: the callers pass registers of RCC, PWR and FLASH; reading them has no effect.
+    (0..PATIENCE).any(|_| unsafe { register.read_volatile() } & bits == value)
 }
 
 /// Restores the regulator's reset state. The PLL must be off.
@@ -114,6 +137,9 @@ fn lower_voltage(rcc: &pac::RCC) {
 fn voltage(rcc: &pac::RCC, scale: u32) {
     // SAFETY: it enables the clock of the power controller and leaves the others on.
     rcc.apb1enr().modify(|r, w| unsafe { w.bits(r.bits() | PWREN) });
+    // The first access comes two cycles after the clock: reading back takes that long (ES0305 and
+    // ES0287, delay after an RCC peripheral clock enabling).
+    let _ = rcc.apb1enr().read();
     // SAFETY: nothing else uses it; only the scale in its register is written.
     let pwr = unsafe { pac::PWR::steal() };
     // SAFETY: a scale that the line has (1 or 2); the other bits stay.
@@ -133,7 +159,7 @@ fn latency(wait_states: u32) {
     let acr = unsafe { &*pac::FLASH::ptr() }.acr();
     // SAFETY: 0 to 15.
     acr.modify(|r, w| unsafe { w.bits((r.bits() & !0xF) | wait_states) });
-    while acr.read().bits() & 0xF != wait_states {}
+    wait(acr.as_ptr(), 0xF, wait_states);
 }
 
 /// The code of a divider in PPRE1 and PPRE2.

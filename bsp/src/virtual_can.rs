@@ -7,6 +7,7 @@ use embedded_can::{Frame, Id};
 use stm32f4xx_hal::pac::Interrupt;
 
 use crate::can::{BitTiming, Errors, Lost, Mode};
+use crate::clock::Source;
 use crate::facts::UartController;
 use crate::identity::serial_number;
 use crate::ring::{Inbox, Ring};
@@ -32,7 +33,7 @@ pub struct Port {
 
 impl Port {
     /// Takes the UART. No frame is received before [`accept`](Self::accept).
-    pub fn new(uart: uart::Port<UartController>) -> Self {
+    pub fn new(uart: uart::Port<UartController>, _clock: Source) -> Self {
         let mut port = Self {
             uart,
             slcan: Slcan::new(serial_number() as u16),
@@ -43,6 +44,11 @@ impl Port {
         uart::on_interrupt(serve);
         port.uart.call_for_bytes();
         port
+    }
+
+    /// A serial line has no bit timing.
+    pub fn clock(&self) -> Source {
+        Source::Crystal
     }
 
     /// Does nothing: a serial line has no bit timing, and no other node that a silent one could

@@ -391,6 +391,71 @@ const MISTAKES: &[Mistake] = &[
         by: By::Board,
         says: "board: the flash needs a wait state for every 30 MHz",
     },
+    // DS10693: HSE 4 to 26 MHz with a crystal, 1 to 50 MHz with a clock on OSC_IN.
+    Mistake {
+        file: BOARD,
+        right: "hse: 8_000_000",
+        wrong: "hse: 80_000_000",
+        by: By::Board,
+        says: "board: a clock on OSC_IN (hse_bypass) has 1 to 50 MHz",
+    },
+    Mistake {
+        file: BOARD,
+        right: "hse: 8_000_000,\n        hse_bypass: true",
+        wrong: "hse: 0,\n        hse_bypass: false",
+        by: By::Board,
+        says: "board: hse must be a crystal of 4 to 26 MHz",
+    },
+    Mistake {
+        file: BOARD,
+        right: "hse: 8_000_000",
+        wrong: "hse: 2_000_000",
+        by: By::Board,
+        says: "board: the crystal is divided by 2 to 63 for the PLL (PLLM)",
+    },
+    Mistake {
+        file: BOARD,
+        right: "node_id: 1",
+        wrong: "node_id: 200",
+        by: By::Board,
+        says: "board: node_id must be 1 to 127, or 255",
+    },
+    // RM0390, SWJ debug port pins.
+    Mistake {
+        file: BOARD,
+        right: "port: 'C', pin: 13",
+        wrong: "port: 'A', pin: 13",
+        by: By::Board,
+        says: "board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)",
+    },
+    Mistake {
+        file: BOARD,
+        right: "port: 'C', pin: 13",
+        wrong: "port: 'B', pin: 8",
+        by: By::Board,
+        says: "board: entry_strap is a pin of the CAN controller",
+    },
+    Mistake {
+        file: BOARD,
+        right: "port: 'C', pin: 13",
+        wrong: "port: 'A', pin: 5",
+        by: By::Board,
+        says: "board: entry_strap is the pin of the LED",
+    },
+    Mistake {
+        file: BOARD,
+        right: "led: ('A', 5)",
+        wrong: "led: ('B', 3)",
+        by: By::Board,
+        says: "board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)",
+    },
+    Mistake {
+        file: BOARD,
+        right: "led: ('A', 5)",
+        wrong: "led: ('B', 9)",
+        by: By::Board,
+        says: "board: led is a pin of the CAN controller",
+    },
     // RM0390, register boundary addresses: ports A to H.
     Mistake {
         file: BOARD,

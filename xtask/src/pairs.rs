@@ -25,7 +25,7 @@ of each.
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
-const FIELDS: [(&str, &[&str]); 35] = [
+const FIELDS: [(&str, &[&str]); 37] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Some(1)", "None"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -34,6 +34,7 @@ const FIELDS: [(&str, &[&str]); 35] = [
     ("bit_rates", &["0..=8", "2..=6"]),
     ("node_source", &["NodeSource::Stored", "NodeSource::Constant", SWITCHES]),
     ("boot_up_message", &["true", "false"]),
+    ("crystal_failure", &["CrystalFailure::Silent", "CrystalFailure::RunFromHsi"]),
     ("sdo_request_base", &["0x600", "0x680"]),
     ("sdo_response_base", &["0x580", "0x480"]),
     ("auto_bit_rate", &["true", "false"]),
@@ -60,6 +61,7 @@ const FIELDS: [(&str, &[&str]); 35] = [
     ("counter_with_confirmation", &["false", "true"]),
     ("second_server", &["true", "false"]),
     ("resume", &["true", "false"]),
+    ("read_back", &["true", "false"]),
     (SEALED, &["false", "true"]),
 ];
 
@@ -140,14 +142,15 @@ fn words(row: &Row) -> String {
 }
 
 /// Whether a product may have these choices (`Product::checked`): a rescue window delays a program
-/// that starts by itself, so it needs such a program; a sealed image carries a CRC-32. `None` is a field
-/// without a choice yet.
+/// that starts by itself, so it needs such a program; a sealed image carries a CRC-32; a silent device waits
+/// for LSS. `None` is a field without a choice yet.
 fn allowed(row: &[Option<u8>; FIELDS.len()]) -> bool {
     let is = |name: &str, value: u8| {
         FIELDS.iter().zip(row).any(|((field, _), chosen)| *field == name && *chosen == Some(value))
     };
     let window = is("rescue_window_ms", 0) || is("rescue_window_confirmed_ms", 1);
-    !(is("autostart", 1) && window || is(SEALED, 1) && is("crc", 1))
+    let is_mute = is("lss", 1) && is("crystal_failure", 0);
+    !(is("autostart", 1) && window || is(SEALED, 1) && is("crc", 1) || is_mute)
 }
 
 /// Rows in which any two compatible values are together at least once. Each row takes a pair that

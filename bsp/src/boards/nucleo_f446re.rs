@@ -14,9 +14,9 @@ pub const FACTS: Facts = Facts {
     },
     node_id: 1,
     bit_rate: 125_000,
-    // 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). HSI alone would be enough for the
-    // core, but its error of 1 % is too large for CAN above 125 kbit/s. If the ST-LINK has been broken
-    // off and no crystal X3 is fitted, the bootloader falls back to HSI.
+    // 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). If the ST-LINK has been broken off
+    // and no crystal X3 is fitted, the bootloader runs from HSI, whose error is too large for CAN at any
+    // bit rate: it only listens (`crystal_failure` of the product).
     //
     // The core runs at 160 MHz instead of the 180 MHz that the chip reaches with over-drive: APB1 at
     // 40 MHz makes each bit rate of CiA 301; 45 MHz and 42 MHz do not make 800 kbit/s.

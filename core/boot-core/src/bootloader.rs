@@ -11,8 +11,8 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY,
-    PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
+    control_count, ClockSource, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS,
+    IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
     SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_PROGRAM_WATCHDOG, UNLOCK,
     UNLOCK_ENTRIES,
 };
@@ -54,6 +54,11 @@ impl Extras {
         second_server: true,
         resume: true,
     };
+
+    /// Whether an object takes a password.
+    const fn has_password(self) -> bool {
+        !matches!(self.password, PasswordObject::None)
+    }
 }
 
 /// The object for a password.
@@ -117,11 +122,16 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
 /// 1018h/4.
 const SERIAL_NUMBER: u8 = 4;
 
-/// What a bootloader can do without, on a chip with little room: the compiler leaves out the code.
+/// What a bootloader has: for what it has not, it has no code.
 pub trait Choices {
-    /// Whether there is a second SDO server (1201h), by which one client writes a program to several
-    /// devices at once.
-    const SECOND_SERVER: bool = true;
+    /// The objects of its dictionary.
+    const EXTRAS: Extras = Extras {
+        password: PasswordObject::Unlock,
+        read_back: true,
+        sealed: true,
+        second_server: true,
+        resume: true,
+    };
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
 }
@@ -165,8 +175,8 @@ pub struct Config {
 pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices = Everything> {
     config: &'static Config,
     serial_number: u32,
-    /// 2007h/1 to 4.
-    state: [u8; 4],
+    /// 2007h/1 to 5.
+    state: [u8; 5],
     /// Node-ID and bit rate as stored.
     node: NodeParameters,
     /// The active node-ID.
@@ -205,7 +215,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         let mut bootloader = Self {
             config,
             serial_number,
-            state: [0, report.reason, report.program_reset, report.crash_resets],
+            state: [0, report.reason, report.program_reset, report.crash_resets, 0],
             node,
             id: config.node_id.or(node.id),
             flash,
@@ -230,6 +240,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.id
     }
 
+    /// Sets 2007h/5. From the internal oscillator, the emergency behind the boot-up has bit 7 set in its
+    /// last byte.
+    pub fn set_clock_source(&mut self, source: ClockSource) {
+        self.state[4] = source as u8;
+    }
+
     /// The address of the device for layer setting services.
     #[must_use]
     pub fn lss_address(&self) -> LssAddress {
@@ -240,7 +256,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
         self.report_outcome();
-        if step == Step::Idle && self.config.download.read_back {
+        if C::EXTRAS.read_back && step == Step::Idle && self.config.download.read_back {
             return self.stored_version.step(&self.flash, self.download.installed(1));
         }
         step
@@ -254,7 +270,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// Reports the result of work on the flash by an emergency.
     fn report_outcome(&mut self) {
         // No other success ends the wait: anybody may send a command that succeeds.
-        if self.download.rights_mut().take_authentic() {
+        if C::EXTRAS.sealed && self.download.rights_mut().take_authentic() {
             self.signatures.succeed();
         }
         match self.download.take_outcome() {
@@ -262,7 +278,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
             Some((_, Ok(()))) => self.emcy.clear(emcy::register::MANUFACTURER),
             Some((program, Err(error))) => {
                 // To check a signature takes the device a tenth of a second.
-                if self.download.rights().is_present() && error == FlashError::Signature {
+                if C::EXTRAS.sealed && self.download.rights().is_present() && error == FlashError::Signature {
                     self.signatures.fail(self.now);
                 }
                 let code = match error {
@@ -303,10 +319,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {
         // A reset would end the wait after a wrong password, and so speed up guessing.
-        if self.lock.is_waiting(self.now) {
+        if C::EXTRAS.has_password() && self.lock.is_waiting(self.now) {
             return true;
         }
-        if self.download.rights().is_present() && self.signatures.remembers(self.now) {
+        if C::EXTRAS.sealed && self.download.rights().is_present() && self.signatures.remembers(self.now) {
             return true;
         }
         self.download.is_finishing()
@@ -334,7 +350,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     for Bootloader<'_, F, P, PROGRAMS, C>
 {
     fn has_second_server() -> bool {
-        C::SECOND_SERVER
+        C::EXTRAS.second_server
     }
 
     fn has_block_upload() -> bool {
@@ -349,7 +365,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if let Some(read) = self.id.and_then(|id| self.emcy.read(id, at, buf)) {
             return read;
         }
-        if at == Address::new(SOFTWARE_VERSION, 0) {
+        if C::EXTRAS.read_back && at == Address::new(SOFTWARE_VERSION, 0) {
             if let Some(version) = self.stored_version.text() {
                 return put(buf, version);
             }
@@ -366,7 +382,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             }
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
             PROGRAM_ID => self.download.identification(at.sub),
-            SECOND_SERVER if C::SECOND_SERVER => self.second_server.read(at.sub),
+            SECOND_SERVER if C::EXTRAS.second_server => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(at.sub).to_word(),
             PROGRAM_VERSION => self.download.version(at.sub),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
@@ -380,17 +396,17 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             return written;
         }
         match (at.index, data) {
-            (ACCESS, request) => {
+            (ACCESS, request) if C::EXTRAS.sealed => {
                 if self.signatures.is_waiting(self.now) {
                     return Err(AbortCode::DEVICE_STATE);
                 }
                 self.download.ask(&self.flash, request)
             }
-            (SECOND_SERVER, &[a, b, c, d]) if C::SECOND_SERVER => {
+            (SECOND_SERVER, &[a, b, c, d]) if C::EXTRAS.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
-            (ENABLE_FLASH | UNLOCK, password) => {
+            (ENABLE_FLASH | UNLOCK, password) if C::EXTRAS.has_password() => {
                 self.lock.open(password, self.now)?;
                 match at.index {
                     ENABLE_FLASH => self.download.unlock(at.sub, true),
@@ -402,7 +418,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn download_start(&mut self, at: Address, size: Option<u32>) -> Result<(), AbortCode> {
-        if self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now) {
+        if C::EXTRAS.sealed && self.download.rights().takes_no_other() && self.signatures.is_waiting(self.now)
+        {
             return Err(AbortCode::DEVICE_STATE);
         }
         self.download.download_start(at.sub, size)
@@ -427,10 +444,16 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn upload_start(&mut self, at: Address) -> Result<Option<u32>, AbortCode> {
+        if !C::EXTRAS.read_back {
+            return Err(AbortCode::WRITE_ONLY);
+        }
         self.download.stored(at.sub).map(|stored| Some(stored.size))
     }
 
     fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
+        if !C::EXTRAS.read_back {
+            return Err(AbortCode::WRITE_ONLY);
+        }
         let stored = self.download.stored(at.sub)?;
         let rest = stored.size.saturating_sub(offset) as usize;
         let len = rest.min(buf.len());
@@ -439,7 +462,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
     }
 
     fn second_server(&self) -> Channel {
-        if C::SECOND_SERVER {
+        if C::EXTRAS.second_server {
             self.second_server.channel()
         } else {
             Channel::NONE
@@ -492,7 +515,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> SlaveDevice
         // Reset communication takes 1201h back to its default (CiA 301 clause 7.3.2.2.1).
         self.second_server = SecondServer::NONE;
         if id.is_some() && self.config.boot_up_emergency {
-            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', self.state[1]]);
+            let [_, reason, _, _, clock] = self.state;
+            let reason = if clock == ClockSource::Internal as u8 { 0x80 | reason } else { reason };
+            self.emcy.announce(emcy::code::DEVICE_SPECIFIC, [b'B', b'O', b'O', b'T', reason]);
         }
     }
 }

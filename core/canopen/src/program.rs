@@ -111,11 +111,23 @@ pub const STATE_REASON: u8 = 2;
 pub const STATE_PROGRAM_RESET: u8 = 3;
 /// In [`DEVICE_STATE`]: resets in a row by which a program ended and that nobody requested.
 pub const STATE_CRASH_RESETS: u8 = 4;
+/// In [`DEVICE_STATE`]: the [`ClockSource`]; 0 for a device without one.
+pub const STATE_CLOCK: u8 = 5;
 /// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
 /// watchdog, which the bootloader starts; 0 if it does not.
 pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
+/// The source of a device's clock ([`STATE_CLOCK`]).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum ClockSource {
+    /// The crystal of the board, or the clock that it gets from outside.
+    Crystal = 1,
+    /// The internal oscillator, because the crystal has failed.
+    Internal = 2,
+}
+
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 6] = [
+pub const STATE_ENTRIES: [Entry; 7] = [
     Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_WATCHDOG),
     Entry::sub(DEVICE_STATE, 1, "Program number of the bootloader", DataType::Unsigned8, Access::Const),
     Entry::sub(
@@ -133,6 +145,7 @@ pub const STATE_ENTRIES: [Entry; 6] = [
         Access::Ro,
     ),
     Entry::sub(DEVICE_STATE, STATE_CRASH_RESETS, "Crash resets in a row", DataType::Unsigned8, Access::Ro),
+    Entry::sub(DEVICE_STATE, STATE_CLOCK, "Source of the clock", DataType::Unsigned8, Access::Ro),
     Entry::sub(
         DEVICE_STATE,
         STATE_PROGRAM_WATCHDOG,

@@ -42,12 +42,15 @@ pub struct Config {
     pub node: node::Config,
     /// The configuration of the layer setting services; `None` for a slave without them.
     pub lss: Option<lss::Config>,
+    /// Whether the slave only listens until a request of the layer setting services arrives: its clock may
+    /// be wrong, and a frame without an error shows that it is good enough.
+    pub is_silent: bool,
 }
 
 impl Default for Config {
     /// With layer setting services.
     fn default() -> Self {
-        Self { node: node::Config::default(), lss: Some(lss::Config::default()) }
+        Self { node: node::Config::default(), lss: Some(lss::Config::default()), is_silent: false }
     }
 }
 
@@ -89,6 +92,8 @@ enum Line {
     Down(BitRate),
     /// The slave detects the bit rate; the controller is set to `set`.
     Listening { detector: Detector, set: Option<BitRate> },
+    /// The controller listens at this rate, until a request of the layer setting services arrives.
+    Silent(BitRate),
     /// The controller takes part in the bus.
     Up { monitor: Monitor, recover_from_bus_off: bool },
 }
@@ -148,9 +153,14 @@ impl Slave {
     /// Processes any received frame; returns whether the NMT master requested a restart of the
     /// device. In this case a running transfer has ended, and a waiting answer was dropped.
     pub fn handle<D: SlaveDevice>(&mut self, frame: &Frame, now: Instant, device: &mut D) -> bool {
-        // A controller that only listens cannot send answers.
-        if !matches!(self.line, Line::Up { .. }) {
-            return false;
+        match self.line {
+            Line::Up { .. } => {}
+            Line::Silent(rate) if frame.has_cob_id(CobId::LSS_REQUEST) => {
+                self.config.is_silent = false;
+                self.line = Line::Down(rate);
+            }
+            // A controller that only listens cannot send answers.
+            _ => return false,
         }
         if self.config.lss.is_some() {
             self.lss.handle(frame, now, device);
@@ -180,7 +190,7 @@ impl Slave {
             device.line_event(LineEvent::Lost(lost));
         }
         match &mut self.line {
-            Line::Down(_) => {}
+            Line::Down(_) | Line::Silent(_) => {}
             Line::Listening { detector, .. } => {
                 if detector.heard(status.heard, now, |rate| device.supports(rate)) {
                     self.line = Line::Down(detector.rate());
@@ -210,6 +220,11 @@ impl Slave {
                     self.line = Line::Listening { detector, set: None };
                     continue;
                 }
+                &mut Line::Down(rate) if self.config.is_silent => {
+                    self.line = Line::Silent(rate);
+                    return Some(Output::Listen(rate));
+                }
+                Line::Silent(_) => return None,
                 &mut Line::Down(rate) => {
                     self.config.node.sdo.bit_rate = rate;
                     if let Some(node) = &mut self.node {

@@ -545,11 +545,11 @@ fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_
 /// A product that does without them has no second server, and a request for a block upload is unknown.
 #[test]
 fn what_a_product_does_without_is_not_there() {
-    use boot_core::bootloader::{Bootloader, Choices};
+    use boot_core::bootloader::{Bootloader, Choices, Extras};
     use canopen::sdo::server::{Config as ServerConfig, SdoServer};
     struct Least;
     impl Choices for Least {
-        const SECOND_SERVER: bool = false;
+        const EXTRAS: Extras = Extras { second_server: false, resume: false, ..Extras::STANDARD };
         const BLOCK_UPLOAD: bool = false;
     }
     let mut flash = ModelFlash::new(&CHIP);
@@ -562,6 +562,12 @@ fn what_a_product_does_without_is_not_there() {
     assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
     assert_eq!(least.second_server(), channel);
     assert!(least.read(Address::new(0x1201, 1), &mut [0; 4]).is_err());
+    // Nor does it take a password, or give a program back.
+    for index in [0x7F50, 0x6005, 0x2002] {
+        assert!(least.write(Address::new(index, 1), &[0; 4]).is_err(), "{index:04X}h");
+    }
+    assert!(least.upload_start(Address::new(0x1F50, 1)).is_err());
+    assert!(least.upload_data(Address::new(0x1F50, 1), 0, &mut [0; 7]).is_err());
 
     let unknown_request = AbortCode(0x0800_0000);
     let node = NodeId::new(5).unwrap();

@@ -172,6 +172,45 @@ fn a_device_without_node_id_lets_lss_in_alone_and_boots_when_it_gets_one() {
     assert_eq!(bench.device.ids, [None, Some(9)]);
 }
 
+/// A device whose crystal has failed. Identify remote slave, six frames (CiA 305), is answered without a
+/// node-ID or a switch before it.
+#[test]
+fn a_silent_slave_says_nothing_until_a_request_of_lss_arrives() {
+    let config = Config { is_silent: true, ..Config::default() };
+    for rate in [BitRate::K250, BitRate::Auto] {
+        let slave = Slave::new(ADDRESS, NodeId::new(5), rate, config);
+        let mut bench = Bench { slave, device: Device::default(), now: 0 };
+        let first = bench.outputs();
+        assert_eq!(first[0], accept([0x000, 0x7E5, 0x605]));
+        if rate == BitRate::Auto {
+            // It hears a frame at its first rate, which proves the rate; the frame may be of anybody.
+            assert_eq!(first[1..], [Output::Listen(BitRate::K125)]);
+            bench.hear(Heard::Frame);
+            assert_eq!(bench.outputs(), [Output::Listen(BitRate::K125)]);
+        } else {
+            assert_eq!(first[1..], [Output::Listen(BitRate::K250)]);
+        }
+        for now in [10, 1_000, 100_000] {
+            bench.now = now;
+            bench.hear(Heard::Error);
+            bench.hear(Heard::Frame);
+            assert_eq!(bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]), [], "{rate:?}");
+            assert!(!bench.put(0x000, &[0x81, 0]));
+            assert_eq!(bench.outputs(), [], "{rate:?}");
+        }
+        let joins = Output::Join(if rate == BitRate::Auto { BitRate::K125 } else { rate });
+        let identify = [(0x46, 1), (0x47, 2), (0x48, 3), (0x49, 3), (0x4A, 4), (0x4B, 4)];
+        let said: Vec<Output> = identify
+            .into_iter()
+            .flat_map(|(command, number)| bench.ask(0x7E5, &[command, number, 0, 0, 0, 0, 0, 0]))
+            .collect();
+        let boot_up = send(0x705, &[0]);
+        assert_eq!(said, [joins, boot_up, send(0x7E4, &[0x4F, 0, 0, 0, 0, 0, 0, 0])], "{rate:?}");
+        let answer = bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+        assert_eq!(answer, [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
+    }
+}
+
 /// A product may disable layer setting services.
 #[test]
 fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {

@@ -51,6 +51,7 @@ unsafe fn HardFault(_frame: &cortex_m_rt::ExceptionFrame) -> ! {
 #[rtic::app(device = bsp::pac, peripherals = true, dispatchers = [SPI1])]
 mod app {
     use app_template::objects::{Application, HEARTBEAT_MS};
+    use bsp::clock::Source;
     use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
     use canopen::node::{self, NmtPolicy};
     use canopen::slave::{self, Slave, SlaveDevice};
@@ -97,9 +98,9 @@ mod app {
         let mut rcc = bsp::clocks(cx.device.RCC);
         let board = bsp::init(&mut rcc, cx.device.CAN1);
         #[cfg(not(feature = "virtual-can"))]
-        let can = CanPort::new(board.can);
+        let can = CanPort::new(board.can, Source::Crystal);
         #[cfg(feature = "virtual-can")]
-        let can = CanPort::new(board.uart);
+        let can = CanPort::new(board.uart, Source::Crystal);
         Mono::start(cx.core.SYST, bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on

@@ -1,0 +1,99 @@
+//! The operating modes of bxCAN, register by register (RM0090 section 32.4). `bxcan` waits without a bound
+//! for a controller that does not follow, and goes from one mode to another through sleep, where status
+//! bits stand still. Here each wait is bounded, and the order is that of the drivers in the field:
+//! initialisation, bit timing, normal mode.
+
+use bxcan::RegisterBlock;
+
+use crate::can::{BitTiming, Mode};
+
+/// Offsets of the registers, in bytes (RM0090 section 32.9.5).
+const MCR: usize = 0x00;
+const MSR: usize = 0x04;
+const TSR: usize = 0x08;
+const BTR: usize = 0x1C;
+/// `CAN_MCR`: initialisation is requested.
+const INRQ: u32 = 1 << 0;
+/// `CAN_MCR`: sleep is requested.
+const SLEEP: u32 = 1 << 1;
+/// `CAN_MCR`: the controller leaves bus-off without a command. Here the slave decides when.
+const ABOM: u32 = 1 << 6;
+/// `CAN_MCR`: all but bit timing, filters and interrupts is as after a reset, and the controller sleeps.
+const RESET: u32 = 1 << 15;
+/// `CAN_MSR`: initialisation is entered.
+const INAK: u32 = 1 << 0;
+/// `CAN_MSR`: initialisation and sleep end with the first 11 recessive bits.
+const INAK_SLAK: u32 = 0b11;
+/// `CAN_TSR`: requests to drop the frames of the three mailboxes; each bit is set until that is
+/// done.
+const ABRQ: u32 = 1 << 7 | 1 << 15 | 1 << 23;
+/// `CAN_BTR`: the controller only listens.
+const SILM: u32 = 1 << 31;
+
+/// Number of checks of a status bit before the controller is reset. Ten cycles each at 168 MHz are 30 ms:
+/// a controller leaves the bus when the frame is over, and no frame takes more than 16 ms (160 bits at 10
+/// kbit/s).
+const PATIENCE: u32 = 500_000;
+
+/// The registers of a controller.
+pub(crate) struct Modes(*mut RegisterBlock);
+
+impl Modes {
+    /// The controller at this address.
+    ///
+    /// # Safety
+    /// It is the base of the registers of a bxCAN controller with its clock on, which the caller owns.
+    pub unsafe fn of(registers: *mut RegisterBlock) -> Self {
+        Self(registers)
+    }
+
+    /// Enters initialisation (section 32.4.1). Returns false if the controller did not follow and was
+    /// reset: reports exist of a busy bus on which it never does.
+    pub fn initialise(&mut self) -> bool {
+        let is_in = self.try_to_initialise();
+        if !is_in {
+            self.write(MCR, RESET);
+            self.try_to_initialise();
+        }
+        is_in
+    }
+
+    fn try_to_initialise(&mut self) -> bool {
+        self.write(MCR, self.read(MCR) & !SLEEP | INRQ);
+        (0..PATIENCE).any(|_| self.read(MSR) & INAK_SLAK == INAK)
+    }
+
+    /// Sets the bit timing, in initialisation (section 32.7.7).
+    pub fn set_bit_timing(&mut self, timing: BitTiming, mode: Mode) {
+        let silent = if mode == Mode::Silent { SILM } else { 0 };
+        self.write(BTR, timing.register() | silent);
+    }
+
+    /// Drops the frames of the mailboxes. In initialisation no frame is on its way (section 32.7.1), and
+    /// the status bits follow, which they do not in sleep.
+    pub fn abort_all(&mut self) {
+        self.write(TSR, ABRQ);
+        let _ = (0..PATIENCE).any(|_| self.read(TSR) & ABRQ == 0);
+    }
+
+    /// Leaves initialisation: the controller waits for 11 recessive bits by itself (section 32.4.2).
+    pub fn join(&mut self) {
+        self.write(MCR, self.read(MCR) & !(INRQ | SLEEP | ABOM));
+    }
+
+    /// Whether the controller has seen the bus idle, and takes part.
+    pub fn is_on_bus(&self) -> bool {
+        self.read(MSR) & INAK_SLAK == 0
+    }
+
+    fn read(&self, offset: usize) -> u32 {
+        // SAFETY: `of` promises the registers, and the offset is one of those above; reading them has no
+        // effect.
+        unsafe { self.0.cast::<u32>().byte_add(offset).read_volatile() }
+    }
+
+    fn write(&mut self, offset: usize, value: u32) {
+        // SAFETY: as above; section 32.9.2 allows these values in these modes.
+        unsafe { self.0.cast::<u32>().byte_add(offset).write_volatile(value) }
+    }
+}
