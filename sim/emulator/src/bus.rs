@@ -9,8 +9,8 @@
 //!   before the end of frame is over (10.9), transmitted ones at its end.
 //! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very
 //!   same bits both succeed; the same identifier with other bits after it is a bit error.
-//! - A node whose bit rate differs by more than 1 % from the transmitter's reads the frame at its
-//!   own sample points, without resynchronisation. It sees a stuff error, and unless it is error
+//! - A node whose bit rate differs from the transmitter's by more than its bit timing tolerates
+//!   ([`Line::tolerance_ppm`]) reads the frame at its own sample points, without resynchronisation. It sees a stuff error, and unless it is error
 //!   passive or silent it destroys the frame for everybody.
 //! - All consequences of a bad frame reach the nodes when its error delimiter is over. An error
 //!   flag is superposed to 12 bits where the nodes see the error at different bits, and has 6 or 7
@@ -51,8 +51,8 @@ const SUSPEND_BITS: u32 = 8;
 const SEQUENCE_BITS: u64 = 11;
 /// After so many bits, nodes that began together at different rates have noticed it.
 const CLASH_BITS: u32 = 12;
-/// Bit rates that differ by more than this part are different.
-const TOLERANCE_PARTS: u64 = 100;
+/// The tolerance of a sender that is no node of this bus.
+const GATEWAY_TOLERANCE_PPM: u32 = 10_000;
 
 /// The earliest time, in bits after the start of a frame, at which a node notices the result of the
 /// frame: six bits of an error flag and eight of its delimiter. Nodes may run ahead of each other
@@ -214,8 +214,9 @@ fn bits(bit: Span, count: u32) -> Span {
     Span(bit.0.saturating_mul(u64::from(count)))
 }
 
-fn in_tune(a: Span, b: Span) -> bool {
-    a.0.abs_diff(b.0) <= a.0.min(b.0) / TOLERANCE_PARTS
+/// Whether bits of two lengths are the same to a node with this tolerance. A bit has 10^8 ps at most.
+fn in_tune(a: Span, b: Span, tolerance_ppm: u32) -> bool {
+    a.0.abs_diff(b.0) * 1_000_000 <= a.0.min(b.0) * u64::from(tolerance_ppm)
 }
 
 /// When a node with another bit rate notices that it does not understand the frame: at its sixth
@@ -430,7 +431,10 @@ impl Bus {
         };
         let (frame, bit) = (strongest.frame, strongest.bit);
         let key = frame.arbitration_key();
-        let clash = contenders.iter().any(|other| !in_tune(other.bit, bit));
+        let clash = contenders.iter().any(|other| {
+            let tolerance = other.party.map_or(GATEWAY_TOLERANCE_PPM, |party| party.line.tolerance_ppm);
+            !in_tune(other.bit, bit, tolerance)
+        });
         // A node that does not read the others' bits as bits does not lose the arbitration against
         // them.
         let (winners, losers): (Vec<&Contender>, Vec<&Contender>) =
@@ -454,7 +458,7 @@ impl Bus {
                 node.event(BusEvent::Started { own: sends }, now);
             }
             if let Some(line) = node.line().filter(|line| !sends && !line.loopback) {
-                let in_tune = !clash && in_tune(line.bit, bit);
+                let in_tune = !clash && in_tune(line.bit, bit, line.tolerance_ppm);
                 let active = !line.silent && node.confinement().state() == ErrorState::Active;
                 let flags_at = (!in_tune && !clash && active).then(|| now + misread(&wire, bit, &line));
                 receivers.push(Party { node: n, epoch: node.epoch(), line, in_tune, flags_at });

@@ -454,6 +454,19 @@ impl BxCan {
         (before * 1000 / (before + self.segment_2())) as u32
     }
 
+    /// By how much the clocks of two nodes may differ, in millionths (ISO 11898-1): in ten bits without an
+    /// edge by no more than the jump width, and in the 13 bits until an error flag is sampled by no more than
+    /// the shorter segment. Both nodes share it.
+    fn tolerance_ppm(&self) -> u32 {
+        let jump = u64::from(self.btr >> 24 & 3) + 1;
+        let bit = 1 + self.segment_1() + self.segment_2();
+        let by_jump = 1_000_000 * jump / (10 * bit);
+        let shorter = self.segment_1().min(self.segment_2());
+        let by_segment = 1_000_000 * shorter / (13 * bit - self.segment_2());
+        // Below a million: a jump is shorter than a bit.
+        by_jump.min(by_segment) as u32
+    }
+
     /// Error counters.
     #[must_use]
     pub fn error_counters(&self) -> Confinement {
@@ -936,6 +949,7 @@ impl BusNode for BxCan {
         Some(Line {
             bit: self.bit_time()?,
             sample: self.quanta(1 + self.segment_1())?,
+            tolerance_ppm: self.tolerance_ppm(),
             silent: self.btr & btr::SILM != 0,
             loopback: self.btr & btr::LBKM != 0,
         })

@@ -11,6 +11,8 @@ pub struct Line {
     pub bit: Span,
     /// The sample point within the bit.
     pub sample: Span,
+    /// By how much the bits of another node may be longer or shorter, in millionths.
+    pub tolerance_ppm: u32,
     /// It never drives the bus dominant: no frames, no acknowledge, no error flags.
     pub silent: bool,
     /// It receives its own frames and nothing else, and needs no acknowledge.

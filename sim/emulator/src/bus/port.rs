@@ -121,12 +121,16 @@ impl HostPort {
     }
 }
 
+/// The tolerance of a host's adapter: that of 16 quanta and a jump width of two, rounded.
+const TOLERANCE_PPM: u32 = 10_000;
+
 impl BusNode for HostPort {
     fn line(&self) -> Option<Line> {
         let sample = Span(self.bit.0 / 8 * 7);
         self.recovery.is_none().then_some(Line {
             bit: self.bit,
             sample,
+            tolerance_ppm: TOLERANCE_PPM,
             silent: self.silent,
             loopback: false,
         })

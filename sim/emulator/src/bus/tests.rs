@@ -344,6 +344,31 @@ fn nearly_the_same_bit_rate_is_the_same() {
     assert_eq!(bench.received(2), [], "2 % off");
 }
 
+/// ISO 11898-1, by hand. 14 quanta, segment 2 of two: with a jump width of one, 1/140 = 0.71 % between the two
+/// clocks; with two, 2/140 = 1.43 % and 2/(13 × 14 - 2) = 1.11 %, of which the smaller counts.
+#[test]
+fn what_a_controller_tolerates_follows_from_its_bit_timing() {
+    for (jump, rate, hears) in [
+        (1, 1_000_000, true),
+        (1, 1_007_000, true),
+        (1, 1_007_500, false),
+        (1, 992_500, false),
+        (2, 1_007_500, true),
+        (2, 1_011_000, true),
+        (2, 1_011_500, false),
+        (2, 989_200, true),
+        (2, 988_500, false),
+    ] {
+        let port = || Node::Port(HostPort::new(rate));
+        let mut bench = Bench::new(vec![controller((jump - 1) << 24, 0), port(), port()]);
+        bench.run(50);
+        bench.send(1, 60, boot_up());
+        bench.run(200);
+        let first = bench.log()[0].3;
+        assert_eq!(first == Outcome::Good, hears, "jump width {jump}, {rate} bit/s: {first:?}");
+    }
+}
+
 #[test]
 fn a_silent_node_neither_acknowledges_nor_disturbs() {
     let mut bench = Bench::new(vec![controller(1 << 31, 0), Node::Port(HostPort::new(1_000_000))]);
