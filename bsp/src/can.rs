@@ -126,8 +126,7 @@ impl<I: Controller> Port<I> {
 
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
-    /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself; this
-    /// function does not wait.
+    /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         self.leave_bus();
         self.waiting = None;
@@ -203,7 +202,7 @@ impl<I: Controller> Port<I> {
     pub fn has_room(&mut self) -> bool {
         self.can.clear_tx_interrupt();
         self.put_waiting();
-        self.boot_up &= !self.can.is_transmitter_idle();
+        self.boot_up &= self.waiting.is_some() || !self.can.is_transmitter_idle();
         (self.waiting.is_none() || self.heartbeat_waits) && !self.boot_up
     }
 

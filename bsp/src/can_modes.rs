@@ -35,6 +35,9 @@ const SILM: u32 = 1 << 31;
 /// kbit/s).
 const PATIENCE: u32 = 500_000;
 
+/// The same for 11 bits on an idle bus: 0.3 ms are 11 bits at 50 kbit/s.
+const SOON: u32 = 5_000;
+
 /// The registers of a controller.
 pub(crate) struct Modes(*mut RegisterBlock);
 
@@ -76,9 +79,11 @@ impl Modes {
         let _ = (0..PATIENCE).any(|_| self.read(TSR) & ABRQ == 0);
     }
 
-    /// Leaves initialisation: the controller waits for 11 recessive bits by itself (section 32.4.2).
+    /// Leaves initialisation: the controller waits for 11 recessive bits by itself (section 32.4.2). On an
+    /// idle bus they are over soon, and no frame has to wait for the next look at the controller.
     pub fn join(&mut self) {
         self.write(MCR, self.read(MCR) & !(INRQ | SLEEP | ABOM));
+        let _ = (0..SOON).any(|_| self.is_on_bus());
     }
 
     /// Whether the controller has seen the bus idle, and takes part.

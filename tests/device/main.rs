@@ -6,6 +6,7 @@ mod boot_time;
 mod bus;
 mod c_application;
 mod contention;
+mod crystal;
 mod debugger;
 mod device;
 mod handover;

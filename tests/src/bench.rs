@@ -94,6 +94,12 @@ impl Bench {
         Self::of(bootloader, vec![Options::default()])
     }
 
+    /// The same on a given chip.
+    #[must_use]
+    pub fn of_image_with(bootloader: &str, options: Options) -> Self {
+        Self::of(bootloader, vec![options])
+    }
+
     /// The same with the transceiver at this CAN controller, 1 or 2, instead of the board's own
     /// one.
     #[must_use]
@@ -143,7 +149,8 @@ impl Bench {
             .map(|options| {
                 let options = Options {
                     transceiver: usize::from(controller) - 1,
-                    hse_hz: bsp::CLOCK_TREE.hse,
+                    // Without one, the crystal has failed.
+                    hse_hz: if options.hse_hz == 0 { 0 } else { bsp::CLOCK_TREE.hse },
                     ..options
                 };
                 let mut machine = Machine::new(firmware::board().chip, options).expect("the emulator starts");

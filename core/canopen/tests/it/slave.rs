@@ -200,12 +200,14 @@ fn a_silent_slave_says_nothing_until_a_request_of_lss_arrives() {
         }
         let joins = Output::Join(if rate == BitRate::Auto { BitRate::K125 } else { rate });
         let identify = [(0x46, 1), (0x47, 2), (0x48, 3), (0x49, 3), (0x4A, 4), (0x4B, 4)];
-        let said: Vec<Output> = identify
-            .into_iter()
-            .flat_map(|(command, number)| bench.ask(0x7E5, &[command, number, 0, 0, 0, 0, 0, 0]))
-            .collect();
-        let boot_up = send(0x705, &[0]);
-        assert_eq!(said, [joins, boot_up, send(0x7E4, &[0x4F, 0, 0, 0, 0, 0, 0, 0])], "{rate:?}");
+        // The controller would hear nothing while it joins: it waits until the requests are over.
+        for (command, number) in identify {
+            assert_eq!(bench.ask(0x7E5, &[command, number, 0, 0, 0, 0, 0, 0]), []);
+            bench.now += 1;
+        }
+        bench.now += 14;
+        let (boot_up, is_he) = (send(0x705, &[0]), send(0x7E4, &[0x4F, 0, 0, 0, 0, 0, 0, 0]));
+        assert_eq!(bench.outputs(), [joins, is_he, boot_up], "{rate:?}");
         let answer = bench.ask(0x605, &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
         assert_eq!(answer, [send(0x585, &[0x43, 0, 0x10, 0, 1, 2, 3, 4])]);
     }

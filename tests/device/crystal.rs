@@ -1,0 +1,86 @@
+//! A board whose crystal has failed: the bootloader runs from the internal oscillator, whose error CAN
+//! does not tolerate (2007h/5, and the choice `crystal_failure` of the product).
+
+use canopen::Address;
+use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
+use coboot_tests::firmware;
+use emulator::bus::Outcome;
+use emulator::machine::Options;
+use emulator::time::Time;
+
+const CLOCK: Address = Address::new(0x2007, 5);
+/// The emergency behind the boot-up (CiA 301 section 7.2.7: COB-ID 80h + node-ID).
+const EMERGENCY: u32 = 0x80 + NODE as u32;
+const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+
+/// A board without a crystal, with this bootloader.
+fn failed(image: &str) -> Bench {
+    Bench::of_image_with(image, Options { hse_hz: 0, ..Options::default() })
+}
+
+/// The reason in the emergency behind the boot-up.
+fn announced(bench: &Bench) -> Option<u8> {
+    let mut frames = bench.frames_since(Time(0)).into_iter();
+    frames.find(|(_, id, _)| *id == EMERGENCY).map(|(_, _, data)| data[7])
+}
+
+#[test]
+fn with_its_crystal_a_device_says_so() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.run_ms(5);
+    assert_eq!(announced(&bench), Some(6), "no program");
+    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 1);
+}
+
+/// Another node acknowledges the host's frames.
+#[test]
+fn without_its_crystal_a_device_only_listens_until_lss_speaks() {
+    let mut bench = failed(firmware::BOOTLOADER);
+    bench.world.add_host_port(BIT_RATE);
+    bench.power_on();
+    // Reset communication, a request, another node's heartbeat.
+    for _ in 0..20 {
+        bench.run_ms(100);
+        bench.post(0x000, &[0x82, 0]);
+        bench.post(REQUEST, &READ_1000);
+        bench.post(0x70F, &[0x7F]);
+    }
+    assert!(bench.frames_since(Time(0)).iter().all(|(_, id, _)| *id < 0x080 || *id > 0x600));
+    let of_device = |(_, id, _): &(_, u32, Vec<u8>)| [RESPONSE, HEARTBEAT, EMERGENCY, 0x7E4].contains(id);
+    assert_eq!(bench.frames_since(Time(0)).into_iter().filter(of_device).count(), 0);
+    assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good));
+
+    // Switch state global to configuration, inquire node-ID (CiA 305).
+    let from = bench.time();
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
+    assert_eq!(answer.as_deref(), Some(&[0x5E, NODE, 0, 0, 0, 0, 0, 0][..]));
+    bench.post(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
+    bench.run_ms(20);
+    let said = bench.frames_since(from);
+    assert!(said.iter().any(|(_, id, data)| *id == HEARTBEAT && data == &[0]), "{said:X?}");
+    assert_eq!(announced(&bench), Some(0x80 | 6));
+    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+}
+
+/// Nobody acknowledges the host: its frames are good only when it is error passive (ISO 11898-1).
+#[test]
+fn a_silent_device_hears_a_host_that_is_alone() {
+    let mut bench = failed(firmware::BOOTLOADER);
+    bench.power_on();
+    bench.run_ms(200);
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    bench.run_ms(200);
+    assert!(bench.is_bootloader(NODE));
+}
+
+#[test]
+fn a_product_that_is_to_speak_in_any_case_does_and_says_so() {
+    let mut bench = failed(firmware::BOOTLOADER_LEAST);
+    bench.power_on();
+    bench.await_boot_up(200);
+    bench.run_ms(20);
+    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+}
