@@ -35,13 +35,13 @@ pub struct Memory {
 
 impl Memory {
     /// The memory of any STM32F4, for a judge that does not know the board: at most 320 KiB of SRAM
-    /// (STM32F413, STM32F469) and 64 KiB of core-coupled RAM. It has no handoff, whose place is that
-    /// of the board.
+    /// (STM32F413, STM32F469), 64 KiB of core-coupled RAM, and no table shorter than that of the STM32F405.
+    /// It has no handoff, whose place is that of the board.
     pub const ANY: Self = Self {
         ram: Region::new(0x2000_0000, 320 * 1024),
         sram: Region::new(0x2000_0000, 320 * 1024),
         ccm: Region::new(0x1000_0000, 64 * 1024),
-        table: 8,
+        table: crate::geometry::STM32F405RG.vector_table_size(),
     };
 
     /// The memory of a board.
@@ -222,8 +222,14 @@ mod tests {
                 chip.chip
             );
             assert_eq!(Memory::ANY.judge_stack(chip.sram.end()), Ok(()), "{}", chip.chip);
+            assert!(Memory::ANY.table <= chip.vector_table_size(), "{}", chip.chip);
         }
         assert_eq!(Memory::ANY.judge_stack(0x2005_0008), Err(VectorFault::StackPointer));
+        // The code of each chip is after its table: 16 + 82 vectors at least (RM0090 table 61).
+        let program = Region::new(0x0802_0000, 0x1000);
+        let judged = |reset| Memory::ANY.judge([0x2001_0000, reset], program);
+        assert_eq!(judged(0x0802_0187), Err(VectorFault::ResetVector));
+        assert_eq!(judged(0x0802_0189), Ok(()));
         // An image that ends in its own table has no code.
         let short = Region::new(0x0802_0000, 4);
         assert_eq!(Memory::ANY.judge([0x2001_0000, 0x0802_0001], short), Err(VectorFault::ResetVector));

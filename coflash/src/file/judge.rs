@@ -73,6 +73,14 @@ pub enum Fault {
         /// The range for a valid vector.
         range: AddressRange,
     },
+    /// The second word points into the vector table, where no code can be.
+    #[error("is not a program: its reset vector is {vector:08X}h, inside the vector table, {table}")]
+    VectorInTable {
+        /// The reset vector.
+        vector: u32,
+        /// The vector table: that of the board's chip, or the shortest of the family.
+        table: AddressRange,
+    },
     /// The reset vector points into the program, but its bit 0 is clear: this CPU only executes
     /// Thumb code.
     #[error("is not a program: its reset vector is {0:08X}h, without the Thumb bit")]
@@ -103,6 +111,10 @@ impl Fault {
             Self::ResetVector { .. } => {
                 "check that it is the right file, and that it is linked for this address (--board, --program); \
                  --force leaves that to the device"
+            }
+            Self::VectorInTable { .. } => {
+                "give the vector table its whole length, one vector for each interrupt of the chip, and let the \
+                 linker script place the code after it; --force leaves that to the device"
             }
             _ => {
                 "check that it is the right file, and that it begins with the vector table; \
@@ -140,15 +152,21 @@ pub fn judge(image: &Image, start: u32, board: Option<&Layout>) -> Result<(), Fa
         judge_stack(stack, board)?;
         return Err(Fault::Bootloader);
     }
-    let range = if start == 0 { FLASH } else { AddressRange { first: start, last } };
-    judge_words([stack, vector], range, board)
+    if start != 0 {
+        return judge_words([stack, vector], AddressRange { first: start, last }, board);
+    }
+    judge_words([stack, vector], FLASH, board)?;
+    match table_anywhere(image, vector, board) {
+        Some(table) => Err(Fault::VectorInTable { vector, table }),
+        None => Ok(()),
+    }
 }
 
 /// Judges the reset vector of an image without addresses, when its place is known: it begins at the
 /// first address of `region`.
 ///
 /// # Errors
-/// [`Fault::ResetVector`], [`Fault::NotThumb`] or [`Fault::NoVectors`].
+/// [`Fault::ResetVector`], [`Fault::VectorInTable`], [`Fault::NotThumb`] or [`Fault::NoVectors`].
 pub fn judge_place(image: &Image, region: AddressRange) -> Result<(), Fault> {
     let words = vectors(image, 0).ok_or(Fault::NoVectors)?;
     let last = region.first.saturating_add(image.span().last).min(region.last);
@@ -188,10 +206,25 @@ impl fmt::Display for StackAtEnd {
     }
 }
 
-/// The memory of the board, or that of the family. A reset vector inside the chip's vector table is left
-/// to the device: an image says nothing of the length of its own table.
+/// The memory of the board, or that of the family.
 fn memory_of(board: Option<&Layout>) -> Memory {
-    board.map_or(Memory::ANY, |layout| Memory { table: Memory::ANY.table, ..Memory::of(layout) })
+    board.map_or(Memory::ANY, Memory::of)
+}
+
+/// The vector table of a program at `range`.
+fn table_of(range: AddressRange, board: Option<&Layout>) -> AddressRange {
+    let last = range.first.saturating_add(memory_of(board).table - 1);
+    AddressRange { first: range.first, last: last.min(range.last) }
+}
+
+/// The vector table of an image without addresses, if the reset vector points into it wherever the image
+/// is linked for. A program begins with a sector, and each sector begins at a multiple of the first one's
+/// size. In an image that is longer than that size, the vector may be meant for an earlier sector.
+fn table_anywhere(image: &Image, vector: u32, board: Option<&Layout>) -> Option<AddressRange> {
+    let step = FIRST_SECTOR.len() as u32;
+    let (first, end) = (vector - vector % step, image.span().last);
+    let table = table_of(AddressRange { first, last: first.saturating_add(end) }, board);
+    (table.has(vector & !1) && end < step + vector % step).then_some(table)
 }
 
 /// Data outside the main flash, of an image with addresses.
@@ -231,7 +264,10 @@ fn named(fault: VectorFault, words: [u32; 2], range: AddressRange, board: Option
             Fault::StackOverHandoff { stack, handoff: layout.handoff.base }
         }
         (VectorFault::StackPointer | VectorFault::StackOverHandoff, _) => Fault::StackPointer(stack),
-        (VectorFault::ResetVector, _) => Fault::ResetVector { vector, range },
+        (VectorFault::ResetVector, _) => match table_of(range, board) {
+            table if table.has(vector & !1) => Fault::VectorInTable { vector, table },
+            _ => Fault::ResetVector { vector, range },
+        },
         (VectorFault::NotThumb, _) => Fault::NotThumb(vector),
         (VectorFault::Misaligned, _) => Fault::NoVectors,
     }
@@ -266,7 +302,7 @@ mod tests {
         for stack_pointer in [0x2000_0008, 0x2001_FFC0, 0x2002_0000, 0x2005_0000, 0x1001_0000, 0x1000_0008] {
             assert_eq!(with(stack_pointer, START + 0x189, START), Ok(()), "{stack_pointer:08X}h");
         }
-        for vector in [START + 9, START + 0x3FF] {
+        for vector in [START + 0x189, START + 0x3FF] {
             assert_eq!(with(0x2001_FFC0, vector, START), Ok(()), "{vector:08X}h");
         }
         // Without addresses, the image may be linked for any place of the flash that a program may
@@ -284,7 +320,7 @@ mod tests {
             assert_eq!(with(stack_pointer, START + 0x189, START), fault);
         }
         let range = AddressRange { first: START, last: START + 0x3FF };
-        for vector in [0, START - 1, START + 1, START + 0x401, 0x0800_0189, 0xFFFF_FFFF] {
+        for vector in [0, START - 1, START + 0x401, 0x0800_0189, 0xFFFF_FFFF] {
             assert_eq!(with(0x2001_FFC0, vector, START), Err(Fault::ResetVector { vector, range }));
         }
         assert_eq!(with(0x2001_FFC0, START + 0x188, START), Err(Fault::NotThumb(START + 0x188)));
@@ -292,6 +328,49 @@ mod tests {
             with(0x2001_FFC0, 0x2000_0189, 0).unwrap_err(),
             Fault::ResetVector { vector: 0x2000_0189, range: FLASH }
         );
+    }
+
+    /// The STM32F405 has the shortest table of the family, 16 + 82 vectors (RM0090 table 61), the
+    /// STM32F446 has 16 + 97 (RM0390 table 38).
+    #[test]
+    fn a_reset_vector_into_the_table_is_refused_with_the_board_and_without() {
+        let judged = |vector, board| judge(&program(0x2001_0000, vector, START), START, board);
+        for (board, size) in [(None, 98 * 4), (Some(&NUCLEO), 113 * 4)] {
+            let table = AddressRange { first: START, last: START + size - 1 };
+            for vector in [START + 1, START + 9, START + size - 1] {
+                let fault = judged(vector, board).unwrap_err();
+                assert_eq!(fault, Fault::VectorInTable { vector, table });
+                let words = fault.to_string();
+                assert!(
+                    words.contains(&format!("{vector:08X}h")) && words.contains(&table.to_string()),
+                    "{words}"
+                );
+            }
+            assert_eq!(judged(START + size + 1, board), Ok(()));
+        }
+        // An image that ends within its table has no code at all.
+        let image =
+            raw::read(&program(0x2001_0000, START + 9, START).bytes::<64>(START).unwrap(), Some(START));
+        let table = AddressRange { first: START, last: START + 63 };
+        let fault = Fault::VectorInTable { vector: START + 9, table };
+        assert_eq!(judge(&image.unwrap(), START, None), Err(fault));
+    }
+
+    /// An image without addresses may be linked for any sector, and each has a multiple of 16 KiB.
+    #[test]
+    fn a_reset_vector_that_is_in_the_table_for_each_place_is_refused() {
+        let table = AddressRange { first: 0x0800_C000, last: 0x0800_C187 };
+        let fault = Err(Fault::VectorInTable { vector: 0x0800_C009, table });
+        assert_eq!(with(0x2001_FFC0, 0x0800_C009, 0), fault);
+        // It may be the code of a program that begins a sector before.
+        let mut bytes = vec![0x5A; 0x4010];
+        bytes[..4].copy_from_slice(&0x2001_0000_u32.to_le_bytes());
+        bytes[4..8].copy_from_slice(&0x0800_C009_u32.to_le_bytes());
+        assert_eq!(judge(&raw::read(&bytes, Some(0)).unwrap(), 0, None), Ok(()));
+        // The device says where the program begins.
+        let image = program(0x2001_0000, START + 9, 0);
+        let place = judge_place(&image, AddressRange { first: START, last: START + 0xFFFF });
+        assert!(matches!(place, Err(Fault::VectorInTable { .. })), "{place:?}");
     }
 
     #[test]

@@ -164,8 +164,8 @@ impl Drop for Ui {
     }
 }
 
-/// A program of twelve bytes in Intel HEX: initial stack pointer 2001_FFC0h, reset vector 0801_0009h.
-const HEX: &[u8] = b":020000040801F1\n:0C000000C0FF012009000108EFBEADDECA\n:00000001FF\n";
+/// A program of 516 bytes in Intel HEX: initial stack pointer 2001_FFC0h, reset vector 0801_0201h.
+const HEX: &[u8] = b":020000040801F1\n:08000000C0FF0120010201080C\n:04020000EFBEADDEC2\n:00000001FF\n";
 
 #[test]
 fn without_the_token_nothing_is_told() {
@@ -354,7 +354,7 @@ fn files_of_every_kind_are_taken_or_refused_with_their_name() {
     let state = ui.until("the file", |state| !state["firmware"].is_null());
     assert_eq!(
         (&state["firmware"]["name"], &state["firmware"]["program_size"]),
-        (&json!("app.hex"), &json!(12))
+        (&json!("app.hex"), &json!(516))
     );
     // A refused file also removes the previous one, which the user no longer means.
     ui.file("bad.hex", b"no");

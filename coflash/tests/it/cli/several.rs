@@ -61,8 +61,10 @@ fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
 #[test]
 fn a_job_file_says_who_gets_what() {
     let folder = folder("job");
-    let small =
-        folder.file("small.hex", b":020000040801F1\n:0C000000001000200900010801020304A8\n:00000001FF\n");
+    let small = folder.file(
+        "small.hex",
+        b":020000040801F1\n:080000000010002001020108BC\n:0402000001020304F0\n:00000001FF\n",
+    );
     folder.file("plain.blk", &fs::read(data("plain-400.blk")).unwrap());
     let job = folder.file(
         "job.toml",
@@ -76,8 +78,11 @@ fn a_job_file_says_who_gets_what() {
     let bus = server.join().unwrap();
     let plain = fs::read(data("plain-400.blk")).unwrap();
     assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
-    // Block 0 and the last one around twelve bytes.
-    assert_eq!((bus.0[1].blocks[1][20..24].to_vec(), bus.0[1].running), (vec![1, 2, 3, 4], Some(BOOTLOADER)));
+    // Block 0 and the last one around one of 516 bytes, after whose header of 12 bytes they are.
+    assert_eq!(
+        (bus.0[1].blocks[1][12 + 0x200..][..4].to_vec(), bus.0[1].running),
+        (vec![1, 2, 3, 4], Some(BOOTLOADER))
+    );
     assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (1, 0));
     assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
     // With an invalid image, no device is changed.
