@@ -102,7 +102,7 @@ fn caught(bench: &mut Bench, options: CatchOptions) -> Caught {
 fn a_mute_program_is_not_released_and_the_device_comes_back() {
     let mut bench = board();
     let (error, left) = fails(&mut bench, &FlashOptions::default());
-    assert!(matches!(error, Error::TrialFailed { how: TrialFailure::Silent, .. }), "{error}");
+    assert!(matches!(error, Error::TrialFailed { how: TrialFailure::Silent(_), .. }), "{error}");
     assert!(error.to_string().contains("not released for autostart"), "{error}");
     assert_eq!((left.state, left.answer), (DeviceState::Unreleased, DeviceAnswer::Silent));
     assert!(bench.session().device_type().unwrap().is_none(), "it runs, and says nothing");

@@ -97,7 +97,7 @@ impl Unlock {
             ));
         }
         let words = if rights & right::OPEN != 0 {
-            "rights rights granted; the device is open from the next reset on (coflash reset)"
+            "rights granted; the device is open from the next reset on (coflash reset)"
         } else {
             "rights granted until the next reset"
         };

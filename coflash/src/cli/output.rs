@@ -511,6 +511,7 @@ impl From<Error> for Failure {
             | Error::Occupied { .. }
             | Error::StartFailed { .. }
             | Error::ProgramEnded { .. }
+            | Error::FellSilent { .. }
             | Error::TrialFailed { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };

@@ -106,15 +106,25 @@ pub struct Security {
 /// # Errors
 /// The errors of a [read](Session::read), except a refusal.
 pub fn security(session: &mut Session<'_>) -> Result<Option<Security>, Error> {
-    let Some(challenge) = told_challenge(session)? else { return Ok(None) };
+    match told_challenge(session)? {
+        Some(challenge) => security_of(session, &challenge).map(Some),
+        None => Ok(None),
+    }
+}
+
+/// The same for a device with this challenge.
+///
+/// # Errors
+/// Those of [`security`].
+pub(crate) fn security_of(session: &mut Session<'_>, challenge: &Challenge) -> Result<Security, Error> {
     let bytes = told(session.read(Address::new(ACCESS, 3)))?.unwrap_or_default();
     let mut words = bytes.chunks_exact(4).map(|bytes| word(bytes, 0));
-    Ok(Some(Security {
+    Ok(Security {
         sealed: challenge.is_sealed(),
         roots: words.by_ref().take(ROOT_COUNT).filter(|id| *id != 0).collect(),
         epoch: words.next(),
         counters: words.collect(),
-    }))
+    })
 }
 
 impl fmt::Display for Security {

@@ -96,8 +96,10 @@ pub enum Error {
         /// The ids of its root keys, as far as it reports them.
         roots: Vec<u32>,
     },
-    /// The image cannot be a program.
+    /// The image cannot be a program of this device.
     NoProgram {
+        /// The stable error number.
+        number: u32,
         /// What is wrong with it, as the rest of a sentence that begins with "the image".
         why: String,
         /// What to do next.
@@ -133,6 +135,8 @@ pub enum Error {
         running: Option<DeviceType>,
         /// The abort code, if the application refused.
         code: Option<AbortCode>,
+        /// Another node that has booted up since the call, if nothing answers.
+        elsewhere: Option<NodeId>,
     },
     /// The program in the device is not the program of the file.
     WrongCrc {
@@ -190,6 +194,8 @@ pub enum Error {
         status: Option<FlashStatus>,
         /// The state in 2007h, if the device has it.
         state: Option<BootloaderState>,
+        /// Another node that has booted up since the start, if nothing answers.
+        elsewhere: Option<NodeId>,
     },
     /// The program has started, and ended soon after.
     ProgramEnded {
@@ -198,20 +204,31 @@ pub enum Error {
         /// Its end.
         ended: Ended,
     },
+    /// The program has started and answered, and the device does not answer any more.
+    FellSilent {
+        /// The device.
+        node: NodeId,
+        /// Another node that has booted up since the start.
+        elsewhere: Option<NodeId>,
+    },
 }
 
 /// How the trial of a program failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TrialFailure {
-    /// The program was started, and nothing answers.
-    Silent,
+    /// The program was started, and nothing answers; with another node that has booted up since then.
+    Silent(Option<NodeId>),
+    /// The program has answered, and does not answer any more; with another node that has booted up since
+    /// its start.
+    FellSilent(Option<NodeId>),
     /// The device stays in its bootloader; with the status in 1F57h and the state in 2007h, if they could
     /// be read.
     NotStarted(Option<FlashStatus>, Option<BootloaderState>),
     /// The program runs and does not return to the bootloader; with the abort code, if it refused.
     Stays(Option<AbortCode>),
-    /// The program was called back, and nothing answers any more.
-    Lost,
+    /// The program was called back, and nothing answers any more; with another node that has booted up
+    /// since then.
+    Lost(Option<NodeId>),
     /// The program ran for a while and then ended by a reset.
     Ended(Ended),
 }
@@ -348,7 +365,7 @@ impl Error {
             Self::WrongTarget { what, .. } => flash_error_number(what.error()),
             // The numbers of the same errors in a firmware file, found without a device.
             Self::OtherRegion { .. } => 0x6000_0015,
-            Self::NoProgram { .. } => 0x6000_0021,
+            Self::NoProgram { number, .. } => *number,
             Self::SealedOnly { .. } => flash_error_number(FlashError::NoAccess),
             Self::NoBootloader { .. } => 0x6000_0010,
             Self::Cancelled => 0x6000_0011,
@@ -359,9 +376,10 @@ impl Error {
             Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
             Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
-            Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost, .. } => 0x6000_0010,
+            Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost(_), .. } => 0x6000_0010,
             Self::StartFailed { .. }
             | Self::ProgramEnded { .. }
+            | Self::FellSilent { .. }
             | Self::TrialFailed { .. }
             | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
@@ -450,11 +468,12 @@ impl fmt::Display for Error {
                 let what = what.words();
                 write!(f, "the program on trial tells {what} {is}, and the bootloader of node {node} {was}")
             }
-            Self::NoBootloader { node, running, code } => {
+            Self::NoBootloader { node, running, code, elsewhere } => {
                 match running {
                     Some(running) => write!(f, "node {node} stays in {running}")?,
                     None => write!(f, "node {node} does not come back in the bootloader")?,
                 }
+                write_elsewhere(f, *elsewhere)?;
                 match code {
                     Some(code) => write!(f, ": it refuses the call with abort {code}"),
                     None => Ok(()),
@@ -499,9 +518,11 @@ impl fmt::Display for Error {
             Self::TrialFailed { node, how } => {
                 write!(f, "the trial failed, and the program is not released for autostart: ")?;
                 match how {
-                    TrialFailure::Silent => {
-                        write!(f, "node {node} has not answered since the program was started")
+                    TrialFailure::Silent(elsewhere) => {
+                        write!(f, "node {node} has not answered since the program was started")?;
+                        write_elsewhere(f, *elsewhere)
                     }
+                    TrialFailure::FellSilent(elsewhere) => write_silence(f, *node, *elsewhere),
                     TrialFailure::NotStarted(status, state) => {
                         write!(f, "it does not start, node {node} stays in the bootloader")?;
                         match status.and_then(|status| status.error) {
@@ -516,18 +537,24 @@ impl fmt::Display for Error {
                     TrialFailure::Stays(Some(code)) => {
                         write!(f, "it runs in node {node}, and refuses the call to the bootloader with abort {code}")
                     }
-                    TrialFailure::Lost => {
-                        write!(f, "node {node} has not answered since the program was called back")
+                    TrialFailure::Lost(elsewhere) => {
+                        write!(f, "node {node} has not answered since the program was called back")?;
+                        write_elsewhere(f, *elsewhere)
                     }
                     TrialFailure::Ended(ended) => write!(f, "{ended} (node {node})"),
                 }
             }
             Self::ProgramEnded { node, ended } => write!(f, "the program of node {node} has ended: {ended}"),
-            Self::StartFailed { node, running, status, state } => {
+            Self::FellSilent { node, elsewhere } => {
+                f.write_str("the program does not answer any more: ")?;
+                write_silence(f, *node, *elsewhere)
+            }
+            Self::StartFailed { node, running, status, state, elsewhere } => {
                 match running {
                     Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
                     None => write!(f, "the program does not start: node {node} does not answer")?,
                 }
+                write_elsewhere(f, *elsewhere)?;
                 match status.and_then(|status| status.error) {
                     Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
                     None => Ok(()),
@@ -535,6 +562,20 @@ impl fmt::Display for Error {
                 write_why(f, *state)
             }
         }
+    }
+}
+
+/// A program that answered once.
+fn write_silence(f: &mut fmt::Formatter<'_>, node: NodeId, elsewhere: Option<NodeId>) -> fmt::Result {
+    write!(f, "it answered after its start, and node {node} is silent since then")?;
+    write_elsewhere(f, elsewhere)
+}
+
+/// A node that may be the device under another node-ID.
+fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt::Result {
+    match elsewhere {
+        Some(other) => write!(f, ", but node {other} has booted up since then"),
+        None => Ok(()),
     }
 }
 

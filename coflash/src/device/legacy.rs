@@ -113,8 +113,11 @@ mod tests {
         for (error, number) in [
             (Error::Cancelled, 0x6000_0011),
             (Error::NoAnswer { node, doing: Doing::Program }, 0x6000_0013),
-            (Error::NoBootloader { node, running: None, code: None }, 0x6000_0010),
-            (Error::StartFailed { node, running: None, status: None, state: None }, 0x6000_0014),
+            (Error::NoBootloader { node, running: None, code: None, elsewhere: None }, 0x6000_0010),
+            (
+                Error::StartFailed { node, running: None, status: None, state: None, elsewhere: None },
+                0x6000_0014,
+            ),
             (Error::Adapter(AdapterError::Url { url: adapter(), why: String::new() }), 0x6000_1019),
             (Error::Adapter(open(ErrorKind::NotFound)), 0x6000_101B),
             (Error::Adapter(open(ErrorKind::ResourceBusy)), 0x6000_101E),

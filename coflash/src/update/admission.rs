@@ -3,13 +3,14 @@
 
 use canopen::program::{DEVICE_NAME, IDENTITY};
 use canopen::Address;
+use seal::access::right;
 use shared_abi::layout;
 
-use super::content::Content;
+use super::content::{refusal_number, Content};
 use super::dialect::is_data;
 use super::options::{FlashOptions, Target};
 use super::steps::compare_target;
-use crate::device::access::{security, told_challenge};
+use crate::device::access::{security_of, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
@@ -79,7 +80,7 @@ pub(super) fn admit_to_bootloader(
 fn admit_open(session: &mut Session<'_>) -> Result<bool, Error> {
     match told_challenge(session)? {
         Some(challenge) if challenge.is_sealed() => {
-            let roots = security(session)?.map(|told| told.roots).unwrap_or_default();
+            let roots = security_of(session, &challenge)?.roots;
             Err(Error::SealedOnly { node: session.node(), roots })
         }
         challenge => Ok(challenge.is_some()),
@@ -110,10 +111,30 @@ fn admit_capable(session: &mut Session<'_>, file: &SealedFile, program: u8) -> R
         let advice =
             "write keys into the device with a debug probe (coflash provision makes the file), or flash the \
                       program as it is, not sealed";
-        return Err(Error::NoProgram { why: why.to_string(), advice });
+        return Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice });
+    }
+    if let Some(challenge) = &challenge {
+        admit_age(session, file, challenge)?;
     }
     let room = admit_room(session, file.head().size(), program)?;
     Ok(room && challenge.is_some())
+}
+
+/// Checks security counter and epoch against those that the device has had at its last reset. It may have
+/// raised them since then, and refuses the image itself in that case.
+fn admit_age(session: &mut Session<'_>, file: &SealedFile, challenge: &Challenge) -> Result<(), Error> {
+    let (head, lowest) = (file.head(), security_of(session, challenge)?);
+    let image = head.counter();
+    match lowest.counters.get(usize::from(head.program()).wrapping_sub(1)) {
+        Some(device) if image < *device && challenge.granted() & right::LOWER_COUNTER == 0 => {
+            return Err(refused(&Refusal::Counter { image, device: *device }));
+        }
+        _ => {}
+    }
+    match (head.certificate().map(|certificate| certificate.epoch()), lowest.epoch) {
+        (Some(image), Some(device)) if image < device => Err(refused(&Refusal::Epoch { image, device })),
+        _ => Ok(()),
+    }
 }
 
 /// Checks the size of a sealed image; returns whether the device has reported its room.
@@ -128,7 +149,8 @@ fn admit_room(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool,
 }
 
 fn refused(refusal: &Refusal) -> Error {
-    Error::NoProgram { why: format!("does not fit: {refusal}"), advice: refusal.advice() }
+    let (number, why) = (refusal_number(refusal), format!("does not fit: {refusal}"));
+    Error::NoProgram { number, why, advice: refusal.advice() }
 }
 
 /// Checks a stack that begins at the end of a chip's SRAM: whether the handoff is there depends on the
@@ -204,5 +226,5 @@ fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatc
 }
 
 fn no_program(fault: Fault) -> Error {
-    Error::NoProgram { why: fault.to_string(), advice: fault.advice() }
+    Error::NoProgram { number: Fault::NUMBER, why: fault.to_string(), advice: fault.advice() }
 }

@@ -88,7 +88,7 @@ pub fn enter_bootloader(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) 
 /// # Errors
 /// [`Error::NoBootloader`].
 pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
-    let node = session.node();
+    let (node, began) = (session.node(), session.now());
     let mut seen = None;
     for call in 1..=CALLS {
         match session.command(CALL_BACK, ProgramControl::StartBootloader) {
@@ -96,7 +96,7 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
             Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
             Err(Error::Refused { code, .. }) => {
                 let running = session.device_type()?;
-                return Err(Error::NoBootloader { node, running, code: Some(code) });
+                return Err(Error::NoBootloader { node, running, code: Some(code), elsewhere: None });
             }
             Err(error) => return Err(error),
         }
@@ -115,7 +115,8 @@ pub fn call_back(session: &mut Session<'_>) -> Result<DeviceType, Error> {
             return Ok(running);
         }
     }
-    Err(Error::NoBootloader { node, running: seen, code: None })
+    let elsewhere = session.booted_elsewhere_since(began).filter(|_| seen.is_none());
+    Err(Error::NoBootloader { node, running: seen, code: None, elsewhere })
 }
 
 /// The program that runs, as 1F51h reports it: `number`, or the one of [`CALL_BACK`]; `None` if
@@ -317,8 +318,9 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
     let node = session.node();
     let failed = |session: &mut Session<'_>, running| {
         let status = session.status(number).ok();
-        Error::StartFailed { node, running, status, state: state_after_failure(session) }
+        Error::StartFailed { node, running, status, state: state_after_failure(session), elsewhere: None }
     };
+    let began = session.now();
     match session.command(number, ProgramControl::Start) {
         // A device that resets at once may not send its answer.
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
@@ -331,7 +333,10 @@ pub fn start(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error>
     match settle(session, |running| !running.is_bootloader())? {
         Some(running) if !running.is_bootloader() => Ok(running),
         Some(running) => Err(failed(session, Some(running))),
-        None => Err(Error::StartFailed { node, running: None, status: None, state: None }),
+        None => {
+            let elsewhere = session.booted_elsewhere_since(began);
+            Err(Error::StartFailed { node, running: None, status: None, state: None, elsewhere })
+        }
     }
 }
 

@@ -36,13 +36,14 @@ pub(super) fn run(
 /// The same error, in the form for a program on trial.
 fn failed(error: Error) -> Error {
     let (node, how) = match error {
-        Error::StartFailed { node, running: Some(_), status, state } => {
+        Error::StartFailed { node, running: Some(_), status, state, .. } => {
             (node, TrialFailure::NotStarted(status, state))
         }
-        Error::StartFailed { node, running: None, .. } => (node, TrialFailure::Silent),
+        Error::StartFailed { node, running: None, elsewhere, .. } => (node, TrialFailure::Silent(elsewhere)),
+        Error::FellSilent { node, elsewhere } => (node, TrialFailure::FellSilent(elsewhere)),
         Error::ProgramEnded { node, ended } => (node, TrialFailure::Ended(ended)),
-        Error::NoBootloader { node, running: Some(_), code } => (node, TrialFailure::Stays(code)),
-        Error::NoBootloader { node, running: None, .. } => (node, TrialFailure::Lost),
+        Error::NoBootloader { node, running: Some(_), code, .. } => (node, TrialFailure::Stays(code)),
+        Error::NoBootloader { node, running: None, elsewhere, .. } => (node, TrialFailure::Lost(elsewhere)),
         error => return error,
     };
     Error::TrialFailed { node, how }

@@ -3,6 +3,8 @@
 
 use std::time::Duration;
 
+use canopen::program::DEVICE_TYPE;
+use canopen::Address;
 use shared_abi::handoff::ResetCause;
 
 use super::options::FlashOptions;
@@ -37,8 +39,8 @@ pub(super) fn time(
 /// message, an emergency 6000h or the bootloader's device type shows that it has ended.
 ///
 /// # Errors
-/// [`Error::ProgramEnded`], [`Error::StartFailed`] for a device that is silent at the end, and the errors of
-/// a [read](Session::read).
+/// [`Error::ProgramEnded`], [`Error::FellSilent`] for a device that is silent at the end, and the errors of a
+/// [read](Session::read).
 pub(super) fn watch(session: &mut Session<'_>, began: Duration, time: Duration) -> Result<(), Error> {
     if time.is_zero() {
         return Ok(());
@@ -48,19 +50,27 @@ pub(super) fn watch(session: &mut Session<'_>, began: Duration, time: Duration) 
     let left = (first + time).saturating_sub(session.now());
     let has_ended = session.await_end(first, left)?;
     let ran = session.now().saturating_sub(first);
-    let running = session.device_type()?;
-    if !has_ended && running.is_some_and(|running| !running.is_bootloader()) {
-        return Ok(());
+    match answering(session)? {
+        Some(running) if !has_ended && !running.is_bootloader() => Ok(()),
+        None if !has_ended => {
+            Err(Error::FellSilent { node, elsewhere: session.booted_elsewhere_since(began) })
+        }
+        running => Err(Error::ProgramEnded { node, ended: Ended { ran, by: ended_by(session, running)? } }),
     }
-    let Some(running) = running else {
-        return Err(Error::StartFailed { node, running: None, status: None, state: None });
-    };
-    Err(Error::ProgramEnded { node, ended: Ended { ran, by: ended_by(session, running)? } })
+}
+
+/// What runs at the end of the watch; `None` if no request is answered: one lost frame is no silence.
+fn answering(session: &mut Session<'_>) -> Result<Option<DeviceType>, Error> {
+    match session.read_number(Address::new(DEVICE_TYPE, 0)) {
+        Ok(number) => Ok(Some(DeviceType(number))),
+        Err(Error::NoAnswer { .. } | Error::ShortAnswer { .. } | Error::Protocol { .. }) => Ok(None),
+        Err(error) => Err(error),
+    }
 }
 
 /// How the program ended, as the bootloader reports it.
-fn ended_by(session: &mut Session<'_>, running: DeviceType) -> Result<Option<ResetCause>, Error> {
-    if !running.is_bootloader() {
+fn ended_by(session: &mut Session<'_>, running: Option<DeviceType>) -> Result<Option<ResetCause>, Error> {
+    if !running.is_some_and(DeviceType::is_bootloader) {
         return Ok(None);
     }
     Ok(read_state(session)?.and_then(BootloaderState::ended_by))

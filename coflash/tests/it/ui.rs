@@ -524,7 +524,7 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
     for (status, phase, words, advice) in [
         (0, "done", "done in", None),
         (0x8A, "failed", "the program's signature is wrong", Some("coflash verify")),
-        (0x8C, "failed", "the program is older than the device allows", Some("--counter")),
+        (0x8C, "failed", "its counter or the epoch of its key is too low", Some("coflash info")),
         (0x8E, "failed", "the device has no key for this program", Some("coflash show")),
     ] {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();

@@ -83,6 +83,15 @@ pub fn boot_up(node: NodeId) -> Frame {
     state_message(node, NmtState::Initialisation)
 }
 
+/// The node that has sent this boot-up message; `None` for every other frame.
+#[must_use]
+pub fn parse_boot_up(frame: &Frame) -> Option<NodeId> {
+    match parse_state_message(frame)? {
+        (node, NmtState::Initialisation) => Some(node),
+        _ => None,
+    }
+}
+
 /// The heartbeat of a node in this state.
 #[must_use]
 pub fn state_message(node: NodeId, state: NmtState) -> Frame {

@@ -393,7 +393,7 @@ flash_errors! {
     Signature = 0x8A, "A sealed image whose signature, certificate, chain or hash is wrong.",
         "the program's signature is wrong";
     Rollback = 0x8C, "A sealed image whose security counter or epoch is lower than the device's.",
-        "the program is older than the device allows";
+        "its counter or the epoch of its key is too low for the device";
     Key = 0x8E, "A sealed image for which the device has no key.",
         "the device has no key for this program";
 }

@@ -15,6 +15,7 @@ use std::thread;
 use std::time::Duration;
 
 use canopen::frame::Channel;
+use canopen::nmt::parse_boot_up;
 use canopen::sdo::client::SERVERS_MAX;
 use canopen::{Address, Frame, NodeId};
 
@@ -56,7 +57,8 @@ enum Ask {
     Gone(usize),
 }
 
-/// A conversation's access to the bus: it receives only the frames that concern its node.
+/// A conversation's access to the bus: it receives the frames that concern its node, and the boot-up
+/// messages of nodes that no conversation is with.
 #[derive(Debug)]
 pub struct Port {
     number: usize,
@@ -146,6 +148,7 @@ pub fn run<'c, R: Send + 'c>(
     terms: &Terms,
 ) -> Vec<R> {
     let count = conversations.len();
+    let nodes: Vec<NodeId> = conversations.iter().map(|conversation| conversation.node).collect();
     let mut meetings = Meetings::new(terms);
     let mut turns = Turns::default();
     let mut waiting: VecDeque<_> = conversations.into_iter().enumerate().collect();
@@ -182,7 +185,7 @@ pub fn run<'c, R: Send + 'c>(
             if lost.is_none() {
                 lost = meetings.go_on(adapter, &mut lines, is_complete).err();
             }
-            serve(adapter, &mut lines, &mut meetings, &mut turns, &mut lost);
+            serve(adapter, &nodes, &mut lines, &mut meetings, &mut turns, &mut lost);
         }
     });
     drop(done);
@@ -249,6 +252,7 @@ fn settle(
 /// Waits until at least one conversation or the group can continue, and wakes it.
 fn serve(
     adapter: &mut dyn Adapter,
+    nodes: &[NodeId],
     lines: &mut [Option<Line>],
     meetings: &mut Meetings,
     turns: &mut Turns,
@@ -284,7 +288,9 @@ fn serve(
             _ => continue,
         };
         let frame = match &received {
-            Ok(Some(frame)) if concerns(frame, line.node) => Ok(Some(*frame)),
+            Ok(Some(frame)) if concerns(frame, line.node) || is_strangers_boot_up(frame, nodes) => {
+                Ok(Some(*frame))
+            }
             Ok(Some(_)) if until + GRACE > now => continue,
             Ok(None) if until > now => continue,
             // Its frames are not sent yet, so its time has not begun.
@@ -306,6 +312,12 @@ fn concerns(frame: &Frame, node: NodeId) -> bool {
     let from =
         |id: u16| id & 0x7F == u16::from(node.get()) && matches!(id & 0x780, 0x080 | 0x580 | 0x600 | 0x700);
     frame.cob_id().is_some_and(|id| from(id.get()))
+}
+
+/// Whether a node has booted up that no conversation is with: it may be one of their devices, under
+/// another node-ID.
+fn is_strangers_boot_up(frame: &Frame, nodes: &[NodeId]) -> bool {
+    parse_boot_up(frame).is_some_and(|node| !nodes.contains(&node))
 }
 
 /// Copies the error, so that each conversation gets it.

@@ -1,12 +1,13 @@
 //! The advice for an error.
 
 use canopen::program::FlashError;
-use canopen::AbortCode;
+use canopen::program::{ACCESS, EVENTS};
+use canopen::{AbortCode, NodeId};
 
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
-use super::{Error, LssFailure, TrialFailure};
+use super::{absent, Error, LssFailure, TrialFailure};
 use crate::device::doing::{Doing, LssDoing};
 use crate::device::state::BootloaderState;
 
@@ -29,6 +30,13 @@ impl Error {
                 if at.index == canopen::debugger::DEBUGGER =>
             {
                 debugger_advice(*code).to_string()
+            }
+            Self::Refused { doing: Doing::Read(at) | Doing::Write(at), code, .. }
+                if matches!(at.index, ACCESS | EVENTS) && absent(*code) =>
+            {
+                "the bootloader has this object, and its application need not have it: coflash enter calls the \
+                 bootloader; one without support for sealed images has none"
+                    .to_string()
             }
             Self::Refused { code, .. } => refusal_advice(*code).to_string(),
             Self::NotInDialect { .. } => "leave out this option, or name another dialect with --dialect".to_string(),
@@ -60,6 +68,10 @@ impl Error {
                                            one that has an identity of its own is flashed with --no-trial"
                 .to_string(),
             Self::Busy { .. } => "give it more time with --command-timeout, or switch the device off and on".to_string(),
+            Self::NoBootloader { elsewhere: Some(other), .. } => format!(
+                "if node {other} is this device (coflash info --node {other}), its bootloader has another node-ID than \
+                 its application: run the command again with --node {other}"
+            ),
             Self::NoBootloader { code: Some(_), .. } => {
                 "this application cannot be called back: bring the device into the bootloader by its entry strap, or \
                  within its rescue window after power-on"
@@ -95,7 +107,19 @@ impl Error {
             Self::TrialFailed { how: TrialFailure::NotStarted(_, state), .. } => {
                 not_started_advice(*state).to_string()
             }
-            Self::TrialFailed { node, how: TrialFailure::Silent | TrialFailure::Lost } => format!(
+            Self::TrialFailed {
+                how:
+                    TrialFailure::Silent(Some(other))
+                    | TrialFailure::FellSilent(Some(other))
+                    | TrialFailure::Lost(Some(other)),
+                ..
+            } => {
+                format!("{}; one that is to keep its own is flashed with --no-trial", elsewhere_advice(*other))
+            }
+            Self::TrialFailed {
+                node,
+                how: TrialFailure::Silent(None) | TrialFailure::FellSilent(None) | TrialFailure::Lost(None),
+            } => format!(
                 "switch the device off and on: it comes up in the bootloader, ready for another program (coflash catch \
                  --node {node} waits for it); the program may crash or have a wrong bit rate; for one that answers \
                  under another node-ID than its bootloader there is --no-trial"
@@ -112,12 +136,23 @@ impl Error {
             Self::StartFailed { running: Some(running), state, .. } if running.is_bootloader() => {
                 not_started_advice(*state).to_string()
             }
-            Self::StartFailed { node, .. } => format!(
+            Self::StartFailed { elsewhere: Some(other), .. } | Self::FellSilent { elsewhere: Some(other), .. } => {
+                elsewhere_advice(*other)
+            }
+            Self::StartFailed { node, .. } | Self::FellSilent { node, .. } => format!(
                 "the program may not speak CANopen, use another node-ID or bit rate, or crash: run coflash catch --node \
                  {node}, switch the device off and on, and flash another one; if it is not caught, use its entry strap"
             ),
         }
     }
+}
+
+/// The advice for a device that may have come back as this node.
+fn elsewhere_advice(other: NodeId) -> String {
+    format!(
+        "if node {other} is this device (coflash info --node {other}), its program has another node-ID than its \
+         bootloader: let it take that of the handoff (docs/application.md)"
+    )
 }
 
 /// The advice for a program after whose start the bootloader runs, by what the device says.
@@ -186,7 +221,9 @@ fn failure_advice(error: FlashError) -> &'static str {
             "check that file and device belong together (coflash info shows the device's identity)"
         }
         FlashError::NoAccess => {
-            "the device forbids updates at present: ask its manufacturer how to unlock it"
+            "the device forbids this at present. If it is sealed (coflash info says so), it takes sealed images alone \
+             (coflash seal), and other changes only with a right, which the signature of a root gives (coflash \
+             unlock); otherwise ask its manufacturer what allows it"
         }
         FlashError::Busy => {
             "wait a moment and run the command again; another tool may be at work on the device"
@@ -196,8 +233,9 @@ fn failure_advice(error: FlashError) -> &'static str {
              that the device's root has certified"
         }
         FlashError::Rollback => {
-            "seal the program with a higher --counter, and sign with a key that is valid now: the device \
-             has seen a newer one"
+            "compare counter and epoch in coflash show with those that the device takes, in coflash info: an old \
+             program is sealed again with a higher --counter, and in place of an old key sign with the one that is \
+             valid now"
         }
         FlashError::Key => {
             "compare the key ids that coflash show tells with those that the device was provisioned with; \

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use canopen::nmt::NmtCommand;
+use canopen::nmt::{parse_boot_up, NmtCommand};
 use canopen::{CobId, Frame, NodeId};
 
 use super::watch::Watch;
@@ -61,6 +61,12 @@ impl Session<'_> {
         self.watch().boot_up_and_requests().0.filter(|at| *at >= began)
     }
 
+    /// Another node that has sent a boot-up message at `began` or later: the last one.
+    pub(crate) fn booted_elsewhere_since(&mut self, began: Duration) -> Option<NodeId> {
+        let elsewhere = self.watch().elsewhere;
+        elsewhere.filter(|(at, _)| *at >= began).map(|(_, node)| node)
+    }
+
     /// Waits for the end of a program that has started at `first`, for at most `time`: another boot-up
     /// message of the node, or an emergency for its software; returns whether it came.
     ///
@@ -89,8 +95,7 @@ impl Session<'_> {
     pub fn await_boot_up_of_another(&mut self, time: Duration) -> Result<Option<NodeId>, Error> {
         let (this, mut other) = (self.node, None);
         self.listen(time, |frame| {
-            let of = |node: &NodeId| *frame == Frame::of(CobId::heartbeat(*node), &[0]);
-            other = (1..=127).filter_map(NodeId::new).filter(|node| *node != this).find(of);
+            other = parse_boot_up(frame).filter(|node| *node != this);
             other.is_some()
         })?;
         Ok(other)

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::emcy::code;
+use canopen::nmt::parse_boot_up;
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
@@ -46,6 +47,8 @@ pub(super) struct Watch {
     pub(super) commanded: Option<Duration>,
     /// The time of the node's last boot-up message.
     pub(super) booted: Option<Duration>,
+    /// The last boot-up message of another node, and its time.
+    pub(super) elsewhere: Option<(Duration, NodeId)>,
     /// The time of the node's last emergency for its software (6000h).
     pub(super) failed: Option<Duration>,
     /// Since when the session hears the bus.
@@ -88,8 +91,10 @@ impl Watch {
         if [CobId::sdo_response(node), CobId::heartbeat(node), CobId::emcy(node)].contains(&id) {
             (self.heard, self.told) = (Some(now), false);
         }
-        if *frame == Frame::of(CobId::heartbeat(node), &[0]) {
-            self.booted = Some(now);
+        match parse_boot_up(frame) {
+            Some(booted) if booted == node => self.booted = Some(now),
+            Some(other) => self.elsewhere = Some((now, other)),
+            None => {}
         }
         if is_failure(frame, node) {
             self.failed = Some(now);

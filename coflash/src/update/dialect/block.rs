@@ -15,6 +15,7 @@ use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
 use crate::file::block_file::{Block as FileBlock, BlockFile};
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
+use crate::file::judge::Fault;
 use crate::file::sealed::SealedFile;
 use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
@@ -159,6 +160,7 @@ fn cut_up(
     program: u8,
 ) -> Result<BlockFile, Error> {
     let not_cut = |why: &str| Error::NoProgram {
+        number: Fault::NUMBER,
         why: format!("cannot be sent in blocks: {why}"),
         advice: "send it in one download: leave out --blocks",
     };

@@ -60,6 +60,7 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
     update.called = Some(running);
     let at = Address::new(program::PROGRAM_CONTROL, running);
     update.tell(Phase::CallingBack.into());
+    let began = session.now();
     match session.command(running, ProgramControl::Stop) {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(Error::Refused { .. }) => {
@@ -80,7 +81,8 @@ fn stop_program(session: &mut Session<'_>, number: u8, update: &mut RunningUpdat
         }
         if session.now() >= deadline {
             let (node, running) = (session.node(), session.device_type()?);
-            return Err(Error::NoBootloader { node, running, code: None });
+            let elsewhere = session.booted_elsewhere_since(began).filter(|_| running.is_none());
+            return Err(Error::NoBootloader { node, running, code: None, elsewhere });
         }
         let pause = session.timing().sdo;
         session.await_boot_up(pause)?;

@@ -136,7 +136,7 @@ fn check(session: &mut Session<'_>, running: DeviceType, password: Option<Passwo
         return if running.is_bootloader() {
             Ok(())
         } else {
-            Err(Error::NoBootloader { node, running: Some(running), code: None })
+            Err(Error::NoBootloader { node, running: Some(running), code: None, elsewhere: None })
         };
     }
     let mut look = session.with(lift, brief(session.timing()));
@@ -174,7 +174,7 @@ fn await_lift(session: &mut Session<'_>) -> Result<(), Error> {
             return Ok(());
         }
         if session.now() >= deadline {
-            return Err(Error::NoBootloader { node: session.node(), running, code: None });
+            return Err(Error::NoBootloader { node: session.node(), running, code: None, elsewhere: None });
         }
     }
 }

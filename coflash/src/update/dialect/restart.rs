@@ -21,11 +21,12 @@ pub(super) fn reset_program(session: &mut Session<'_>, number: u8) -> Result<(),
 
 /// Waits for the application.
 pub(super) fn arrived(session: &mut Session<'_>, number: u8) -> Result<DeviceType, Error> {
-    let boot = session.timing().boot;
+    let (began, boot) = (session.now(), session.timing().boot);
     if let Some(running) = await_application(session, boot)? {
         return Ok(running);
     }
     let (node, running) = (session.node(), session.device_type()?);
     let (status, state) = (session.status(number).ok(), state_after_failure(session));
-    Err(Error::StartFailed { node, running, status, state })
+    let elsewhere = session.booted_elsewhere_since(began).filter(|_| running.is_none());
+    Err(Error::StartFailed { node, running, status, state, elsewhere })
 }

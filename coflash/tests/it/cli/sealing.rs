@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use crate::fake::vault::Vault;
-use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
 use crate::tool::{coflash, folder, serve, Done};
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
@@ -651,7 +651,12 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
     // The results that the device reports.
     for (status, number, words, advice) in [
         (0x8A, "[0x6000018a]", "the program's signature is wrong", "coflash verify"),
-        (0x8C, "[0x6000018c]", "the program is older than the device allows", "--counter"),
+        (
+            0x8C,
+            "[0x6000018c]",
+            "its counter or the epoch of its key is too low for the device",
+            "coflash info",
+        ),
         (0x8E, "[0x6000018e]", "the device has no key for this program", "coflash show"),
     ] {
         let (done, kept, _) = flashed(&file, 0x10000, status, &[]);
@@ -688,6 +693,87 @@ fn a_sealed_image_goes_into_a_device_as_it_is() {
         assert_eq!(done.exit, 0, "{}", done.err);
         server.join().unwrap();
         assert!(*kept.lock().unwrap() == bytes);
+    }
+}
+
+/// The lowest epoch and the lowest counter that a device takes (2002h/3), after the ids of two roots.
+fn lowest(epoch: u32, counter: u32) -> ((u16, u8), Vec<u8>) {
+    ((0x2002, 3), [1, 2, epoch, counter].into_iter().flat_map(u32::to_le_bytes).collect())
+}
+
+/// An old program and an old key are two things. Both are refused before anything is erased, by what
+/// the device says.
+#[test]
+fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
+    let room = Room::new("old");
+    room.0.file("app.hex", ihex::emit(&raw::read(&program()[..1024], Some(START)).unwrap()).as_bytes());
+    // The key has epoch 3.
+    assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
+    let file = room.path("app.cbs");
+    let counter = "its security counter is 7, and the device accepts none below 8";
+    let epoch = "its certificate has epoch 3, and the device accepts none below 4";
+    for (told, words, advice) in [
+        (lowest(3, 8), counter, "a higher --counter"),
+        (lowest(4, 7), epoch, "sign with the key that is valid now"),
+        (lowest(4, 8), counter, "a higher --counter"),
+    ] {
+        let (done, fake) = on(BOOTLOADER, Told::sealed(&program()).but(told), &["flash", &file]);
+        assert_eq!(done.exit, 6, "{}", done.err);
+        for words in [words, advice, "it was not changed", "[0x6000018c]"] {
+            assert!(done.err.contains(words), "{words}: {}", done.err);
+        }
+        assert!(!done.err.contains("program is old") && fake.writes().is_empty(), "{}", done.err);
+    }
+    // A right for a lower counter has been granted; and what the device takes.
+    let granted = Told::sealed(&program()).but(challenge(1 << 31 | 4)).but(lowest(3, 8));
+    for told in [granted, Told::sealed(&program()).but(lowest(3, 7))] {
+        let (_, fake) = on(BOOTLOADER, told, &["flash", &file]);
+        assert!(fake.count("command 03") == 1, "{:?}", fake.writes());
+    }
+    // Who forces it leaves it to the device.
+    let (_, fake) = on(BOOTLOADER, Told::sealed(&program()).but(lowest(4, 8)), &["flash", &file, "--force"]);
+    assert_eq!(fake.count("command 03"), 1);
+}
+
+/// An application has no 2002h and no 2003h: its bootloader has.
+#[test]
+fn what_the_bootloader_alone_has_is_said_with_the_way_there() {
+    let room = Room::new("way");
+    let root = room.path("root.pem");
+    for words in [&["events"][..], &["unlock", "erase", "--root", &root]] {
+        let (done, fake) = on(APPLICATION, Told::sealed(&program()), words);
+        assert_eq!((done.exit, fake.writes().len()), (6, 0), "{}", done.err);
+        assert!(done.err.contains("coflash enter"), "{words:?}: {}", done.err);
+        // In the bootloader of a product without sealed images, too, it is the object that is missing.
+        let (done, _) = on(BOOTLOADER, Told { bootloader: Vec::new(), application: Vec::new() }, words);
+        assert!(done.exit == 6 && done.err.contains("without support for sealed images"), "{}", done.err);
+    }
+}
+
+/// A sealed device refuses what needs a right with 84h; the advice names the ways.
+#[test]
+fn a_refusal_for_want_of_a_right_names_the_right() {
+    let room = Room::new("right");
+    room.0.file("app.hex", ihex::emit(&raw::read(&program()[..1024], Some(START)).unwrap()).as_bytes());
+    let app = room.path("app.hex");
+    for (command, words) in [
+        (0x03, &["erase"][..]),
+        (0x84, &["withdraw"]),
+        (0x03, &["flash", &app, "--force", "--board", "nucleo-f446re"]),
+    ] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.on_command = Box::new(move |came| match came == command {
+            true => Outcome::AbortStatus(0x0800_0022, 0x84),
+            false => Outcome::Accept,
+        });
+        fake.maker = Some(Box::new(Told::sealed(&program())));
+        let (bus, server) = serve(fake);
+        let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
+        server.join().unwrap();
+        assert!(done.exit == 6 && done.err.contains("[0x60000184]"), "{words:?}: {}", done.err);
+        for way in ["coflash info", "coflash seal", "coflash unlock"] {
+            assert!(done.err.contains(way), "{words:?}, {way}: {}", done.err);
+        }
     }
 }
 

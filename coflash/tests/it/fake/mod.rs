@@ -75,8 +75,8 @@ pub enum Deed {
 /// The end of a program that the fake has started.
 #[derive(Clone, Copy, Debug)]
 pub enum End {
-    /// A reset, after which this device type runs.
-    Reset { after: Duration, into: u32 },
+    /// A reset, after which this device type runs; nothing if it stays silent.
+    Reset { after: Duration, into: Option<u32> },
     /// It sends an emergency 6000h, and goes on.
     Panic { after: Duration },
 }
@@ -278,7 +278,7 @@ impl Fake {
     /// A program that started at this time ends.
     fn end_later(&mut self, at: Duration, end: End) {
         match end {
-            End::Reset { after, into } => self.restart = Some((at + after, Some(into))),
+            End::Reset { after, into } => self.restart = Some((at + after, into)),
             End::Panic { after } => {
                 let id = CobId::new(0x80 + u16::from(self.node)).unwrap();
                 self.emergency = Some((at + after, Frame::of(id, &[0x00, 0x60, 0x01, 0, 0, 0, 0, 0])));
