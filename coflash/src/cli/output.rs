@@ -470,9 +470,35 @@ impl From<FileError> for Failure {
             },
             Cause::Empty => "the file is empty: build the program again, or copy the file again",
             Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
-            Cause::CutOff { .. } | Cause::NoEnd(_) | Cause::Checksum { .. } | Cause::BadDigit { .. } => {
-                "copy the file again from where it was built, or build it again"
+            Cause::NoData => {
+                "name the linker's output: an object file, or one without loadable sections, has nothing for the flash"
             }
+            Cause::WrongElf(_) | Cause::WrongMachine(_) => {
+                "name the linker's output for the board: Arm, 32 bit, little-endian (thumbv7em-none-eabihf, \
+                 arm-none-eabi)"
+            }
+            Cause::AfterEnd => {
+                "if these are two files one after the other, make one file of them (srec_cat, objcopy); otherwise copy \
+                 the file again from where it was built"
+            }
+            Cause::Overlap { .. } => {
+                "two parts of the file have other data for one address: link them for different addresses, or leave \
+                 one of them out"
+            }
+            Cause::CutOff { .. }
+            | Cause::TooLong { .. }
+            | Cause::NoEnd(_)
+            | Cause::Malformed(_)
+            | Cause::UnknownRecord(_)
+            | Cause::Count { .. }
+            | Cause::Checksum { .. }
+            | Cause::BadDigit { .. }
+            | Cause::ProgramHeaderSize(_)
+            | Cause::BlockCrc { .. }
+            | Cause::BlockNumber { .. }
+            | Cause::ControlSize(_)
+            | Cause::LastSize(_)
+            | Cause::ProgramCrc { .. } => "copy the file again from where it was built, or build it again",
             // Their messages contain the advice.
             _ => "",
         };

@@ -28,6 +28,8 @@ pub enum Area {
     Registers,
     /// A memory outside the chip, at the memory controller (FMC) or at QUADSPI.
     External,
+    /// Where no STM32F4 has anything.
+    Reserved,
 }
 
 /// Main flash of the STM32F4: at most 2 MiB.
@@ -60,10 +62,14 @@ const fn range(first: u32, last: u32) -> AddressRange {
 }
 
 impl Area {
-    /// The area of an address; `None` in the main flash and where there is nothing.
+    /// The area of an address; `None` in the main flash.
     #[must_use]
     pub fn of(address: u32) -> Option<Self> {
-        AREAS.iter().find(|(range, _)| range.has(address)).map(|(_, area)| *area)
+        if FLASH.has(address) {
+            return None;
+        }
+        let area = AREAS.iter().find(|(range, _)| range.has(address)).map(|(_, area)| *area);
+        Some(area.unwrap_or(Self::Reserved))
     }
 
     /// The area of an address that the region of a program does not have.
@@ -81,7 +87,10 @@ impl Area {
     #[must_use]
     pub const fn advice(self) -> &'static str {
         match self {
-            Self::Alias => "link the program for the flash, which begins at 08000000h",
+            Self::Alias => {
+                "link the program for the flash, which begins at 08000000h; S1 and S2 records have no room for such \
+                 an address: write S3 records (objcopy --srec-forceS3), or add what is missing (--adjust-start)"
+            }
             Self::Eeprom => "an STM32F4 has no data EEPROM: leave this section out of the file",
             Self::OptionBytes => {
                 "a bootloader does not write them: leave the section out of the file (objcopy \
@@ -98,6 +107,10 @@ impl Area {
             }
             Self::BackupSram => "the program itself has to fill it: leave this section out of the file",
             Self::Registers => "no file can fill them: leave this section out of the file",
+            Self::Reserved => {
+                "check that the file is for an STM32F4; if it is, leave the section out of it (objcopy \
+                 --remove-section)"
+            }
             Self::External => {
                 "the bootloader writes the chip's own flash alone: leave the section out of the file \
                  (objcopy --remove-section), and let the program or a debug probe write it"
@@ -119,6 +132,7 @@ impl fmt::Display for Area {
             Self::BackupSram => "the backup SRAM, which is no EEPROM",
             Self::Registers => "the registers of peripherals",
             Self::External => "an external memory (FMC, QUADSPI)",
+            Self::Reserved => "a range where no STM32F4 has memory",
         })
     }
 }
@@ -145,6 +159,10 @@ mod tests {
             (0xE000_0000, 0xE00F_FFFF, Some(Area::Registers)),
             (0x0000_0000, 0x001F_FFFF, Some(Area::Alias)),
             (0x0800_0000, 0x081F_FFFF, None),
+            // Reserved: behind the largest flash, behind the CCM RAM, around OTP and option bytes.
+            (0x0820_0000, 0x0FFF_FFFF, Some(Area::Reserved)),
+            (0x1001_0000, 0x1FFE_BFFF, Some(Area::Reserved)),
+            (0x1FFF_7A10, 0x1FFF_BFFF, Some(Area::Reserved)),
         ] {
             assert_eq!((Area::of(first), Area::of(last)), (area, area), "{first:08X}h");
         }

@@ -54,6 +54,10 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
         let words = "is not a linked program (it is an object file or library): give the linker's output";
         return Err(Place::Offset(16).fault(Cause::WrongElf(words)));
     }
+    let header_size = header.e_phentsize(endian);
+    if header.e_phnum(endian) > 0 && usize::from(header_size) != size_of::<ProgramHeader32<Endianness>>() {
+        return Err(Place::Offset(42).fault(Cause::ProgramHeaderSize(header_size)));
+    }
     let table = u64::from(header.e_phoff(endian));
     let table_end = table + u64::from(header.e_phentsize(endian)) * u64::from(header.e_phnum(endian));
     let program_headers = header

@@ -79,6 +79,22 @@ impl std::error::Error for FileError {
     }
 }
 
+/// An encoding of text that no firmware file has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Encoding {
+    /// Its name.
+    pub name: &'static str,
+    /// The text begins with a byte order mark.
+    pub is_marked: bool,
+}
+
+impl fmt::Display for Encoding {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let what = if self.is_marked { "begins with a byte order mark of" } else { "is a text in" };
+        write!(f, "{what} {}", self.name)
+    }
+}
+
 /// The faults of a firmware file. The messages give advice if it is not obvious.
 #[derive(Debug, thiserror::Error)]
 pub enum Cause {
@@ -110,9 +126,9 @@ pub enum Cause {
     /// A file in none of the known formats.
     #[error("is not a firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
     NotFirmware,
-    /// A text with a byte order mark.
-    #[error("begins with a byte order mark of {0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
-    ByteOrderMark(&'static str),
+    /// A text in another encoding than ASCII.
+    #[error("{0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
+    Encoding(Encoding),
     /// A sealed image in a place that needs the program itself.
     #[error("is a sealed image and cannot be converted: `coflash flash` downloads it, `coflash show` and `coflash verify` describe it")]
     Sealed,
@@ -234,6 +250,11 @@ pub enum Cause {
     /// An ELF file that cannot run on the device.
     #[error("{0}")]
     WrongElf(&'static str),
+    /// Program headers of another size than those of a 32-bit ELF file.
+    #[error(
+        "its program headers have {0} bytes, and those of a 32-bit ELF file have 32: the file is damaged"
+    )]
+    ProgramHeaderSize(u16),
     /// An ELF file for another machine.
     #[error("is an ELF file for machine {0} and not for Arm (40)")]
     WrongMachine(u16),
@@ -308,7 +329,7 @@ impl Cause {
             | Self::NoRegularFile(_)
             | Self::TooLarge { .. }
             | Self::NotFirmware
-            | Self::ByteOrderMark(_)
+            | Self::Encoding(_)
             | Self::Sealed
             | Self::NoAddress
             | Self::WrongElf(_)
@@ -323,6 +344,7 @@ impl Cause {
             | Self::UnknownRecord(_)
             | Self::Count { .. }
             | Self::AddressOverflow { .. }
+            | Self::ProgramHeaderSize(_)
             | Self::BlockNumber { .. }
             | Self::BlockSize { .. }
             | Self::ControlSize(_)

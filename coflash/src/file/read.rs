@@ -8,7 +8,7 @@ use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
 use super::sealed::{blocks, Sealed};
-use super::text::marked_encoding;
+use super::text::encoding;
 use super::{elf, ihex, limit, raw, srec};
 
 /// The formats of a firmware file.
@@ -123,8 +123,8 @@ fn read_telling(
     }
     let format = format.or_else(|| Format::detect(bytes));
     if matches!(format, None | Some(Format::IntelHex | Format::SRecord)) {
-        if let Some(encoding) = marked_encoding(bytes) {
-            return Err(Place::File.fault(Cause::ByteOrderMark(encoding)));
+        if let Some(encoding) = encoding(bytes) {
+            return Err(Place::File.fault(Cause::Encoding(encoding)));
         }
     }
     let format = format.ok_or(Place::File.fault(Cause::NotFirmware))?;

@@ -1,6 +1,6 @@
 //! Common code of the two text formats: lines and hexadecimal digits.
 
-use super::fault::{Cause, Place, ReadError};
+use super::fault::{Cause, Encoding, Place, ReadError};
 
 /// The lines with their numbers, without line end (LF, CR LF or CR) and blanks around them. Empty
 /// lines are left out, and so is what fills a file after its last line: the end mark of CP/M and
@@ -43,15 +43,40 @@ pub(super) fn bytes_of(digits: &[u8], skipped: usize, place: Place) -> Result<Ve
     Ok(nibbles.chunks_exact(2).map(|pair| pair[0] << 4 | pair[1]).collect())
 }
 
-/// The encoding of a text that begins with a byte order mark, if its first letter is that of an
-/// Intel HEX file or of an S-record.
-pub(super) fn marked_encoding(bytes: &[u8]) -> Option<&'static str> {
-    const MARKS: [(&[u8], &str); 3] =
-        [(b"\xEF\xBB\xBF", "UTF-8"), (b"\xFF\xFE", "UTF-16"), (b"\xFE\xFF", "UTF-16")];
-    let (text, encoding) =
-        MARKS.iter().find_map(|(mark, encoding)| Some((bytes.strip_prefix(*mark)?, *encoding)))?;
-    let letter = text.iter().find(|byte| **byte != 0 && !byte.is_ascii_whitespace());
-    matches!(letter, Some(b':' | b'S')).then_some(encoding)
+/// The encoding of a text that is not in ASCII, if its first letter is that of an Intel HEX file or of an
+/// S-record.
+pub(super) fn encoding(bytes: &[u8]) -> Option<Encoding> {
+    // The mark of UTF-32 begins with that of UTF-16.
+    const MARKS: [(&[u8], &str); 5] = [
+        (b"\xEF\xBB\xBF", "UTF-8"),
+        (b"\xFF\xFE\0\0", "UTF-32"),
+        (b"\0\0\xFE\xFF", "UTF-32"),
+        (b"\xFF\xFE", "UTF-16"),
+        (b"\xFE\xFF", "UTF-16"),
+    ];
+    if let Some((text, name)) =
+        MARKS.iter().find_map(|(mark, name)| Some((bytes.strip_prefix(*mark)?, *name)))
+    {
+        let letter = text.iter().find(|byte| **byte != 0 && !byte.is_ascii_whitespace());
+        return is_first_letter(letter).then_some(Encoding { name, is_marked: true });
+    }
+    let wide = [(2, "UTF-16"), (4, "UTF-32")].into_iter().find(|(width, _)| is_wide(bytes, *width));
+    wide.map(|(_, name)| Encoding { name, is_marked: false })
+}
+
+fn is_first_letter(letter: Option<&u8>) -> bool {
+    matches!(letter, Some(b':' | b'S'))
+}
+
+/// Whether a text begins with characters of `width` bytes, one of which is not 0: the first or the last.
+fn is_wide(bytes: &[u8], width: usize) -> bool {
+    const LOOKED_AT: usize = 4;
+    [0, width - 1].into_iter().any(|place| {
+        let is_ascii = |(at, byte): (usize, &u8)| (at % width == place) == (*byte != 0);
+        bytes.len() >= LOOKED_AT * width
+            && is_first_letter(bytes.get(place))
+            && bytes[..LOOKED_AT * width].iter().enumerate().all(is_ascii)
+    })
 }
 
 /// Checks that a record of `found` bytes has the announced length.

@@ -116,6 +116,51 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
     }
 }
 
+/// Each fault of a file comes with something that the user can do.
+#[test]
+fn each_fault_of_a_file_says_what_to_do() {
+    let folder = folder("faults");
+    let hex = fs::read_to_string(data("program.hex")).unwrap();
+    let srec = fs::read_to_string(data("program.s3")).unwrap();
+    let elf = fs::read(data("program.elf")).unwrap();
+    let with = |at: usize, value: u8| {
+        let mut bytes = elf.clone();
+        bytes[at] = value;
+        bytes
+    };
+    let end = ":00000001FF";
+    let again = "copy the file again";
+    for (what, bytes, advice) in [
+        ("no data", b"S0030000FC\nS9030000FC\n".to_vec(), "the linker's output"),
+        ("a record type", hex.replace(end, ":0000000600FA").into_bytes(), again),
+        ("its length", hex.replace(end, ":0100000401FA\n:00000001FF").into_bytes(), again),
+        ("an unknown type", hex.replace(end, ":00000006FA").into_bytes(), again),
+        ("half a byte", hex.replacen('\n', "0\n", 2).into_bytes(), again),
+        ("a count", srec.replace("S705", "S5030005F7\nS705").into_bytes(), again),
+        ("two files", [hex.clone(), hex.clone()].concat().into_bytes(), "one file"),
+        ("64 bits", with(4, 2), "Arm"),
+        ("big-endian", with(5, 2), "Arm"),
+        ("another machine", with(18, 243), "Arm"),
+        ("an object file", with(16, 1), "the linker's output"),
+        (
+            "other data twice",
+            hex.replace(end, ":02000004080 1F1\n:0100000055AA\n:00000001FF").replace(' ', "").into_bytes(),
+            "one address",
+        ),
+    ] {
+        let file = folder.file("bad", &bytes);
+        let done = coflash(&["inspect", &file]);
+        assert_eq!(done.exit, 3, "{what}: {}{}", done.out, done.err);
+        let (_, todo) = done.err.split_once("what to do: ").unwrap_or_else(|| panic!("{what}: {}", done.err));
+        assert!(todo.contains(advice), "{what}: {}", done.err);
+    }
+    // Addresses of 24 bits do not reach the flash.
+    let done =
+        coflash(&["convert", &data("program.s2"), &folder.path("out.blk"), "--board", "nucleo-f446re"]);
+    assert_eq!(done.exit, 3, "{}", done.err);
+    assert!(done.err.contains("S3 records") && done.err.contains("--adjust-start"), "{}", done.err);
+}
+
 #[test]
 fn inspect_tells_what_a_file_holds() {
     let shown = |file: &str, options: &[&str]| {

@@ -75,6 +75,55 @@ fn an_empty_or_foreign_file_is_named_so() {
     }
 }
 
+/// Texts in 16 and 32 bits, with and without a byte order mark.
+#[test]
+fn a_text_of_wide_characters_is_named_with_what_to_do() {
+    let text = std::str::from_utf8(data!("program.hex")).unwrap();
+    let records = std::str::from_utf8(data!("program.s3")).unwrap();
+    let wide = |text: &str, little: bool, width: usize| -> Vec<u8> {
+        let bytes = |character: char| {
+            let mut bytes = [0; 4];
+            let number = u32::from(character);
+            bytes[..width].copy_from_slice(&number.to_le_bytes()[..width]);
+            if !little {
+                bytes[..width].reverse();
+            }
+            bytes.into_iter().take(width).collect::<Vec<u8>>()
+        };
+        text.chars().flat_map(bytes).collect()
+    };
+    for text in [text, records] {
+        for (marked, little, width, name) in [
+            ("\u{FEFF}", true, 2, "UTF-16"),
+            ("\u{FEFF}", false, 2, "UTF-16"),
+            ("\u{FEFF}", true, 4, "UTF-32"),
+            ("\u{FEFF}", false, 4, "UTF-32"),
+            ("", true, 2, "UTF-16"),
+            ("", false, 2, "UTF-16"),
+            ("", true, 4, "UTF-32"),
+            ("", false, 4, "UTF-32"),
+        ] {
+            let bytes = wide(&format!("{marked}{text}"), little, width);
+            let error = meaning(&bytes, None).unwrap_err();
+            assert!(error.contains(name) && error.contains("plain ASCII"), "{error}");
+            assert_eq!(error.contains("byte order mark"), !marked.is_empty(), "{error}");
+        }
+    }
+}
+
+#[test]
+fn program_headers_of_another_size_are_damage_and_not_missing() {
+    for size in [0_u8, 31, 33, 40, 56] {
+        let mut bytes = elf(1, 400, |_| (100, 0x0801_0000, 4));
+        bytes[42] = size;
+        let error = meaning(&bytes, None).unwrap_err();
+        let words = format!(
+            "offset 0x2a: its program headers have {size} bytes, and those of a 32-bit ELF file have 32"
+        );
+        assert!(error.starts_with(&words), "{error}");
+    }
+}
+
 #[test]
 fn a_damaged_block_file_is_named_with_its_offset() {
     let good = data!("plain-400.blk");
@@ -149,7 +198,7 @@ fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
     let bytes = elf(20_000, 0, |number| (52 + 4 * number, 0x0801_0000 + 4 * number, 4));
     assert_eq!(meaning(&bytes, None).unwrap().program_size(), 80_000);
     // The gap between two segments counts as well.
-    let apart = elf(2, 0, |number| (52, 0x0801_0000 + number * 0x0400_0000, 4));
+    let apart = elf(2, 0, |number| (52, 0x0C01_0000 + number * 0x0400_0000, 4));
     let error = meaning(&apart, None).unwrap_err();
     assert!(error.contains("too much for one program"), "{error}");
 }
