@@ -18,6 +18,7 @@ use super::controller::{Flashed, News};
 use super::run::{Devices, Order};
 use crate::bus::Link;
 use crate::device::lock::Lock;
+use crate::device::state::{reason, source};
 use crate::device::{info, DeviceInfo, Error, Session, Timing};
 use crate::update::event::Phase;
 use crate::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
@@ -123,7 +124,7 @@ impl Buses<'_> {
         let program = job.options.program;
         let mut number = |index| session.read_number(Address::new(index, program)).ok();
         number(PROGRAM_CONTROL) == Some(ProgramState::Running as u32)
-            && number(PROGRAM_ID) == Some(size_and_crc(&job.file).1)
+            && number(PROGRAM_ID).is_some_and(|crc| job.file.program_crcs().contains(&crc))
     }
 }
 
@@ -164,17 +165,9 @@ impl Devices for Buses<'_> {
     }
 }
 
-fn size_and_crc(program: &Program) -> (u32, u32) {
-    match program {
-        Program::Blocks(file) => (file.program_size(), file.program_crc()),
-        Program::Sealed(file) => (file.head().size(), file.head().crc()),
-    }
-}
-
 /// A program in words.
 fn of(program: &Program) -> String {
-    let (size, crc) = size_and_crc(program);
-    format!("program of {size} bytes, CRC {crc:08X}h")
+    format!("program of {} bytes, CRC {:08X}h", program.program_size(), program.program_crc())
 }
 
 /// The news in an event of an update.
@@ -209,7 +202,7 @@ fn flashed(job: &Job, result: Result<Report, Failed>) -> Flashed {
     }
 }
 
-/// What the server gets to know of a device: what `coflash scan` shows.
+/// What the server gets to know of a device: what `coflash info` shows.
 fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
     let mut all = vec![
         ("bus".to_string(), device.bus.clone()),
@@ -226,6 +219,11 @@ fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
         ["vendor_id", "product_code", "revision", "serial_number"].into_iter().zip(info.identity)
     {
         all.extend(number.map(|number| (key.to_string(), format!("{number:08X}h"))));
+    }
+    if let Some(state) = info.state {
+        all.push(("stays".to_string(), reason(state.reason)));
+        all.extend(state.ended_by().map(|by| ("program_ended_by".to_string(), source(by).to_string())));
+        all.push(("crash_resets".to_string(), state.crash_resets.to_string()));
     }
     for program in &info.programs {
         let key = |what: &str| format!("program_{}_{what}", program.number);

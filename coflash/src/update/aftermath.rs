@@ -15,14 +15,15 @@ use crate::device::{DeviceType, Session, Timing};
 const ANSWER: Duration = Duration::from_millis(500);
 
 /// Asks the device for its state after the update. `original` is the node-ID at the start of the
-/// update, and `crc` the CRC of the file.
+/// update, and `crcs` the values that 1F56h may have with the
+/// file's program.
 pub(super) fn look(
     session: &mut Session<'_>,
     error: &Error,
     update: &RunningUpdate<'_>,
     original: NodeId,
     number: u8,
-    crc: u32,
+    crcs: [u32; 2],
 ) -> DeviceAfterUpdate {
     let unseen = |answer| DeviceAfterUpdate { state: update.state, answer };
     let untouched = update.state == DeviceState::Untouched && !update.touched;
@@ -38,7 +39,7 @@ pub(super) fn look(
         match ask(&mut asked, number) {
             Ok(seen) => {
                 return DeviceAfterUpdate {
-                    state: judge(update, &seen, crc, error),
+                    state: judge(update, &seen, crcs, error),
                     answer: DeviceAnswer::Seen(seen),
                 }
             }
@@ -65,7 +66,7 @@ fn is_not_admitted(error: &Error) -> bool {
 }
 
 /// The state of a device, from the course of the update, its error and the device's answers.
-fn judge(update: &RunningUpdate<'_>, seen: &Seen, crc: u32, error: &Error) -> DeviceState {
+fn judge(update: &RunningUpdate<'_>, seen: &Seen, crcs: [u32; 2], error: &Error) -> DeviceState {
     let wrote = update.wrote && !is_not_admitted(error);
     match update.state {
         // The application was called and has stayed, or is back.
@@ -73,7 +74,7 @@ fn judge(update: &RunningUpdate<'_>, seen: &Seen, crc: u32, error: &Error) -> De
         DeviceState::Erased if !seen.empty() => match seen.crc {
             // A device that erases with the first good block has received none.
             told @ Some(_) if !wrote && told == update.before => update.resting,
-            Some(told) if wrote && told == crc && seen.control.is_some() => DeviceState::Unreleased,
+            Some(told) if wrote && crcs.contains(&told) && seen.control.is_some() => DeviceState::Unreleased,
             _ => DeviceState::Erased,
         },
         state => state,

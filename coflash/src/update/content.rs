@@ -71,6 +71,19 @@ impl Program {
         self.content().program_crc()
     }
 
+    /// The values that 1F56h of a device with this program may report: the CRC of its product may be
+    /// another one than that of the file.
+    #[must_use]
+    pub fn program_crcs(&self) -> [u32; 2] {
+        self.content().program_crcs()
+    }
+
+    /// Size of the program in flash in bytes.
+    #[must_use]
+    pub fn program_size(&self) -> u32 {
+        self.content().program_size()
+    }
+
     /// The target device, if the content names one.
     #[must_use]
     pub fn target(&self) -> Option<Target> {

@@ -85,7 +85,7 @@ fn flash_content(
     let result = procedure(&mut inner, file, options, &mut update);
     let left = match &result {
         Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
-        Err(error) => look(&mut inner, error, &update, original, options.program, file.program_crc()),
+        Err(error) => look(&mut inner, error, &update, original, options.program, file.program_crcs()),
     };
     if let Some(taken) = update.mastership.take() {
         // The result of the update remains, even if this fails.

@@ -114,6 +114,9 @@ fn nothing_is_started_that_was_not_verified() {
     for (id, words) in IDS.iter().zip(["SHA-256", "has announced", "what to do"]) {
         let action = server.action(id);
         assert!(action.details("closed").contains(words), "{action:?}");
+        // What 2007h says, in the words of `coflash info`.
+        let stays = server.state().targets[*id].attributes.get("stays").cloned();
+        assert_eq!(stays, Some("it has no program".into()));
     }
 }
 
@@ -145,6 +148,15 @@ fn an_agent_that_was_ended_goes_on() {
     assert!(folder.read("1.flash")[0x2_0000..0x2_0000 + 40 * 1024] == program(0xA5));
 }
 
+/// The state file of the first device.
+fn record(folder: &Folder) -> std::path::PathBuf {
+    let state = std::fs::read_dir(folder.path("agent-state")).unwrap().flatten().map(|entry| entry.path());
+    let is_record = |path: &std::path::PathBuf| {
+        path.to_string_lossy().contains("door-1-") && path.extension().is_some_and(|end| end == "json")
+    };
+    state.into_iter().find(is_record).unwrap()
+}
+
 /// The agent died between the end of the update and the report: its state is that of a moment
 /// before. A device that runs the program is not flashed again.
 #[test]
@@ -155,11 +167,7 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
     let config = config(&server, nodes.url(), &folder, &IDS[..1]);
     assert_eq!(serve(&config, &options()).0.updated, 1);
-    let state = std::fs::read_dir(folder.path("agent-state")).unwrap().flatten().map(|entry| entry.path());
-    let record = state.into_iter().find(|path| {
-        path.to_string_lossy().contains("door-1-") && path.extension().is_some_and(|end| end == "json")
-    });
-    let record = record.unwrap();
+    let record = record(&folder);
     let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
     for (kept, byte, starts) in [(true, 0xA5, 0), (false, 0xA5, 1), (true, 0x5A, 1)] {
         value["ended"] = serde_json::json!([]);
@@ -173,6 +181,29 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
         assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
         assert!(folder.read("1.flash")[0x2_0100] == byte);
     }
+}
+
+/// The same for a product with CRC-16 and a file that has none: the device tells the CRC of its own.
+#[test]
+fn a_program_that_was_kept_is_known_by_a_crc_16_too() {
+    let folder = Folder::new("agent-kept-crc-16");
+    let product = ["--profile", "esacademy", "--crc16"];
+    let arguments = [&["--node", "5", "--flash", "instant", "--stand-in"], &product[..]].concat();
+    let nodes = Nodes::start(&folder, &arguments);
+    let server = Server::start(&IDS);
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+    assert_eq!(serve(&config, &options()).0.updated, 1);
+    let record = record(&folder);
+    let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
+    value["ended"] = serde_json::json!([]);
+    value["begun"] = serde_json::json!({ "action": "1", "kept": true });
+    std::fs::write(&record, value.to_string()).unwrap();
+    server.assign(IDS[0], Action::new(1, &file(0xA5)));
+    let (ended, said) = serve(&config, &options());
+    assert_eq!(ended.updated, 1, "{said}");
+    let action = server.action(IDS[0]);
+    assert!(action.details("closed").contains("since before the agent was restarted"), "{action:?}");
 }
 
 #[test]
