@@ -426,8 +426,9 @@ impl fmt::Display for Error {
             Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
             Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
             Self::Failed { doing, error, detail, code } => {
-                write!(f, "{doing} failed: {error} (1F57h reads {:02X}h", error.code())?;
-                if *detail != 0 {
+                let words = failure_words(*error, *detail);
+                write!(f, "{doing} failed: {words} (1F57h reads {:02X}h", error.code())?;
+                if *detail != 0 && *error != FlashError::Secured {
                     write!(f, ", detail {detail:04X}h")?;
                 }
                 match code {
@@ -579,12 +580,21 @@ fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt
     }
 }
 
+/// An error of 1F57h in words, with its detail: for a protected sector that is its number
+/// (docs/protocol.md). Sector 0 belongs to the bootloader on each board, so 0 is none.
+pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
+    match (error, detail) {
+        (FlashError::Secured, 1..) => format!("sector {detail} of the flash is write-protected"),
+        _ => error.to_string(),
+    }
+}
+
 /// Why a device stays in its bootloader, and how its program ended.
 fn write_why(f: &mut fmt::Formatter<'_>, state: Option<BootloaderState>) -> fmt::Result {
     let Some(state) = state else { return Ok(()) };
     write!(f, "; {}", reason(state.reason))?;
     match state.ended_by() {
-        Some(by) => write!(f, ", which was ended by {}", source(by)),
+        Some(by) => write!(f, "; the program was ended by {}", source(by)),
         None => Ok(()),
     }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use canopen::program::{self, FlashStatus, ProgramState};
+use canopen::program::{self, FlashError, FlashStatus, ProgramState};
 use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
@@ -11,7 +11,7 @@ use shared_abi::block_file::ProgramVersion;
 use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
-use super::error::{told, Error};
+use super::error::{failure_words, told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
 use super::session::Session;
@@ -287,9 +287,11 @@ impl fmt::Display for ProgramInfo {
             write!(f, "    status          ")?;
             match status.error {
                 None => f.write_str("ok")?,
-                Some(error) => write!(f, "{error} ({:02X}h)", error.code())?,
+                Some(error) => {
+                    write!(f, "{} ({:02X}h)", failure_words(error, status.detail), error.code())?;
+                }
             }
-            if status.detail != 0 {
+            if status.detail != 0 && status.error != Some(FlashError::Secured) {
                 write!(f, ", detail {:04X}h", status.detail)?;
             }
             writeln!(f, "{}", if status.busy { ", busy" } else { "" })?;

@@ -19,11 +19,12 @@ pub struct BootloaderState {
 }
 
 impl BootloaderState {
-    /// The reset by which the program ended, if it is known.
+    /// The reset by which the program ended, if there is one and the reset is known.
     #[must_use]
     pub fn ended_by(self) -> Option<ResetCause> {
         let cause = ResetCause::from_byte(self.program_reset);
-        (cause != ResetCause::Unknown).then_some(cause)
+        let has_program = Reason::from_byte(self.reason) != Some(Reason::NoProgram);
+        (has_program && cause != ResetCause::Unknown).then_some(cause)
     }
 }
 
@@ -94,7 +95,10 @@ mod tests {
             "stays in the bootloader: its program is not released for autostart; the program was ended by the \
              independent watchdog; 1 reset that nobody requested"
         );
-        assert_eq!(state(6, 0, 0), "stays in the bootloader: it has no program");
+        // After power-on, too: the power has ended no program.
+        for program_reset in [0, 1, 3] {
+            assert_eq!(state(6, program_reset, 0), "stays in the bootloader: it has no program");
+        }
         assert_eq!(
             state(200, 200, 0),
             "stays in the bootloader: for a reason that this tool does not know (200)"

@@ -139,10 +139,15 @@ impl fmt::Display for DeviceAfterUpdate {
                 write!(f, "its {what} is running; {}", self.state)?;
                 match seen.crc {
                     Some(crc) if !seen.empty() && self.state != DeviceState::Erased => {
-                        write!(f, " (CRC {crc:08X}h)")
+                        write!(f, " (CRC {crc:08X}h)")?;
                     }
-                    _ => Ok(()),
+                    _ => {}
                 }
+                let waits = self.state == DeviceState::Called && seen.running.is_bootloader();
+                if waits && !seen.empty() {
+                    f.write_str(": coflash start starts it again")?;
+                }
+                Ok(())
             }
         }
     }

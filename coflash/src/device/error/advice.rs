@@ -55,6 +55,10 @@ impl Error {
                  program again, with --crc16 for a product with CRC-16 and without it for one with CRC-32"
                     .to_string()
             }
+            Self::Failed { error: FlashError::Secured, detail: sector @ 1.., .. } => format!(
+                "take the write protection of sector {sector} away with a debug probe (option bytes: nWRP, SPRMOD), and \
+                 look whether the installed program sets it; nothing of that program is lost"
+            ),
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::SealedOnly { .. } => "seal the program with a key that a root of the device has certified (coflash seal), and \
@@ -160,6 +164,7 @@ fn not_started_advice(state: Option<BootloaderState>) -> &'static str {
     let reason = state.and_then(|state| Reason::from_byte(state.reason));
     let ended_by = state.and_then(BootloaderState::ended_by);
     match (reason, ended_by) {
+        (Some(Reason::NoProgram), _) => "flash a program first (coflash flash): the device has none",
         (Some(Reason::Damaged), _) => {
             "flash the program again: what is in the flash is not what was sent; if it happens again, the flash is worn out"
         }
@@ -213,7 +218,10 @@ fn failure_advice(error: FlashError) -> &'static str {
             "run the command again; if it happens again, the flash may be worn out or write-protected"
         }
         FlashError::Address => "the file is for another memory map: check --board and --program",
-        FlashError::Secured => "the file wants to write into the bootloader: check how the program is linked",
+        FlashError::Secured => {
+            "the file wants to write into the bootloader: check how the program is linked; if it is linked right, the \
+             flash is write-protected by its option bytes"
+        },
         FlashError::NvData => {
             "run the command again; if it happens again, the device cannot store its parameters"
         }

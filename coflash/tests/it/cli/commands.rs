@@ -89,6 +89,31 @@ fn a_step_that_fails_has_the_words_and_numbers_of_the_manual() {
     assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));
 }
 
+/// The words of 2007h in the message of a start that failed: of a device without a program after
+/// power-on, and of one whose program was ended by its watchdog.
+#[test]
+fn a_start_that_fails_is_told_with_the_device_s_reason() {
+    for (state, words, advice) in [
+        ([6, 1, 0], "(1F57h reads 02h); it has no program [", "flash a program"),
+        (
+            [5, 4, 1],
+            "(1F57h reads 02h); its program is not released for autostart; the program was ended by the independent \
+             watchdog [",
+            "does not feed its watchdog",
+        ),
+    ] {
+        let stays = || {
+            let mut fake = quick(BOOTLOADER);
+            fake.starts = Some(BOOTLOADER);
+            fake.state = Some(state);
+            fake
+        };
+        let (said, json, _) = on(stays, &["start", "--boot-timeout", "300"]);
+        assert_eq!((said.exit, &json["error"]["number"]), (7, &"0x60000014".into()));
+        assert!(said.err.contains(words) && said.err.contains(advice), "{}", said.err);
+    }
+}
+
 #[test]
 fn status_shows_and_clears() {
     let failed = || {

@@ -80,11 +80,16 @@ fn a_refusal_before_the_erasure_leaves_the_old_program() {
             assert!(words.starts_with("its bootloader is running; it was not changed"), "{words}");
         }
     }
-    let called = left(APPLICATION, &on_command(CLEAR, Outcome::Abort(0x0800_0022)), FlashOptions::default());
+    let refuses = |fake: &mut Fake| {
+        on_command(CLEAR, Outcome::Abort(0x0800_0022))(fake);
+        fake.crc = Some(0x0BAD_CAFE);
+    };
+    let called = left(APPLICATION, &refuses, FlashOptions::default());
     assert_eq!(called.state, DeviceState::Called);
     assert_eq!(
         called.to_string(),
-        "its bootloader is running; it was called back to the bootloader, and its program is unchanged"
+        "its bootloader is running; it was called back to the bootloader, and its program is unchanged (CRC \
+         0BADCAFEh): coflash start starts it again"
     );
 }
 

@@ -488,6 +488,22 @@ const STATUS: [(u32, u32, &str); 14] = [
     (0x88, 0x6000_0188, "order"),
 ];
 
+/// A sector that the option bytes protect (nWRP): bits 16 to 31 of 1F57h have its number.
+#[test]
+fn a_write_protected_sector_is_named_with_the_way_out() {
+    for outcome in [Outcome::Status(0x0004_000E), Outcome::AbortStatus(0x0800_0020, 0x0004_000E)] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.on_block = script(1, usize::MAX, outcome);
+        let error = fails(&mut fake);
+        let text = error.to_string();
+        let words = "writing block 1 failed: sector 4 of the flash is write-protected (1F57h reads 0Eh";
+        assert!(text.starts_with(words) && !text.contains("detail"), "{text}");
+        let advice = error.advice();
+        assert!(advice.contains("option bytes") && advice.contains("debug probe"), "{advice}");
+        assert!(!advice.contains("linked"), "{advice}");
+    }
+}
+
 #[test]
 fn every_status_of_the_manual_has_its_number_and_words() {
     for (status, number, words) in STATUS {

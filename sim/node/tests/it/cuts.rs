@@ -15,7 +15,7 @@ use coflash::update::{flash, Event, FlashOptions, Report};
 use coflash::Error;
 
 use crate::cut::{CutBus, Way};
-use kit::bench::{block, block_file, crc32, program, LAYOUT, PROGRAM};
+use kit::bench::{self, block, block_file, crc32, LAYOUT, PROGRAM};
 use kit::model::{Cut, ModelFlash, CHIP};
 use kit::random::Random;
 
@@ -24,6 +24,14 @@ const CHUNK: usize = 256;
 /// The bytes of the program: the step in which a device stores its progress is 1 KiB.
 const SIZE: usize = 0x3B00;
 const UPDATES: u64 = 1000;
+
+/// A program whose code comes after the vector table of each STM32F4, as the tool wants it: the chip of
+/// the model has a shorter one.
+fn program(len: usize, seed: u8) -> Vec<u8> {
+    let mut bytes = bench::program(len, seed);
+    bytes[4..8].copy_from_slice(&(PROGRAM.base + 0x201).to_le_bytes());
+    bytes
+}
 
 /// A block file with size and identity in block 0.
 fn named(image: &[u8]) -> Vec<u8> {
