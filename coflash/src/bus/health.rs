@@ -46,6 +46,8 @@ pub struct Health {
     /// Errors of an unknown kind: socketcand sends the class of an error frame alone, and an SLCAN
     /// adapter refuses a frame without a reason.
     pub unclear: u32,
+    /// What an adapter has sent that is not of its protocol.
+    pub strange: u32,
     /// The transmit and receive error counters, if the adapter reports them.
     pub counters: Option<(u8, u8)>,
     /// The bit rate in bit/s, where it is known.
@@ -67,6 +69,8 @@ pub enum Trouble {
     Passive,
     /// There are errors, and the adapter does not report their kind.
     Unclear,
+    /// The adapter speaks another protocol than when it was opened.
+    Strange,
 }
 
 /// The transmit error counter of a sender without any receiver stays at this value: an error
@@ -97,6 +101,7 @@ impl Health {
             }
             _ if passive => Some(Trouble::Passive),
             _ if self.unclear > 0 => Some(Trouble::Unclear),
+            _ if self.strange > 0 => Some(Trouble::Strange),
             _ => None,
         }
     }
@@ -142,6 +147,11 @@ impl Health {
                  bit rate is wrong{rate}; check power, cable, terminators and bit rate",
                 self.unclear_errors()
             ),
+            Trouble::Strange => {
+                "the adapter sends what is not of its protocol, and no frames: it was reset, or something else is at this \
+                 port or address; unplug it and plug it in again, or check --bus"
+                    .to_string()
+            }
         })
     }
 
@@ -154,7 +164,7 @@ impl Health {
                 "the adapter has reported {} of the bus: check the bit rate of each node, cable and terminators",
                 self.unclear_errors()
             )),
-            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive => None,
+            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive | Trouble::Strange => None,
         }
     }
 

@@ -16,6 +16,8 @@ use super::tcp::{connect, PATIENCE};
 
 mod opening;
 
+use self::opening::is_version;
+
 /// How long an adapter may take to answer a command. Some adapters never answer, but work.
 const ANSWER: Duration = Duration::from_millis(300);
 
@@ -71,6 +73,8 @@ pub struct Slcan<L: Line> {
     sent: VecDeque<Frame>,
     /// Frames that the adapter has refused: its queue is full, or its bus is closed.
     refused: u32,
+    /// Lines outside the protocol that came since the bus is open.
+    strange: u32,
     /// The first line outside the protocol that came while the adapter was opened.
     odd: Option<String>,
 }
@@ -127,6 +131,7 @@ impl<L: Line> Slcan<L> {
             echoes: false,
             sent: VecDeque::new(),
             refused: 0,
+            strange: 0,
             odd: None,
         }
     }
@@ -260,7 +265,11 @@ impl<L: Line> Adapter for Slcan<L> {
             match message {
                 // Acknowledgements (z, Z, empty) are ignored.
                 Message::Text(text) => {
-                    if let Some(frame) = parse_frame(&text).filter(|frame| !self.is_echo(frame)) {
+                    let frame = parse_frame(&text);
+                    if frame.is_none() && !is_of_protocol(&text) {
+                        self.strange = self.strange.saturating_add(1);
+                    }
+                    if let Some(frame) = frame.filter(|frame| !self.is_echo(frame)) {
                         return Ok(Some(frame));
                     }
                 }
@@ -286,8 +295,9 @@ impl<L: Line> Adapter for Slcan<L> {
             flags if flags & WARNING != 0 => Controller::Warning,
             _ => Controller::Active,
         });
-        let known = controller.is_some() || self.refused > 0;
-        known.then_some(Health { controller, unclear: self.refused, ..Health::default() })
+        let (unclear, strange) = (self.refused, self.strange);
+        let known = controller.is_some() || unclear > 0 || strange > 0;
+        known.then_some(Health { controller, unclear, strange, ..Health::default() })
     }
 }
 
@@ -299,6 +309,14 @@ const PASSIVE: u32 = 0x20;
 fn status_flags(text: &[u8]) -> Option<u32> {
     let digits = text.strip_prefix(b"F").filter(|digits| digits.len() == 2)?;
     hex_number(std::str::from_utf8(digits).ok()?)
+}
+
+/// Whether a line that has no frame is one of the protocol: an acknowledgement, the answer to a command of
+/// before, or a CAN FD frame of those that have extended it.
+fn is_of_protocol(text: &[u8]) -> bool {
+    matches!(text, b"" | b"z" | b"Z" | [b'd' | b'D' | b'b' | b'B' | b'N', ..])
+        || status_flags(text).is_some()
+        || is_version(text)
 }
 
 /// `t6018400010…`, `T1234567880…`, `r6018`, `R123456788`, with the end of the line.

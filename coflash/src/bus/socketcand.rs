@@ -174,7 +174,7 @@ impl Adapter for Socketcand {
 
     /// The reports of the error frames. A server sends them if it was told to (`--error-mask`).
     fn health(&mut self) -> Option<Health> {
-        Some(self.health)
+        Some(Health { strange: self.messages.strays, ..self.health })
     }
 }
 
@@ -261,6 +261,8 @@ pub struct Messages {
     partial: Option<Vec<u8>>,
     complete: VecDeque<String>,
     overlong: bool,
+    /// Bytes between messages that are no blanks.
+    strays: u32,
 }
 
 impl Messages {
@@ -276,7 +278,9 @@ impl Messages {
                 (_, Some(text)) if text.len() < LONGEST_MESSAGE => text.push(byte),
                 (_, Some(_)) => self.overlong = true,
                 // A byte between two messages.
-                (_, None) => {}
+                (byte, None) => {
+                    self.strays = self.strays.saturating_add(u32::from(!byte.is_ascii_whitespace()))
+                }
             }
         }
     }
@@ -304,6 +308,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::bus::health::Trouble;
 
     fn frame(id: u16, data: &[u8]) -> Frame {
         Frame::of(CobId::new(id).unwrap(), data)
@@ -432,6 +437,24 @@ mod tests {
         ] {
             assert_eq!(parse_error_frame(message), frame, "{message}");
         }
+    }
+
+    /// A server that becomes something else: what it sends has no brackets.
+    #[test]
+    fn what_is_between_messages_is_told() {
+        let address = server(&[
+            LOG_IN[0],
+            LOG_IN[1],
+            ("< rawmode >", "< ok >\r\n\t "),
+            ("< send 601 8 40 00 10 00 00 00 00 00 >", "[1] OK\r\n< frame 701 1.0 7F >"),
+            ("< send 601 8 40 00 10 00 00 00 00 00 >", ""),
+        ]);
+        let mut bus = crate::bus::open(&format!("socketcand://{address}/can0")).unwrap();
+        assert_eq!(bus.health().unwrap().trouble(), None);
+        bus.send(&Frame::of(CobId::sdo_request(NodeId::MIN), &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
+        assert_eq!(bus.receive(Duration::from_secs(20)).unwrap(), Some(frame(0x701, &[0x7F])));
+        let health = bus.health().unwrap();
+        assert_eq!((health.strange, health.trouble()), (5, Some(Trouble::Strange)));
     }
 
     #[test]

@@ -24,6 +24,7 @@ use canopen::{AbortCode, NodeId};
 
 use self::line::{Line, ERROR};
 use super::adapter::AdapterError;
+use super::found::shown;
 use super::gateway::{Ask, Gateway, GatewayError};
 use super::tcp;
 
@@ -42,6 +43,8 @@ const AT_ONCE: Duration = Duration::from_secs(5);
 const LONGEST_LINE: usize = 100 << 20;
 /// Longer than any line that is not an answer, and than any answer without a value.
 const LONGEST_WORDS: usize = 4096;
+/// The most bytes of an unfinished line that an error shows.
+const SHOWN: usize = 80;
 /// The characters of an answer that a gateway on the slowest bus sends in a second. An answer that
 /// comes so fast may take longer than the time limit.
 const SLOWEST: u32 = 250;
@@ -215,8 +218,14 @@ impl Cia309 {
                 return Err(GatewayError::Cancelled);
             }
             if Instant::now() >= limit + Duration::from_secs(part as u64) / SLOWEST {
-                let seconds = wait.patience.as_secs_f64();
-                return Err(self.failed(format!("it has not answered for {seconds:.1} s")).into());
+                let (seconds, said) =
+                    (wait.patience.as_secs_f64(), shown(&self.inbox[..self.inbox.len().min(SHOWN)]));
+                let said = if said.is_empty() {
+                    said
+                } else {
+                    format!("; it sent '{said}', and no end of the line")
+                };
+                return Err(self.failed(format!("it has not answered for {seconds:.1} s{said}")).into());
             }
             self.receive()?;
         }

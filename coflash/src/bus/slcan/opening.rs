@@ -294,7 +294,7 @@ impl<L: Line> Slcan<L> {
 
 /// Whether a line is the version of the protocol: `V` and digits, such as `V1013`. An adapter may
 /// have echoed the command before it.
-fn is_version(text: &[u8]) -> bool {
+pub(super) fn is_version(text: &[u8]) -> bool {
     let version = text.strip_prefix(b"VV").or_else(|| text.strip_prefix(b"V"));
     version.is_some_and(|version| version.first().is_some_and(u8::is_ascii_digit))
 }

@@ -533,6 +533,33 @@ fn refused_frames_are_errors_of_the_bus() {
     assert_eq!(bus.health().unwrap().unclear, 3);
 }
 
+/// An adapter that becomes something else in the middle of a session: a gateway, a boot loader, a modem.
+#[test]
+fn an_adapter_that_becomes_something_else_is_told() {
+    for answers in
+        [(|_, _| "[1] OK\r\n".to_string()) as Answers, modem_without_echo, |_, _| "< ok >\r".into()]
+    {
+        let mut device = Device::new(lawicel);
+        let mut bus = open(&mut device, None).unwrap();
+        bus.send(&frame(0x605, &[0x40])).unwrap();
+        assert_eq!(bus.receive(ms(20)).unwrap(), None);
+        assert_eq!(
+            bus.health().map_or(0, |health| health.strange),
+            0,
+            "acknowledgements are of the protocol"
+        );
+        bus.line.answers = answers;
+        for _ in 0..3 {
+            bus.send(&frame(0x605, &[0x40])).unwrap();
+            assert_eq!(bus.receive(ms(20)).unwrap(), None);
+        }
+        let health = bus.health().unwrap();
+        assert!(health.strange >= 3, "{health:?}");
+        let advice = health.advice().unwrap();
+        assert!(advice.contains("not of its protocol") && advice.contains("--bus"), "{advice}");
+    }
+}
+
 #[test]
 fn a_line_that_is_too_long_is_skipped_and_the_session_goes_on() {
     let mut device = Device::new(lawicel);

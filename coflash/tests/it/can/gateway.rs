@@ -417,7 +417,7 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
         ("HTTP/1.1 400 Bad Request\r\n", "answered unexpectedly: HTTP/1.1 400"),
         ("...ERROR:0x05040005\r\n", "answered unexpectedly: '...ERROR:0x05040005'"),
         ("[2] kgECAA==\n", "it has not answered for 0.3 s"),
-        ("[2] kgECAA==", "it has not answered for 0.3 s"),
+        ("[2] kgECAA==", "it has not answered for 0.3 s; it sent '[2] kgECAA==', and no end of the line"),
     ] {
         let (result, _) = asked(move |_| Some(answer.to_string()));
         let found = words(result);
