@@ -144,9 +144,13 @@ impl SysTick {
         self.reload
     }
 
-    /// Writes SYST_RVR; it counts from the next reload on.
+    /// Writes SYST_RVR; it counts from the next reload on. Two stores are a clock of the core apart at
+    /// least, also where both come at one time here: a counter at zero has loaded the old value by then.
     pub fn write_reload(&mut self, value: u32, now: Time) {
         self.anchor_at(now);
+        if self.is_running() && self.value == 0 && self.csr & CSR_CLKSOURCE != 0 {
+            self.value = self.reload;
+        }
         self.reload = value & COUNTER;
     }
 
@@ -205,6 +209,30 @@ mod tests {
         assert_eq!(tick.next_event(), Some(Time(10_000_000)));
         tick.set_clock(16_000_000, Time(0));
         assert_eq!(tick.next_event(), Some(Time(5_000_000)));
+    }
+
+    /// A timer for one time, as Klipper sets it: LOAD = n, VAL = 0, LOAD = 0, three stores in a row. The
+    /// cleared counter has loaded n before the last of them (ARMv7-M B3.3.1: with the next clock).
+    #[test]
+    fn a_cleared_counter_has_loaded_before_the_next_store() {
+        let mut tick = SysTick::new(1_000_000);
+        tick.write_csr(7, Time(0));
+        for once in 0..3 {
+            let now = once * 100_000_000;
+            tick.write_reload(9, Time(now));
+            tick.write_value(Time(now));
+            tick.write_reload(0, Time(now));
+            let due = tick.next_event().unwrap().0 - now;
+            assert!((9_000_000..=10_000_000).contains(&due), "{due} ps");
+            assert!(tick.advance(Time(now + due)) && tick.next_event().is_none(), "once");
+        }
+        // With an eighth of the clock the stores may all be before the next clock of the counter.
+        let mut tick = SysTick::new(8_000_000);
+        tick.write_csr(3, Time(0));
+        tick.write_reload(9, Time(0));
+        tick.write_value(Time(0));
+        tick.write_reload(0, Time(0));
+        assert_eq!(tick.next_event(), None);
     }
 
     #[test]
