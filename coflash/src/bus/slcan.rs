@@ -16,8 +16,6 @@ use super::tcp::{connect, PATIENCE};
 
 mod opening;
 
-use self::opening::is_version;
-
 /// How long an adapter may take to answer a command. Some adapters never answer, but work.
 const ANSWER: Duration = Duration::from_millis(300);
 
@@ -309,6 +307,13 @@ const PASSIVE: u32 = 0x20;
 fn status_flags(text: &[u8]) -> Option<u32> {
     let digits = text.strip_prefix(b"F").filter(|digits| digits.len() == 2)?;
     hex_number(std::str::from_utf8(digits).ok()?)
+}
+
+/// Whether a line is the version of the protocol: `V` and digits, such as `V1013`. An adapter may
+/// have echoed the command before it.
+fn is_version(text: &[u8]) -> bool {
+    let version = text.strip_prefix(b"VV").or_else(|| text.strip_prefix(b"V"));
+    version.is_some_and(|version| version.first().is_some_and(u8::is_ascii_digit))
 }
 
 /// Whether a line that has no frame is one of the protocol: an acknowledgement, the answer to a command of

@@ -28,7 +28,7 @@ pub enum Area {
     Registers,
     /// A memory outside the chip, at the memory controller (FMC) or at QUADSPI.
     External,
-    /// Where no STM32F4 has anything.
+    /// Where no STM32F4 has anything that can be written: the unique ID, and nothing at all.
     Reserved,
 }
 
@@ -132,7 +132,7 @@ impl fmt::Display for Area {
             Self::BackupSram => "the backup SRAM, which is no EEPROM",
             Self::Registers => "the registers of peripherals",
             Self::External => "an external memory (FMC, QUADSPI)",
-            Self::Reserved => "a range where no STM32F4 has memory",
+            Self::Reserved => "a range in which no STM32F4 has memory that can be written",
         })
     }
 }

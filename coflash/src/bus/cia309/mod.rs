@@ -218,8 +218,10 @@ impl Cia309 {
                 return Err(GatewayError::Cancelled);
             }
             if Instant::now() >= limit + Duration::from_secs(part as u64) / SLOWEST {
-                let (seconds, said) =
-                    (wait.patience.as_secs_f64(), shown(&self.inbox[..self.inbox.len().min(SHOWN)]));
+                let (seconds, said) = (
+                    wait.patience.as_secs_f64(),
+                    shown(self.inbox[..self.inbox.len().min(SHOWN)].trim_ascii()),
+                );
                 let said = if said.is_empty() {
                     said
                 } else {

@@ -18,7 +18,7 @@
 
 use std::time::Duration;
 
-use super::{Line, Message, Slcan, ANSWER};
+use super::{is_version, Line, Message, Slcan, ANSWER};
 use crate::bus::adapter::AdapterError;
 use crate::bus::found::shown;
 use crate::bus::ports;
@@ -290,11 +290,4 @@ impl<L: Line> Slcan<L> {
         );
         AdapterError::unusable(self.name.clone(), what, advice)
     }
-}
-
-/// Whether a line is the version of the protocol: `V` and digits, such as `V1013`. An adapter may
-/// have echoed the command before it.
-pub(super) fn is_version(text: &[u8]) -> bool {
-    let version = text.strip_prefix(b"VV").or_else(|| text.strip_prefix(b"V"));
-    version.is_some_and(|version| version.first().is_some_and(u8::is_ascii_digit))
 }
