@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use canopen::program::{
-    DEVICE_STATE, STATE_CRASH_RESETS, STATE_PROGRAM_RESET, STATE_PROGRAM_WATCHDOG, STATE_REASON,
+    DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_PROGRAM_RESET, STATE_PROGRAM_WATCHDOG, STATE_REASON,
 };
 use canopen::Address;
 
@@ -23,7 +23,8 @@ pub fn read_state(session: &mut Session<'_>) -> Result<Option<BootloaderState>, 
     let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
     let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
     let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
-    Ok(Some(BootloaderState { reason, program_reset, crash_resets }))
+    let clock = byte(STATE_CLOCK)?.unwrap_or(0);
+    Ok(Some(BootloaderState { reason, program_reset, crash_resets, clock }))
 }
 
 /// The state of a device that is in trouble already: an error of the read is no news.

@@ -2,6 +2,7 @@
 
 use std::fmt;
 
+use canopen::program::ClockSource;
 use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
@@ -16,6 +17,8 @@ pub struct BootloaderState {
     pub program_reset: u8,
     /// 2007h/4: resets in a row by which a program ended and that nobody requested.
     pub crash_resets: u8,
+    /// 2007h/5: the number of a [`ClockSource`]; 0 if it is not known.
+    pub clock: u8,
 }
 
 impl BootloaderState {
@@ -73,11 +76,15 @@ impl fmt::Display for BootloaderState {
             write!(f, "; the program was ended by {}", source(how))?;
         }
         match self.crash_resets {
-            0 => Ok(()),
-            1 => write!(f, "; 1 reset that nobody requested"),
-            255 => write!(f, "; 255 or more resets in a row that nobody requested"),
-            n => write!(f, "; {n} resets in a row that nobody requested"),
+            0 => {}
+            1 => write!(f, "; 1 reset that nobody requested")?,
+            255 => write!(f, "; 255 or more resets in a row that nobody requested")?,
+            n => write!(f, "; {n} resets in a row that nobody requested")?,
         }
+        if self.clock == ClockSource::Internal as u8 {
+            write!(f, "; its crystal has failed, and it runs from its internal oscillator")?;
+        }
+        Ok(())
     }
 }
 
@@ -88,7 +95,7 @@ mod tests {
     #[test]
     fn each_state_has_its_words() {
         let state = |reason, program_reset, crash_resets| {
-            BootloaderState { reason, program_reset, crash_resets }.to_string()
+            BootloaderState { reason, program_reset, crash_resets, clock: 1 }.to_string()
         };
         assert_eq!(
             state(5, 4, 1),
@@ -102,6 +109,12 @@ mod tests {
         assert_eq!(
             state(200, 200, 0),
             "stays in the bootloader: for a reason that this tool does not know (200)"
+        );
+        let failed = BootloaderState { reason: 6, program_reset: 0, crash_resets: 0, clock: 2 };
+        assert_eq!(
+            failed.to_string(),
+            "stays in the bootloader: it has no program; its crystal has failed, and it runs from its internal \
+             oscillator"
         );
         // No two reasons share their words.
         let mut words: Vec<_> = (0..=12).map(reason).collect();
