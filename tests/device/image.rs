@@ -380,7 +380,7 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
     bench.power_on();
     bench.await_boot_up(1000);
     for reset in 1..=6 {
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(300);
         assert!(!bench.is_bootloader(NODE), "after {reset}");
         assert_eq!(cell(&bench).is_some(), reset >= 3, "after {reset}");
@@ -392,7 +392,7 @@ fn beside_a_damaged_image_a_program_is_not_given_up() {
         bytes
     };
     let before = parameters(&bench);
-    bench.machine().start_watchdog(64);
+    bench.machine().preset_watchdog(64);
     bench.run_ms(300);
     assert!(parameters(&bench) == before);
 }

@@ -240,7 +240,7 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     let mut bench = running_board();
     for reset in 1..=3 {
         bench.events();
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(300);
         assert_eq!(bench.is_bootloader(NODE), reset == 3, "after {reset}");
     }
@@ -257,11 +257,11 @@ fn an_application_that_crashes_is_given_up_until_somebody_asks_for_it() {
     }
     // A confirmed program has not crashed.
     for _ in 0..2 {
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(300);
         assert!(!bench.is_bootloader(NODE));
         write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(300);
         assert!(!bench.is_bootloader(NODE));
         write(&mut bench, CONFIRMATION, SIGNED as u8).unwrap();
@@ -353,7 +353,7 @@ fn the_rescue_window_holds_the_device_for_whoever_speaks_to_it() {
 
     // The window does not reset the count of crashes.
     for reset in 1..=3 {
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(1200);
         assert_eq!(bench.is_bootloader(NODE), reset == 3, "after {reset}");
     }

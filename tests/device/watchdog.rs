@@ -111,7 +111,7 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
         bench.events();
         // An application that started the watchdog and then hangs: LSI / 4, 8 ms.
         let from = bench.time();
-        bench.machine().start_watchdog(64);
+        bench.machine().preset_watchdog(64);
         bench.run_ms(200);
         let events = bench.events();
         assert!(matches!(events[..], [(_, Stop::Reset(ResetCause::IndependentWatchdog))]), "{events:?}");
@@ -176,7 +176,7 @@ fn a_watchdog_does_not_survive_a_jump_into_the_bootloader() {
     bench.session().write(way_back, &[2], Doing::Write(way_back), &mut |_| {}).unwrap();
     bench.events();
     // LSI / 4, 100 ms: longer than the way back, and shorter than the bootloader stays.
-    bench.machine().start_watchdog(800);
+    bench.machine().preset_watchdog(800);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     assert!(bench.is_bootloader(NODE));

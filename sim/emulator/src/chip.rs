@@ -16,12 +16,13 @@ use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
 use crate::periph::iwdg::Iwdg;
 use crate::periph::pwr::Pwr;
-use crate::periph::rcc::{self, Clocks, Rcc, ResetCause, HSI_HZ};
+use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
 use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::report::{Access, Report, Reports};
+use crate::silicon::Silicon;
 use crate::slice::Slice;
 use crate::time::Time;
 use crate::variant::{self, Variant};
@@ -185,6 +186,7 @@ pub struct Chip {
     /// What the chip has.
     pub geometry: &'static Geometry,
     variant: &'static Variant,
+    silicon: Silicon,
     /// From cycles to time.
     pub clock: CycleClock,
     /// Core registers and exceptions.
@@ -223,6 +225,8 @@ pub struct Chip {
     /// What the chip and the CPU loop have to say to each other.
     pub slice: Slice,
     clocks: Clocks,
+    /// The core sleeps, and some blocks that it uses have no clock meanwhile.
+    is_halved: bool,
     lines: Vec<u16>,
 }
 
@@ -241,16 +245,18 @@ impl Chip {
         let kib = u16::try_from(geometry.flash.size / 1024).unwrap_or(u16::MAX);
         place(&mut system, FLASH_SIZE, &kib.to_le_bytes());
         let variant = variant::of(geometry);
-        let rcc = Rcc::new(variant, options.hse_hz);
+        let silicon = options.silicon;
+        let rcc = Rcc::new(variant, options.hse_hz, silicon);
         Self {
             geometry,
             variant,
-            clock: CycleClock::new(Time(0), HSI_HZ),
-            scs: Scs::new(geometry.interrupts, HSI_HZ.into()),
+            silicon,
+            clock: CycleClock::new(Time(0), silicon.hsi_hz),
+            scs: Scs::new(geometry.interrupts, silicon.hsi_hz.into(), silicon.systick_value),
             flash: Flash::new(geometry, options.flash_times),
             clocks: rcc.clocks(),
             rcc,
-            iwdg: Iwdg::default(),
+            iwdg: Iwdg::new(silicon),
             gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
             can: [BxCan::new(), BxCan::slave()],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
@@ -277,6 +283,7 @@ impl Chip {
                 flash_stall_time: crate::time::Span(0),
             },
             slice: Slice::default(),
+            is_halved: false,
             lines: Vec::new(),
         }
     }
@@ -290,9 +297,66 @@ impl Chip {
     /// A system reset of everything but the CPU: RAM stays, the flags in RCC_CSR gather.
     pub fn reset(&mut self, cause: ResetCause) {
         self.rcc.note_reset(cause);
-        let (crc, pwr, syscfg): (&mut dyn Peripheral, _, _) =
-            (&mut self.crc, &mut self.pwr, &mut self.syscfg);
-        for block in [crc, pwr, syscfg, &mut self.exti, &mut self.rcc, &mut self.flash, &mut self.iwdg] {
+        self.iwdg.reset();
+        match cause {
+            ResetCause::Standby => self.pwr.leave_standby(),
+            _ => self.pwr.reset(),
+        }
+        self.reset_core_domain(cause);
+        if self.flash.hardware_watchdog() {
+            let now = self.now();
+            // The key that starts the watchdog is always accepted.
+            let _ = self.iwdg.write(0x00, 0xCCCC, now);
+        }
+        self.follow_watchdog();
+    }
+
+    /// Enters Standby: the supply of the core domain goes off; a watchdog that runs goes on.
+    pub fn enter_standby(&mut self) {
+        self.reset_core_domain(ResetCause::Standby);
+        self.follow_watchdog();
+        if self.pwr.enter_standby() {
+            self.wake_up();
+        }
+    }
+
+    /// Leaves Standby.
+    pub fn wake_up(&mut self) {
+        self.pwr.wake_up();
+        self.slice.reset_request = Some(ResetCause::Standby);
+    }
+
+    /// See [`Iwdg::preset`]; the prescaler stays.
+    pub fn preset_watchdog(&mut self, reload: u32) {
+        let now = self.now();
+        self.iwdg.preset(reload, now);
+        self.follow_watchdog();
+    }
+
+    /// A rising edge at the pin WKUP. Returns whether it is a wake-up.
+    pub fn wkup_rises(&mut self) -> bool {
+        self.pwr.wkup_rises()
+    }
+
+    /// Whether a WFI now enters Standby; `None` if the sleep is not deep.
+    #[must_use]
+    pub fn deep_sleep_is_standby(&self) -> Option<bool> {
+        self.scs.sleeps_deeply().then(|| self.pwr.chooses_standby())
+    }
+
+    /// The watchdog forces the LSI on, and the LSI carries its updates out.
+    fn follow_watchdog(&mut self) {
+        let now = self.now();
+        if self.iwdg.is_running() {
+            self.rcc.force_lsi(now);
+        }
+        self.iwdg.follow_lsi(self.rcc.lsi_is_on(), now);
+    }
+
+    fn reset_core_domain(&mut self, cause: ResetCause) {
+        self.is_halved = false;
+        let (crc, syscfg): (&mut dyn Peripheral, _) = (&mut self.crc, &mut self.syscfg);
+        for block in [crc, syscfg, &mut self.exti, &mut self.rcc, &mut self.flash] {
             block.reset();
         }
         for can in &mut self.can {
@@ -315,7 +379,7 @@ impl Chip {
             ResetCause::PowerOn => Debug::default(),
             _ => self.scs.debug.after_reset(),
         };
-        self.scs = Scs::new(self.geometry.interrupts, self.clock.hz());
+        self.scs = Scs::new(self.geometry.interrupts, self.clock.hz(), self.silicon.systick_value);
         self.scs.debug = debug;
         self.slice.breakpoints_changed = true;
         self.slice.leave = false;
@@ -323,19 +387,14 @@ impl Chip {
         self.slice.reset_request = None;
         self.slice.hold_until = None;
         self.slice.bus_error = None;
-        if self.flash.hardware_watchdog() {
-            let now = self.now();
-            // The key that starts the watchdog is always accepted.
-            let _ = self.iwdg.write(0x00, 0xCCCC, now);
-            self.rcc.force_lsi(now);
-        }
         self.take_flash_changes();
     }
 
     /// Power-on: as a reset, but all state is lost.
     pub fn power_on(&mut self, now: Time, hse_hz: u32) {
-        self.clock = CycleClock::new(now, HSI_HZ);
-        self.rcc = Rcc::new(self.variant, hse_hz);
+        self.clock = CycleClock::new(now, self.silicon.hsi_hz);
+        self.rcc = Rcc::new(self.variant, hse_hz, self.silicon);
+        self.pwr = Pwr::new(self.variant);
         self.dbgmcu = [0; 3];
         self.counters.resets = 0;
         self.slice.attention = false;
@@ -348,7 +407,7 @@ impl Chip {
         self.clock.set_hz(self.clocks.hclk);
         self.scs.systick.set_clock(self.clocks.hclk.into(), now);
         for (_, block, enable) in BLOCKS {
-            let clock_of = |clock: u32| if self.has_clock(enable) { clock } else { 0 };
+            let clock_of = |clock: u32| if self.is_clocked(enable) { clock } else { 0 };
             let (pclk1, pclk2) = (clock_of(self.clocks.pclk1), clock_of(self.clocks.pclk2));
             let (timclk1, timclk2) = (clock_of(self.clocks.timclk1), clock_of(self.clocks.timclk2));
             match block {
@@ -370,7 +429,7 @@ impl Chip {
 
     /// Passes a change of CAN1's filters or clock on to CAN2.
     fn tell_slave(&mut self) {
-        let clocked = self.rcc.plain(rcc::APB1ENR) & 1 << 25 != 0;
+        let clocked = self.is_clocked(Some((rcc::APB1ENR, 25)));
         let [master, slave] = &mut self.can;
         slave.follow(master, clocked);
     }
@@ -637,6 +696,25 @@ impl Chip {
         enable.is_none_or(|(register, bit)| self.rcc.plain(register) & 1 << bit != 0)
     }
 
+    /// The same while the core may be asleep: the low-power enable bits are 20h after the others (sections
+    /// 7.3.15 to 7.3.19).
+    fn is_clocked(&self, enable: ClockEnable) -> bool {
+        let sleeps_on =
+            |(register, bit): (u32, u32)| !self.is_halved || self.rcc.plain(register + 0x20) & 1 << bit != 0;
+        self.has_clock(enable) && enable.is_none_or(sleeps_on)
+    }
+
+    /// The core falls asleep or wakes up: a block whose low-power enable bit is 0 stands still meanwhile.
+    /// All blocks that do something by themselves are at APB1 and APB2.
+    pub fn core_sleeps(&mut self, sleeps: bool) {
+        let stops = |register| self.rcc.plain(register) & !self.rcc.plain(register + 0x20) != 0;
+        let is_halved = sleeps && (stops(rcc::APB1ENR) || stops(rcc::APB2ENR));
+        if is_halved != self.is_halved {
+            self.is_halved = is_halved;
+            self.apply_clocks();
+        }
+    }
+
     fn unknown(address: u32) -> Unmodelled {
         let block = UNMODELLED.iter().rev().find(|&&(base, _)| address >= base && address - base < 0x1_0000);
         Unmodelled(match block {
@@ -729,8 +807,9 @@ impl Chip {
                 if changed {
                     self.check_clocks();
                 }
+                self.follow_watchdog();
             }
-            Block::Iwdg if self.iwdg.is_running() => self.rcc.force_lsi(now),
+            Block::Iwdg => self.follow_watchdog(),
             Block::Flash => {
                 self.settle_flash();
             }

@@ -11,6 +11,7 @@
 //! | [`periph`] | the peripherals except CAN; [`peripheral`] is their interface to the chip |
 //! | [`bxcan`] | the CAN controllers |
 //! | [`variant`] | how the lines of the family differ |
+//! | [`silicon`] | what the manuals leave open: the values of one chip |
 //! | [`memory`], [`clock`], [`noise`] | memory of host and chip, cycles as time, random values by a seed |
 //! | [`options`], [`error`], [`report`] | set-up, errors, accesses that are wrong or not modelled |
 //! | [`bus`], [`frame`] | the CAN bus: arbitration, errors, faults; frames and their bits |
@@ -42,6 +43,7 @@ pub mod peripheral;
 pub mod report;
 pub mod rtt;
 pub mod serial;
+pub mod silicon;
 pub mod slice;
 pub mod socketcand;
 pub mod time;

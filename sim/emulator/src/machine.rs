@@ -19,6 +19,7 @@ pub use crate::periph::rcc::ResetCause;
 pub use crate::periph::usart::Usart;
 use crate::peripheral::Peripheral;
 pub use crate::report::{Access, Report};
+use crate::silicon::Silicon;
 use crate::slice::Watch;
 use crate::time::{Span, Time};
 use debugger::Debugger;
@@ -54,12 +55,17 @@ enum Activity {
     Dozes {
         until: Time,
     },
+    /// The core domain has no supply: only a reset or a wake-up ends it.
+    Standby,
     LockedUp,
 }
 
 /// A WFE ends after this time even without an event: SEV is invisible to the model, and the
 /// architecture allows WFE to end for no reason (DDI 0403E B1.5.18).
 const DOZE: Span = Span::from_micros(10);
+
+/// The pin WKUP is PA0 (datasheet, pin definitions).
+const WKUP: (usize, u8) = (0, 0);
 
 /// One board.
 pub struct Machine {
@@ -145,18 +151,23 @@ impl Machine {
 
     /// Power comes up at `now`: RAM holds noise, the chip starts at its reset vector.
     pub fn power_on(&mut self, now: Time) {
+        self.lose_ram();
+        let hse_hz = self.options.hse_hz;
+        self.cpu.chip_mut().power_on(now, hse_hz);
+        self.cpu.forget_translations();
+        self.start();
+    }
+
+    /// The supply of the RAM was off.
+    fn lose_ram(&mut self) {
         self.power_cycles += 1;
         let mut noise = Noise(self.options.seed ^ self.power_cycles.wrapping_mul(0xA24B_AED4_963E_E407));
-        let hse_hz = self.options.hse_hz;
         let chip = self.cpu.chip_mut();
         for memory in [&mut chip.sram, &mut chip.ccm] {
             for word in memory.bytes_mut().chunks_exact_mut(8) {
                 word.copy_from_slice(&noise.word().to_le_bytes());
             }
         }
-        chip.power_on(now, hse_hz);
-        self.cpu.forget_translations();
-        self.start();
     }
 
     /// The power goes off; a running flash operation is torn.
@@ -184,6 +195,25 @@ impl Machine {
         }
     }
 
+    /// Wakes the chip from Standby, as its real-time clock would, if it is in Standby.
+    pub fn wake_up(&mut self) {
+        if self.is_in_standby() {
+            self.cpu.chip_mut().wake_up();
+        }
+    }
+
+    /// Whether the chip is in Standby.
+    #[must_use]
+    pub fn is_in_standby(&self) -> bool {
+        self.activity == Activity::Standby
+    }
+
+    /// What the manuals leave open, as this chip has it.
+    #[must_use]
+    pub fn silicon(&self) -> Silicon {
+        self.options.silicon
+    }
+
     /// Whether the power is on.
     #[must_use]
     pub fn is_powered(&self) -> bool {
@@ -191,6 +221,10 @@ impl Machine {
     }
 
     fn reset(&mut self, cause: ResetCause) {
+        if self.activity == Activity::Standby {
+            self.lose_ram();
+            self.cpu.forget_translations();
+        }
         let chip = self.cpu.chip_mut();
         chip.reset(cause);
         chip.counters.resets += 1;
@@ -306,25 +340,48 @@ impl Machine {
         }
         match self.activity {
             Activity::Runs => self.execute(),
-            Activity::Sleeps if self.cpu.wakes() => {
-                self.activity = Activity::Runs;
-                Entry::Taken
-            }
+            Activity::Sleeps if self.cpu.wakes() => self.become_active(Activity::Runs),
             Activity::Dozes { until } if now >= until || self.cpu.wakes() => {
-                self.activity = Activity::Runs;
-                Entry::Taken
+                self.become_active(Activity::Runs)
             }
             Activity::Dozes { until } => {
                 let target = self.cpu.chip().next_stop().min(until);
                 self.skip_to(target);
                 Entry::Taken
             }
-            Activity::Sleeps | Activity::LockedUp | Activity::Off => {
+            Activity::Sleeps | Activity::Standby | Activity::LockedUp | Activity::Off => {
                 let target = self.cpu.chip().next_stop();
                 self.skip_to(target);
                 Entry::Taken
             }
         }
+    }
+
+    /// The core sleeps, or goes on.
+    fn become_active(&mut self, activity: Activity) -> Entry {
+        self.cpu.chip_mut().core_sleeps(activity != Activity::Runs);
+        self.activity = activity;
+        Entry::Taken
+    }
+
+    /// The core executes WFI or WFE, or sleeps on exit: it sleeps as `light` says unless SLEEPDEEP is set.
+    fn fall_asleep(&mut self, light: Activity) -> Entry {
+        match self.cpu.chip().deep_sleep_is_standby() {
+            // With an interrupt pending, WFI does nothing (PM0214 section 3.11.12).
+            Some(true) if !self.cpu.wakes() => {
+                self.cpu.chip_mut().enter_standby();
+                self.activity = Activity::Standby;
+                return Entry::Taken;
+            }
+            Some(false) => {
+                let chip = self.cpu.chip_mut();
+                let pc = chip.slice.block.0;
+                let what = "SLEEPDEEP is set: Stop is not modelled, the CPU sleeps".into();
+                chip.report(Access::Read, pc, 2, 0, pc, what);
+            }
+            Some(true) | None => {}
+        }
+        self.become_active(light)
     }
 
     /// Lets time pass up to `target`, and at least a cycle.
@@ -347,25 +404,13 @@ impl Machine {
         let Some(exit) = self.debugger.run_code(&mut self.cpu) else { return Entry::Taken };
         match exit {
             Exit::Slice => Entry::Taken,
-            Exit::WaitForInterrupt => {
-                let chip = self.cpu.chip_mut();
-                if chip.scs.sleeps_deeply() {
-                    let pc = chip.slice.block.0;
-                    let what = "SLEEPDEEP is set: Stop and Standby are not modelled, the CPU sleeps".into();
-                    chip.report(Access::Read, pc, 2, 0, pc, what);
-                }
-                self.activity = Activity::Sleeps;
-                Entry::Taken
-            }
-            Exit::WaitForEvent => {
-                self.activity = Activity::Dozes { until: self.now() + DOZE };
-                Entry::Taken
-            }
+            Exit::WaitForInterrupt => self.fall_asleep(Activity::Sleeps),
+            Exit::WaitForEvent => self.fall_asleep(Activity::Dozes { until: self.now() + DOZE }),
             Exit::SupervisorCall => self.cpu.supervisor_call(),
             Exit::ExceptionReturn(value) => match self.cpu.return_from_exception(value) {
                 Ok(()) => {
                     if self.cpu.ipsr() == 0 && self.cpu.chip().scs.sleeps_on_exit() {
-                        self.activity = Activity::Sleeps;
+                        return self.fall_asleep(Activity::Sleeps);
                     }
                     Entry::Taken
                 }
@@ -474,16 +519,10 @@ impl Machine {
     // --- looking and touching
     // ----------------------------------------------------------------------------------------
 
-    /// Starts the independent watchdog with this reload value, as code that never feeds it would
-    /// do. The prescaler stays.
-    pub fn start_watchdog(&mut self, reload: u32) {
-        let chip = self.cpu.chip_mut();
-        let now = chip.now();
-        for (offset, value) in [(0x00, 0xCCCC), (0x00, 0x5555), (0x08, reload), (0x00, 0xAAAA)] {
-            // These registers take these values at any time.
-            let _ = chip.iwdg.write(offset, value, now);
-        }
-        chip.rcc.force_lsi(now);
+    /// The state that a program leaves which has started the independent watchdog with this reload value
+    /// in the order of the manual, waits included, and never feeds it. The prescaler stays.
+    pub fn preset_watchdog(&mut self, reload: u32) {
+        self.cpu.chip_mut().preset_watchdog(reload);
     }
 
     /// Protects a sector of the flash by its option byte, as a debug probe does, or no longer.
@@ -578,10 +617,15 @@ impl Machine {
     /// have are ignored.
     pub fn set_pin(&mut self, port: char, pin: u8, level: Option<bool>) {
         if let Some(index) = port_index(port) {
+            let before = self.pin(port, pin);
             let chip = self.cpu.chip_mut();
             if let Some(port) = chip.gpio.get_mut(index) {
                 port.set_outside(pin, level);
                 chip.show_pins();
+            }
+            let rises = !before && self.pin(port, pin);
+            if (index, pin) == WKUP && rises && self.cpu.chip_mut().wkup_rises() {
+                self.wake_up();
             }
         }
     }

@@ -1,6 +1,7 @@
 //! The set-up of a machine.
 
 use crate::periph::flash::FlashTimes;
+use crate::silicon::{self, Silicon};
 
 /// How a machine is set up.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -16,6 +17,8 @@ pub struct Options {
     /// The CAN controller whose pins the board's transceiver is at: 0 is CAN1, 1 is CAN2. The other
     /// one hears a recessive line.
     pub transceiver: usize,
+    /// What the manuals leave open: the values of this chip.
+    pub silicon: Silicon,
 }
 
 impl Default for Options {
@@ -26,6 +29,7 @@ impl Default for Options {
             flash_times: FlashTimes::Typical,
             unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
             transceiver: 0,
+            silicon: silicon::TYPICAL,
         }
     }
 }

@@ -95,9 +95,8 @@ impl Target for Board {
                 Stop::PowerCut => Happened::PowerCut,
                 // The power came on.
                 Stop::Reset(ResetCause::PowerOn) => continue,
-                Stop::Reset(ResetCause::IndependentWatchdog | ResetCause::Pin) | Stop::Lockup => {
-                    Happened::Trouble
-                }
+                Stop::Reset(ResetCause::IndependentWatchdog | ResetCause::Pin | ResetCause::Standby)
+                | Stop::Lockup => Happened::Trouble,
                 Stop::Deadline | Stop::Attention | Stop::Halted => continue,
             };
             events.push((micros(at), happened));

@@ -147,12 +147,12 @@ pub struct Scs {
 }
 
 impl Scs {
-    /// As after reset, with `lines` interrupt lines and a core clock of `hclk` Hz.
+    /// As after reset, with `lines` interrupt lines, a core clock of `hclk` Hz and this value of SysTick.
     #[must_use]
-    pub fn new(lines: u16, hclk: u64) -> Self {
+    pub fn new(lines: u16, hclk: u64, systick_value: u32) -> Self {
         Self {
             exceptions: Exceptions::new(lines),
-            systick: SysTick::new(hclk),
+            systick: SysTick::new(hclk, systick_value),
             vtor: 0,
             cfsr: 0,
             hfsr: 0,
@@ -498,7 +498,7 @@ mod tests {
     use super::*;
 
     fn scs() -> Scs {
-        Scs::new(82, 16_000_000)
+        Scs::new(82, 16_000_000, 0)
     }
 
     #[test]

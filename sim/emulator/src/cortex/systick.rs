@@ -25,11 +25,11 @@ pub struct SysTick {
 }
 
 impl SysTick {
-    /// As after reset, with a core clock of `hclk` Hz. The counter's value is unknown on the chip,
-    /// zero here.
+    /// As after reset, with a core clock of `hclk` Hz and this value of the counter, which is unknown
+    /// on the chip.
     #[must_use]
-    pub fn new(hclk: u64) -> Self {
-        Self { csr: 0, reload: 0, value: 0, anchor: Time(0), zeros_seen: 0, hclk }
+    pub fn new(hclk: u64, value: u32) -> Self {
+        Self { csr: 0, reload: 0, value: value & COUNTER, anchor: Time(0), zeros_seen: 0, hclk }
     }
 
     fn is_running(&self) -> bool {
@@ -182,7 +182,7 @@ mod tests {
     /// At 1 MHz a reload value of 9 gives a period of 10 µs.
     #[test]
     fn the_period_is_the_reload_value_plus_one() {
-        let mut tick = SysTick::new(1_000_000);
+        let mut tick = SysTick::new(1_000_000, 0);
         tick.write_reload(9, Time(0));
         tick.write_value(Time(0));
         tick.write_csr(7, Time(0));
@@ -203,7 +203,7 @@ mod tests {
 
     #[test]
     fn the_external_clock_is_an_eighth() {
-        let mut tick = SysTick::new(8_000_000);
+        let mut tick = SysTick::new(8_000_000, 0);
         tick.write_reload(9, Time(0));
         tick.write_csr(3, Time(0));
         assert_eq!(tick.next_event(), Some(Time(10_000_000)));
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn a_reload_value_of_zero_stops_it() {
-        let mut tick = SysTick::new(1_000_000);
+        let mut tick = SysTick::new(1_000_000, 0);
         tick.write_reload(4, Time(0));
         tick.write_csr(7, Time(0));
         tick.write_reload(0, Time(3_000_000));

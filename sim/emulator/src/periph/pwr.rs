@@ -7,17 +7,24 @@ use crate::variant::Variant;
 const CR_DBP: u32 = 1 << 8;
 const CR_FPDS: u32 = 1 << 9;
 const CR_LOW_POWER: u32 = 0b11;
+const CR_PDDS: u32 = 1 << 1;
+const CR_CWUF: u32 = 1 << 2;
+const CR_CSBF: u32 = 1 << 3;
 const CR_PVD: u32 = 0b1111 << 4;
 /// On chips that can do 180 MHz.
 const CR_OVER_DRIVE: u32 = 0b11 << 16;
+const CSR_WUF: u32 = 1 << 0;
+const CSR_SBF: u32 = 1 << 1;
+/// The pin WKUP, PA0; some lines have more such pins, which are not modelled.
+const CSR_EWUP: u32 = 1 << 8;
 const CSR_VOSRDY: u32 = 1 << 14;
 
-/// Regulator scale and backup-domain access; standby, stop and the voltage detector are not
-/// modelled.
+/// Regulator scale, backup-domain access and Standby; Stop and the voltage detector are not modelled.
 #[derive(Clone, Debug)]
 pub struct Pwr {
     variant: &'static Variant,
     cr: u32,
+    /// WUF, SBF and EWUP.
     csr: u32,
 }
 
@@ -33,6 +40,38 @@ impl Pwr {
     pub fn is_at_scale_1(&self) -> bool {
         let (scale, _) = self.variant.voltage_scale;
         self.cr & scale == scale
+    }
+
+    /// CR.PDDS: whether a deep sleep is Standby.
+    #[must_use]
+    pub fn chooses_standby(&self) -> bool {
+        self.cr & CR_PDDS != 0
+    }
+
+    /// The chip enters Standby. Returns whether it wakes up at once, because WUF is set (section 5.3.5).
+    pub fn enter_standby(&mut self) -> bool {
+        self.csr |= CSR_SBF;
+        self.csr & CSR_WUF != 0
+    }
+
+    /// The core domain has its supply again: of these registers only CR is as after a reset (section
+    /// 5.4).
+    pub fn leave_standby(&mut self) {
+        *self = Self { csr: self.csr, ..Self::new(self.variant) };
+    }
+
+    /// Something asks for a wake-up.
+    pub fn wake_up(&mut self) {
+        self.csr |= CSR_WUF;
+    }
+
+    /// A rising edge at the pin WKUP. Returns whether it is a wake-up.
+    pub fn wkup_rises(&mut self) -> bool {
+        let listens = self.csr & CSR_EWUP != 0;
+        if listens {
+            self.wake_up();
+        }
+        listens
     }
 
     /// CR.DBP: whether the backup domain may be written.
@@ -59,6 +98,9 @@ impl Peripheral for Pwr {
         match offset {
             0x00 => {
                 // CWUF and CSBF read as zero.
+                for (clear, flag) in [(CR_CWUF, CSR_WUF), (CR_CSBF, CSR_SBF)] {
+                    self.csr &= if value & clear != 0 { !flag } else { u32::MAX };
+                }
                 let (voltage_scale, _) = self.variant.voltage_scale;
                 self.cr = value & (voltage_scale | CR_DBP | CR_FPDS | CR_LOW_POWER | CR_PVD);
                 if value & CR_PVD != 0 {
@@ -69,9 +111,9 @@ impl Peripheral for Pwr {
                 }
             }
             0x04 => {
-                self.csr = value & (1 << 8 | 1 << 9);
-                if self.csr != 0 {
-                    return Err(Unmodelled("wake-up pin and backup regulator are not modelled".into()));
+                self.csr = self.csr & !CSR_EWUP | value & CSR_EWUP;
+                if value & 1 << 9 != 0 {
+                    return Err(Unmodelled("the backup regulator is not modelled".into()));
                 }
             }
             _ => return Err(Unmodelled("PWR has no such register".into())),
@@ -87,7 +129,48 @@ impl Peripheral for Pwr {
 
     fn interrupts(&self, _active: &mut Vec<u16>) {}
 
+    /// A system reset leaves SBF alone (section 5.4.2).
     fn reset(&mut self) {
-        *self = Self::new(self.variant);
+        *self = Self { csr: self.csr & CSR_SBF, ..Self::new(self.variant) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::geometry::STM32F407VG;
+
+    use super::*;
+    use crate::variant;
+
+    const CR: u32 = 0x00;
+    const CSR: u32 = 0x04;
+
+    /// RM0090 sections 5.3.5, 5.4.1 and 5.4.2: CSBF and CWUF clear SBF and WUF; a system reset clears WUF and
+    /// EWUP, too. With WUF set the chip does not stay in Standby.
+    #[test]
+    fn standby_is_remembered_until_the_program_clears_it() {
+        let mut pwr = Pwr::new(variant::of(&STM32F407VG));
+        assert!(!pwr.chooses_standby());
+        pwr.write(CR, CR_PDDS, Time(0)).unwrap();
+        assert!(pwr.chooses_standby() && !pwr.enter_standby());
+        assert!(!pwr.wkup_rises(), "the pin is not enabled");
+        pwr.write(CSR, 1 << 8, Time(0)).unwrap();
+        assert!(pwr.wkup_rises());
+        pwr.leave_standby();
+        assert!(!pwr.chooses_standby());
+        assert_eq!(pwr.read(CSR, Time(0)), Ok(0x4103));
+        // A write does not clear the flags; and each has its own bit.
+        pwr.write(CSR, 0, Time(0)).unwrap();
+        assert_eq!(pwr.read(CSR, Time(0)), Ok(0x4003));
+        assert!(pwr.enter_standby(), "WUF is still set");
+        pwr.write(CR, CR_CSBF, Time(0)).unwrap();
+        assert_eq!(pwr.read(CSR, Time(0)), Ok(0x4001));
+        pwr.write(CR, CR_CWUF, Time(0)).unwrap();
+        assert_eq!((pwr.read(CR, Time(0)), pwr.read(CSR, Time(0))), (Ok(0), Ok(0x4000)));
+        pwr.enter_standby();
+        pwr.write(CSR, 1 << 8, Time(0)).unwrap();
+        pwr.wake_up();
+        pwr.reset();
+        assert_eq!(pwr.read(CSR, Time(0)), Ok(0x4002), "a system reset");
     }
 }

@@ -1,11 +1,9 @@
 //! Reset and clock control (RM0090 sections 6 and 7, RM0390 section 6).
 
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::silicon::Silicon;
 use crate::time::{Span, Time};
 use crate::variant::Variant;
-
-/// High-speed internal oscillator, Hz.
-pub const HSI_HZ: u32 = 16_000_000;
 
 // Start-up times, typical, from the datasheet (DocID022152 rev 8, section 5.3.8 to 5.3.10).
 const HSI_START: Span = Span(2_200_000);
@@ -53,6 +51,8 @@ pub enum ResetCause {
     Software,
     /// The independent watchdog ran out.
     IndependentWatchdog,
+    /// A wake-up from Standby, which starts the chip as a reset does.
+    Standby,
 }
 
 /// The frequencies that the program has set up, in Hz.
@@ -103,6 +103,7 @@ impl Source {
 }
 
 const PLLCFGR: u32 = 0x04;
+const SSCGR: u32 = 0x80;
 /// Offset of RCC_AHB1ENR.
 pub const AHB1ENR: u32 = 0x30;
 /// Offset of RCC_AHB2ENR.
@@ -123,6 +124,7 @@ pub struct Rcc {
     /// Frequency of the crystal or clock at OSC_IN; 0 where there is none.
     hse_hz: u32,
     variant: &'static Variant,
+    silicon: Silicon,
     /// The values of the variant's plain registers, in its order.
     plain: Vec<u32>,
     hsi: Source,
@@ -143,10 +145,11 @@ pub struct Rcc {
 impl Rcc {
     /// As after power-on, on this chip, with a crystal of `hse_hz`; 0 means that there is none.
     #[must_use]
-    pub fn new(variant: &'static Variant, hse_hz: u32) -> Self {
+    pub fn new(variant: &'static Variant, hse_hz: u32, silicon: Silicon) -> Self {
         Self {
             hse_hz,
             variant,
+            silicon,
             plain: variant.rcc.iter().map(|&(_, reset, _)| reset).collect(),
             hsi: Source::On { ready: Time(0) },
             hse: Source::Off,
@@ -164,15 +167,23 @@ impl Rcc {
     }
 
     /// Adds the flags of a reset. Every internal reset pulls NRST low too, so the pin's flag comes
-    /// with it (section 7.1.1).
+    /// with it (section 7.1.1); a wake-up from Standby is no such reset.
     pub fn note_reset(&mut self, cause: ResetCause) {
-        self.csr_flags |= CSR_PINRSTF
-            | match cause {
-                ResetCause::PowerOn => CSR_PORRSTF | CSR_BORRSTF,
-                ResetCause::Pin => 0,
-                ResetCause::Software => CSR_SFTRSTF,
-                ResetCause::IndependentWatchdog => CSR_IWDGRSTF,
-            };
+        const POWER_ON: u32 = CSR_PORRSTF | CSR_BORRSTF | CSR_PINRSTF;
+        self.csr_flags |= match cause {
+            ResetCause::PowerOn => POWER_ON,
+            ResetCause::Pin => CSR_PINRSTF,
+            ResetCause::Software => CSR_SFTRSTF | CSR_PINRSTF,
+            ResetCause::IndependentWatchdog => CSR_IWDGRSTF | CSR_PINRSTF,
+            ResetCause::Standby if self.silicon.flags_after_standby => POWER_ON,
+            ResetCause::Standby => 0,
+        };
+    }
+
+    /// Whether the LSI is on.
+    #[must_use]
+    pub fn lsi_is_on(&self) -> bool {
+        self.lsi.is_on()
     }
 
     /// The watchdog forces the LSI on (section 21.3).
@@ -196,18 +207,32 @@ impl Rcc {
 
     fn pll_hz(&self) -> u32 {
         let cfgr = self.plain(PLLCFGR);
-        let input = if cfgr & 1 << 22 != 0 { self.hse_hz } else { HSI_HZ };
+        let input = if cfgr & 1 << 22 != 0 { self.hse_hz } else { self.silicon.hsi_hz };
         let (m, n) = (cfgr & 0x3F, cfgr >> 6 & 0x1FF);
         let p = 2 * ((cfgr >> 16 & 3) + 1);
         let vco = u64::from(input) * u64::from(n) / u64::from(m.max(1));
+        let vco = vco.saturating_sub(vco * self.down_spread() / (2 * u64::from(n.max(1)) * 0x7FFF));
         u32::try_from(vco / u64::from(p)).unwrap_or(u32::MAX)
+    }
+
+    /// By SSCGR in down-spread mode, the depth of the modulation, in parts of PLLN × (2^15 - 1) (section
+    /// 7.3.23). The mean frequency is half of it lower; centre-spread mode leaves the mean as it is.
+    fn down_spread(&self) -> u64 {
+        const SSCGEN_AND_SPREADSEL: u32 = 0b11 << 30;
+        let value = self.plain(SSCGR);
+        let (period, step) = (u64::from(value & 0x1FFF), u64::from(value >> 13 & 0x7FFF));
+        if value & SSCGEN_AND_SPREADSEL == SSCGEN_AND_SPREADSEL {
+            5 * (period * step).min(0x7FFF)
+        } else {
+            0
+        }
     }
 
     /// What the program has set up.
     #[must_use]
     pub fn clocks(&self) -> Clocks {
         let sysclk = match self.sws {
-            0 => HSI_HZ,
+            0 => self.silicon.hsi_hz,
             1 => self.hse_hz,
             _ => self.pll_hz(),
         };
@@ -323,6 +348,9 @@ impl Peripheral for Rcc {
             PLLCFGR if self.pll.is_on() => {
                 return Err(Unmodelled("PLLCFGR is written while the PLL is on: the chip ignores it".into()));
             }
+            SSCGR if self.pll.is_on() => {
+                return Err(Unmodelled("SSCGR is written while the PLL is on, which is not allowed".into()));
+            }
             0x08 => {
                 self.cfgr = value & !0b1100;
                 self.follow_sw(now);
@@ -379,7 +407,7 @@ impl Peripheral for Rcc {
     /// System reset: everything but the reset flags, the LSI's request and the backup domain
     /// (section 7.1.1).
     fn reset(&mut self) {
-        let fresh = Self::new(self.variant, self.hse_hz);
+        let fresh = Self::new(self.variant, self.hse_hz, self.silicon);
         *self = Self {
             csr_flags: self.csr_flags,
             lse: self.lse,
@@ -395,10 +423,11 @@ mod tests {
     use shared_abi::geometry::{STM32F407VG, STM32F429ZI, STM32F446RE};
 
     use super::*;
+    use crate::silicon::TYPICAL;
     use crate::variant;
 
     fn f407(hse_hz: u32) -> Rcc {
-        Rcc::new(variant::of(&STM32F407VG), hse_hz)
+        Rcc::new(variant::of(&STM32F407VG), hse_hz, TYPICAL)
     }
 
     const MS: u64 = 1_000_000_000;
@@ -443,7 +472,7 @@ mod tests {
     /// Section 6.3.25: without TIMPRE twice the bus's clock, with it four times, HCLK at most.
     #[test]
     fn timpre_gives_the_timers_four_times_the_clock_of_their_bus() {
-        let mut rcc = Rcc::new(variant::of(&STM32F429ZI), 8_000_000);
+        let mut rcc = Rcc::new(variant::of(&STM32F429ZI), 8_000_000, TYPICAL);
         // PPRE2 /8, PPRE1 /4.
         rcc.write(0x08, 0b110 << 13 | 0b101 << 10, Time(0)).unwrap();
         assert_eq!((rcc.clocks().timclk1, rcc.clocks().timclk2), (8_000_000, 4_000_000));
@@ -480,6 +509,37 @@ mod tests {
         assert_eq!(rcc.read(0x74, Time(0)), Ok(0x3400_0000));
     }
 
+    /// No manual says which flag a wake-up from Standby sets.
+    #[test]
+    fn a_wake_up_from_standby_sets_the_flags_of_the_chip() {
+        for (flags_after_standby, csr) in [(false, 0), (true, 0x0E00_0000)] {
+            let silicon = Silicon { flags_after_standby, ..TYPICAL };
+            let mut rcc = Rcc::new(variant::of(&STM32F407VG), 8_000_000, silicon);
+            rcc.write(0x74, CSR_RMVF, Time(0)).unwrap();
+            rcc.note_reset(ResetCause::Standby);
+            rcc.reset();
+            assert_eq!(rcc.read(0x74, Time(0)), Ok(csr));
+        }
+    }
+
+    /// Section 7.3.23: INCSTEP = md × PLLN × (2^15 - 1) / (100 × 5 × MODPER); 250 and 88 are 2 % at PLLN
+    /// 168. In down-spread mode the mean is 1 % lower.
+    #[test]
+    fn down_spread_slows_the_clock() {
+        for (sscgr, hclk) in [(0, 168_000_000), (0x8000_0000, 168_000_000), (0xC000_0000, 166_320_000)] {
+            let mut rcc = f407(8_000_000);
+            let spread = sscgr | 88 << 13 | 250;
+            rcc.write(SSCGR, spread, Time(0)).unwrap();
+            // M 8, N 168, P 2 from HSI.
+            rcc.write(PLLCFGR, 168 << 6 | 8, Time(0)).unwrap();
+            rcc.write(0x00, CR_RESET | CR_PLLON, Time(0)).unwrap();
+            assert!(rcc.write(SSCGR, 0, Time(0)).is_err());
+            rcc.write(0x08, 2, Time(MS)).unwrap();
+            let parts = rcc.clocks().hclk.abs_diff(hclk) / 168;
+            assert!(parts < 500, "{sscgr:08X}: {} Hz", rcc.clocks().hclk);
+        }
+    }
+
     #[test]
     fn without_a_crystal_hse_never_gets_ready() {
         let mut rcc = f407(0);
@@ -493,7 +553,7 @@ mod tests {
     fn registers_and_bits_are_those_of_the_chip() {
         const CKGATENR: u32 = 0x90;
         let mut f407 = f407(8_000_000);
-        let mut f446 = Rcc::new(variant::of(&STM32F446RE), 8_000_000);
+        let mut f446 = Rcc::new(variant::of(&STM32F446RE), 8_000_000, TYPICAL);
         for (rcc, there) in [(&mut f407, 0x1FF), (&mut f446, 0x0FF)] {
             // As the PACs of both have it.
             assert_eq!(rcc.plain(AHB1ENR), 0x0010_0000);

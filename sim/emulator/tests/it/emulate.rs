@@ -60,6 +60,36 @@ fn runs_for_the_time_it_is_told() {
     assert!(text.contains("board 1: power on") && text.contains("board 2: power on"), "{text}");
 }
 
+/// A failure with a seed can be seen again: the seed and what it draws are printed. Without the option
+/// nothing is.
+#[test]
+fn prints_the_chip_that_was_chosen() {
+    let image = program(&folder("silicon"), FOREVER);
+    let lines = |args: &[&str]| -> Vec<String> {
+        let output = emulate(&[&[&image, "--speed", "max", "--for", "0.01"], args].concat());
+        assert!(output.status.success(), "{output:?}");
+        let text = String::from_utf8(output.stdout).unwrap();
+        text.lines().filter(|line| line.contains("silicon")).map(str::to_owned).collect()
+    };
+    assert_eq!(lines(&[]), [""; 0]);
+    // Datasheet DocID022152: the ends of the ranges.
+    for (choice, words) in [
+        ("typical", "board: silicon typical: LSI 32000 Hz, HSI 16000000 Hz"),
+        ("worst", "board: silicon worst: LSI 47000 Hz, HSI 16640000 Hz"),
+        ("7", "board: silicon 7: LSI "),
+    ] {
+        let told = lines(&["--silicon", choice]);
+        assert!(told.len() == 1 && told[0].starts_with(words), "{told:?}");
+    }
+    assert_eq!(lines(&["--silicon", "7"]), lines(&["--silicon", "7"]));
+    let two = lines(&["--silicon", "7", "--node-count", "2"]);
+    assert!(
+        two[0].starts_with("board 1: silicon 7:") && two[1].starts_with("board 2: silicon 7:"),
+        "{two:?}"
+    );
+    assert_ne!(two[0][7..], two[1][7..], "each board has a chip of its own");
+}
+
 #[test]
 fn says_what_is_not_modelled_with_address_and_program_counter() {
     let image = program(&folder("unmodelled"), READS_CAN2);
@@ -104,6 +134,8 @@ fn refuses_with_a_reason() {
         (&[&image, "--for", "-1"], "--for"),
         (&[&image, "--for", "1e30"], "number of seconds"),
         (&[&image, "--bit-rate", "0"], "bit-rate"),
+        (&[&image, "--silicon", "best"], "`typical`, `worst`, or a number"),
+        (&[&image, "--silicon", "18446744073709551616"], "as a seed"),
         (&[&image, "--node-count", "0"], "node-count"),
         (&[&image, "--socketcand", "nonsense"], "cannot listen at nonsense"),
         (&[&image, "--trace", "/nowhere/trace.log"], "/nowhere/trace.log"),

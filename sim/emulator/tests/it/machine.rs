@@ -4,7 +4,8 @@
 mod programs;
 
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
-use emulator::time::Time;
+use emulator::silicon::{Silicon, TYPICAL};
+use emulator::time::{Span, Time};
 use programs::Program;
 use shared_abi::geometry::{Region, STM32F407VG};
 
@@ -208,6 +209,11 @@ const NO_CONDITION: Condition = (OUT, 0, 1);
 
 /// Runs [`programs::WRITES_AND_WAITS`] for 100 ms: the stores, then the wait.
 fn wait_after(stores: &[(u32, u32)], condition: Condition) -> (Machine, Stop) {
+    wait_until(ms(100), stores, condition)
+}
+
+/// The same until this time.
+fn wait_until(deadline: Time, stores: &[(u32, u32)], condition: Condition) -> (Machine, Stop) {
     const SEEN: u32 = 0x2000_1027;
     // RCC_AHB1ENR: port D. DEMCR.TRCENA and DWT_CTRL.CYCCNTENA: the counter of cycles.
     let common = [(0x4002_3830, 1 << 3), (0xE000_EDFC, 1 << 24), (0xE000_1000, 1)];
@@ -222,7 +228,7 @@ fn wait_after(stores: &[(u32, u32)], condition: Condition) -> (Machine, Stop) {
     }
     put(&mut machine, OUT + 4, 0);
     let stop = loop {
-        match machine.run_until(ms(100)) {
+        match machine.run_until(deadline) {
             Stop::Attention => {}
             stop => break stop,
         }
@@ -280,15 +286,13 @@ fn a_usart_is_not_late_because_the_program_writes_registers() {
     assert_no_delay(&stores, (USART2_SR, TC, TC), 320);
 }
 
-/// RM0090 section 21.3: 10 counts of 4 periods of the LSI's 32 kHz are 1.25 ms.
+/// RM0090 table 107: 4096 counts of 4 periods of the LSI's 32 kHz are 512 ms.
 #[test]
 fn the_watchdog_is_not_late_because_the_program_writes_registers() {
-    const IWDG: u32 = 0x4000_3000;
-    let stores = [(IWDG, 0x5555), (IWDG + 8, 9), (IWDG, 0xAAAA), (IWDG, 0xCCCC)];
-    let (machine, stop) = wait_after(&stores, NO_CONDITION);
+    let (machine, stop) = wait_until(ms(600), &[(0x4000_3000, 0xCCCC)], NO_CONDITION);
     assert_eq!(stop, Stop::Reset(ResetCause::IndependentWatchdog));
     let at = machine.now().0;
-    assert!((MS + MS / 4..MS + MS / 4 + MS / 50).contains(&at), "{}", machine.now());
+    assert!((512 * MS..512 * MS + MS / 50).contains(&at), "{}", machine.now());
 }
 
 /// The core goes from 16 MHz to the crystal's 8 MHz when the crystal is ready, after 2 ms.
@@ -550,13 +554,101 @@ fn the_watchdog_resets_unless_it_is_fed() {
     let mut hungry = machine(&programs::WATCHDOG);
     put(&mut hungry, ARGUMENT, 0);
     assert_eq!(hungry.run_until(ms(10)), Stop::Reset(ResetCause::IndependentWatchdog));
-    let at = hungry.now().0;
-    assert!((MS..MS + MS / 50).contains(&at), "{}", hungry.now());
+    // Five periods of 32 kHz until the values have got across, then the millisecond.
+    let (at, across) = (hungry.now().0, 5 * MS / 32);
+    assert!((across + MS..across + MS + MS / 50).contains(&at), "{}", hungry.now());
     let mut fed = machine(&programs::WATCHDOG);
     put(&mut fed, ARGUMENT, 10);
     assert_eq!(fed.run_until(ms(30)), Stop::Reset(ResetCause::IndependentWatchdog));
     // Ten rounds of 6 400 × 2 cycles at 16 MHz, 0.8 ms each, then the millisecond that is not fed.
-    assert!((9 * MS..9 * MS + MS / 10).contains(&fed.now().0), "{}", fed.now());
+    assert!((across + 9 * MS..across + 9 * MS + MS / 10).contains(&fed.now().0), "{}", fed.now());
+}
+
+/// RM0090 sections 5.3.5 and 5.4.2: the chip starts anew, SBF and WUF say why; RAM is lost; which flags
+/// RCC_CSR has is a matter of the chip.
+#[test]
+fn a_chip_wakes_up_from_standby_by_the_pin_or_by_a_reset() {
+    for (flags_after_standby, flags) in [(false, 0), (true, 0x0E00_0000)] {
+        let silicon = Silicon { flags_after_standby, ..TYPICAL };
+        let mut machine = with_options(&programs::STANDBY, Options { silicon, ..Options::default() });
+        put(&mut machine, ARGUMENT, 0);
+        assert_eq!(machine.run_until(ms(10)), Stop::Deadline);
+        assert!(machine.is_in_standby());
+        assert_eq!(words(&machine, 2), [0x0E00_0000, 0x4000]);
+        put(&mut machine, OUT + 8, 0x600D_CAFE);
+        let instructions = machine.counters().instructions;
+        assert_eq!(machine.run_until(ms(1_000)), Stop::Deadline);
+        assert_eq!(machine.counters().instructions, instructions, "nothing runs");
+
+        machine.set_pin('A', 0, Some(true));
+        assert_eq!(machine.run_until(ms(1_001)), Stop::Reset(ResetCause::Standby));
+        assert_ne!(word(&machine, OUT + 8), 0x600D_CAFE, "RAM is lost");
+        machine.set_pin('A', 0, Some(false));
+        assert_eq!(machine.run_until(ms(1_010)), Stop::Deadline);
+        assert_eq!(words(&machine, 2), [flags, 0x4103]);
+        machine.wake_up();
+        assert_eq!(machine.run_until(ms(1_020)), Stop::Reset(ResetCause::Standby));
+        machine.run_until(ms(1_030));
+        machine.reset_pin();
+        machine.run_until(ms(1_040));
+        assert_eq!(words(&machine, 2), [0x0400_0000, 0x4002], "NRST wakes it, too");
+        assert_eq!(machine.reports(), []);
+    }
+}
+
+/// PM0214 section 3.11.12: WFI ends when an interrupt is pending, whatever PRIMASK says.
+#[test]
+fn a_pending_interrupt_keeps_the_chip_out_of_standby() {
+    let mut machine = machine(&programs::STANDBY);
+    put(&mut machine, ARGUMENT, 2);
+    assert_eq!(machine.run_until(ms(10)), Stop::Deadline);
+    assert!(!machine.is_in_standby());
+    assert_eq!(machine.register(0x4000_7004), Some(0x4100), "EWUP, no SBF");
+}
+
+/// RM0090 sections 5.3.5 and 21.3: in Standby the core domain stands still, and the watchdog runs on.
+#[test]
+fn the_watchdog_bites_in_standby() {
+    let mut machine = machine(&programs::STANDBY);
+    put(&mut machine, ARGUMENT, 1);
+    assert_eq!(machine.run_until(ms(600)), Stop::Reset(ResetCause::IndependentWatchdog));
+    let at = machine.now().0;
+    assert!((512 * MS..513 * MS).contains(&at), "{}", machine.now());
+    put(&mut machine, ARGUMENT, 0);
+    machine.run_until(ms(610));
+    assert_eq!(words(&machine, 2), [0x2400_0000, 0x4002]);
+}
+
+/// RM0090 sections 5.3.3 and 7.3.18: in sleep mode a peripheral has a clock if its bit of the low-power
+/// enable register is 1. SysTick has the core's.
+#[test]
+fn a_timer_without_a_clock_in_sleep_mode_stands_still() {
+    for (apb1lpenr, overflows) in [(0x36FE_C9FF, 99..=100), (0x36FE_C9FE, 0..=0)] {
+        let mut machine = machine(&programs::SLEEPS_WITH_A_TIMER);
+        put(&mut machine, ARGUMENT, apb1lpenr);
+        assert_eq!(machine.run_until(ms(100) + Span::from_micros(10)), Stop::Deadline);
+        let counted = words(&machine, 2);
+        assert!(overflows.contains(&counted[0]), "{apb1lpenr:08X}h: {counted:?}");
+        assert_eq!(counted[1], 10, "SysTick");
+        assert_eq!(machine.reports(), []);
+    }
+}
+
+/// ARMv7-M B3.3.5: SYST_CVR is unknown after a reset, and SYST_RVR is loaded when it has reached 0.
+#[test]
+fn systick_begins_with_what_the_chip_has() {
+    for (systick_value, first) in [(0, 16_000), (0x1234, 0x1234), (0x00FF_FFFF, 0x00FF_FFFF)] {
+        let silicon = Silicon { systick_value, ..TYPICAL };
+        let mut machine =
+            with_options(&programs::STORES_AND_SLEEPS, Options { silicon, ..Options::default() });
+        machine.run_until(ms(1));
+        for (register, value) in [(0xE000_E014, 15_999_u32), (0xE000_E010, 5)] {
+            machine.poke(register, &value.to_le_bytes()).unwrap();
+        }
+        machine.run_until(ms(1) + Span::from_micros(100));
+        let value = machine.register(0xE000_E018).unwrap();
+        assert!((first - 1_602..=first - 1_598).contains(&value), "{systick_value:X}h: {value}");
+    }
 }
 
 // --- flash

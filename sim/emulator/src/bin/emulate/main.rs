@@ -25,6 +25,7 @@ use emulator::pacing::{Lag, Pacer, Speed, NAP};
 use emulator::periph::usart::Character;
 use emulator::rtt;
 use emulator::serial::Serial;
+use emulator::silicon::Choice;
 use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
@@ -126,6 +127,11 @@ struct Args {
     #[arg(long)]
     worst_flash: bool,
 
+    /// The chip, in what the manuals leave open or give as a range, such as the frequency of the LSI:
+    /// `typical`, `worst`, or a seed that draws it; the values are printed. Without it: typical
+    #[arg(long, value_name = "SEED|worst|typical")]
+    silicon: Option<Choice>,
+
     /// End after so many seconds of virtual time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
     run_for: Option<Time>,
@@ -214,6 +220,7 @@ fn run(args: &Args) -> Result<()> {
 
     let mut bench = Bench::new(args)?;
     bench.listen(args)?;
+    bench.print_silicon(args)?;
     bench.power_on()?;
     let outcome = bench.live(args, &end);
     // The report and the files are written even if an error occurred.
@@ -365,6 +372,7 @@ impl Bench {
                     flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
                     unique_id,
                     transceiver: args.can.map_or(args.board.transceiver, |can| usize::from(can) - 1),
+                    silicon: args.silicon.unwrap_or(Choice::Typical).of_board(n.into()),
                 },
             );
             let mut machine = machine.context("setting up the board")?;
@@ -461,6 +469,16 @@ impl Bench {
             let door = door.with_context(|| format!("cannot listen at {address}"))?;
             print_line(&format!("gdb reaches the board by `target remote {}`", door.address()))?;
             self.gdb = Some(door);
+        }
+        Ok(())
+    }
+
+    /// Prints which chips were chosen, if the user chose: a failure can then be seen again.
+    fn print_silicon(&self, args: &Args) -> Result<()> {
+        let Some(choice) = args.silicon else { return Ok(()) };
+        for n in 0..self.boards.len() {
+            let silicon = self.world.machine(self.boards[n].id).silicon();
+            print_line(&format!("{}: silicon {choice}: {silicon}", self.name(n)))?;
         }
         Ok(())
     }
@@ -627,6 +645,7 @@ impl Bench {
         let state = match (on, machine.halted()) {
             (false, _) => "power off",
             (true, Some(_)) => "halted by the debugger",
+            (true, None) if machine.is_in_standby() => "in Standby",
             (true, None) => "runs",
         };
         Ok(format!("{now} s, {}: {state}, pc {:08X}h", self.name(board), machine.pc()))
@@ -703,6 +722,7 @@ fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
         Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
         Stop::Reset(ResetCause::Software) => "reset by its software".into(),
         Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
+        Stop::Reset(ResetCause::Standby) => "woke up from Standby".into(),
         Stop::PowerCut => "the power is cut".into(),
         Stop::Lockup => {
             format!("the CPU has locked up (CFSR {cfsr:08X}h, HFSR {hfsr:08X}h): only a reset helps it")

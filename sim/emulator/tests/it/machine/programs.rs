@@ -68,4 +68,6 @@ programs! {
     TIMER_PERIOD,
     WRITES_AND_WAITS,
     BUTTON,
+    STANDBY,
+    SLEEPS_WITH_A_TIMER,
 }

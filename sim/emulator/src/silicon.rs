@@ -1,0 +1,183 @@
+//! What the manuals leave open, or give as a range: the values of one chip.
+//!
+//! Firmware that is right works with every chip of a line, so a test may draw a chip by a seed. Without
+//! a draw a chip is [`TYPICAL`].
+
+use std::fmt;
+use std::ops::RangeInclusive;
+use std::str::FromStr;
+
+use crate::noise::Noise;
+
+/// The values of one chip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Silicon {
+    /// The low-speed internal oscillator, in Hz: 17 to 47 kHz, 32 typical (datasheet DocID022152, LSI
+    /// oscillator characteristics).
+    pub lsi_hz: u32,
+    /// The high-speed internal oscillator, in Hz: 16 MHz ± 4 % at -10 to 85 °C (datasheet, HSI oscillator
+    /// characteristics).
+    pub hsi_hz: u32,
+    /// How many periods of the LSI a new value of IWDG_PR or IWDG_RLR takes to get to the counter: up to 5
+    /// (RM0090 section 21.4.4).
+    pub iwdg_update_periods: u32,
+    /// The value of SYST_CVR after a reset: unknown, 24 bits (ARMv7-M B3.3.5).
+    pub systick_value: u32,
+    /// Whether a wake-up from Standby sets PORRSTF, PINRSTF and BORRSTF, or no flag of RCC_CSR at all. RM0090
+    /// section 7.3.21 does not name Standby.
+    pub flags_after_standby: bool,
+}
+
+/// The typical values of the datasheet, and what most programs assume where it has none.
+pub const TYPICAL: Silicon = Silicon {
+    lsi_hz: 32_000,
+    hsi_hz: 16_000_000,
+    iwdg_update_periods: 5,
+    systick_value: 0,
+    flags_after_standby: false,
+};
+
+/// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, and the first
+/// period of SysTick is the longest.
+pub const WORST: Silicon = Silicon {
+    lsi_hz: *LSI.end(),
+    hsi_hz: *HSI.end(),
+    iwdg_update_periods: *UPDATE.end(),
+    systick_value: *SYSTICK.end(),
+    flags_after_standby: false,
+};
+
+const LSI: RangeInclusive<u32> = 17_000..=47_000;
+const HSI: RangeInclusive<u32> = 15_360_000..=16_640_000;
+const UPDATE: RangeInclusive<u32> = 1..=5;
+const SYSTICK: RangeInclusive<u32> = 0..=0x00FF_FFFF;
+
+impl Silicon {
+    /// A chip that the seed chooses.
+    #[must_use]
+    pub fn drawn(seed: u64) -> Self {
+        // Of a generator of its own: what RAM holds does not depend on it. A new value is drawn after the
+        // others, which keep theirs.
+        let mut noise = Noise(seed ^ 0x5111_C011_5111_C011);
+        let mut draw = |range: RangeInclusive<u32>| {
+            let count = u64::from(range.end() - range.start()) + 1;
+            // Less than `count`, which fits.
+            range.start() + (noise.word() % count) as u32
+        };
+        Self {
+            lsi_hz: draw(LSI),
+            hsi_hz: draw(HSI),
+            iwdg_update_periods: draw(UPDATE),
+            systick_value: draw(SYSTICK),
+            flags_after_standby: draw(0..=1) == 1,
+        }
+    }
+}
+
+impl Default for Silicon {
+    fn default() -> Self {
+        TYPICAL
+    }
+}
+
+impl fmt::Display for Silicon {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby } = self;
+        let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
+        write!(
+            f,
+            "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
+             after a reset: {systick_value:06X}h, reset flags after Standby: {flags}"
+        )
+    }
+}
+
+/// Which chips a bench has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Choice {
+    /// [`TYPICAL`].
+    Typical,
+    /// [`WORST`].
+    Worst,
+    /// Each board has a chip of its own, the first one this seed's.
+    Seed(u64),
+}
+
+impl Choice {
+    /// The chip of a board; 0 is the first.
+    #[must_use]
+    pub fn of_board(self, board: u64) -> Silicon {
+        match self {
+            Self::Typical => TYPICAL,
+            Self::Worst => WORST,
+            Self::Seed(seed) => Silicon::drawn(seed.wrapping_add(board)),
+        }
+    }
+}
+
+impl fmt::Display for Choice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Typical => f.write_str("typical"),
+            Self::Worst => f.write_str("worst"),
+            Self::Seed(seed) => write!(f, "{seed}"),
+        }
+    }
+}
+
+impl FromStr for Choice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "typical" => Ok(Self::Typical),
+            "worst" => Ok(Self::Worst),
+            _ => text
+                .parse()
+                .map(Self::Seed)
+                .map_err(|_| format!("say `typical`, `worst`, or a number from 0 to {} as a seed", u64::MAX)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Datasheet DocID022152, sections 5.3.9 and 5.3.10; RM0090 section 21.4.4.
+    #[test]
+    fn each_seed_draws_a_chip_within_the_ranges_and_the_same_one_each_time() {
+        let chips: Vec<Silicon> = (0..2_000).map(Silicon::drawn).collect();
+        for (seed, chip) in (0..).zip(&chips) {
+            assert!((17_000..=47_000).contains(&chip.lsi_hz), "{seed}: {chip}");
+            assert!((15_360_000..=16_640_000).contains(&chip.hsi_hz), "{seed}: {chip}");
+            assert!((1..=5).contains(&chip.iwdg_update_periods), "{seed}: {chip}");
+            assert!(chip.systick_value < 1 << 24, "{seed}: {chip}");
+            assert_eq!(Silicon::drawn(seed), *chip, "{seed}");
+        }
+        // The ends are reached, or nearly.
+        assert!(
+            chips.iter().any(|chip| chip.lsi_hz < 17_300) && chips.iter().any(|chip| chip.lsi_hz > 46_700)
+        );
+        assert!(chips.iter().any(|chip| chip.flags_after_standby));
+        assert!(chips.iter().any(|chip| !chip.flags_after_standby));
+    }
+
+    #[test]
+    fn a_choice_is_a_word_or_a_seed() {
+        for (text, choice) in [
+            ("typical", Choice::Typical),
+            ("worst", Choice::Worst),
+            ("0", Choice::Seed(0)),
+            ("18446744073709551615", Choice::Seed(u64::MAX)),
+        ] {
+            assert_eq!(text.parse(), Ok(choice));
+        }
+        for text in ["", "best", "-1", "1.5", "0x10", "18446744073709551616", "Worst"] {
+            let error = text.parse::<Choice>().unwrap_err();
+            assert!(error.contains("`typical`, `worst`, or a number"), "{text}: {error}");
+        }
+        // The last seed has a second board, too.
+        assert_ne!(Choice::Seed(u64::MAX).of_board(0), Choice::Seed(u64::MAX).of_board(1));
+    }
+}
