@@ -80,8 +80,12 @@ global_asm!(
 /// The report of the resident part. Without one a debugger has started the image; it then stays, as
 /// after a fault.
 pub fn boot_report() -> Option<BootReport> {
-    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image;
-    // nothing writes it while the image runs.
-    let words = unsafe { (LAYOUT.handoff.base as *const Words).read_volatile() };
+    let base = LAYOUT.handoff.base as *const u32;
+    let mut words: Words = [0; _];
+    for (n, word) in words.iter_mut().enumerate() {
+        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image;
+        // nothing writes it while the image runs.
+        *word = unsafe { base.add(n).read_volatile() };
+    }
     BootReport::parse(&words)
 }

@@ -1,7 +1,5 @@
 //! Loads the rest of the bootloader from flash to RAM, if it is undamaged and for this device.
 
-use core::slice;
-
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
@@ -40,16 +38,17 @@ pub unsafe fn load(flash: &ResidentFlash) -> Result<VectorTable, Damage> {
             return Err(Damage::Crc);
         }
     }
-    let vectors = header.entry([flash.read_word(data), flash.read_word(data + 4)])?;
+    // SAFETY: `check` has found that the image, which is longer than two words, ends within its flash.
+    let vectors = header.entry(unsafe { (data as *const [u32; 2]).read_volatile() })?;
     let words = header.size as usize / 4;
     // SAFETY: `check` has found that the image ends within its flash and within its RAM, leaves the
     // stack its room, and has a multiple of four bytes; both addresses are aligned. The caller
     // guarantees that nothing else uses the RAM.
     unsafe {
-        let to = slice::from_raw_parts_mut(header.ram_base as *mut u32, words);
-        for (to, from) in to.iter_mut().zip((data..).step_by(4)) {
+        let (from, to) = (data as *const u32, header.ram_base as *mut u32);
+        for n in 0..words {
             // Volatile: a call of memcpy would copy by bytes.
-            *to = (from as *const u32).read_volatile();
+            to.add(n).write(from.add(n).read_volatile());
         }
     }
     Ok(vectors)
