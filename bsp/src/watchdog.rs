@@ -2,17 +2,15 @@
 
 use stm32f4xx_hal::pac;
 
+/// How often the status is read before an update is given up: 3 ms at 168 MHz and 8 cycles a read. It takes
+/// 0.3 ms with the slowest LSI (17 kHz).
+const PATIENCE: u32 = 0xFFFF;
+
 /// Starts the watchdog: a reset follows unless it is [fed](feed) every `ms` milliseconds, 2 to
-/// 8000. The LSI counts them (± 50 %).
+/// 8000. The LSI counts them (17 to 47 kHz for 32).
 pub fn start(registers: &pac::IWDG, ms: u16) {
-    // SAFETY: the keys of section 21.4.1.
-    let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });
-    key(0xCCCC);
-    key(0x5555);
-    // SAFETY: LSI / 64, 2 ms a count (section 21.4.2).
-    registers.pr().write(|w| unsafe { w.bits(4) });
-    // SAFETY: a reload value of 12 bits.
-    registers.rlr().write(|w| unsafe { w.bits(ms / 2) });
+    // LSI / 64, 2 ms a count (section 21.4.2).
+    run(registers, 4, ms / 2);
 }
 
 /// The prescaler after a reset: LSI / 4.
@@ -21,13 +19,26 @@ pub const AFTER_RESET: u16 = 0;
 /// LSI.
 pub const SLOWEST: u16 = 6;
 
-/// Gives a watchdog that runs another prescaler, and restarts its time. It takes effect within five
-/// cycles of the LSI (section 21.4.4).
+/// Gives a watchdog that runs another prescaler and the reload value after a reset, and restarts its time.
 pub fn rescale(registers: &pac::IWDG, prescaler: u16) {
-    // SAFETY: the key of section 21.4.1.
-    registers.kr().write(|w| unsafe { w.bits(0x5555) });
+    run(registers, prescaler, 0xFFF);
+}
+
+/// Lets the watchdog run with these values. It waits for the LSI, 0.1 to 0.3 ms.
+///
+/// A watchdog starts with 4096 counts, and only AAAAh loads the reload value. Both values take up to five
+/// cycles of the LSI to get to the counter, and meanwhile no others may be written (section 21.4.4).
+fn run(registers: &pac::IWDG, prescaler: u16, reload: u16) {
+    // SAFETY: the keys that start the counter and permit the two writes (section 21.4.1).
+    let key = |key: u16| registers.kr().write(|w| unsafe { w.bits(key) });
+    key(0xCCCC);
+    key(0x5555);
     // SAFETY: a value of three bits (section 21.4.2).
     registers.pr().write(|w| unsafe { w.bits(prescaler) });
+    // SAFETY: a value of 12 bits (section 21.4.3).
+    registers.rlr().write(|w| unsafe { w.bits(reload) });
+    // If they never get there, the counter is loaded with what it has.
+    (0..PATIENCE).any(|_| registers.sr().read().bits() == 0);
     feed(registers);
 }
 

@@ -6,7 +6,8 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::device::Doing;
 use coflash::update::{flash, FlashOptions};
-use emulator::machine::{ResetCause, Stop};
+use emulator::machine::{Options, ResetCause, Stop};
+use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::{Span, Time};
 use object::{Object, ObjectSymbol};
 
@@ -128,6 +129,10 @@ fn an_application_that_the_watchdog_ends_again_and_again_is_given_up() {
 const IWDG_PR: u32 = 0x4000_3004;
 const IWDG_RLR: u32 = 0x4000_3008;
 
+fn register(bench: &mut Bench, address: u32) -> u32 {
+    bench.machine().register(address).expect("it is modelled")
+}
+
 /// The option byte WDG_SW starts the watchdog with each reset, with 512 ms at 32 kHz (RM0090 table
 /// 107); at 47 kHz the erase of a sector of 16 KiB may take longer. The boot stage slows it down, and
 /// leaves it to a program as after the reset.
@@ -142,13 +147,15 @@ fn a_watchdog_of_the_option_bytes_is_slow_in_the_boot_stage_alone() {
     bench.session().command(1, ProgramControl::Start).unwrap();
     let mut prescalers = Vec::new();
     while bench.events().is_empty() {
-        bench.world.run_for(Span::from_micros(20));
+        bench.world.run_for(Span::from_micros(5));
     }
-    let register = |bench: &mut Bench, address| bench.machine().register(address).expect("it is modelled");
-    for _ in 0..200 {
+    for _ in 0..400 {
         prescalers.push(register(&mut bench, IWDG_PR));
         bench.world.run_for(Span::from_micros(5));
     }
+    // First thing, before anything else is waited for: five periods of 32 kHz are 156 us.
+    let first = prescalers.iter().position(|prescaler| *prescaler == 6).expect("it is slowed down");
+    assert!(5 * first <= 156 + 30, "after {} us", 5 * first);
     prescalers.dedup();
     // After the reset; in the boot stage; in the program.
     assert_eq!(prescalers, [0, 6, 0]);
@@ -161,6 +168,40 @@ fn a_watchdog_of_the_option_bytes_is_slow_in_the_boot_stage_alone() {
     let ms = (at - from).0 / 1_000_000_000;
     assert!((505..=512).contains(&ms), "reset after {ms} ms");
     bench.assert_nothing_unmodelled();
+}
+
+/// A product that starts programs with a watchdog of 1000 ms (`program_watchdog_ms`): it bites after a second
+/// of the LSI's nominal 32 kHz, also beside the option byte, and the registers are those that were asked for.
+#[test]
+fn a_program_that_never_feeds_its_watchdog_is_ended_after_a_second_of_the_lsi() {
+    for (lsi_hz, has_watchdog) in [(17_000, false), (32_000, false), (32_000, true), (47_000, false)] {
+        let silicon = Silicon { lsi_hz, ..TYPICAL };
+        let options = Options { silicon, ..Options::default() };
+        let mut bench = Bench::of_image_with(firmware::BOOTLOADER_WATCHDOG, options);
+        bench.machine().set_hardware_watchdog(has_watchdog);
+        bootloader_with_a_program(&mut bench);
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_boot_up(1000);
+        // RM0090 section 21.4.2: LSI / 64, 2 ms a count.
+        let values = [IWDG_PR, IWDG_RLR].map(|address| register(&mut bench, address));
+        assert_eq!(values, [4, 500], "{lsi_hz} Hz, {has_watchdog}");
+        bench.run_ms(3_000);
+        let events = bench.events();
+        let [(started, Stop::Reset(ResetCause::Software)), (bitten, Stop::Reset(ResetCause::IndependentWatchdog)), ..] =
+            events[..]
+        else {
+            panic!("{lsi_hz} Hz, {has_watchdog}: {events:?}")
+        };
+        // The boot stage takes some milliseconds of it.
+        let ms = (bitten - started).0 / 1_000_000_000;
+        let nominal = 1000 * 32_000 / u64::from(lsi_hz);
+        println!("program_watchdog_ms 1000, LSI {lsi_hz} Hz: reset {ms} ms after START");
+        assert!(
+            (nominal..=nominal + nominal / 100 + 5).contains(&ms),
+            "{lsi_hz} Hz, {has_watchdog}: {ms} ms"
+        );
+        bench.assert_nothing_unmodelled();
+    }
 }
 
 /// An application that jumps to the bootloader while its watchdog runs: a reset ends the watchdog, and

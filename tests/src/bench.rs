@@ -94,7 +94,7 @@ impl Bench {
         Self::of(bootloader, vec![Options::default()])
     }
 
-    /// The same on a given chip.
+    /// A board with this bootloader on a given chip.
     #[must_use]
     pub fn of_image_with(bootloader: &str, options: Options) -> Self {
         Self::of(bootloader, vec![options])

@@ -19,6 +19,8 @@ pub const BOOTLOADER_LEAST: &str = "bootloader-least.elf";
 pub const BOOTLOADER_CRC_16: &str = "bootloader-crc-16.elf";
 /// The bootloader that reads node-ID and bit rate from switches, with its own COB-IDs.
 pub const BOOTLOADER_SWITCHES: &str = "bootloader-switches.elf";
+/// The bootloader that starts programs with a watchdog of a second.
+pub const BOOTLOADER_WATCHDOG: &str = "bootloader-watchdog.elf";
 /// The bootloaders for masters that expect Paulus, and for masters that expect the boot loader of
 /// ESAcademy.
 pub const BOOTLOADER_PAULUS: &str = "bootloader-paulus.elf";

@@ -66,6 +66,8 @@ pub const VARIANTS: &[Variant] = table![
     product("bootloader-least", "least"),
     // A board's own choices: switches, identifiers, ranges.
     product("bootloader-switches", "switches"),
+    // Programs start with the watchdog.
+    product("bootloader-watchdog", "watchdog"),
     // They log their work, each one in another way (`cargo xtask emulate --log=WAY`).
     bootloader("bootloader-log-rtt", "log-rtt"),
     bootloader("bootloader-log-defmt", "log-defmt"),

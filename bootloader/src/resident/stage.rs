@@ -39,6 +39,14 @@ pub unsafe extern "C" fn stage() -> ! {
     // SAFETY: nothing else runs yet.
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
+    // SAFETY: as above.
+    let mut flash = unsafe { ResidentFlash::steal(true) };
+    // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
+    // 349 at the fastest LSI.
+    if flash.starts_watchdog() {
+        bsp::watchdog::rescale(&iwdg, bsp::watchdog::SLOWEST);
+    }
+
     let status = rcc.csr().read();
     let reset_cause = ResetCause::from_rcc_csr(status.bits());
     rcc.csr().modify(|_, w| w.rmvf().set_bit());
@@ -55,14 +63,6 @@ pub unsafe extern "C" fn stage() -> ! {
 
     // CRCs need speed, but no exact clock. The crystal would take time to start.
     CLOCK_TREE.speed_up(&rcc, Source::Internal);
-    // SAFETY: as above.
-    let mut flash = unsafe { ResidentFlash::steal(true) };
-    // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
-    // 349 at the fastest LSI.
-    let has_watchdog = flash.starts_watchdog();
-    if has_watchdog {
-        bsp::watchdog::rescale(&iwdg, bsp::watchdog::SLOWEST);
-    }
     ResidentFlash::switch_crc_unit_on(&rcc);
     if SEALED {
         crate::callgate::store_after_reset(&mut flash, request);
@@ -91,6 +91,7 @@ pub unsafe extern "C" fn stage() -> ! {
         let verified = |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number);
         let decision = decide(&circumstances, &DECISION, verified);
         if let BootDecision::Start { program, trial } = decision {
+            let has_watchdog = flash.starts_watchdog();
             drop(caches);
             flash.release(&rcc);
             CLOCK_TREE.slow_down(&rcc);
@@ -108,11 +109,10 @@ pub unsafe extern "C" fn stage() -> ! {
                 // SAFETY: only this code runs, and it writes the flash no more.
                 unsafe { crate::flash_lock::lock_flash() };
             }
-            if has_watchdog {
-                bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
-            }
             if let Some(ms) = PRODUCT.program_watchdog_ms {
                 bsp::watchdog::start(&iwdg, ms);
+            } else if has_watchdog {
+                bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
             }
             // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
             // image. Since the reset no interrupt was enabled and no bus master started.
