@@ -144,7 +144,7 @@ pub enum ReentryPath {
     #[default]
     SystemReset = 0,
     /// By a reset of the independent watchdog, for code that may not write the system control
-    /// block. It takes a millisecond, or longer if the watchdog already runs.
+    /// block. It takes a millisecond at most, also if the watchdog already runs.
     Watchdog = 1,
     /// By a jump, with all resources released, for a chip on which a reset would switch something
     /// off. Call it in thread mode; in a handler it becomes a system reset.

@@ -3,7 +3,7 @@
 //! | way | cost | use |
 //! |---|---|---|
 //! | [`system_reset`] | none: the chip is as after any reset | the usual way |
-//! | [`watchdog_reset`] | a millisecond | code that may not write the system control block |
+//! | [`watchdog_reset`] | 13 periods of the LSI: 0.3 to 0.8 ms | code that may not write the system control block |
 //! | [`jump`] | the list below | a device on which a reset would switch off something that must
 //! stay on |
 //!
@@ -54,8 +54,8 @@ pub fn system_reset(layout: &Layout, request: BootRequest) -> ! {
     }
 }
 
-/// Makes the independent watchdog reset the chip: within a millisecond if it is not running yet,
-/// otherwise when it runs out.
+/// Makes the independent watchdog reset the chip within a millisecond, whether it runs already or not: 13
+/// periods of the LSI, which has 17 to 47 kHz, and its start (RM0090 section 21.4).
 pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
     interrupts_off();
     put_request(layout, request);
@@ -69,15 +69,15 @@ pub fn watchdog_reset(layout: &Layout, request: BootRequest) -> ! {
 ///
 /// - interrupts are disabled, and none is pending; priorities, fault handlers and vector table are
 ///   those after a reset;
-/// - every peripheral of the buses, including DMA, was reset and has no clock;
+/// - every peripheral of the buses, including DMA, was reset and has no clock; in sleep mode all have one;
 /// - the core runs from HSI, without wait states, caches or prefetch;
 /// - FPU and MPU are disabled; the stack is the bootloader's.
 ///
 /// Only a real reset can do the rest: a running independent watchdog continues, and the backup
 /// domain is unchanged.
 ///
-/// Call it in thread mode. In a handler, whose exception would stay active, it does a
-/// [`system_reset`] instead.
+/// Call it in thread mode. In a handler, whose exception would stay active, and on a chip whose clocks do
+/// not follow, it does a [`system_reset`] instead.
 pub fn jump(layout: &Layout, request: BootRequest) -> ! {
     let ipsr: u32;
     // SAFETY: reads a register.
@@ -86,7 +86,9 @@ pub fn jump(layout: &Layout, request: BootRequest) -> ! {
         system_reset(layout, request);
     }
     interrupts_off();
-    registers::release_peripherals(&mut Hardware);
+    if !registers::release_peripherals(&mut Hardware) {
+        system_reset(layout, request);
+    }
     registers::release_core(&mut Hardware);
     put_request(layout, request);
     let table = layout.bootloader.base;

@@ -28,23 +28,48 @@ pub(crate) fn request_reset(chip: &mut impl Registers) {
     chip.write(AIRCR, grouping | VECTKEY | SYSRESETREQ);
 }
 
-/// Starts the independent watchdog with its shortest time (RM0090 section 21.4).
+/// How often a flag is read that has to change, before it is given up: 4 ms at 180 MHz and 8 cycles a
+/// read. The slowest of them needs 0.3 ms: five periods of the LSI at 17 kHz.
+const PATIENCE: u32 = 100_000;
+
+/// Waits until the bits of `mask` read `value`; returns whether they do.
+fn wait(chip: &mut impl Registers, register: u32, mask: u32, value: u32) -> bool {
+    (0..PATIENCE).any(|_| chip.read(register) & mask == value)
+}
+
+/// Makes the independent watchdog run out in two counts of the LSI / 4, after the five periods that the
+/// values take to get to the counter (RM0090 section 21.4).
+///
+/// CCCCh starts the counter with FFFh, and only AAAAh loads RLR. The values must be there before, and may
+/// be written only while no others are on their way.
 pub(crate) fn start_watchdog(chip: &mut impl Registers) {
     const KR: u32 = 0x4000_3000;
     const PR: u32 = 0x4000_3004;
     const RLR: u32 = 0x4000_3008;
-    for (register, value) in [(KR, 0xCCCC), (KR, 0x5555), (PR, 0), (RLR, 1)] {
+    const SR: u32 = 0x4000_300C;
+    const PVU_AND_RVU: u32 = 0b11;
+    chip.write(KR, 0xCCCC);
+    wait(chip, SR, PVU_AND_RVU, 0);
+    for (register, value) in [(KR, 0x5555), (PR, 0), (RLR, 1)] {
         chip.write(register, value);
     }
+    // If they never get there, the counter is loaded with what it has.
+    wait(chip, SR, PVU_AND_RVU, 0);
+    chip.write(KR, 0xAAAA);
 }
 
-/// Clocks, peripherals and flash interface as after a reset (RM0090 sections 3.8.1 and 7.3).
-pub(crate) fn release_peripherals(chip: &mut impl Registers) {
+/// Clocks, peripherals and flash interface as after a reset (RM0090 sections 3.8.1 and 7.3). Returns
+/// whether they are; if a clock does not follow, only a reset helps.
+#[must_use]
+pub(crate) fn release_peripherals(chip: &mut impl Registers) -> bool {
     const RCC: u32 = 0x4002_3800;
     const CR: u32 = RCC;
     const PLLCFGR: u32 = RCC + 0x04;
     const CFGR: u32 = RCC + 0x08;
     const CIR: u32 = RCC + 0x0C;
+    const SSCGR: u32 = RCC + 0x80;
+    /// The register with the clocks of the sleep mode comes so far after that with the clocks.
+    const LOW_POWER: u32 = 0x20;
     /// AHB1, AHB2, AHB3, APB1, APB2: offset of the reset register, offset of the clock register,
     /// and the clock register's value after a reset.
     const BUSES: [(u32, u32, u32); 5] = [
@@ -63,27 +88,38 @@ pub(crate) fn release_peripherals(chip: &mut impl Registers) {
     // The core must run from HSI before its previous clock source is switched off.
     let running = chip.read(CR) | HSION;
     chip.write(CR, running);
-    while chip.read(CR) & HSIRDY == 0 {}
+    if !wait(chip, CR, HSIRDY, HSIRDY) {
+        return false;
+    }
     chip.write(CFGR, 0);
-    while chip.read(CFGR) & SWS != 0 {}
+    if !wait(chip, CFGR, SWS, 0) {
+        return false;
+    }
     chip.write(CR, reset::RCC_CR);
-    while chip.read(CR) & PLLRDY != 0 {}
+    if !wait(chip, CR, PLLRDY, 0) {
+        return false;
+    }
     chip.write(PLLCFGR, reset::RCC_PLLCFGR);
+    chip.write(SSCGR, 0);
     chip.write(CIR, 0);
     for (resets, clocks, after) in BUSES {
         chip.write(RCC + resets, u32::MAX);
         chip.write(RCC + resets, 0);
         chip.write(RCC + clocks, after);
+        // After a reset each bit that exists is set.
+        chip.write(RCC + clocks + LOW_POWER, u32::MAX);
     }
     // The caches can only be cleared while they are disabled.
     chip.write(FLASH_ACR, 0);
     chip.write(FLASH_ACR, 0b11 << 11);
     chip.write(FLASH_ACR, 0);
+    true
 }
 
 /// The core's own peripherals as after a reset (ARMv7-M B3).
 pub(crate) fn release_core(chip: &mut impl Registers) {
     const SYST_CSR: u32 = 0xE000_E010;
+    const SYST_CVR: u32 = 0xE000_E018;
     const NVIC_ICER: u32 = 0xE000_E180;
     const NVIC_ICPR: u32 = 0xE000_E280;
     const NVIC_IPR: u32 = 0xE000_E400;
@@ -100,6 +136,8 @@ pub(crate) fn release_core(chip: &mut impl Registers) {
     const WORDS: u32 = 4;
 
     chip.write(SYST_CSR, 0);
+    // It is unknown after a reset. From 0 the first period is as long as the others.
+    chip.write(SYST_CVR, 0);
     for word in 0..WORDS {
         chip.write(NVIC_ICER + 4 * word, u32::MAX);
         chip.write(NVIC_ICPR + 4 * word, u32::MAX);

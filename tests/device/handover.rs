@@ -23,6 +23,8 @@ const HERE: [u8; 2] = [0xFE, 0xE7];
 const RCC: u32 = 0x4002_3800;
 const AHB1ENR: u32 = RCC + 0x30;
 const APB1ENR: u32 = RCC + 0x40;
+/// AHB1LPENR, AHB2LPENR, AHB3LPENR, APB1LPENR, APB2LPENR.
+const LOW_POWER: [u32; 5] = [RCC + 0x50, RCC + 0x54, RCC + 0x58, RCC + 0x60, RCC + 0x64];
 const FLASH_ACR: u32 = 0x4002_3C00;
 const CAN_MCR: u32 = 0x4000_6400;
 /// All GPIO ports.
@@ -87,6 +89,10 @@ fn after_a_reset(bench: &mut Bench) -> BTreeMap<u32, u32> {
 fn the_bootloader_finds_the_chip_as_after_a_reset() {
     let mut bench = running_board();
     bench.session().write(REENTRY_PATH, &[JUMP], Doing::Write(REENTRY_PATH), &mut |_| {}).unwrap();
+    // An application that saves current: in sleep mode no clocks but those of the CAN controllers.
+    for (register, value) in LOW_POWER.into_iter().zip([0, 0, 0, 3 << 25, 0_u32]) {
+        bench.machine().poke(register, &value.to_le_bytes()).unwrap();
+    }
     let running = registers(&mut bench);
     let first = stop_at_reset_of(&mut bench, firmware::board().bootloader.base);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
@@ -97,6 +103,9 @@ fn the_bootloader_finds_the_chip_as_after_a_reset() {
     let reset = after_a_reset(&mut bench);
     // There was something to restore: the clocks, the controller, a pin, the interrupts, the timer,
     // the caches.
+    for register in LOW_POWER {
+        assert_ne!(running[&register], reset[&register], "{register:08X}");
+    }
     for register in [RCC, AHB1ENR, APB1ENR, FLASH_ACR, CAN_MCR, SYST_CSR, NVIC_ISER, VTOR] {
         assert_ne!(running[&register], reset[&register], "{register:08X}");
     }

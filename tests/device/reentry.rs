@@ -7,7 +7,8 @@ use coboot_tests::{call_back, firmware};
 use coflash::device::Doing;
 use coflash::update::{flash, FlashOptions};
 use coflash::Error;
-use emulator::machine::{ResetCause, Stop};
+use emulator::machine::{Options, ResetCause, Stop};
+use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -29,7 +30,11 @@ fn install(bench: &mut Bench, node: u8, image: &str) {
 
 /// A board that runs version 1.
 fn running_board() -> Bench {
-    let mut bench = Bench::new();
+    running_board_with(TYPICAL)
+}
+
+fn running_board_with(silicon: Silicon) -> Bench {
+    let mut bench = Bench::with(Options { silicon, ..Options::default() });
     bench.power_on();
     bench.await_boot_up(100);
     install(&mut bench, NODE, firmware::APP_V1);
@@ -80,6 +85,42 @@ fn three_ways_lead_back_and_the_bootloader_is_whole_behind_each() {
     }
     let mut bench = running_board();
     assert!(write(&mut bench, REENTRY_PATH, 3).is_err(), "there is no fourth way");
+}
+
+/// The design's 18 ms from the answer to 80h to the boot-up, of which the application takes 11. By the
+/// watchdog it is some periods of the LSI longer: five until its values are there, and two counts of four
+/// (RM0090 section 21.4); the LSI has 17 to 47 kHz.
+#[test]
+fn each_way_back_is_short_with_the_slowest_and_the_fastest_lsi() {
+    for lsi_hz in [17_000, 32_000, 47_000] {
+        for (way, periods) in [(0, 0), (1, 5 + 2 * 4), (2, 0)] {
+            let mut bench = running_board_with(Silicon { lsi_hz, ..TYPICAL });
+            write(&mut bench, REENTRY_PATH, way).unwrap();
+            bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+            let answered = bench.time();
+            let us = (bench.await_boot_up(1500) - answered).0 / 1_000_000;
+            println!(
+                "boot-up of the bootloader by way {way}, LSI {lsi_hz} Hz: {us} us after the answer to 80h"
+            );
+            let limit = 18_000 + periods * 1_000_000 / u64::from(lsi_hz);
+            assert!((10_000..=limit).contains(&us), "way {way}, LSI {lsi_hz} Hz: {us} us");
+            bench.assert_nothing_unmodelled();
+        }
+    }
+}
+
+/// A watchdog of its own that the application feeds does not make the way longer.
+#[test]
+fn the_way_back_by_the_watchdog_is_short_though_it_runs_already() {
+    let mut bench = running_board();
+    write(&mut bench, REENTRY_PATH, 1).unwrap();
+    // 512 ms: longer than the way back.
+    bench.machine().preset_watchdog(0xFFF);
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    let answered = bench.time();
+    assert!(bench.await_boot_up(1000) - answered < Span::from_millis(19));
+    assert!(bench.is_bootloader(NODE));
+    bench.assert_nothing_unmodelled();
 }
 
 /// Jumps during thousands of interrupts, repeated: no stray interrupt reaches the other program.

@@ -13,6 +13,11 @@ const RCC_CR: u32 = 0x4002_3800;
 const RCC_PLLCFGR: u32 = 0x4002_3804;
 const RCC_CFGR: u32 = 0x4002_3808;
 const RCC_CIR: u32 = 0x4002_380C;
+const RCC_SSCGR: u32 = 0x4002_3880;
+const IWDG_KR: u32 = 0x4000_3000;
+const IWDG_PR: u32 = 0x4000_3004;
+const IWDG_RLR: u32 = 0x4000_3008;
+const IWDG_SR: u32 = 0x4000_300C;
 /// FLASH_ACR.
 const ACR: u32 = 0x4002_3C00;
 const HSI_ON: u32 = 0x1;
@@ -31,6 +36,8 @@ struct Chip {
     written: Vec<(u32, u32)>,
     /// The number of reads since the last write.
     reads: u32,
+    /// No flag changes.
+    is_stuck: bool,
 }
 
 impl Chip {
@@ -46,8 +53,9 @@ impl Chip {
 impl Registers for Chip {
     fn read(&mut self, register: u32) -> u32 {
         self.reads += 1;
-        assert!(self.reads < 100, "{register:08X} is read for ever");
-        if self.reads == LATENCY {
+        assert!(self.reads <= PATIENCE, "{register:08X} is read for ever");
+        if self.reads == LATENCY && !self.is_stuck {
+            self.words.insert(IWDG_SR, 0);
             let cr = self.word(RCC_CR);
             let hsi = if cr & HSI_ON == 0 { 0 } else { HSI_READY };
             let pll = if cr & PLL_ON == 0 { 0 } else { PLL_READY };
@@ -74,6 +82,22 @@ impl Registers for Chip {
                 assert_eq!(cr & PLL_READY, 0, "the PLL is changed while it runs");
                 0
             }
+            RCC_SSCGR => {
+                assert_eq!(cr & PLL_READY, 0, "the spread is changed while the PLL runs");
+                0
+            }
+            IWDG_KR => {
+                let early = value == 0xAAAA && self.word(IWDG_SR) != 0;
+                assert!(!early || self.is_stuck, "the counter takes the value before");
+                0
+            }
+            IWDG_PR | IWDG_RLR => {
+                let bit = if register == IWDG_PR { 1 } else { 2 };
+                let updates = self.word(IWDG_SR);
+                assert_eq!(updates & bit, 0, "the value before is still on its way");
+                self.words.insert(IWDG_SR, updates | bit);
+                0
+            }
             _ => 0,
         };
         self.words.insert(register, value & !(if register == RCC_CR { 0x0200_0002 } else { 0 }) | status);
@@ -82,29 +106,36 @@ impl Registers for Chip {
     }
 }
 
-/// The values after a reset: RM0090 sections 7.3.1 to 7.3.14 and 3.9.1. Between them each bus is
-/// reset; the caches are cleared while they are off.
-const RELEASED: [(u32, u32); 21] = [
+/// The values after a reset: RM0090 sections 7.3.1 to 7.3.19, 7.3.23 and 3.9.1. Between them each bus is
+/// reset; the caches are cleared while they are off. In the low-power registers all bits that exist are
+/// 1 then; the others cannot be set.
+const RELEASED: [(u32, u32); 27] = [
     (RCC_CFGR, 0),
     (RCC_CR, 0x0000_0083),
     (RCC_PLLCFGR, 0x2400_3010),
+    (RCC_SSCGR, 0),
     (RCC_CIR, 0),
-    // AHB1RSTR, AHB1ENR, and so on for AHB2, AHB3, APB1, APB2.
+    // AHB1RSTR, AHB1ENR, AHB1LPENR, and so on for AHB2, AHB3, APB1, APB2.
     (0x4002_3810, 0xFFFF_FFFF),
     (0x4002_3810, 0),
     (0x4002_3830, 0x0010_0000),
+    (0x4002_3850, 0xFFFF_FFFF),
     (0x4002_3814, 0xFFFF_FFFF),
     (0x4002_3814, 0),
     (0x4002_3834, 0),
+    (0x4002_3854, 0xFFFF_FFFF),
     (0x4002_3818, 0xFFFF_FFFF),
     (0x4002_3818, 0),
     (0x4002_3838, 0),
+    (0x4002_3858, 0xFFFF_FFFF),
     (0x4002_3820, 0xFFFF_FFFF),
     (0x4002_3820, 0),
     (0x4002_3840, 0),
+    (0x4002_3860, 0xFFFF_FFFF),
     (0x4002_3824, 0xFFFF_FFFF),
     (0x4002_3824, 0),
     (0x4002_3844, 0),
+    (0x4002_3864, 0xFFFF_FFFF),
     // ICEN and DCEN off, then ICRST and DCRST.
     (ACR, 0),
     (ACR, 0x0000_1800),
@@ -115,12 +146,23 @@ fn clocks_and_peripherals_are_as_after_a_reset() {
     // The PLL runs from HSE, with HSI off and with HSI on.
     for (before, first) in [(0x0303_0080, 0x0303_0081), (0x0303_0083, 0x0303_0083)] {
         let mut chip = Chip::with(&[(RCC_CR, before), (RCC_CFGR, FROM_PLL), (ACR, 0x0705)]);
-        release_peripherals(&mut chip);
+        assert!(release_peripherals(&mut chip));
         assert_eq!(chip.written[0], (RCC_CR, first));
-        assert_eq!(chip.written[1..22], RELEASED);
-        assert_eq!(chip.written[22..], [(ACR, 0)]);
+        assert_eq!(chip.written[1..28], RELEASED);
+        assert_eq!(chip.written[28..], [(ACR, 0)]);
         // HSION, HSIRDY and HSITRIM; the core runs from HSI.
         assert_eq!((chip.word(RCC_CR), chip.word(RCC_CFGR)), (0x83, 0));
+    }
+}
+
+/// A chip whose clocks do not follow: there is an end, and the caller can reset.
+#[test]
+fn a_clock_that_does_not_follow_is_given_up() {
+    for (cr, cfgr) in [(0x0303_0080, FROM_PLL), (0x0303_0083, FROM_PLL), (0x0303_0083, 0)] {
+        let mut chip = Chip::with(&[(RCC_CR, cr), (RCC_CFGR, cfgr)]);
+        chip.is_stuck = true;
+        assert!(!release_peripherals(&mut chip), "{cr:08X}h, {cfgr:X}h");
+        assert!(chip.written.iter().all(|(register, _)| *register != RCC_PLLCFGR), "{cr:08X}h, {cfgr:X}h");
     }
 }
 
@@ -130,7 +172,8 @@ fn clocks_and_peripherals_are_as_after_a_reset() {
 fn the_core_is_as_after_a_reset() {
     let mut chip = Chip::default();
     release_core(&mut chip);
-    let mut expected = std::vec![(0xE000_E010, 0)];
+    // SysTick off; any write clears SYST_CVR (B3.3.5).
+    let mut expected = std::vec![(0xE000_E010, 0), (0xE000_E018, 0)];
     for (clear_enable, clear_pending) in [
         (0xE000_E180, 0xE000_E280),
         (0xE000_E184, 0xE000_E284),
@@ -172,15 +215,21 @@ fn a_reset_is_requested_with_the_key() {
     }
 }
 
-/// RM0090 section 21.4: start, then unlock prescaler and reload; 4 and 1, the shortest.
+/// RM0090 sections 21.3 and 21.4: start; when no value is on its way, unlock prescaler and reload, 4 and 1,
+/// the shortest; when they are there, load the counter. If SR never gets 0, the watchdog still runs.
 #[test]
 fn the_watchdog_runs_out_as_soon_as_it_can() {
-    let mut chip = Chip::default();
+    let stores = [(IWDG_KR, 0xCCCC), (IWDG_KR, 0x5555), (IWDG_PR, 0), (IWDG_RLR, 1), (IWDG_KR, 0xAAAA)];
+    // The application has just changed its values.
+    for before in [0, 0b11] {
+        let mut chip = Chip::with(&[(IWDG_SR, before)]);
+        start_watchdog(&mut chip);
+        assert_eq!(chip.written, stores);
+        assert_eq!(chip.word(IWDG_SR), 0, "AAAAh comes when the values are there");
+    }
+    let mut chip = Chip { is_stuck: true, ..Chip::default() };
     start_watchdog(&mut chip);
-    assert_eq!(
-        chip.written,
-        [(0x4000_3000, 0xCCCC), (0x4000_3000, 0x5555), (0x4000_3004, 0), (0x4000_3008, 1)]
-    );
+    assert_eq!(chip.written, stores);
 }
 
 /// ARMv7-M B1.4.2: bits 0 to 8 of IPSR are the exception number.
