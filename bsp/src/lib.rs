@@ -22,6 +22,7 @@
 //! | `port.rs` | the port for frames: the CAN controller, or the UART |
 //! | [`line`](mod@line) | what a CANopen slave wants of its port |
 //! | `watchdog.rs` | the independent watchdog |
+//! | `low_power.rs` | the wake-up from Standby |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
 #![cfg_attr(not(test), no_std)]
@@ -38,6 +39,8 @@ pub mod debugger;
 mod drivers;
 mod identity;
 pub mod line;
+#[cfg(target_arch = "arm")]
+pub mod low_power;
 #[cfg(all(target_arch = "arm", feature = "debugger"))]
 mod memory;
 #[cfg(all(target_arch = "arm", feature = "monitor"))]

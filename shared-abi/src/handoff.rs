@@ -24,7 +24,7 @@ pub const OLDEST: u16 = 1;
 /// In [`Handoff::flags`]: [`BootInfo::fresh`].
 pub const FLAG_FRESH: u32 = 1 << 0;
 
-/// Why the chip left reset, from `RCC_CSR` (RM0090 section 7.3.21).
+/// Why the chip left reset, from `RCC_CSR` and `PWR_CSR` (RM0090 sections 7.3.21 and 5.4.2).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[repr(u8)]
 pub enum ResetCause {
@@ -45,6 +45,8 @@ pub enum ResetCause {
     LowPower = 6,
     /// The supply fell below the brown-out level.
     BrownOut = 7,
+    /// The chip woke up from Standby (`PWR_CSR.SBF`), by whatever.
+    Standby = 8,
 }
 
 impl ResetCause {
@@ -59,18 +61,21 @@ impl ResetCause {
             5 => Self::WindowWatchdog,
             6 => Self::LowPower,
             7 => Self::BrownOut,
+            8 => Self::Standby,
             _ => Self::Unknown,
         }
     }
 
-    /// From the reset flags of `RCC_CSR` (RM0090 section 7.3.21).
+    /// From the reset flags of `RCC_CSR` (RM0090 section 7.3.21), and whether the chip has woken up from
+    /// Standby, after which these flags say nothing reliable.
     ///
     /// Every reset also pulls NRST low, and a power-on also sets the brown-out flag; the most
     /// specific flag determines the result.
     #[must_use]
-    pub const fn from_rcc_csr(csr: u32) -> Self {
-        /// The bits, the most specific one first.
-        const FLAGS: [(u8, ResetCause); 7] = [
+    pub const fn from_flags(csr: u32, woke_up: bool) -> Self {
+        /// The bits, the most specific one first. Bit 0 is free: it is no reset flag.
+        const FLAGS: [(u8, ResetCause); 8] = [
+            (0, ResetCause::Standby),
             (27, ResetCause::PowerOn),             // PORRSTF
             (25, ResetCause::BrownOut),            // BORRSTF
             (29, ResetCause::IndependentWatchdog), // IWDGRSTF
@@ -79,10 +84,11 @@ impl ResetCause {
             (28, ResetCause::Software),            // SFTRSTF
             (26, ResetCause::Pin),                 // PINRSTF
         ];
+        let flags = csr & !1 | woke_up as u32;
         let mut i = 0;
         while i < FLAGS.len() {
             let (bit, cause) = FLAGS[i];
-            if csr >> bit & 1 != 0 {
+            if flags >> bit & 1 != 0 {
                 return cause;
             }
             i += 1;
@@ -307,6 +313,7 @@ mod tests {
             WindowWatchdog,
             LowPower,
             BrownOut,
+            Standby,
             Unknown,
         ];
         for (byte, cause) in (0..).zip(causes) {
@@ -317,10 +324,20 @@ mod tests {
     /// Flag positions from RM0090 section 7.3.21.
     #[test]
     fn the_most_telling_reset_flag_wins() {
-        assert_eq!(ResetCause::from_rcc_csr(0x0E00_0003), ResetCause::PowerOn);
-        assert_eq!(ResetCause::from_rcc_csr(0x1400_0000), ResetCause::Software);
-        assert_eq!(ResetCause::from_rcc_csr(0x2400_0000), ResetCause::IndependentWatchdog);
-        assert_eq!(ResetCause::from_rcc_csr(0x0400_0000), ResetCause::Pin);
-        assert_eq!(ResetCause::from_rcc_csr(0), ResetCause::Unknown);
+        for (csr, cause) in [
+            (0x0E00_0003, ResetCause::PowerOn),
+            (0x0600_0000, ResetCause::BrownOut),
+            (0x1400_0000, ResetCause::Software),
+            (0x2400_0000, ResetCause::IndependentWatchdog),
+            (0x4400_0000, ResetCause::WindowWatchdog),
+            (0x8400_0000, ResetCause::LowPower),
+            (0x0400_0000, ResetCause::Pin),
+            (0, ResetCause::Unknown),
+            // LSION and LSIRDY are no reset flags.
+            (3, ResetCause::Unknown),
+        ] {
+            assert_eq!(ResetCause::from_flags(csr, false), cause, "{csr:08X}h");
+            assert_eq!(ResetCause::from_flags(csr, true), ResetCause::Standby, "{csr:08X}h");
+        }
     }
 }

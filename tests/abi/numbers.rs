@@ -71,6 +71,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("RESET_WINDOW_WATCHDOG", ResetCause::WindowWatchdog as u32),
         ("RESET_LOW_POWER", ResetCause::LowPower as u32),
         ("RESET_BROWN_OUT", ResetCause::BrownOut as u32),
+        ("RESET_STANDBY", ResetCause::Standby as u32),
         ("CALLGATE_MAGIC", callgate::MAGIC),
         ("CALLGATE_ABI_VERSION", callgate::ABI_VERSION.into()),
         ("CALLGATE_TABLE_SIZE", callgate::TABLE_SIZE),

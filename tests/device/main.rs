@@ -19,6 +19,7 @@ mod options;
 mod program_control;
 mod reentry;
 mod slcan;
+mod standby;
 mod uart;
 mod virtual_can;
 mod watchdog;

@@ -1,8 +1,8 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
-//! Before it, nothing has used a peripheral. It uses only the reset flags, the warm-start cell, the
-//! flash controller, the CRC unit and the entry strap, and leaves the peripherals to a program in
-//! their reset state. The rest of the bootloader gets the CRC unit with its clock on, for the
+//! Before it, nothing has used a peripheral. It uses only the reset flags, that of Standby among them, the
+//! warm-start cell, the watchdog, the flash controller, the CRC unit and the entry strap, and leaves the
+//! peripherals to a program in their reset state. The rest of the bootloader gets the CRC unit with its clock on, for the
 //! services.
 
 use boot_core::canopen::NodeId;
@@ -48,8 +48,9 @@ pub unsafe extern "C" fn stage() -> ! {
     }
 
     let status = rcc.csr().read();
-    let reset_cause = ResetCause::from_rcc_csr(status.bits());
-    rcc.csr().modify(|_, w| w.rmvf().set_bit());
+    // SAFETY: it removes the flags, and leaves the LSI as it is.
+    rcc.csr().write(|w| unsafe { w.bits(status.bits()).rmvf().set_bit() });
+    let reset_cause = ResetCause::from_flags(status.bits(), bsp::low_power::woke_up(&rcc));
 
     // Without a reset cause an application has jumped here. The flash may be locked, and the watchdog,
     // whose clock is the LSI, may run. A reset ends both; the request stays in the cell.

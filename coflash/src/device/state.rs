@@ -43,6 +43,7 @@ pub const fn source(cause: ResetCause) -> &'static str {
         ResetCause::WindowWatchdog => "the window watchdog",
         ResetCause::LowPower => "a low-power mode that the option bytes forbid",
         ResetCause::BrownOut => "a supply below the brown-out level",
+        ResetCause::Standby => "a wake-up from Standby",
     }
 }
 

@@ -148,6 +148,7 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 #define COBOOT_RESET_WINDOW_WATCHDOG UINT32_C(0x5)
 #define COBOOT_RESET_LOW_POWER UINT32_C(0x6)
 #define COBOOT_RESET_BROWN_OUT UINT32_C(0x7)
+#define COBOOT_RESET_STANDBY UINT32_C(0x8)
 
 struct coboot_handoff {
     uint32_t magic;

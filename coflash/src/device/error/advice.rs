@@ -196,6 +196,10 @@ fn ended_advice(by: Option<ResetCause>) -> &'static str {
         Some(ResetCause::PowerOn | ResetCause::BrownOut) => {
             "check the supply of the device: it lost its power while the program ran"
         }
+        Some(ResetCause::Standby) => {
+            "the program put the device into Standby, and it woke up: a program that does so on purpose is flashed \
+             with --watch 0"
+        }
         _ => {
             "the program ends by itself: read its log, or run it under a debugger; coflash info says why the device \
              stays in the bootloader; a program that restarts on purpose is flashed with --watch 0"

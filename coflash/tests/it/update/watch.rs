@@ -42,6 +42,7 @@ fn a_program_that_dies_in_its_trial_is_not_released() {
         (200, 3, "was reset by software"),
         (500, 4, "was reset by the independent watchdog"),
         (950, 4, "was reset by the independent watchdog"),
+        (600, 8, "was reset by a wake-up from Standby"),
         (350, 0, "was reset by itself or by a watchdog"),
     ] {
         let mut fake = device(&[reset(ms, BOOTLOADER)], Some([5, cause, 1]));

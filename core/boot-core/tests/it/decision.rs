@@ -183,7 +183,7 @@ fn any_damage_to_a_program_keeps_it_from_starting() {
 #[test]
 fn resets_in_a_row_are_counted_until_somebody_asks() {
     use ResetCause::{
-        BrownOut, IndependentWatchdog, LowPower, Pin, PowerOn, Software, Unknown, WindowWatchdog,
+        BrownOut, IndependentWatchdog, LowPower, Pin, PowerOn, Software, Standby, Unknown, WindowWatchdog,
     };
     let policy = policy();
     for cause in [Software, IndependentWatchdog, WindowWatchdog, LowPower] {
@@ -191,7 +191,7 @@ fn resets_in_a_row_are_counted_until_somebody_asks() {
             assert_eq!(policy.crash_resets(before, cause, None), after, "{cause:?}");
         }
     }
-    for cause in [PowerOn, Pin, BrownOut, Unknown] {
+    for cause in [PowerOn, Pin, BrownOut, Standby, Unknown] {
         for (before, after) in [(0, 0), (2, 0), (3, 3), (4, 4)] {
             assert_eq!(policy.crash_resets(before, cause, None), after, "{cause:?}");
         }
