@@ -91,7 +91,7 @@ mod app {
         let mut rcc = bsp::clocks(cx.device.RCC);
         let board = bsp::init(&mut rcc, cx.device.CAN1);
         let can = CanPort::new(board.can, Source::Crystal);
-        Mono::start(cx.core.SYST, bsp::SYSCLK);
+        Mono::start(bsp::cleared_systick(cx.core.SYST), bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
         // with the application.

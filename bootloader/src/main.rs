@@ -162,7 +162,7 @@ mod app {
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
         #[cfg(feature = "log-uart")]
         log::uart::open(board.uart);
-        Mono::start(cx.core.SYST, clock.tree().sysclk());
+        Mono::start(bsp::cleared_systick(cx.core.SYST), clock.tree().sysclk());
 
         let parameters = Store::open(cx.local.store);
         let report = start::boot_report().unwrap_or(BootReport::NONE);

@@ -22,7 +22,7 @@
 //! | `port.rs` | the port for frames: the CAN controller, or the UART |
 //! | [`line`](mod@line) | what a CANopen slave wants of its port |
 //! | `watchdog.rs` | the independent watchdog |
-//! | `low_power.rs` | the wake-up from Standby |
+//! | `low_power.rs` | the wake-up from Standby, the clocks of the sleep mode |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
 #![cfg_attr(not(test), no_std)]
@@ -72,6 +72,15 @@ pub use port::CanPort;
 pub use stm32f4xx_hal as hal;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal::pac;
+
+/// SysTick with an empty counter. After a reset the counter holds anything (ARMv7-M B3.3.5): the first period
+/// could last a tenth of a second.
+#[cfg(target_arch = "arm")]
+#[must_use]
+pub fn cleared_systick(mut systick: cortex_m::peripheral::SYST) -> cortex_m::peripheral::SYST {
+    systick.clear_current();
+    systick
+}
 
 /// The count of the system timer, which runs with the clock of the core.
 #[cfg(target_arch = "arm")]

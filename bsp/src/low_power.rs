@@ -1,4 +1,4 @@
-//! Low-power modes (RM0090 section 5): the wake-up from Standby.
+//! Low-power modes (RM0090 section 5): the wake-up from Standby, and the clocks of the sleep mode.
 
 use stm32f4xx_hal::pac;
 
@@ -18,4 +18,17 @@ pub fn woke_up(rcc: &pac::RCC) -> bool {
     pwr.cr().modify(|_, w| w.csbf().set_bit());
     rcc.apb1enr().reset();
     woke_up
+}
+
+/// Gives every peripheral a clock in sleep mode, as after a reset: an application that jumped may have taken
+/// it away, and the bootloader sleeps (sections 7.3.15 to 7.3.19).
+pub fn keep_clocks_in_sleep(rcc: &pac::RCC) {
+    // SAFETY: after a reset every bit that exists is set; the others stay 0.
+    unsafe {
+        rcc.ahb1lpenr().write(|w| w.bits(u32::MAX));
+        rcc.ahb2lpenr().write(|w| w.bits(u32::MAX));
+        rcc.ahb3lpenr().write(|w| w.bits(u32::MAX));
+        rcc.apb1lpenr().write(|w| w.bits(u32::MAX));
+        rcc.apb2lpenr().write(|w| w.bits(u32::MAX));
+    }
 }

@@ -55,6 +55,8 @@ impl ClockTree {
         // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
         // keep their reset values.
         rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR & 0xFF00_0000 | pll) });
+        // An application that jumped may have spread the clock, which CAN needs exact (section 7.3.23).
+        rcc.sscgr().reset();
         raise_voltage(rcc);
         set(rcc, PLLON);
         latency(self.wait_states);

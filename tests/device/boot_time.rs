@@ -7,6 +7,8 @@ use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::read::{read, Firmware, Format};
 use coflash::update::{flash, FlashOptions};
+use emulator::machine::Options as ChipOptions;
+use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::{Span, Time};
 
 /// The application, followed by other data up to 400 KiB.
@@ -50,7 +52,18 @@ fn a_program_of_400_kib_is_checked_and_started_within_5_ms() {
 /// of its boot-up message. This includes the copy of the RAM image. The limits are the budget of the design.
 #[test]
 fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
-    let mut bench = Bench::new();
+    start_times(TYPICAL);
+}
+
+/// SysTick holds anything after a reset (ARMv7-M B3.3.5). From FFFFFFh the first period is a tenth of a second.
+/// The watchdog's values take longest with the slowest LSI.
+#[test]
+fn the_bootloader_does_not_wait_for_what_systick_held() {
+    start_times(Silicon { systick_value: 0x00FF_FFFF, lsi_hz: 17_000, ..TYPICAL });
+}
+
+fn start_times(silicon: Silicon) {
+    let mut bench = Bench::with(ChipOptions { silicon, ..ChipOptions::default() });
     bench.power_on();
     let power_on = bench.await_boot_up(100) - Time(0);
     flash(

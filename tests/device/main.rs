@@ -12,6 +12,7 @@ mod device;
 mod handover;
 mod hostile_bus;
 mod image;
+mod leftovers;
 mod line;
 mod log;
 mod mute;

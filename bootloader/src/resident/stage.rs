@@ -46,6 +46,7 @@ pub unsafe extern "C" fn stage() -> ! {
     if flash.starts_watchdog() {
         bsp::watchdog::rescale(&iwdg, bsp::watchdog::SLOWEST);
     }
+    bsp::low_power::keep_clocks_in_sleep(&rcc);
 
     let status = rcc.csr().read();
     // SAFETY: it removes the flags, and leaves the LSI as it is.

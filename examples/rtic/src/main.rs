@@ -64,7 +64,10 @@ mod app {
     #[init]
     fn init(cx: init::Context) -> (Shared, Local) {
         let mut rcc = cx.device.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
-        Mono::start(cx.core.SYST, rcc.clocks.sysclk().raw());
+        // Its counter holds anything after a reset: the first tick could be a tenth of a second late.
+        let mut systick = cx.core.SYST;
+        systick.clear_current();
+        Mono::start(systick, rcc.clocks.sysclk().raw());
 
         // The bootloader gives node-ID and bit rate, so that whoever talked to it goes on talking to
         // this program. The defaults hold where a debugger has started the program.

@@ -101,7 +101,7 @@ mod app {
         let can = CanPort::new(board.can, Source::Crystal);
         #[cfg(feature = "virtual-can")]
         let can = CanPort::new(board.uart, Source::Crystal);
-        Mono::start(cx.core.SYST, bsp::SYSCLK);
+        Mono::start(bsp::cleared_systick(cx.core.SYST), bsp::SYSCLK);
 
         // Same node-ID and bit rate as the bootloader, so that a client of the bootloader can go on
         // with the application.
