@@ -19,6 +19,7 @@ mod mute;
 mod options;
 mod program_control;
 mod reentry;
+mod silicon;
 mod slcan;
 mod standby;
 mod uart;

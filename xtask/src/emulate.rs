@@ -19,6 +19,7 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
                   --serial pty                    where other programs reach the board's UART
                   --trace FILE                    the bus as a candump log
                   --hse HZ                        the crystal, if it has not 8 MHz
+                  --silicon SEED                  a chip that the seed draws, within what the manuals leave open
                   --can NUMBER                    the CAN controller that the transceiver is at
                   --flash FILE                    keeps the flash from one run to the next
                   --control 127.0.0.1:29600       where commands for power, reset and pins are taken
