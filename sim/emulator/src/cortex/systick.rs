@@ -215,7 +215,7 @@ mod tests {
     /// cleared counter has loaded n before the last of them (ARMv7-M B3.3.1: with the next clock).
     #[test]
     fn a_cleared_counter_has_loaded_before_the_next_store() {
-        let mut tick = SysTick::new(1_000_000);
+        let mut tick = SysTick::new(1_000_000, 0);
         tick.write_csr(7, Time(0));
         for once in 0..3 {
             let now = once * 100_000_000;
@@ -227,7 +227,7 @@ mod tests {
             assert!(tick.advance(Time(now + due)) && tick.next_event().is_none(), "once");
         }
         // With an eighth of the clock the stores may all be before the next clock of the counter.
-        let mut tick = SysTick::new(8_000_000);
+        let mut tick = SysTick::new(8_000_000, 0);
         tick.write_csr(3, Time(0));
         tick.write_reload(9, Time(0));
         tick.write_value(Time(0));
