@@ -219,7 +219,10 @@ fn a_client_that_comes_back_goes_on_with_the_next_block() {
     let mut bench = board_with_a_program();
     let all = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
     let blocks = self::blocks(&seal(&all, firmware::APP_V2), SIZE);
-    let others = self::blocks(&seal(&all, firmware::APP_V1), SIZE);
+    // Of another length: block 0 contains the length, and nothing else of the file.
+    let plain = Sealer { compress: false, ..all };
+    let others = self::blocks(&seal(&plain, firmware::APP_V1), SIZE);
+    assert_ne!(blocks[0], others[0]);
     let control_crc = u32::from_le_bytes(*blocks[0].last_chunk().unwrap());
     assert_eq!(begun(&mut bench), (0, 0));
     clear(&mut bench);
