@@ -6,8 +6,10 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::device::Doing;
 use coflash::update::{flash, FlashOptions};
+use emulator::bus::Outcome;
 use emulator::machine::Options;
-use emulator::silicon::Choice;
+use emulator::silicon::{Choice, Silicon, TYPICAL};
+use emulator::time::Time;
 
 /// Seeds of each run; `COBOOT_SEEDS` is the number for a night.
 const SEEDS: u64 = 6;
@@ -58,4 +60,100 @@ fn the_main_job_works_with_the_worst_chip() {
     for way in 0..3 {
         main_job(Choice::Worst, way);
     }
+}
+
+/// The chips of the tests below.
+fn chips() -> impl Iterator<Item = Silicon> {
+    let drawn = (0..SEEDS).map(Choice::Seed);
+    [Choice::Worst].into_iter().chain(drawn).map(|choice| choice.of_board(0))
+}
+
+fn board(silicon: Silicon, hse_hz: u32) -> Bench {
+    println!("{silicon}");
+    let mut bench = Bench::with(Options { silicon, hse_hz, ..Options::default() });
+    bench.power_on();
+    bench
+}
+
+const CRYSTAL: u32 = 8_000_000;
+const LSS: u16 = 0x7E5;
+/// Switch state global to configuration (CiA 305).
+const CONFIGURATION: [u8; 8] = [0x04, 1, 0, 0, 0, 0, 0, 0];
+
+fn lss(bench: &mut Bench, request: [u8; 8]) {
+    let answer = bench.ask(LSS, &request, 0x7E4).expect("an answer");
+    assert_eq!(answer[..2], [request[0], 0]);
+}
+
+/// A controller that sticks on a busy bus, whose acknowledgements come late, or whose aborts do not end.
+#[test]
+fn the_bit_rate_changes_on_a_busy_bus_with_every_chip() {
+    for silicon in chips() {
+        let mut bench = board(silicon, CRYSTAL);
+        bench.await_boot_up(200);
+        let other = bench.world.add_host_port(125_000);
+        bench.post(LSS, &CONFIGURATION);
+        // 500 kbit/s, after 50 ms.
+        lss(&mut bench, [0x13, 0, 2, 0, 0, 0, 0, 0]);
+        bench.post(LSS, &[0x15, 50, 0, 0, 0, 0, 0, 0]);
+        // A frame takes a millisecond.
+        for n in 0..300 {
+            let data = [n as u8; 8];
+            bench.world.send(other, emulator::frame::Frame::standard(0x200, &data).expect("11 bits"));
+        }
+        bench.run_ms(250);
+        bench.world.port_mut(other).set_bit_rate(500_000);
+        bench.set_host_bit_rate(500_000);
+        bench.run_ms(1000);
+        assert!(bench.is_bootloader(NODE));
+        let resets = bench.events();
+        assert_eq!(resets, [], "it needed no watchdog");
+    }
+}
+
+/// A last error code that was lost would make the first bit rate a found one.
+#[test]
+fn the_bit_rate_is_found_and_nobody_is_disturbed_with_every_chip() {
+    for silicon in chips() {
+        let mut bench = board(silicon, CRYSTAL);
+        bench.await_boot_up(200);
+        bench.post(LSS, &CONFIGURATION);
+        lss(&mut bench, [0x13, 0, 9, 0, 0, 0, 0, 0]);
+        lss(&mut bench, [0x17, 0, 0, 0, 0, 0, 0, 0]);
+        bench.power_off();
+        bench.run_ms(10);
+        bench.power_on();
+        bench.set_host_bit_rate(500_000);
+        bench.world.add_host_port(500_000);
+        let from = bench.time();
+        for n in 0..100 {
+            bench.post(0x300, &[n; 5]);
+            bench.run_ms(20);
+        }
+        assert!(bench.records().iter().all(|record| record.start < from || record.outcome == Outcome::Good));
+        assert!(bench.is_bootloader(NODE));
+    }
+}
+
+/// HSI may be 4 % too fast or too slow, and CAN tolerates 1 % at most.
+#[test]
+fn a_device_without_its_crystal_disturbs_nobody_whatever_its_oscillator_makes() {
+    let mut joined = [0; 2];
+    for hsi_hz in (15_360_000..=16_640_000).step_by(80_000) {
+        let mut bench = board(Silicon { hsi_hz, ..TYPICAL }, 0);
+        bench.world.add_host_port(125_000);
+        for n in 0..20 {
+            bench.run_ms(20);
+            bench.post(0x300, &[n; 8]);
+        }
+        bench.post(LSS, &CONFIGURATION);
+        bench.run_ms(200);
+        let frames = bench.frames_since(Time(0));
+        let speaks = frames.iter().any(|(_, id, _)| *id == 0x700 + u32::from(NODE));
+        let is_exact = hsi_hz.abs_diff(16_000_000) <= 16_000_000 / 1000 * 9;
+        assert_eq!(speaks, is_exact, "{hsi_hz} Hz");
+        assert!(bench.records().iter().all(|record| record.outcome == Outcome::Good), "{hsi_hz} Hz");
+        joined[usize::from(speaks)] += 1;
+    }
+    assert!(joined.iter().all(|count| *count > 1), "{joined:?}");
 }

@@ -23,6 +23,7 @@ use crate::bus::confinement::{Confinement, ErrorState};
 use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Wait};
 use crate::frame::{ExtendedId, Frame, Id, StandardId};
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::silicon::{self, Silicon};
 use crate::time::{Span, Time};
 use filters::{Filters, Share};
 
@@ -337,6 +338,11 @@ pub struct BxCan {
     mode: Mode,
     /// The mode to enter when the controller leaves normal mode, and since when it waits for that.
     leaving: Option<(Time, Rest)>,
+    /// Aborts that were requested while the registers stood still: they show as requested until a reset.
+    frozen_aborts: u32,
+    /// It will not leave before MCR.RESET.
+    is_stuck: bool,
+    silicon: Silicon,
     recovery: Recovery,
     activity: Activity,
     confinement: Confinement,
@@ -371,6 +377,9 @@ impl BxCan {
             epoch: 0,
             mode: Mode::Resting(Rest::Sleep),
             leaving: None,
+            frozen_aborts: 0,
+            is_stuck: false,
+            silicon: silicon::TYPICAL,
             recovery: Recovery::None,
             activity: Activity::Idle,
             confinement: Confinement::default(),
@@ -390,6 +399,12 @@ impl BxCan {
     #[must_use]
     pub fn slave() -> Self {
         Self { share: Share::Can2, master_clocked: false, ..Self::new() }
+    }
+
+    /// The same on this chip.
+    #[must_use]
+    pub fn on(self, silicon: Silicon) -> Self {
+        Self { silicon, ..self }
     }
 
     /// CAN2 takes over the state of CAN1: its filters, and whether it has a clock.
@@ -516,8 +531,11 @@ impl BxCan {
             }
             (Mode::Synchronising { .. }, None) => {}
             (Mode::Normal, Some(rest)) => {
-                self.leaving = Some((now, rest));
-                self.attend(now);
+                self.is_stuck |= self.silicon.can_sticks && self.activity != Activity::Idle;
+                if !self.is_stuck && self.leaving.is_none_or(|(_, other)| other != rest) {
+                    self.leaving = Some((now + Span::from_micros(self.silicon.can_mode_us.into()), rest));
+                    self.attend(now);
+                }
             }
             (Mode::Normal, None) => self.leaving = None,
         }
@@ -549,6 +567,8 @@ impl BxCan {
         self.epoch = self.epoch.wrapping_add(1);
         self.mode = Mode::Resting(Rest::Sleep);
         self.leaving = None;
+        self.is_stuck = false;
+        self.frozen_aborts = 0;
         self.recovery = Recovery::None;
         self.activity = Activity::Idle;
         self.confinement = Confinement::default();
@@ -603,7 +623,7 @@ impl BxCan {
     }
 
     fn read_tsr(&self) -> u32 {
-        let mut value = 0;
+        let mut value = if self.is_frozen() { self.frozen_aborts } else { 0 };
         for (n, mailbox) in self.mailboxes.iter().enumerate() {
             value |= mailbox.flags << (8 * n);
             match mailbox.state {
@@ -622,7 +642,16 @@ impl BxCan {
         value | (free.or(last).unwrap_or(0) as u32) << 24
     }
 
+    /// Whether the registers stand still.
+    fn is_frozen(&self) -> bool {
+        self.silicon.can_sleeps_deeply && self.mode == Mode::Resting(Rest::Sleep)
+    }
+
     fn write_tsr(&mut self, value: u32) {
+        if self.is_frozen() {
+            self.frozen_aborts |= value & (tsr::ABRQ | tsr::ABRQ << 8 | tsr::ABRQ << 16);
+            return;
+        }
         for (n, mailbox) in self.mailboxes.iter_mut().enumerate() {
             let bits = value >> (8 * n);
             if bits & tsr::RQCP != 0 {
@@ -866,6 +895,7 @@ impl Peripheral for BxCan {
                     return Err(Unmodelled(format!("IER: reserved bits set in {value:#010x}")));
                 }
             }
+            0x18 if self.is_frozen() => {}
             0x18 => self.last_error = value >> esr::LEC_SHIFT & 7,
             0x1C => {
                 if !matches!(
@@ -935,6 +965,7 @@ impl Peripheral for BxCan {
             clock_hz: self.clock_hz,
             on_bus: self.on_bus,
             epoch: self.epoch,
+            silicon: self.silicon,
             filters,
             ..Self::new()
         };

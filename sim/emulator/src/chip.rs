@@ -258,7 +258,7 @@ impl Chip {
             rcc,
             iwdg: Iwdg::new(silicon),
             gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
-            can: [BxCan::new(), BxCan::slave()],
+            can: [BxCan::new().on(silicon), BxCan::slave().on(silicon)],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             tims: tim::INSTANCES.each_ref().map(Tim::new),
             pwr: Pwr::new(variant),

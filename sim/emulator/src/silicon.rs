@@ -26,6 +26,18 @@ pub struct Silicon {
     /// Whether a wake-up from Standby sets PORRSTF, PINRSTF and BORRSTF, or no flag of RCC_CSR at all. RM0090
     /// section 7.3.21 does not name Standby.
     pub flags_after_standby: bool,
+    /// The time from HSEON to HSERDY with a crystal, in µs: some milliseconds, by the crystal (datasheet, HSE
+    /// oscillator characteristics: 2 ms typical).
+    pub crystal_start_us: u32,
+    /// How long after a request on the bus INAK and SLAK come at the earliest, in µs (RM0090 section 32.4
+    /// has no time).
+    pub can_mode_us: u32,
+    /// Whether CAN_TSR and CAN_ESR stand still in sleep mode, so that an abort of a mailbox does not end, and
+    /// a last error code that software writes is lost. The manual has the clock of the controller stop there
+    /// (RM0090 section 32.4.3).
+    pub can_sleeps_deeply: bool,
+    /// Whether a controller that is asked to leave a busy bus never does, until MCR.RESET: reported of an F469.
+    pub can_sticks: bool,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -35,6 +47,10 @@ pub const TYPICAL: Silicon = Silicon {
     iwdg_update_periods: 5,
     systick_value: 0,
     flags_after_standby: false,
+    crystal_start_us: 2_000,
+    can_mode_us: 0,
+    can_sleeps_deeply: false,
+    can_sticks: false,
 };
 
 /// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, and the first
@@ -45,12 +61,18 @@ pub const WORST: Silicon = Silicon {
     iwdg_update_periods: *UPDATE.end(),
     systick_value: *SYSTICK.end(),
     flags_after_standby: false,
+    crystal_start_us: *CRYSTAL_START.end(),
+    can_mode_us: *CAN_MODE.end(),
+    can_sleeps_deeply: true,
+    can_sticks: true,
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
 const HSI: RangeInclusive<u32> = 15_360_000..=16_640_000;
 const UPDATE: RangeInclusive<u32> = 1..=5;
 const SYSTICK: RangeInclusive<u32> = 0..=0x00FF_FFFF;
+const CRYSTAL_START: RangeInclusive<u32> = 300..=20_000;
+const CAN_MODE: RangeInclusive<u32> = 0..=30;
 
 impl Silicon {
     /// A chip that the seed chooses.
@@ -70,6 +92,10 @@ impl Silicon {
             iwdg_update_periods: draw(UPDATE),
             systick_value: draw(SYSTICK),
             flags_after_standby: draw(0..=1) == 1,
+            crystal_start_us: draw(CRYSTAL_START),
+            can_mode_us: draw(CAN_MODE),
+            can_sleeps_deeply: draw(0..=1) == 1,
+            can_sticks: draw(0..=1) == 1,
         }
     }
 }
@@ -82,12 +108,15 @@ impl Default for Silicon {
 
 impl fmt::Display for Silicon {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby } = self;
+        let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
+        let Self { crystal_start_us, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
             f,
             "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
-             after a reset: {systick_value:06X}h, reset flags after Standby: {flags}"
+             after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
+             INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
+             on a busy bus: {can_sticks}"
         )
     }
 }
@@ -153,6 +182,8 @@ mod tests {
             assert!((15_360_000..=16_640_000).contains(&chip.hsi_hz), "{seed}: {chip}");
             assert!((1..=5).contains(&chip.iwdg_update_periods), "{seed}: {chip}");
             assert!(chip.systick_value < 1 << 24, "{seed}: {chip}");
+            assert!((300..=20_000).contains(&chip.crystal_start_us), "{seed}: {chip}");
+            assert!(chip.can_mode_us <= 30, "{seed}: {chip}");
             assert_eq!(Silicon::drawn(seed), *chip, "{seed}");
         }
         // The ends are reached, or nearly.

@@ -84,6 +84,38 @@ impl Bench {
     }
 }
 
+/// In sleep the registers stand still: an abort does not end, and a last error code is not taken.
+#[test]
+fn what_a_deep_sleeper_is_told_is_lost() {
+    let mut bench = Bench::new();
+    bench.can = bench.can.on(silicon::WORST);
+    bench.write(TSR, 1 << 7);
+    bench.write(ESR, 7 << 4);
+    assert_eq!((bench.read(TSR) & 1 << 7, bench.read(ESR) & 7 << 4), (1 << 7, 0));
+    bench.write(MCR, 0x1_0001);
+    bench.write(ESR, 7 << 4);
+    assert_eq!((bench.read(TSR) & 1 << 7, bench.read(ESR) & 7 << 4), (0, 7 << 4));
+}
+
+/// A controller that sticks leaves an idle bus, and a busy one by a master reset alone.
+#[test]
+fn a_controller_that_sticks_leaves_a_busy_bus_by_a_master_reset() {
+    for is_busy in [false, true] {
+        let mut bench = Bench::running(0x1_0000);
+        bench.can = bench.can.on(silicon::WORST);
+        if is_busy {
+            bench.event(BusEvent::Started { own: false });
+        }
+        bench.write(MCR, 0x1_0001);
+        // 30 µs after the request at the earliest.
+        assert_eq!(bench.can.leaving(), (!is_busy).then_some(bench.now + Span::from_micros(30)));
+        bench.write(MCR, 1 << 15);
+        assert_eq!(bench.read(MSR) & 3, 2, "asleep");
+        bench.write(MCR, 0x1_0001);
+        assert_eq!(bench.read(MSR) & 3, 1, "in initialisation");
+    }
+}
+
 #[test]
 fn reset_values() {
     let mut bench = Bench::new();

@@ -7,7 +7,6 @@ use crate::variant::Variant;
 
 // Start-up times, typical, from the datasheet (DocID022152 rev 8, section 5.3.8 to 5.3.10).
 const HSI_START: Span = Span(2_200_000);
-const HSE_START: Span = Span::from_millis(2);
 const LSI_START: Span = Span::from_micros(15);
 const LSE_START: Span = Span::from_millis(2_000);
 /// The maximum at the upper end of the VCO range.
@@ -292,7 +291,8 @@ impl Rcc {
         let pll_fed = uses(2);
         self.hsi.switch(value & CR_HSION != 0 || hsi_fed, HSI_START, now);
         if self.hse_hz > 0 {
-            self.hse.switch(value & CR_HSEON != 0 || hse_fed, HSE_START, now);
+            let start = Span::from_micros(self.silicon.crystal_start_us.into());
+            self.hse.switch(value & CR_HSEON != 0 || hse_fed, start, now);
         }
         self.pll.switch(value & CR_PLLON != 0 || pll_fed, PLL_LOCK, now);
         self.plli2s.switch(value & CR_PLLI2SON != 0, PLL_LOCK, now);
