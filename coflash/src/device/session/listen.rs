@@ -139,6 +139,9 @@ impl Session<'_> {
             Way::Gateway(gateway) => {
                 let booted = gateway.wait(timeout);
                 let booted = booted.map_err(|error| of_gateway(error, self.node, Doing::Restart))?;
+                if let Some(booted) = booted {
+                    self.watch().heard_boot_up(booted, self.node, self.now());
+                }
                 return Ok(booted.map(|node| Frame::of(CobId::heartbeat(node), &[0])));
             }
         };

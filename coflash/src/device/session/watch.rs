@@ -73,6 +73,15 @@ impl Watch {
         }
     }
 
+    /// A node has booted up: the session's own, `node`, or another.
+    pub(super) fn heard_boot_up(&mut self, booted: NodeId, node: NodeId, now: Duration) {
+        if booted == node {
+            self.booted = Some(now);
+        } else {
+            self.elsewhere = Some((now, booted));
+        }
+    }
+
     pub(super) fn received(&mut self, frame: &Frame, node: NodeId, now: Duration) {
         let Some(id) = frame.cob_id() else { return };
         if id == CobId::sdo_request(node) {
@@ -91,10 +100,8 @@ impl Watch {
         if [CobId::sdo_response(node), CobId::heartbeat(node), CobId::emcy(node)].contains(&id) {
             (self.heard, self.told) = (Some(now), false);
         }
-        match parse_boot_up(frame) {
-            Some(booted) if booted == node => self.booted = Some(now),
-            Some(other) => self.elsewhere = Some((now, other)),
-            None => {}
+        if let Some(booted) = parse_boot_up(frame) {
+            self.heard_boot_up(booted, node, now);
         }
         if is_failure(frame, node) {
             self.failed = Some(now);

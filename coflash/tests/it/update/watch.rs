@@ -4,12 +4,15 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::fake::{left, Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
-use coflash::device::{Session, Timing};
+use coflash::bus::gateway::{Ask, Gateway, GatewayError};
+use coflash::bus::AdapterError;
+use coflash::device::{Doing, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
-use coflash::Error;
+use coflash::{Adapter, Error};
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {
@@ -255,4 +258,71 @@ fn a_neighbour_is_not_taken_for_the_program() {
     fake.noise = vec![Frame::of(CobId::new(0x70A).unwrap(), &[5])];
     let text = text(&run(&mut fake, FlashOptions::default()).0.unwrap_err());
     assert!(!text.contains("booted up since") && text.contains("node 5 has not answered"), "{text}");
+}
+
+/// A gateway that tells of boot-up messages (CiA 309-3 need not), in front of a device.
+struct Through(Fake);
+
+impl Through {
+    fn session(&mut self, ask: &Ask<'_>) -> Session<'_> {
+        Session::new(&mut self.0, ask.node, Timing::default().sdo(ask.sdo).attempts(1))
+    }
+}
+
+fn refusal(error: Error) -> GatewayError {
+    match error {
+        Error::Refused { code, .. } => GatewayError::Abort(code),
+        Error::NoAnswer { .. } => GatewayError::NoAnswer,
+        other => panic!("{other}"),
+    }
+}
+
+impl Gateway for Through {
+    fn upload(&mut self, ask: &Ask<'_>, _: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError> {
+        self.session(ask).read_once(ask.at).map_err(refusal)
+    }
+
+    fn download(&mut self, ask: &Ask<'_>, data: &[u8], _: &mut dyn FnMut(u32)) -> Result<(), GatewayError> {
+        self.session(ask).write(ask.at, data, Doing::Write(ask.at), &mut |_| {}).map_err(refusal)
+    }
+
+    fn reset_node(&mut self, _: NodeId) -> Result<(), GatewayError> {
+        panic!("nobody resets a node here")
+    }
+
+    fn greet(&mut self, _: Duration) -> Result<(), AdapterError> {
+        Ok(())
+    }
+
+    fn wait(&mut self, time: Duration) -> Result<Option<NodeId>, GatewayError> {
+        let end = self.0.now + time;
+        while self.0.now < end {
+            let frame = self.0.receive(end - self.0.now)?;
+            if let Some(node) = frame.as_ref().and_then(parse_boot_up) {
+                return Ok(Some(node));
+            }
+        }
+        Ok(None)
+    }
+
+    fn now(&self) -> Duration {
+        self.0.now
+    }
+}
+
+/// Behind a gateway, too: a program that comes back by itself, and one under another node-ID.
+#[test]
+fn boot_up_messages_of_a_gateway_count_as_those_of_a_bus() {
+    let through = |fake: Fake| {
+        let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+        let mut gateway = Through(fake);
+        let mut session = Session::through(&mut gateway, NodeId::new(NODE).unwrap(), Timing::default());
+        text(&flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap_err())
+    };
+    let back = through(device(&[None, reset(400, APPLICATION)], None));
+    assert!(back.contains("it ran for 400 ms and was reset by itself or by a watchdog"), "{back}");
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.maker = Some(Box::new(Elsewhere(9)));
+    let elsewhere = through(fake);
+    assert!(elsewhere.contains("node 9 has booted up since then"), "{elsewhere}");
 }
