@@ -101,7 +101,7 @@ impl<I: Controller> Port<I> {
     pub fn new(controller: I, clock: Source) -> Self {
         // SAFETY: `REGISTERS` is the base of the controller that this function has taken.
         unsafe { Modes::of(I::REGISTERS) }.initialise();
-        // It finds the controller in initialisation, and does not wait.
+        // It finds the controller in initialisation, and from there it sleeps without a look at the bus.
         let can = Can::builder(controller).leave_disabled();
         let (waiting, lost) = (None, Lost::default());
         let mut port =
