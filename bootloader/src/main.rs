@@ -154,7 +154,7 @@ mod app {
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        // First: whatever the chip does not do from here on ends in a reset.
+        // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
         let clock = CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
         // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
@@ -291,8 +291,8 @@ mod app {
                 while let Some(frame) = next {
                     log::received(&frame);
                     // The filters pass only NMT and frames for this device or for layer setting
-                    // services (LSS). All but NMT end the rescue window.
-                    if frame.cob_id() != Some(CobId::NMT) {
+                    // services (LSS). All but NMT, and what is not answered, end the rescue window.
+                    if frame.cob_id() != Some(CobId::NMT) && !slave.ignores(&frame) {
                         *held = None;
                     }
                     if slave.handle(&frame, now, device) {

@@ -29,8 +29,8 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 /// Whether the bootloader takes sealed images.
 pub const SEALED: bool = cfg!(feature = "sealed");
 
-/// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % (DS8626
-/// table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
+/// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
+/// (DS8626 table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum CrystalFailure {
     /// It listens, until a request of the layer setting services (LSS) arrives without an error: then its
@@ -124,7 +124,8 @@ pub struct Product {
     /// delivers some 55 KiB.
     pub block_buffer: usize,
     /// The longest time without a check-in of a task of the bootloader before the watchdog resets
-    /// the chip, in ms, 100 to 4000; `None` for no watchdog (`BLCOP_USE_WATCHDOG`).
+    /// the chip, in ms, 250 to 4000: it runs while a crystal that does not start is waited for. `None` for no
+    /// watchdog (`BLCOP_USE_WATCHDOG`).
     pub watchdog_ms: Option<u16>,
     /// The time within which a program must feed the independent watchdog, from its first
     /// instruction on, in ms, 1 to 4000; `None` to start programs without the watchdog.
@@ -250,7 +251,7 @@ impl Product {
             "product: block_buffer must be 1024 bytes or more, and fit the RAM"
         );
         if let Some(ms) = self.watchdog_ms {
-            assert!(ms >= 100 && ms <= 4000, "product: watchdog_ms must be 100 to 4000");
+            assert!(ms >= 250 && ms <= 4000, "product: watchdog_ms must be 250 to 4000");
         }
         if let Some(ms) = self.program_watchdog_ms {
             assert!(ms >= 1 && ms <= 4000, "product: program_watchdog_ms must be 1 to 4000");

@@ -1,7 +1,8 @@
 //! The operating modes of bxCAN, register by register (RM0090 section 32.4). `bxcan` waits without a bound
 //! for a controller that does not follow, and goes from one mode to another through sleep, where status
 //! bits stand still. Here each wait is bounded, and the order is that of the drivers in the field:
-//! initialisation, bit timing, normal mode.
+//! initialisation, bit timing, normal mode. What is left of `bxcan`'s waits is its start, from initialisation to
+//! sleep, which needs no bus.
 
 use bxcan::RegisterBlock;
 
@@ -18,7 +19,7 @@ const INRQ: u32 = 1 << 0;
 const SLEEP: u32 = 1 << 1;
 /// `CAN_MCR`: the controller leaves bus-off without a command. Here the slave decides when.
 const ABOM: u32 = 1 << 6;
-/// `CAN_MCR`: all but bit timing, filters and interrupts is as after a reset, and the controller sleeps.
+/// `CAN_MCR`: FIFOs and `CAN_MCR` are as after a reset, and the controller sleeps.
 const RESET: u32 = 1 << 15;
 /// `CAN_MSR`: initialisation is entered.
 const INAK: u32 = 1 << 0;
@@ -35,7 +36,8 @@ const SILM: u32 = 1 << 31;
 /// kbit/s).
 const PATIENCE: u32 = 500_000;
 
-/// The same for 11 bits on an idle bus: 0.3 ms are 11 bits at 50 kbit/s.
+/// The same for 11 bits on an idle bus: 0.3 ms. They take 0.22 ms at 50 kbit/s; below, the next look at the
+/// controller finds it.
 const SOON: u32 = 5_000;
 
 /// The registers of a controller.
@@ -53,16 +55,19 @@ impl Modes {
     /// Enters initialisation (section 32.4.1). Returns false if the controller did not follow and was
     /// reset: reports exist of a busy bus on which it never does.
     pub fn initialise(&mut self) -> bool {
-        let is_in = self.try_to_initialise();
+        let is_in = self.enter(self.read(MCR) & !SLEEP | INRQ);
         if !is_in {
+            // Not every manual says that the bit timing stays.
+            let timing = self.read(BTR);
             self.write(MCR, RESET);
-            self.try_to_initialise();
+            self.enter(INRQ);
+            self.write(BTR, timing);
         }
         is_in
     }
 
-    fn try_to_initialise(&mut self) -> bool {
-        self.write(MCR, self.read(MCR) & !SLEEP | INRQ);
+    fn enter(&mut self, request: u32) -> bool {
+        self.write(MCR, request);
         (0..PATIENCE).any(|_| self.read(MSR) & INAK_SLAK == INAK)
     }
 

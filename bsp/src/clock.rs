@@ -30,8 +30,8 @@ pub struct ClockTree {
 /// The input of the PLL.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Source {
-    /// The internal oscillator (HSI): it needs no start-up time, and is exact to 4 % over the
-    /// temperature (DS8626 table 41), which is too little for CAN.
+    /// The internal oscillator (HSI): it needs no start-up time, and is exact to 4 % from -10 to 85 °C
+    /// (DS8626 table 41), which is too little for CAN.
     Internal,
     /// The crystal: it is exact, and needs some milliseconds to start.
     Crystal,
@@ -41,15 +41,25 @@ pub enum Source {
 pub const HSI: u32 = 16_000_000;
 
 impl ClockTree {
-    /// The tree with HSI in place of the crystal. The core is slower, so that it stays within its limits
-    /// when HSI is 5 % too fast, and the CAN controller can be set to the same bit rates.
+    /// The tree with HSI in place of the crystal. The core is as fast as it may be when HSI is 5 % too fast,
+    /// and the CAN controller can be set to the same bit rates.
+    ///
+    /// # Panics
+    /// At compile time, if there is none.
     #[must_use]
-    pub const fn internal(self) -> Self {
-        let mut internal = Self { hse: HSI, pll_n: self.pll_n * 20 / 21, ..self };
-        while !internal.makes_the_bit_rates_of(&self) && internal.pll_n > 50 {
+    pub const fn internal(self, limits: &Limits) -> Self {
+        let mut internal = Self { hse: HSI, ..self };
+        while !internal.is_within(limits) || !internal.makes_the_bit_rates_of(&self) {
+            assert!(internal.pll_n > 50, "board: with HSI the PLL cannot make the bit rates of the crystal");
             internal.pll_n -= 1;
         }
         internal
+    }
+
+    /// Whether the clocks are within these limits when their source is 5 % too fast.
+    const fn is_within(&self, limits: &Limits) -> bool {
+        let fastest = self.sysclk() / 20 * 21;
+        fastest <= limits.sysclk && fastest / self.apb1 <= limits.apb1 && fastest / self.apb2 <= limits.apb2
     }
 
     /// Whether the CAN controller can be set to each bit rate to which it can be set with the other tree.
@@ -128,7 +138,7 @@ impl ClockTree {
             return Err("board: APB1 and APB2 are divided by 1, 2, 4, 8 or 16");
         }
         if self.pll_p < 2 || self.pll_p > 8 || !self.pll_p.is_multiple_of(2) {
-            return Err("board: behind the PLL, the divider is 2, 4, 6 or 8");
+            return Err("board: after the PLL, the divider is 2, 4, 6 or 8");
         }
         let is_slow = limits.sysclk <= 100_000_000;
         if self.sysclk() > limits.sysclk {
@@ -237,14 +247,15 @@ mod tests {
     fn with_hsi_the_core_stays_within_its_limits_and_the_bit_rates_stay() {
         for (line, tree, core, apb1) in [
             (Line::F407, FAST, 160, 40),
-            (Line::F446, ClockTree { pll_n: 160, ..FAST }, 144, 36),
+            (Line::F446, ClockTree { pll_n: 160, ..FAST }, 160, 40),
             (Line::F412, SLOW, 90, 45),
+            // It is far below its limits.
+            (Line::F407, ClockTree { pll_n: 50, ..FAST }, 50, 12),
         ] {
-            let internal = tree.internal();
+            let internal = tree.internal(&line.limits());
             assert_eq!(internal.sysclk(), core * 1_000_000);
             assert_eq!(internal.apb1_clock(), apb1 * 1_000_000);
             assert_eq!(internal.check(&line.limits()), Ok(()));
-            assert!(internal.sysclk() / 20 * 21 <= tree.sysclk());
         }
     }
 

@@ -144,7 +144,7 @@ pub const BIT_RATE: u32 = FACTS.bit_rate;
 /// How the clocks are made; the chip can run with them.
 pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&CHIP.line.limits());
 /// The same with HSI in place of the crystal.
-pub const INTERNAL: ClockTree = CLOCK_TREE.internal().checked(&CHIP.line.limits());
+pub const INTERNAL: ClockTree = CLOCK_TREE.internal(&CHIP.line.limits()).checked(&CHIP.line.limits());
 /// The pin that asks for the bootloader after a reset.
 pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
 

@@ -31,8 +31,8 @@ impl Source {
 }
 
 impl ClockTree {
-    /// Runs the core from the PLL, and returns its source: if the crystal does not start, that is the
-    /// internal oscillator, until the next reset.
+    /// Runs the core from the PLL, and returns its source: if the crystal does not start, or the PLL does not
+    /// lock to it, that is the internal oscillator, until the next reset.
     pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
         // The PLL cannot be changed while it runs (section 7.3.2).
         if rcc.cr().read().bits() & PLLON != 0 {
@@ -60,6 +60,10 @@ impl ClockTree {
         raise_voltage(rcc);
         set(rcc, PLLON);
         latency(self.wait_states);
+        if source == Source::Crystal && !reaches(rcc.cr().as_ptr(), PLLRDY, PLLRDY) {
+            // A crystal at another frequency, for one.
+            return self.speed_up(rcc, Source::Internal);
+        }
         wait(rcc.cr().as_ptr(), PLLRDY, PLLRDY);
         await_voltage();
         // The buses are divided before the clock rises.

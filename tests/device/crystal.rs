@@ -4,12 +4,13 @@
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
+use coflash::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
 use emulator::time::Time;
 
 const CLOCK: Address = Address::new(0x2007, 5);
-/// The emergency behind the boot-up (CiA 301 section 7.2.7: COB-ID 80h + node-ID).
+/// The emergency after the boot-up (CiA 301 section 7.2.7: COB-ID 80h + node-ID).
 const EMERGENCY: u32 = 0x80 + NODE as u32;
 const READ_1000: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
 
@@ -18,7 +19,7 @@ fn failed(image: &str) -> Bench {
     Bench::of_image_with(image, Options { hse_hz: 0, ..Options::default() })
 }
 
-/// The reason in the emergency behind the boot-up.
+/// The reason in the emergency after the boot-up.
 fn announced(bench: &Bench) -> Option<u8> {
     let mut frames = bench.frames_since(Time(0)).into_iter();
     frames.find(|(_, id, _)| *id == EMERGENCY).map(|(_, _, data)| data[7])
@@ -63,6 +64,27 @@ fn without_its_crystal_a_device_only_listens_until_lss_speaks() {
     assert!(said.iter().any(|(_, id, data)| *id == HEARTBEAT && data == &[0]), "{said:X?}");
     assert_eq!(announced(&bench), Some(0x80 | 6));
     assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+}
+
+/// The rescue window of a device that cannot answer ends as if nobody had asked.
+#[test]
+fn a_request_that_is_not_heard_does_not_keep_a_device_from_its_program() {
+    let mut installed = Bench::new();
+    installed.power_on();
+    installed.await_boot_up(100);
+    let options = FlashOptions::default().trial_run(false);
+    flash(&mut installed.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    let cells = installed.machine().flash().to_vec();
+
+    let mut bench = failed(firmware::BOOTLOADER);
+    bench.world.add_host_port(BIT_RATE);
+    bench.machine().load_bin(firmware::board().chip.flash.base, &cells).unwrap();
+    bench.power_on();
+    for _ in 0..20 {
+        bench.run_ms(20);
+        bench.post(REQUEST, &READ_1000);
+    }
+    assert!(firmware::board().programs[0].contains(bench.machine().pc(), 2), "the program runs");
 }
 
 /// Nobody acknowledges the host: its frames are good only when it is error passive (ISO 11898-1).

@@ -523,7 +523,7 @@ const MISTAKES: &[Mistake] = &[
     ),
     product(
         "Product { watchdog_ms: Some(4001), ..Product::DEFAULT }",
-        "product: watchdog_ms must be 100 to 4000",
+        "product: watchdog_ms must be 250 to 4000",
     ),
     product(
         "Product { bit_rates: 3..=9, ..Product::DEFAULT }",

@@ -159,7 +159,7 @@ mod tests {
             (0xE000_0000, 0xE00F_FFFF, Some(Area::Registers)),
             (0x0000_0000, 0x001F_FFFF, Some(Area::Alias)),
             (0x0800_0000, 0x081F_FFFF, None),
-            // Reserved: behind the largest flash, behind the CCM RAM, around OTP and option bytes.
+            // Reserved: after the largest flash, after the CCM RAM, around OTP and option bytes.
             (0x0820_0000, 0x0FFF_FFFF, Some(Area::Reserved)),
             (0x1001_0000, 0x1FFE_BFFF, Some(Area::Reserved)),
             (0x1FFF_7A10, 0x1FFF_BFFF, Some(Area::Reserved)),

@@ -240,7 +240,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.id
     }
 
-    /// Sets 2007h/5. From the internal oscillator, the emergency behind the boot-up has bit 7 set in its
+    /// Sets 2007h/5. From the internal oscillator, the emergency after the boot-up has bit 7 set in its
     /// last byte.
     pub fn set_clock_source(&mut self, source: ClockSource) {
         self.state[4] = source as u8;

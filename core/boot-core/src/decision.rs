@@ -43,6 +43,9 @@ pub struct Policy {
     pub start_allowed: fn(program: u8) -> bool,
 }
 
+/// The most resets that are counted, unless the policy wants more: 2007h/4 has no larger number.
+const MOST_CRASHES: u32 = 255;
+
 impl Policy {
     /// The number of consecutive resets by which the application ended without a request, including
     /// this one if it is one; `before` is the count up to now. A request resets the count. A
@@ -54,7 +57,8 @@ impl Policy {
             Some(BootRequest::Fault | BootRequest::Resume(_) | BootRequest::Damaged(_)) => before,
             Some(_) => 0,
             None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
-                before.saturating_add(1)
+                // A device that resets for ever does not wear its flash out.
+                before.saturating_add(1).min(self.max_crash_resets.max(MOST_CRASHES))
             }
             None if before < self.max_crash_resets => 0,
             None => before,

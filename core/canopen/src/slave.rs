@@ -88,7 +88,7 @@ pub struct Slave {
 
 /// The time from a request of the layer setting services until a silent slave joins, in milliseconds. A
 /// controller that changes its mode hears nothing, and the next request may follow at once: it takes 14 ms
-/// at 10 kbit/s.
+/// at 10 kbit/s. The rest of a longer sequence is lost at the lowest bit rates, and the master repeats it.
 const JOIN_MS: u32 = 20;
 
 #[derive(Debug)]
@@ -156,12 +156,21 @@ impl Slave {
         self.node.as_ref().is_none_or(|node| !node.has_sdo_answer())
     }
 
+    /// Whether this frame has no effect, because the slave is [silent](Config::is_silent).
+    #[must_use]
+    pub fn ignores(&self, frame: &Frame) -> bool {
+        matches!(self.line, Line::Silent { .. }) && !frame.has_cob_id(CobId::LSS_REQUEST)
+    }
+
     /// Processes any received frame; returns whether the NMT master requested a restart of the
     /// device. In this case a running transfer has ended, and a waiting answer was dropped.
     pub fn handle<D: SlaveDevice>(&mut self, frame: &Frame, now: Instant, device: &mut D) -> bool {
+        if self.ignores(frame) {
+            return false;
+        }
         match self.line {
             Line::Up { .. } => {}
-            Line::Silent { rate, join_at } if frame.has_cob_id(CobId::LSS_REQUEST) => {
+            Line::Silent { rate, join_at } => {
                 // A frame that nobody acknowledges comes again and again.
                 let join_at = join_at.unwrap_or(now + JOIN_MS);
                 self.line = Line::Silent { rate, join_at: Some(join_at) };

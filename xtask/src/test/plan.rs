@@ -88,7 +88,7 @@ pub struct Images {
 }
 
 /// The images for a board of another chip.
-const OF_A_CHIP: &[&str] = &["bootloader", "bootloader-paulus", "app-v1", "app-v2"];
+const OF_A_CHIP: &[&str] = &["bootloader", "bootloader-paulus", "bootloader-watchdog", "app-v1", "app-v2"];
 
 /// The images by tier.
 pub const IMAGES: &[Images] = &[

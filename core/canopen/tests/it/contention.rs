@@ -239,6 +239,50 @@ fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
     }
 }
 
+/// A client has read the abort and begun another transfer: its requests are answered, whatever number they
+/// would be. Segment upload 60h follows place 5Fh, segment download 10h place 0Fh.
+#[test]
+fn a_transfer_after_an_abort_is_served_at_each_place() {
+    for place in 1..126 {
+        let mut bench = aborted_at(place, None);
+        if place != 0x3F {
+            assert_eq!(bench.ask([0x40, 0x08, 0x10, 0, 0, 0, 0, 0]).len(), 1, "after {place}");
+            for toggle in [0x60, 0x70, 0x60] {
+                let answer = bench.ask([toggle, 0, 0, 0, 0, 0, 0, 0]);
+                assert_eq!(answer.len(), 1, "{toggle:02X} after {place}");
+            }
+        }
+        let mut bench = aborted_at(place, None);
+        if place != 0x20 {
+            assert_eq!(bench.ask([0x21, 0x00, 0x20, 0, 14, 0, 0, 0]).len(), 1, "after {place}");
+            for segment in [0x00, 0x11] {
+                assert_eq!(bench.ask([segment, 1, 2, 3, 4, 5, 6, 7]).len(), 1, "{segment:02X} after {place}");
+            }
+        }
+    }
+}
+
+/// Another client ends a download by its own through the second server, and the first one's segments come.
+#[test]
+fn another_servers_download_makes_no_requests_of_segments() {
+    let second = Channel { request: CobId::new(0x6A0).unwrap(), response: CobId::new(0x1A0).unwrap() };
+    for place in 1..126 {
+        let mut bench = Bench::with(Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+        bench.device.second = Some(second);
+        bench.begin(place);
+        let initiate = Frame::full(second.request, [0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0]);
+        bench.server.handle(&initiate, at(bench.now), &mut bench.device);
+        assert_eq!(bench.sent(), [Frame::full(second.response, GRANTED)]);
+        for seqno in place + 1..=126 {
+            assert_eq!(bench.ask([seqno, 0x51, 0x1F, 1, 3, 0, 0, 0]), [], "{seqno} after {place}");
+        }
+        assert_eq!(bench.device.control, 0, "after {place}");
+        let segment = Frame::full(second.request, [1, 1, 2, 3, 4, 5, 6, 7]);
+        bench.server.handle(&segment, at(bench.now), &mut bench.device);
+        assert_eq!(bench.device.taken.last_chunk(), Some(&[1, 2, 3, 4, 5, 6, 7]), "it goes on");
+    }
+}
+
 /// A client on a busy machine stops for up to 200 ms anywhere in a sub-block, and goes on as if nothing
 /// had happened.
 #[test]

@@ -40,8 +40,7 @@ impl SdoServer {
         let size = (bytes[0] & fields::BLOCK_SIZE_TOLD != 0).then(|| fields::number(bytes));
         let incoming = Incoming::start(at, data_type, size, objects)?;
         let receiver = Receiver::new(bytes[0] & fields::CRC != 0);
-        // The segments that follow are those of this download.
-        self.under_way = None;
+        self.forget_under_way();
         self.state = State::BlockDownload { incoming, receiver };
         let command = scs::INITIATE_BLOCK_DOWNLOAD | fields::CRC;
         self.answer_initiate(command, 0);

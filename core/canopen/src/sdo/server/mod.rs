@@ -253,6 +253,12 @@ impl SdoServer {
         }
     }
 
+    /// The segments that follow are those of a new download of this client, or it has aborted.
+    fn forget_under_way(&mut self) {
+        let response = self.response;
+        self.under_way.take_if(|segments| segments.response == response);
+    }
+
     /// What follows from the bit rate.
     fn pace(&self) -> Pace {
         PACES[self.config.bit_rate as usize]
@@ -261,7 +267,7 @@ impl SdoServer {
     /// Ends the transfer without a message to the client, and drops a waiting answer.
     pub fn reset(&mut self, objects: &mut impl Objects) {
         self.end(objects);
-        self.under_way = None;
+        self.forget_under_way();
         self.answer = None;
     }
 
@@ -276,7 +282,9 @@ impl SdoServer {
             response = second.response;
         }
         let Some(bytes) = frame.exactly() else { return };
-        let due = self.under_way.filter(|segments| segments.is_next(bytes, response, objects));
+        // A client that has begun another transfer sends no more segments.
+        let may_be = self.response != response || matches!(self.state, State::Idle);
+        let due = self.under_way.filter(|segments| may_be && segments.is_next(bytes, response, objects));
         if due.is_some_and(|segments| !segments.is_over(now, self.pace().gap_ms)) {
             self.under_way = UnderWay::behind(bytes, response, now);
             return;

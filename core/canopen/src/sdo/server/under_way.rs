@@ -3,7 +3,7 @@
 //!
 //! A client reads this only after it has sent more segments. They are no requests: number 2Fh with
 //! the data 51h 1Fh 01h 03h would be a CLEAR. What continues the sub-block is therefore
-//! ignored: the next numbers in order, without a pause, until another block download begins. Every
+//! ignored: the next numbers in order, without a pause, until the client begins another transfer. Every
 //! other frame is a request at once. So is the next number after a pause; if it is refused, its
 //! successors continue the sub-block.
 //!
@@ -31,7 +31,7 @@ pub(super) struct UnderWay {
 }
 
 impl UnderWay {
-    /// What may follow a segment; `None` behind the last one.
+    /// What may follow a segment; `None` after the last one.
     pub fn behind(segment: &[u8; 8], response: CobId, heard: Instant) -> Option<Self> {
         let last = segment[0] & fields::LAST_OF_BLOCKS != 0;
         let next = (segment[0] & !fields::LAST_OF_BLOCKS) + 1;
