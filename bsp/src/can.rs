@@ -5,17 +5,9 @@ use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, Standa
 use embedded_can::Frame;
 pub use shared_abi::bit_timing::BitTiming;
 
+pub use crate::can_modes::Mode;
 use crate::can_modes::Modes;
 use crate::clock::Source;
-
-/// The controller's mode on the bus.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Mode {
-    /// It receives, acknowledges and sends.
-    Normal,
-    /// It only listens; it neither acknowledges nor sends error frames.
-    Silent,
-}
 
 /// The controller's error state (`CAN_ESR` and `CAN_MSR`, RM0090 section 32.9.2).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -5,8 +5,16 @@
 //! sleep, which needs no bus.
 
 use bxcan::RegisterBlock;
+use shared_abi::bit_timing::BitTiming;
 
-use crate::can::{BitTiming, Mode};
+/// The controller's mode on the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// It receives, acknowledges and sends.
+    Normal,
+    /// It only listens; it neither acknowledges nor sends error frames.
+    Silent,
+}
 
 /// Offsets of the registers, in bytes (RM0090 section 32.9.5).
 const MCR: usize = 0x00;

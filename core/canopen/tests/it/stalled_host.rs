@@ -110,7 +110,7 @@ impl Wire {
 
 /// A client that reads before each segment.
 fn attentive(wire: &mut Wire, data: &[u8]) -> Result<(), String> {
-    let config = ClientConfig { timeout_ms: (TIMEOUT_US / 1000) as u32, ..ClientConfig::default() };
+    let config = ClientConfig { timeout_ms: (TIMEOUT_US / 1000) as u32 };
     let block = Block { fallback: false, ..Block::default() };
     let mut client = Download::as_blocks(node(), Address::new(0x1F50, 1), data, config, block);
     loop {
