@@ -49,9 +49,12 @@ pub enum Event {
     Cancel,
 }
 
-/// A domain at 2000h and 1F50h/1, and writable values.
+/// A device with a second SDO server.
+pub type Device = DeviceOf<true>;
+
+/// A domain at 2000h and 1F50h/1, and writable values; with or without a second SDO server.
 #[derive(Debug, Default)]
-pub struct Device {
+pub struct DeviceOf<const SECOND: bool> {
     pub heartbeat: u16,
     pub control: u8,
     pub text: Vec<u8>,
@@ -74,9 +77,9 @@ pub struct Device {
     pub second: Option<Channel>,
 }
 
-impl Objects for Device {
+impl<const SECOND: bool> Objects for DeviceOf<SECOND> {
     fn has_second_server() -> bool {
-        true
+        SECOND
     }
 
     fn entries(&self) -> &'static [Entry] {

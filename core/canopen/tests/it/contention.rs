@@ -4,9 +4,9 @@
 use canopen::frame::Channel;
 use canopen::od::Objects;
 use canopen::sdo::client::{Block, Config as ClientConfig, Download, Step, Transfer};
-use canopen::sdo::server::Config;
+use canopen::sdo::server::{Config, SdoServer};
 use canopen::{Address, BitRate, CobId, Frame};
-use kit::bus::{at, node, response, Bench, Device, Event};
+use kit::bus::{at, node, request, response, Bench, Device, DeviceOf, Event};
 use kit::random::Random;
 
 /// The clock, and the beginning of a download.
@@ -236,6 +236,40 @@ fn the_rest_of_a_sub_block_after_the_end_of_its_download_is_no_request() {
         let [low, high] = u16::to_le_bytes(at);
         let answer = bench.ask([asked, low, high, 0, 1, 2, 3, 4]);
         assert_eq!(answer.len(), 1, "{asked:02X}: {answer:?}");
+    }
+}
+
+/// The time-out of a device that has no second server.
+#[test]
+fn a_server_that_is_alone_passes_the_rest_of_a_sub_block_over_too() {
+    for place in 1..126 {
+        let mut device = DeviceOf::<false>::default();
+        let mut server = SdoServer::new(node(), Config { bit_rate: BitRate::K1000, ..Config::DEFAULT });
+        let mut ask = |ms, bytes: Option<[u8; 8]>| {
+            if let Some(bytes) = bytes {
+                server.handle(&request(bytes), at(ms), &mut device);
+            }
+            let answer = server.poll(at(ms), &mut device);
+            (answer, device.control)
+        };
+        assert_eq!(ask(0, Some([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0])).0, Some(response(GRANTED)));
+        for seqno in 1..=place {
+            assert_eq!(ask(0, Some([seqno, 1, 2, 3, 4, 5, 6, 7])).0, None);
+        }
+        assert_eq!(ask(250, None).0, Some(response(acked(place))));
+        assert_eq!(ask(2250, None).0, Some(response(TIMED_OUT)));
+        assert!(ask(2300, Some([place + 1, 9, 9, 9, 9, 9, 9, 9])).0.is_some());
+        for seqno in place + 2..=126 {
+            // CLEAR, if it were a request.
+            let after = ask(2300, Some([seqno, 0x51, 0x1F, 1, 3, 0, 0, 0]));
+            assert_eq!(after, (None, 0), "{seqno} after {place}");
+        }
+        // A new download is served from its first segment on.
+        assert_eq!(ask(2300, Some([0xC2, 0x50, 0x1F, 1, 0, 0x10, 0, 0])).0, Some(response(GRANTED)));
+        for seqno in 1..=126 {
+            assert_eq!(ask(2300, Some([seqno, 1, 2, 3, 4, 5, 6, 7])).0, None);
+        }
+        assert_eq!(ask(2300, Some([127, 1, 2, 3, 4, 5, 6, 7])).0, Some(response(acked(127))));
     }
 }
 

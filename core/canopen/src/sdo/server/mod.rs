@@ -194,7 +194,7 @@ impl SdoServer {
         Self {
             node,
             config,
-            response: CobId::NMT,
+            response: config.response(node),
             at: Address::new(0, 0),
             state: State::Idle,
             moved: Instant::from_millis(0),
@@ -294,7 +294,7 @@ impl SdoServer {
             self.end(objects);
             self.response = response;
         }
-        let is_segment = match &self.state {
+        let may_continue = match &self.state {
             State::BlockDownload { receiver, .. } if !receiver.is_complete() => {
                 if let Err(code) = self.block_segment(bytes, now, objects) {
                     self.abort(code, objects);
@@ -306,7 +306,7 @@ impl SdoServer {
                 due.is_some()
             }
         };
-        if is_segment && self.answer.is_some_and(|answer| answer[0] == fields::ABORT) {
+        if may_continue && self.answer.is_some_and(|answer| answer[0] == fields::ABORT) {
             self.under_way = UnderWay::behind(bytes, response, now);
         }
     }
@@ -340,8 +340,7 @@ impl SdoServer {
         if answer[..2] != [scs::ACK_BLOCK_DOWNLOAD, 0] {
             self.moved = now;
         }
-        let response = if O::has_second_server() { self.response } else { self.config.response(self.node) };
-        Some(Frame::full(response, answer))
+        Some(Frame::full(self.response, answer))
     }
 
     /// Aborts a transfer with a silent client, and acknowledges a sub-block that stopped early.
