@@ -55,7 +55,7 @@ mod app {
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
-    use bsp::{line, pac, CanPort, CLOCK_TREE, IDENTITY, LAYOUT};
+    use bsp::{line, pac, CanPort, IDENTITY, LAYOUT};
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
@@ -156,7 +156,7 @@ mod app {
     fn init(cx: init::Context) -> (Shared, Local) {
         // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
-        let clock = CLOCK_TREE.speed_up(&cx.device.RCC, Source::Crystal);
+        let clock = Source::Crystal.speed_up(&cx.device.RCC);
         // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
         let flash = unsafe { BootFlash::steal() };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);

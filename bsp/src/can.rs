@@ -23,7 +23,7 @@ pub struct Errors {
     pub last: Option<Result<(), ()>>,
 }
 
-/// Offsets of registers that `bxcan` does not make public, in bytes (RM0090 section 32.9.5).
+/// Offsets of registers, in bytes (RM0090 section 32.9.5).
 const RF0R: usize = 0x0C;
 const ESR: usize = 0x18;
 /// `CAN_RF0R`: a frame was lost because the FIFO was full; writing 1 clears it.
@@ -60,6 +60,7 @@ pub unsafe trait Controller: Instance {
 /// A bxCAN controller and one frame that may wait for a mailbox.
 pub struct Port<I: Controller> {
     can: Can<I>,
+    modes: Modes<I>,
     /// The source of the controller's clock.
     clock: Source,
     /// The last error code was 7 since the bit timing was set: what it says now has been heard since.
@@ -91,13 +92,13 @@ impl<I: Controller> Port<I> {
     /// [`configure`](Self::configure) and [`accept`](Self::accept). Interrupts of receive FIFO 0 and of
     /// the mailboxes are on.
     pub fn new(controller: I, clock: Source) -> Self {
-        // SAFETY: `REGISTERS` is the base of the controller that this function has taken.
-        unsafe { Modes::of(I::REGISTERS) }.initialise();
+        let mut modes = Modes::of(&controller);
+        modes.initialise();
         // It finds the controller in initialisation, and from there it sleeps without a look at the bus.
         let can = Can::builder(controller).leave_disabled();
         let (waiting, lost) = (None, Lost::default());
         let mut port =
-            Self { can, clock, listens: false, waiting, heartbeat_waits: false, boot_up: false, lost };
+            Self { can, modes, clock, listens: false, waiting, heartbeat_waits: false, boot_up: false, lost };
         port.enable_interrupts();
         port
     }
@@ -111,32 +112,27 @@ impl<I: Controller> Port<I> {
         self.clock
     }
 
-    fn modes(&mut self) -> Modes {
-        // SAFETY: `REGISTERS` is the base of the controller that this port owns.
-        unsafe { Modes::of(I::REGISTERS) }
-    }
-
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
     /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself.
     pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
         self.leave_bus();
         self.waiting = None;
-        self.modes().set_bit_timing(timing, mode);
-        self.modes().abort_all();
+        self.modes.set_bit_timing(timing, mode);
+        self.modes.abort_all();
         self.listens = self.forget_last_error();
-        self.modes().join();
+        self.modes.join();
     }
 
     /// Starts the recovery from bus-off: it ends when the bus was idle for 128 × 11 bits.
     pub fn recover_from_bus_off(&mut self) {
         self.leave_bus();
-        self.modes().join();
+        self.modes.join();
     }
 
     /// Enters initialisation. A controller that had to be reset for it may have lost frames.
     fn leave_bus(&mut self) {
-        if !self.modes().initialise() {
+        if !self.modes.initialise() {
             self.lost.in_controller = true;
             self.enable_interrupts();
         }
@@ -215,7 +211,7 @@ impl<I: Controller> Port<I> {
 
     /// Moves the waiting frame, if any, into a mailbox if one is free and the controller is on the bus.
     fn put_waiting(&mut self) {
-        if !self.modes().is_on_bus() {
+        if !self.modes.is_on_bus() {
             return;
         }
         if let Some(Ok(status)) = self.waiting.as_ref().map(|frame| self.can.transmit(frame)) {
@@ -234,7 +230,7 @@ impl<I: Controller> Port<I> {
 
     /// Reads the controller's error state.
     pub fn errors(&mut self) -> Errors {
-        let status = self.read(ESR);
+        let status = self.modes.read(ESR);
         let last = match status & LEC {
             _ if !self.listens => None,
             LEC => None,
@@ -242,34 +238,23 @@ impl<I: Controller> Port<I> {
             _ => Some(Err(())),
         };
         self.listens |= self.forget_last_error();
-        let joined = self.modes().is_on_bus();
+        let joined = self.modes.is_on_bus();
         Errors { off: status & BOFF != 0, passive: status & EPVF != 0, joined, last }
     }
 
     /// Sets the last error code to "none"; returns whether it is.
     fn forget_last_error(&mut self) -> bool {
-        self.write(ESR, LEC);
-        self.read(ESR) & LEC == LEC
+        self.modes.write(ESR, LEC);
+        self.modes.read(ESR) & LEC == LEC
     }
 
     /// The places where frames were lost since the previous call.
     pub fn take_overruns(&mut self) -> Lost {
-        if self.read(RF0R) & FOVR0 != 0 {
-            self.write(RF0R, FOVR0);
+        if self.modes.read(RF0R) & FOVR0 != 0 {
+            self.modes.write(RF0R, FOVR0);
             self.lost.in_controller = true;
         }
         core::mem::take(&mut self.lost)
-    }
-
-    fn read(&self, offset: usize) -> u32 {
-        // SAFETY: `REGISTERS` is the base of the controller that this port owns, and the offset is
-        // one of the registers above; reading them has no effect.
-        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
-    }
-
-    fn write(&mut self, offset: usize, value: u32) {
-        // SAFETY: as above; section 32.9.2 allows these values at any time.
-        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).write_volatile(value) }
     }
 }
 

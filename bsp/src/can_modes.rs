@@ -4,7 +4,9 @@
 //! initialisation, bit timing, normal mode. What is left of `bxcan`'s waits is its start, from initialisation to
 //! sleep, which needs no bus.
 
-use bxcan::RegisterBlock;
+use core::marker::PhantomData;
+
+use bxcan::Instance;
 use shared_abi::bit_timing::BitTiming;
 
 /// The controller's mode on the bus.
@@ -48,16 +50,13 @@ const PATIENCE: u32 = 500_000;
 /// controller finds it.
 const SOON: u32 = 5_000;
 
-/// The registers of a controller.
-pub(crate) struct Modes(*mut RegisterBlock);
+/// The registers of a controller that `bxcan` does not make public.
+pub(crate) struct Modes<I>(PhantomData<I>);
 
-impl Modes {
-    /// The controller at this address.
-    ///
-    /// # Safety
-    /// It is the base of the registers of a bxCAN controller with its clock on, which the caller owns.
-    pub unsafe fn of(registers: *mut RegisterBlock) -> Self {
-        Self(registers)
+impl<I: Instance> Modes<I> {
+    /// Those of this controller, which has its clock. It exists once, and who has it has this, too.
+    pub fn of(_: &I) -> Self {
+        Self(PhantomData)
     }
 
     /// Enters initialisation (section 32.4.1). Returns false if the controller did not follow and was
@@ -104,14 +103,16 @@ impl Modes {
         self.read(MSR) & INAK_SLAK == 0
     }
 
-    fn read(&self, offset: usize) -> u32 {
-        // SAFETY: `of` promises the registers, and the offset is one of those above; reading them has no
-        // effect.
-        unsafe { self.0.cast::<u32>().byte_add(offset).read_volatile() }
+    /// Reads a register of control and status (section 32.9.2), at this offset in bytes.
+    pub fn read(&self, offset: usize) -> u32 {
+        // SAFETY: `Instance` promises the registers, and the offset is one of the constants of this file or
+        // of `can.rs`; reading them has no effect.
+        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).read_volatile() }
     }
 
-    fn write(&mut self, offset: usize, value: u32) {
-        // SAFETY: as above; section 32.9.2 allows these values in these modes.
-        unsafe { self.0.cast::<u32>().byte_add(offset).write_volatile(value) }
+    /// Writes it.
+    pub fn write(&mut self, offset: usize, value: u32) {
+        // SAFETY: as above; section 32.9.2 allows the values in these modes, and they are not addresses.
+        unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).write_volatile(value) }
     }
 }

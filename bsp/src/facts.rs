@@ -124,14 +124,13 @@ impl Strap {
     pub const SAMPLES: u32 = 4;
 
     /// Whether the chip has this pin, and the resistor does not hold it at the pressed level.
-    const fn is_possible(&self, ports: u8) -> bool {
-        let port = (self.port as u32).wrapping_sub('A' as u32);
+    const fn is_possible(&self) -> bool {
         let holds = match self.pull {
             Pull::None => !self.pressed,
             Pull::Up => true,
             Pull::Down => false,
         };
-        port < ports as u32 && self.pin < 16 && holds != self.pressed
+        exists((self.port, self.pin)) && holds != self.pressed
     }
 }
 
@@ -219,7 +218,7 @@ const fn is_can(pin: Pin) -> bool {
 
 const _: () = assert!(
     match ENTRY_STRAP {
-        Some(strap) => strap.is_possible(CHIP.ports),
+        Some(strap) => strap.is_possible(),
         None => true,
     },
     "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`"

@@ -67,6 +67,8 @@ pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
 pub use facts::*;
 pub use identity::{serial_number, unique_id, Identity};
 #[cfg(target_arch = "arm")]
+pub use pll::slow_down;
+#[cfg(target_arch = "arm")]
 pub use port::CanPort;
 #[cfg(target_arch = "arm")]
 pub use stm32f4xx_hal as hal;

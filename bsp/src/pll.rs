@@ -12,6 +12,8 @@ const HSERDY: u32 = 1 << 17;
 const HSEBYP: u32 = 1 << 18;
 const PLLON: u32 = 1 << 24;
 const PLLRDY: u32 = 1 << 25;
+/// RCC_PLLCFGR: the PLL's input is the crystal.
+const PLLSRC_HSE: u32 = 1 << 22;
 /// RCC_CFGR: the system clock in use, as the chip reports it.
 const SWS_PLL: u32 = 0b10 << 2;
 const SWS: u32 = 0b11 << 2;
@@ -28,29 +30,27 @@ impl Source {
             Self::Crystal => &CLOCK_TREE,
         }
     }
-}
 
-impl ClockTree {
-    /// Runs the core from the PLL, and returns its source: if the crystal does not start, or the PLL does not
-    /// lock to it, that is the internal oscillator, until the next reset.
-    pub fn speed_up(&self, rcc: &pac::RCC, wanted: Source) -> Source {
+    /// Runs the core from the PLL with this source, and returns the source: if the crystal does not start,
+    /// or the PLL does not lock to it, that is the internal oscillator, until the next reset.
+    pub fn speed_up(self, rcc: &pac::RCC) -> Self {
         // The PLL cannot be changed while it runs (section 7.3.2).
         if rcc.cr().read().bits() & PLLON != 0 {
-            self.slow_down(rcc);
+            slow_down(rcc);
         }
-        let mut source = Source::Internal;
-        if wanted == Source::Crystal {
+        let tree = self.tree();
+        let mut bit = 0;
+        if self == Self::Crystal {
             // The bypass can be selected only while the oscillator is off (section 7.3.1).
-            if self.hse_bypass {
+            if tree.hse_bypass {
                 set(rcc, HSEBYP);
             }
             set(rcc, HSEON);
-            if reaches(rcc.cr().as_ptr(), HSERDY, HSERDY) {
-                source = Source::Crystal;
+            if !reaches(rcc.cr().as_ptr(), HSERDY, HSERDY) {
+                return Self::Internal.speed_up(rcc);
             }
+            bit = PLLSRC_HSE;
         }
-        let tree = source.tree();
-        let bit = if source == Source::Crystal { 1 << 22 } else { 0 };
         let pll = (tree.hse / tree.pll_input) | (tree.pll_n << 6) | ((tree.pll_p / 2 - 1) << 16) | bit;
         // SAFETY: a valid word of PLLCFGR, which `checked` ensures; the reserved bits and Q
         // keep their reset values.
@@ -59,36 +59,38 @@ impl ClockTree {
         rcc.sscgr().reset();
         raise_voltage(rcc);
         set(rcc, PLLON);
-        latency(self.wait_states);
-        if source == Source::Crystal && !reaches(rcc.cr().as_ptr(), PLLRDY, PLLRDY) {
-            // A crystal at another frequency, for one.
-            return self.speed_up(rcc, Source::Internal);
+        latency(tree.wait_states);
+        if !reaches(rcc.cr().as_ptr(), PLLRDY, PLLRDY) {
+            if self == Self::Crystal {
+                // A crystal at another frequency, for one.
+                return Self::Internal.speed_up(rcc);
+            }
+            SCB::sys_reset();
         }
-        wait(rcc.cr().as_ptr(), PLLRDY, PLLRDY);
         await_voltage();
         // The buses are divided before the clock rises.
-        let dividers = (prescaler(self.apb1) << 10) | (prescaler(self.apb2) << 13);
+        let dividers = (prescaler(tree.apb1) << 10) | (prescaler(tree.apb2) << 13);
         // SAFETY: valid dividers of the buses.
         rcc.cfgr().write(|w| unsafe { w.bits(dividers) });
         // SAFETY: the same, and the PLL as system clock.
         rcc.cfgr().write(|w| unsafe { w.bits(dividers | 0b10) });
         wait(rcc.cfgr().as_ptr(), SWS, SWS_PLL);
-        source
+        self
     }
+}
 
-    /// Restores the clocks of the reset state.
-    pub fn slow_down(&self, rcc: &pac::RCC) {
-        // SAFETY: the reset value.
-        rcc.cfgr().write(|w| unsafe { w.bits(0) });
-        wait(rcc.cfgr().as_ptr(), SWS, 0);
-        // SAFETY: the reset values; nothing uses the PLL or the crystal any more.
-        rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
-        wait(rcc.cr().as_ptr(), PLLRDY, 0);
-        // SAFETY: the reset value.
-        rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
-        lower_voltage(rcc);
-        latency(0);
-    }
+/// Restores the clocks of the reset state.
+pub fn slow_down(rcc: &pac::RCC) {
+    // SAFETY: the reset value.
+    rcc.cfgr().write(|w| unsafe { w.bits(0) });
+    wait(rcc.cfgr().as_ptr(), SWS, 0);
+    // SAFETY: the reset values; nothing uses the PLL or the crystal any more.
+    rcc.cr().write(|w| unsafe { w.bits(reset::RCC_CR) });
+    wait(rcc.cr().as_ptr(), PLLRDY, 0);
+    // SAFETY: the reset value.
+    rcc.pllcfgr().write(|w| unsafe { w.bits(reset::RCC_PLLCFGR) });
+    lower_voltage(rcc);
+    latency(0);
 }
 
 /// Whether the core is faster than the regulator's scale after a reset allows.

@@ -2,15 +2,15 @@
 //!
 //! Before it, nothing has used a peripheral. It uses only the reset flags, that of Standby among them, the
 //! warm-start cell, the watchdog, the flash controller, the CRC unit and the entry strap, and leaves the
-//! peripherals to a program in their reset state. The rest of the bootloader gets the CRC unit with its clock on, for the
-//! services.
+//! peripherals to a program in their reset state. The rest of the bootloader gets the CRC unit with its
+//! clock on, for the services.
 
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances};
 use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
-use bsp::{pac, CLOCK_TREE, LAYOUT};
+use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
@@ -64,7 +64,7 @@ pub unsafe extern "C" fn stage() -> ! {
     let strap = bsp::entry_strap();
 
     // CRCs need speed, but no exact clock. The crystal would take time to start.
-    CLOCK_TREE.speed_up(&rcc, Source::Internal);
+    Source::Internal.speed_up(&rcc);
     ResidentFlash::switch_crc_unit_on(&rcc);
     if SEALED {
         crate::callgate::store_after_reset(&mut flash, request);
@@ -96,7 +96,7 @@ pub unsafe extern "C" fn stage() -> ! {
             let has_watchdog = flash.starts_watchdog();
             drop(caches);
             flash.release(&rcc);
-            CLOCK_TREE.slow_down(&rcc);
+            bsp::slow_down(&rcc);
             let handoff = Handoff::new(&BootInfo {
                 node_id,
                 bit_rate: node.bit_rate.or_zero(),
@@ -147,7 +147,7 @@ pub unsafe extern "C" fn stage() -> ! {
             Err(damage) => cell.put(BootRequest::Damaged(damage)),
         }
     }
-    CLOCK_TREE.slow_down(&rcc);
+    bsp::slow_down(&rcc);
     // One pass of the loop takes three cycles.
     cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
     SCB::sys_reset()

@@ -10,8 +10,8 @@
 //! - Arbitration is among the requests pending at the start of frame. Two nodes that send the very
 //!   same bits both succeed; the same identifier with other bits after it is a bit error.
 //! - A node whose bit rate differs from the transmitter's by more than its bit timing tolerates
-//!   ([`Line::tolerance_ppm`]) reads the frame at its own sample points, without resynchronisation. It sees a stuff error, and unless it is error
-//!   passive or silent it destroys the frame for everybody.
+//!   ([`Line::tolerance_ppm`]) reads the frame at its own sample points, without resynchronisation. It
+//!   sees a stuff error, and unless it is error passive or silent it destroys the frame for everybody.
 //! - All consequences of a bad frame reach the nodes when its error delimiter is over. An error
 //!   flag is superposed to 12 bits where the nodes see the error at different bits, and has 6 or 7
 //!   where they see it together.
@@ -51,8 +51,6 @@ const SUSPEND_BITS: u32 = 8;
 const SEQUENCE_BITS: u64 = 11;
 /// After so many bits, nodes that began together at different rates have noticed it.
 const CLASH_BITS: u32 = 12;
-/// The tolerance of a sender that is no node of this bus.
-const GATEWAY_TOLERANCE_PPM: u32 = 10_000;
 
 /// The earliest time, in bits after the start of a frame, at which a node notices the result of the
 /// frame: six bits of an error flag and eight of its delimiter. Nodes may run ahead of each other
@@ -432,7 +430,7 @@ impl Bus {
         let (frame, bit) = (strongest.frame, strongest.bit);
         let key = frame.arbitration_key();
         let clash = contenders.iter().any(|other| {
-            let tolerance = other.party.map_or(GATEWAY_TOLERANCE_PPM, |party| party.line.tolerance_ppm);
+            let tolerance = other.party.map_or(port::TOLERANCE_PPM, |party| party.line.tolerance_ppm);
             !in_tune(other.bit, bit, tolerance)
         });
         // A node that does not read the others' bits as bits does not lose the arbitration against

@@ -121,8 +121,9 @@ impl HostPort {
     }
 }
 
-/// The tolerance of a host's adapter: that of 16 quanta and a jump width of two, rounded.
-const TOLERANCE_PPM: u32 = 10_000;
+/// The tolerance of a host's adapter, and of a gateway's: 2/(13 × 16 - 2), that of 16 quanta with a jump
+/// width and a segment 2 of two, rounded.
+pub(super) const TOLERANCE_PPM: u32 = 10_000;
 
 impl BusNode for HostPort {
     fn line(&self) -> Option<Line> {

@@ -157,6 +157,14 @@ fn record(folder: &Folder) -> std::path::PathBuf {
     state.into_iter().find(is_record).unwrap()
 }
 
+/// Leaves the state of an agent that died between the end of action 1 and its report.
+fn leave_begun(record: &std::path::Path, kept: bool) {
+    let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(record).unwrap()).unwrap();
+    value["ended"] = serde_json::json!([]);
+    value["begun"] = serde_json::json!({ "action": "1", "kept": kept });
+    std::fs::write(record, value.to_string()).unwrap();
+}
+
 /// The agent died between the end of the update and the report: its state is that of a moment
 /// before. A device that runs the program is not flashed again.
 #[test]
@@ -168,11 +176,8 @@ fn a_device_that_has_kept_the_program_is_not_flashed_again() {
     let config = config(&server, nodes.url(), &folder, &IDS[..1]);
     assert_eq!(serve(&config, &options()).0.updated, 1);
     let record = record(&folder);
-    let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
     for (kept, byte, starts) in [(true, 0xA5, 0), (false, 0xA5, 1), (true, 0x5A, 1)] {
-        value["ended"] = serde_json::json!([]);
-        value["begun"] = serde_json::json!({ "action": "1", "kept": kept });
-        std::fs::write(&record, value.to_string()).unwrap();
+        leave_begun(&record, kept);
         server.assign(IDS[0], Action::new(1, &file(byte)));
         let (ended, said) = serve(&config, &options());
         assert_eq!(ended.updated, 1, "{said}");
@@ -195,10 +200,7 @@ fn a_program_that_was_kept_is_known_by_a_crc_16_too() {
     let config = config(&server, nodes.url(), &folder, &IDS[..1]);
     assert_eq!(serve(&config, &options()).0.updated, 1);
     let record = record(&folder);
-    let mut value: serde_json::Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
-    value["ended"] = serde_json::json!([]);
-    value["begun"] = serde_json::json!({ "action": "1", "kept": true });
-    std::fs::write(&record, value.to_string()).unwrap();
+    leave_begun(&record, true);
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
     let (ended, said) = serve(&config, &options());
     assert_eq!(ended.updated, 1, "{said}");

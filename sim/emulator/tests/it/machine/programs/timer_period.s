@@ -11,14 +11,7 @@ vector 44, tick
     str r0, [r5, #48]
     movs r0, #1
     str r0, [r5, #64]
-    mov r6, #0x40000000
-    movw r0, #15999
-    str r0, [r6, #44]
-    movs r0, #1
-    str r0, [r6, #12]
-    mov r1, #0xE000E000
-    mov r0, #0x10000000
-    str r0, [r1, #0x100]
+    overflows_of_tim2
     movs r0, #1
     str r0, [r6]
     ldr r7, =GPIOD
