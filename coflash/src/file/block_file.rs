@@ -31,6 +31,15 @@ pub enum Checksum {
 }
 
 impl Checksum {
+    /// The other one of the two.
+    #[must_use]
+    pub const fn other(self) -> Self {
+        match self {
+            Self::Crc32 => Self::Crc16,
+            Self::Crc16 => Self::Crc32,
+        }
+    }
+
     /// The CRC over all parts in sequence.
     fn of<'a>(self, parts: impl Iterator<Item = &'a [u8]>) -> u32 {
         match self {
@@ -316,11 +325,28 @@ impl BlockFile {
     /// the other one, which the device may use for a program that it got without blocks.
     #[must_use]
     pub fn program_crcs(&self) -> [u32; 2] {
-        let other = match self.checksum {
-            Checksum::Crc32 => Checksum::Crc16,
-            Checksum::Crc16 => Checksum::Crc32,
-        };
-        [self.program_crc(), other.of([self.flash_image().as_slice()].into_iter())]
+        [self.checksum, self.checksum.other()].map(|checksum| self.program_crc_with(checksum))
+    }
+
+    fn program_crc_with(&self, checksum: Checksum) -> u32 {
+        if checksum == self.checksum {
+            return self.last.program_crc;
+        }
+        checksum.of([self.flash_image().as_slice()].into_iter())
+    }
+
+    /// The bytes of one of its blocks for a device that checks with this CRC: the block's own one, and
+    /// in the last block that of the program.
+    #[must_use]
+    pub(crate) fn emit_block(&self, block: &Block, checksum: Checksum) -> Vec<u8> {
+        if block.number != NUMBER_LAST {
+            return block.emit_with(checksum);
+        }
+        let last = Last { program_crc: self.program_crc_with(checksum), ..self.last };
+        let mut block = block.clone();
+        let at = block.data.len().saturating_sub(LAST_SIZE);
+        block.data.splice(at.., last.emit());
+        block.emit_with(checksum)
     }
 
     /// The CRC of the blocks and the program.

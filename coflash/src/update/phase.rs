@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::options::Target;
 use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
+use crate::file::block_file::Checksum;
 use crate::json;
 
 /// An erase that ends within this time was postponed by the device, or had nothing to do: to erase
@@ -84,6 +85,12 @@ pub enum Note {
     Dialect {
         /// The dialect.
         dialect: Dialect,
+    },
+    /// The device checks with another CRC than that of the file: the blocks are sent with this one.
+    OtherCrc {
+        /// The CRC of the device.
+        #[serde(serialize_with = "json::words")]
+        crc: Checksum,
     },
     /// The password was accepted.
     Unlocked,
@@ -198,6 +205,7 @@ impl fmt::Display for Note {
                 )
             }
             Self::Dialect { dialect } => write!(f, "dialect: {dialect}"),
+            Self::OtherCrc { crc } => write!(f, "the device checks with {crc}: sending the blocks with it"),
             Self::Unlocked => f.write_str("unlocked"),
             Self::Together { devices } => write!(f, "receiving the program together: {devices} devices"),
             Self::Moved { node } => write!(f, "the device now answers as node {node}"),

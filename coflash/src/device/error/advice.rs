@@ -51,8 +51,9 @@ impl Error {
                                       --sdo-timeout helps against answers that come late"
                 .to_string(),
             Self::Failed { error: FlashError::Crc, doing: Doing::Block(0), .. } => {
-                "the device finds a wrong CRC in a block that has arrived whole: it checks with the other CRC. Convert the \
-                 program again, with --crc16 for a product with CRC-16 and without it for one with CRC-32"
+                "the device finds a wrong CRC in a block that has arrived whole: it checks with the other CRC, or another tool \
+                 writes to it, too. Each repeat of block 0 has the other CRC: leave out --block-repeats 0, or give --crc16 \
+                 for a product with CRC-16; then end the other tool"
                     .to_string()
             }
             Self::Failed { error: FlashError::Secured, detail: sector @ 1.., .. } => format!(

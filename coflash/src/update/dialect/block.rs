@@ -13,7 +13,7 @@ use crate::bus::adapter::Met;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
-use crate::file::block_file::{Block as FileBlock, BlockFile};
+use crate::file::block_file::{Block as FileBlock, BlockFile, Checksum, FRAMING};
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
 use crate::file::sealed::SealedFile;
@@ -171,11 +171,12 @@ fn cut_up(
 }
 
 impl PartialDownload {
-    /// Whether it is the download of this file.
-    fn is_of(self, file: &BlockFile) -> bool {
+    /// The CRC of the device, if it is the download of this file.
+    fn checksum_of(self, file: &BlockFile) -> Option<Checksum> {
         let control = &file.blocks()[0];
-        let bytes = control.emit_with(file.checksum());
-        bytes.ends_with(&self.control_crc.to_le_bytes())
+        let is_its =
+            |checksum: &Checksum| control.emit_with(*checksum).ends_with(&self.control_crc.to_le_bytes());
+        [file.checksum(), file.checksum().other()].into_iter().find(is_its)
     }
 
     /// Whether the device has this block's data.
@@ -197,7 +198,7 @@ fn send_verified(
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
     let partial = if options.from_start { None } else { partial_download(session, number)? };
-    let partial = partial.filter(|partial| partial.is_of(file.own));
+    let partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, options, update)?;
         steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
@@ -245,6 +246,7 @@ fn send(
 /// Steps 6 to 9: sends all blocks that are not in the begun download, those with data together with
 /// the other devices of a group; returns the number of repetitions. If the device refuses a joined
 /// block, the rest goes in the file's own blocks: they need less room, and a damaged frame costs less.
+/// A device that takes block 0 with the other CRC alone gets all blocks with it.
 fn send_blocks(
     session: &mut Session<'_>,
     file: Cut<'_>,
@@ -253,9 +255,9 @@ fn send_blocks(
     options: &FlashOptions,
     update: &mut RunningUpdate<'_>,
 ) -> Result<u32, Error> {
-    let checksum = file.own.checksum();
-    let size =
-        |blocks: &VecDeque<FileBlock>| blocks.iter().map(|block| block.emit_with(checksum).len()).sum();
+    let begun = partial.and_then(|partial| partial.checksum_of(file.own));
+    let mut checksum = begun.unwrap_or(file.own.checksum());
+    let size = |blocks: &VecDeque<FileBlock>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
     let mut blocks: VecDeque<FileBlock> = file.file().blocks().iter().cloned().collect();
     let mut total = size(&blocks);
     let mut may_split = file.joined.is_some() && !*in_group;
@@ -265,7 +267,7 @@ fn send_blocks(
     let (mut together, mut disturbed) = (0, false);
     update.tell(Event::Progress { done, total });
     while let Some(block) = blocks.pop_front() {
-        let bytes = block.emit_with(checksum);
+        let bytes = file.own.emit_block(&block, checksum);
         if partial.is_some_and(|partial| partial.has(&block)) {
             done += bytes.len();
             continue;
@@ -274,10 +276,12 @@ fn send_blocks(
             session.part_from_group()?;
             *in_group = false;
         }
+        let is_control = block.number == NUMBER_CONTROL;
         let one = One {
             number: block.number,
             bytes: &bytes,
-            in_group: *in_group && block.number != NUMBER_CONTROL,
+            other_crc: is_control.then(|| file.own.emit_block(&block, checksum.other())),
+            in_group: *in_group && !is_control,
             may_split: may_split && file.has_joined(&block),
         };
         let form = session.transfers();
@@ -301,6 +305,13 @@ fn send_blocks(
         update.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
         let sent = sent?;
         repeats += sent.repeats;
+        if sent.by_other_crc {
+            checksum = checksum.other();
+            update.tell(Note::OtherCrc { crc: checksum }.into());
+            if std::mem::take(in_group) {
+                session.part_from_group()?;
+            }
+        }
         in_vain = if session.transfers() == form { 0 } else { in_vain + 1 };
         if session.takes_blocks() && in_vain < HOPELESS {
             session.transfer_by(form);
@@ -331,10 +342,12 @@ fn leave_after(session: &mut Session<'_>, error: &Error) {
 }
 
 /// A block to send.
-#[derive(Clone, Copy)]
 struct One<'b> {
     number: u32,
     bytes: &'b [u8],
+    /// The same with the other CRC, for block 0: a device says which CRC it has when it takes or
+    /// refuses this block.
+    other_crc: Option<Vec<u8>>,
     /// It goes to the devices of a group.
     in_group: bool,
     /// It has joined several blocks of the file, which can go one by one.
@@ -342,8 +355,11 @@ struct One<'b> {
 }
 
 /// The end of a block that the device has not refused for good.
+#[derive(Default)]
 struct Sent {
     repeats: u32,
+    /// The device has taken block 0 with the other CRC.
+    by_other_crc: bool,
     /// The device has not taken it as it is; the blocks that it has joined may get through.
     split: bool,
 }
@@ -351,7 +367,7 @@ struct Sent {
 /// Steps 7 and 8 for one block, with repetition.
 fn send_block(
     session: &mut Session<'_>,
-    One { number: block, bytes, in_group, may_split }: One<'_>,
+    One { number: block, mut bytes, ref other_crc, in_group, may_split }: One<'_>,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Sent, Error> {
@@ -360,13 +376,14 @@ fn send_block(
     let mut repeat = 0;
     // Whether the result of an earlier transfer is unknown: its block may have arrived.
     let mut in_doubt = false;
+    let (own, mut by_other_crc) = (bytes, false);
     loop {
         let met = if in_group { session.write_together(block, at, bytes)? } else { Met::Alone };
         let sent = match met {
             Met::Taken(devices) => {
                 tell(Note::Together { devices }.into());
                 // A block that the device cannot write is reported with the next one.
-                return Ok(Sent { repeats: repeat, split: false });
+                return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
             }
             Met::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
             Met::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
@@ -386,14 +403,14 @@ fn send_block(
         // The earlier block had arrived, and the bootloader waits for the next one. If this is
         // wrong, the next block, or at the latest the program's CRC, shows it.
         if in_doubt && status.error == Some(FlashError::Sequence) {
-            return Ok(Sent { repeats: repeat, split: false });
+            return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
         }
         let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
-            Judgement::Good => return Ok(Sent { repeats: repeat, split: false }),
+            Judgement::Good => return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() }),
             Judgement::Bad { why, error } => (why, error),
         };
         if may_split && !in_doubt && is_too_long(&error) {
-            return Ok(Sent { repeats: repeat, split: true });
+            return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
         }
         in_doubt |= why == Some(RepeatReason::NoAnswer);
         match why {
@@ -403,9 +420,13 @@ fn send_block(
                 if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
                     session.transfer_by(Transfers::Segments);
                 }
+                if let (RepeatReason::Crc, Some(other)) = (why, other_crc) {
+                    by_other_crc = !by_other_crc;
+                    bytes = if by_other_crc { other } else { own };
+                }
                 tell(Event::Retry(Retry::block(block, repeat, options.repeats, why)));
                 if repeat > 1 && may_split && !in_doubt {
-                    return Ok(Sent { repeats: repeat, split: true });
+                    return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
                 }
             }
             _ => return Err(error),
@@ -417,4 +438,27 @@ fn send_block(
 fn is_too_long(error: &Error) -> bool {
     let (Error::Refused { code, .. } | Error::Failed { code: Some(code), .. }) = error else { return false };
     matches!(*code, AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Both files have the same program, and block 0 has its CRC at offset 20.
+    #[test]
+    fn a_begun_download_says_the_crc_of_its_device() {
+        let files = [
+            (Checksum::Crc32, &include_bytes!("../../../tests/data/plain-400.blk")[..]),
+            (Checksum::Crc16, include_bytes!("../../../tests/data/crc16-400.blk")),
+        ];
+        for (_, file) in files {
+            let file = BlockFile::parse(file).unwrap();
+            for (checksum, begun) in files {
+                let control_crc = u32::from_le_bytes(begun[20..24].try_into().unwrap());
+                let partial = PartialDownload { control_crc, end: 0 };
+                assert_eq!(partial.checksum_of(&file), Some(checksum));
+            }
+            assert_eq!(PartialDownload { control_crc: 1, end: 0 }.checksum_of(&file), None);
+        }
+    }
 }

@@ -127,6 +127,8 @@ pub struct Fake {
     /// The largest value that 1F50h takes, as its announced size: a larger one is refused with
     /// 06070012h.
     pub room: usize,
+    /// The CRC that it checks blocks with; `None` checks none.
+    pub crc_of_blocks: Option<fn(&[u8]) -> u32>,
     /// The segment of a block download at which the device aborts; from then on 1F57h has this
     /// value.
     pub refuses_segment: Option<(usize, u32)>,
@@ -191,6 +193,7 @@ impl Fake {
             lost_segments: Vec::new(),
             altered_segments: Vec::new(),
             room: usize::MAX,
+            crc_of_blocks: None,
             refuses_segment: None,
             segments: 0,
             block_downloads: 0,
@@ -535,10 +538,16 @@ impl Fake {
         }
     }
 
+    fn finds_wrong_crc(&self, block: &[u8]) -> bool {
+        let (checked, crc) = block.split_last_chunk().unwrap();
+        self.crc_of_blocks.is_some_and(|of| of(checked) != u32::from_le_bytes(*crc))
+    }
+
     fn carry_out(&mut self, at: (u16, u8), data: Vec<u8>) {
         self.status = 0;
         let in_bootloader = self.running == Some(BOOTLOADER);
         match (at.0, data[0]) {
+            (0x1F50, _) if in_bootloader && self.finds_wrong_crc(&data) => self.status = 0x06,
             (0x1F50, _) if in_bootloader => {
                 let number = u32::from_le_bytes(data[..4].try_into().unwrap());
                 let last = number == u32::MAX && self.next_block > 0;
@@ -568,7 +577,7 @@ impl Fake {
 }
 
 /// CRC of a block transfer: polynomial 1021h, start value 0 (CiA 301, 7.2.4.3.16), bit by bit.
-fn crc16(data: &[u8]) -> u16 {
+pub fn crc16(data: &[u8]) -> u16 {
     data.iter().fold(0, |crc, byte| {
         (0..8).fold(
             crc ^ u16::from(*byte) << 8,

@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{AbortCode, NodeId};
 use coflash::device::{DeviceType, Dialect, Session, Timing};
+use coflash::file::block_file::Checksum;
 use coflash::file::BlockFile;
 use coflash::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
 use coflash::update::{flash, Event, FlashOptions, Target};
@@ -149,6 +150,10 @@ fn the_names_stay() {
         (
             Note::Dialect { dialect: Dialect::EsAcademy }.into(),
             json!({ "event": "note", "note": "dialect", "dialect": "esacademy" }),
+        ),
+        (
+            Note::OtherCrc { crc: Checksum::Crc16 }.into(),
+            json!({ "event": "note", "note": "other_crc", "crc": "CRC-16" }),
         ),
         (Note::Unlocked.into(), json!({ "event": "note", "note": "unlocked" })),
         (Note::Moved { node: of(126) }.into(), json!({ "event": "note", "note": "moved", "to": 126 })),

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::fake::{left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{crc16, left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{CobId, Frame, NodeId};
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
@@ -313,6 +313,44 @@ fn blocks_are_joined_where_the_device_takes_them() {
     let (report, _, fake) = into_coboot(&file, FlashOptions::default(), damage);
     let report = report.unwrap();
     assert_eq!((report.repeats, report.transfers, fake.blocks.len()), (2, Transfers::Blocks, own));
+}
+
+/// Polynomial EDB88320h, start value and end FFFFFFFFh (manual L-1112d_10, chapter 3.1), bit by bit.
+fn crc_of_32_bits(data: &[u8]) -> u32 {
+    !data.iter().fold(!0, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xEDB8_8320 & (crc & 1).wrapping_neg()))
+    })
+}
+
+/// A file's CRC is its own, and a device checks with that of its product: it says so when it refuses
+/// block 0.
+#[test]
+fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
+    let (plain, other) = (data!("plain-400.blk"), data!("crc16-400.blk"));
+    let of_16_bits: fn(&[u8]) -> u32 = |data| crc16(data).into();
+    for (file, wanted, of) in
+        [(plain, other, of_16_bits), (other, plain, crc_of_32_bits), (plain, plain, crc_of_32_bits)]
+    {
+        let sent = |fake: &mut Fake, options: FlashOptions| {
+            fake.crc_of_blocks = Some(of);
+            let mut session = Session::new(fake, node(), Timing::default());
+            flash(&mut session, &BlockFile::parse(file).unwrap(), &options, &mut |_| {})
+        };
+        let mut fake = Fake::new(BOOTLOADER);
+        let report = sent(&mut fake, FlashOptions::default()).unwrap();
+        assert!(fake.blocks.concat() == wanted);
+        let repeats = u32::from(file != wanted);
+        assert_eq!((report.repeats, fake.count("command 03")), (repeats, 1));
+        // A damaged block 0 looks the same: the other CRC is then in vain.
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.on_block = script(0, 1, Outcome::Status(0x06));
+        assert_eq!(sent(&mut fake, FlashOptions::default()).unwrap().repeats, 2 - repeats);
+        assert!(fake.blocks.concat() == wanted);
+        if repeats > 0 {
+            let error = sent(&mut Fake::new(BOOTLOADER), FlashOptions::default().repeats(0)).unwrap_err();
+            assert!(error.advice().contains("--crc16"), "{}", error.advice());
+        }
+    }
 }
 
 #[test]

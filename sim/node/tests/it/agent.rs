@@ -208,6 +208,25 @@ fn a_program_that_was_kept_is_known_by_a_crc_16_too() {
     assert!(action.details("closed").contains("since before the agent was restarted"), "{action:?}");
 }
 
+/// Nobody tells the agent which CRC the device has: the device does, when it gets its blocks.
+#[test]
+fn a_product_with_crc_16_gets_files_of_any_kind() {
+    let folder = Folder::new("agent-crc-16");
+    let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in", "--crc16"]);
+    for (action, name, byte) in [(1, "program.bin", 0xA5), (2, "program.hex", 0x5A)] {
+        let bytes = match action {
+            1 => program(byte),
+            _ => kit::ihex::intel_hex(0x0802_0000, &program(byte)).into_bytes(),
+        };
+        let server = Server::start(&IDS);
+        server.assign(IDS[0], Action::new(action, &File::new(name, &bytes)));
+        let config = config(&server, nodes.url(), &folder, &IDS[..1]);
+        let (ended, said) = serve(&config, &options());
+        assert_eq!(ended.updated, 1, "{said}");
+        assert!(folder.read("1.flash")[0x2_0000..0x2_0000 + 40 * 1024] == program(byte));
+    }
+}
+
 #[test]
 fn a_bus_that_is_not_there_is_waited_for() {
     let folder = Folder::new("agent-bus");
