@@ -16,6 +16,7 @@
 //! CANopenNode's `canopend` and Lely's `coctl` tools speak this form.
 
 use std::collections::BTreeSet;
+use std::fmt;
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
@@ -218,16 +219,11 @@ impl Cia309 {
                 return Err(GatewayError::Cancelled);
             }
             if Instant::now() >= limit + Duration::from_secs(part as u64) / SLOWEST {
-                let (seconds, said) = (
-                    wait.patience.as_secs_f64(),
-                    shown(self.inbox[..self.inbox.len().min(SHOWN)].trim_ascii()),
-                );
-                let said = if said.is_empty() {
-                    said
-                } else {
-                    format!("; it sent '{said}', and no end of the line")
+                let said = match shown(self.inbox[..self.inbox.len().min(SHOWN)].trim_ascii()) {
+                    said if said.is_empty() => said,
+                    said => format!("; it sent '{said}', and no end of the line"),
                 };
-                return Err(self.failed(format!("it has not answered for {seconds:.1} s{said}")).into());
+                return Err(self.failed(format!("it has not answered for {wait}{said}")).into());
             }
             self.receive()?;
         }
@@ -313,7 +309,7 @@ impl Cia309 {
         if self.timeout == Some(sdo) {
             return Ok(());
         }
-        let wait = Wait { patience: AT_ONCE, longest: LONGEST_WORDS, cancelled };
+        let wait = Wait { patience: AT_ONCE, sdo: Duration::ZERO, longest: LONGEST_WORDS, cancelled };
         let words = format!("set sdo_timeout {}", sdo.as_millis().clamp(1, LONGEST_TIMEOUT));
         let sequence = self.command(&words, &wait, |_| {})?;
         let answer = self.answer(sequence, &wait, false, |_| {})?;
@@ -338,6 +334,8 @@ impl Cia309 {
 /// How long to wait for the gateway, and until when.
 struct Wait<'c> {
     patience: Duration,
+    /// The part of it that is the node's.
+    sdo: Duration,
     /// The longest answer, in characters.
     longest: usize,
     cancelled: &'c dyn Fn() -> bool,
@@ -347,9 +345,27 @@ impl<'c> From<&Ask<'c>> for Wait<'c> {
     fn from(ask: &Ask<'c>) -> Self {
         Self {
             patience: ask.patience,
+            sdo: ask.sdo,
             longest: base64::length(ask.longest).saturating_add(LONGEST_WORDS),
             cancelled: ask.cancelled,
         }
+    }
+}
+
+impl fmt::Display for Wait<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let seconds = |time: Duration| time.as_secs_f64();
+        write!(f, "{:.1} s", seconds(self.patience))?;
+        if self.sdo.is_zero() {
+            return Ok(());
+        }
+        let own = self.patience.saturating_sub(self.sdo);
+        write!(
+            f,
+            " ({:.1} s for the node, --sdo-timeout, and {:.1} s for the gateway)",
+            seconds(self.sdo),
+            seconds(own)
+        )
     }
 }
 
@@ -396,7 +412,8 @@ impl Gateway for Cia309 {
     }
 
     fn reset_node(&mut self, node: NodeId) -> Result<(), GatewayError> {
-        let wait = Wait { patience: AT_ONCE, longest: LONGEST_WORDS, cancelled: &|| false };
+        let wait =
+            Wait { patience: AT_ONCE, sdo: Duration::ZERO, longest: LONGEST_WORDS, cancelled: &|| false };
         let sequence = self.command(&format!("{node} reset node"), &wait, |_| {})?;
         let answer = self.answer(sequence, &wait, false, |_| {})?;
         self.done(&answer)

@@ -20,10 +20,7 @@ const GATEWAY_BYTES: u64 = 250;
 impl Session<'_> {
     /// Reads a short value through the gateway.
     pub(super) fn read_there(&mut self, at: Address) -> Result<Vec<u8>, Error> {
-        let patience = self.timing.sdo + GATEWAY_GRACE;
-        let value = self.through_gateway(at, Doing::Read(at), patience, VALUE_MAX, |gateway, ask| {
-            gateway.upload(ask, &mut |_| {})
-        })?;
+        let value = self.upload_through(at, VALUE_MAX, &mut |_| {})?;
         let long = Error::Protocol { doing: Doing::Read(at), code: AbortCode::OUT_OF_MEMORY };
         if value.len() > VALUE_MAX {
             Err(long)
@@ -32,14 +29,25 @@ impl Session<'_> {
         }
     }
 
-    /// Reads a value of any length through the gateway, with this time limit for each part of it.
+    /// Reads a value of any length through the gateway.
     pub(super) fn upload_there(
         &mut self,
         at: Address,
-        patience: Duration,
         progress: &mut dyn FnMut(u32),
     ) -> Result<Vec<u8>, Error> {
-        self.through_gateway(at, Doing::Read(at), patience, UPLOAD_MAX, |gateway, ask| {
+        self.upload_through(at, UPLOAD_MAX, progress)
+    }
+
+    /// Reads a value of at most this length. Its first characters are due after the time-out of the
+    /// node and of the gateway; what a gateway collects before it answers must arrive by then, too.
+    fn upload_through(
+        &mut self,
+        at: Address,
+        longest: usize,
+        progress: &mut dyn FnMut(u32),
+    ) -> Result<Vec<u8>, Error> {
+        let patience = self.timing.sdo + GATEWAY_GRACE;
+        self.through_gateway(at, Doing::Read(at), patience, longest, |gateway, ask| {
             gateway.upload(ask, progress)
         })
     }

@@ -110,7 +110,7 @@ impl Session<'_> {
 
     fn upload_once(&mut self, at: Address, progress: &mut dyn FnMut(u32)) -> Result<Vec<u8>, Error> {
         if !self.hears_the_bus() {
-            return self.upload_there(at, self.timing.command, progress);
+            return self.upload_there(at, progress);
         }
         let (sink, config) = (Grown(Vec::new()), self.config());
         let mut upload = match self.transfers {

@@ -369,6 +369,52 @@ fn words(result: Result<Vec<u8>, GatewayError>) -> String {
     }
 }
 
+/// Notes how long it may be silent, and does not answer.
+struct Patient(Duration);
+
+impl Gateway for Patient {
+    fn upload(&mut self, ask: &Ask<'_>, _: &mut dyn FnMut(u32)) -> Result<Vec<u8>, GatewayError> {
+        self.0 = ask.patience;
+        Err(GatewayError::NoAnswer)
+    }
+
+    fn download(&mut self, _: &Ask<'_>, _: &[u8], _: &mut dyn FnMut(u32)) -> Result<(), GatewayError> {
+        Err(GatewayError::NoAnswer)
+    }
+
+    fn reset_node(&mut self, _: NodeId) -> Result<(), GatewayError> {
+        Ok(())
+    }
+
+    fn greet(&mut self, _: Duration) -> Result<(), coflash::bus::AdapterError> {
+        Ok(())
+    }
+
+    fn wait(&mut self, _: Duration) -> Result<Option<NodeId>, GatewayError> {
+        Ok(None)
+    }
+
+    fn now(&self) -> Duration {
+        Duration::ZERO
+    }
+}
+
+/// A gateway sends a value while it comes, so its first word is due after the time-out of the node
+/// and its own, whatever the length of the value.
+#[test]
+fn a_read_waits_for_the_node_and_the_gateway_and_no_longer() {
+    let at = Address::new(0x1000, 0);
+    let timing = Timing::default().sdo(Duration::from_millis(700)).attempts(1);
+    type Read = fn(&mut Session<'_>, Address) -> Result<Vec<u8>, Error>;
+    let reads: [Read; 2] =
+        [|session, at| session.upload(at, &mut |_| {}), |session, at| session.read_once(at)];
+    for read in reads {
+        let mut gateway = Patient(Duration::ZERO);
+        read(&mut Session::through(&mut gateway, NodeId::new(5).unwrap(), timing), at).unwrap_err();
+        assert_eq!(gateway.0, Duration::from_millis(5700));
+    }
+}
+
 #[test]
 fn answers_of_every_form_are_understood() {
     let ok = Ok(vec![0x92, 1, 2, 0]);
@@ -417,14 +463,17 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
         ("HTTP/1.1 400 Bad Request\r\n", "answered unexpectedly: HTTP/1.1 400"),
         ("...ERROR:0x05040005\r\n", "answered unexpectedly: '...ERROR:0x05040005'"),
         ("[2] kgECAA==\n", "it has not answered for 0.3 s"),
-        ("[2] kgECAA==", "it has not answered for 0.3 s; it sent '[2] kgECAA==', and no end of the line"),
+        ("[2] kgECAA==", "s for the gateway); it sent '[2] kgECAA==', and no end of the line"),
     ] {
         let (result, _) = asked(move |_| Some(answer.to_string()));
         let found = words(result);
         assert!(found.contains(expected), "{answer:?}: {found}");
     }
     let (result, _) = asked(|_| None);
-    assert!(words(result).contains("it has not answered for 0.3 s"));
+    let found = words(result);
+    let expected =
+        "it has not answered for 0.3 s (0.1 s for the node, --sdo-timeout, and 0.2 s for the gateway)";
+    assert!(found.contains(expected), "{found}");
 }
 
 /// A gateway for one command, which then sends this without end; returns its address.
