@@ -48,6 +48,8 @@ pub struct Health {
     pub unclear: u32,
     /// What an adapter has sent that is not of its protocol.
     pub strange: u32,
+    /// The tool's own frames have come back, and no others were received.
+    pub only_echoes: bool,
     /// The transmit and receive error counters, if the adapter reports them.
     pub counters: Option<(u8, u8)>,
     /// The bit rate in bit/s, where it is known.
@@ -71,6 +73,8 @@ pub enum Trouble {
     Unclear,
     /// The adapter speaks another protocol than when it was opened.
     Strange,
+    /// The server returns the tool's own frames, and nobody else sends any.
+    Echo,
 }
 
 /// The transmit error counter of a sender without any receiver stays at this value: an error
@@ -102,6 +106,7 @@ impl Health {
             _ if passive => Some(Trouble::Passive),
             _ if self.unclear > 0 => Some(Trouble::Unclear),
             _ if self.strange > 0 => Some(Trouble::Strange),
+            _ if self.only_echoes => Some(Trouble::Echo),
             _ => None,
         }
     }
@@ -152,6 +157,11 @@ impl Health {
                  port or address; unplug it and plug it in again, or check --bus"
                     .to_string()
             }
+            Trouble::Echo => {
+                "the server returns our own frames and nothing else: no other node is on its bus; check that the bus in \
+                 --bus is that of the device, and that the device has power"
+                    .to_string()
+            }
         })
     }
 
@@ -164,7 +174,7 @@ impl Health {
                 "the adapter has reported {} of the bus: check the bit rate of each node, cable and terminators",
                 self.unclear_errors()
             )),
-            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive | Trouble::Strange => None,
+            Trouble::Stopped | Trouble::Unacknowledged | Trouble::Passive | Trouble::Strange | Trouble::Echo => None,
         }
     }
 

@@ -9,6 +9,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
+use super::echo::Echoes;
 use super::health::{Controller, Health};
 use super::hex::{hex_bytes, hex_number};
 use super::ports;
@@ -68,7 +69,7 @@ pub struct Slcan<L: Line> {
     /// The adapter sends back what it gets.
     echoes: bool,
     /// Frames that were sent and did not come back yet, if the adapter echoes.
-    sent: VecDeque<Frame>,
+    sent: Echoes<MOST_EARLY>,
     /// Frames that the adapter has refused: its queue is full, or its bus is closed.
     refused: u32,
     /// Lines outside the protocol that came since the bus is open.
@@ -127,26 +128,17 @@ impl<L: Line> Slcan<L> {
             rest: Vec::new(),
             early: VecDeque::new(),
             echoes: false,
-            sent: VecDeque::new(),
+            sent: Echoes::default(),
             refused: 0,
             strange: 0,
             odd: None,
         }
     }
 
-    /// Whether a frame is the echo of one that was sent, and not another node's.
-    fn is_echo(&mut self, frame: &Frame) -> bool {
-        let at = self.sent.iter().position(|sent| sent == frame);
-        if let Some(at) = at {
-            self.sent.drain(..=at);
-        }
-        at.is_some()
-    }
-
     /// Keeps a frame that arrived while the tool waited for another message. Frames may come as
     /// soon as the bus is open. Returns whether it was a frame.
     fn stray(&mut self, text: &[u8]) -> bool {
-        let frame = parse_frame(text).filter(|frame| !self.is_echo(frame));
+        let frame = parse_frame(text).filter(|frame| !self.sent.takes(frame));
         if let Some(frame) = frame.filter(|_| self.early.len() < MOST_EARLY) {
             self.early.push_back(frame);
         }
@@ -246,10 +238,7 @@ impl<L: Line> Drop for Slcan<L> {
 impl<L: Line> Adapter for Slcan<L> {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
         if self.echoes {
-            if self.sent.len() == MOST_EARLY {
-                self.sent.pop_front();
-            }
-            self.sent.push_back(*frame);
+            self.sent.sent(frame);
         }
         self.send_text(&text_of(frame))
     }
@@ -267,7 +256,7 @@ impl<L: Line> Adapter for Slcan<L> {
                     if frame.is_none() && !is_of_protocol(&text) {
                         self.strange = self.strange.saturating_add(1);
                     }
-                    if let Some(frame) = frame.filter(|frame| !self.is_echo(frame)) {
+                    if let Some(frame) = frame.filter(|frame| !self.sent.takes(frame)) {
                         return Ok(Some(frame));
                     }
                 }

@@ -10,6 +10,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
+use super::echo::Echoes;
 use super::health::Health;
 use super::hex::{hex_bytes, hex_number};
 use super::tcp::{connect, PATIENCE};
@@ -18,6 +19,8 @@ use super::tcp::{connect, PATIENCE};
 const LONGEST_MESSAGE: usize = 4096;
 /// The bits of an error frame's identifier that tell its class: those below `CAN_ERR_FLAG`.
 const ERROR_CLASS: u32 = 0x1FFF_FFFF;
+/// More frames than are sent before their echoes come.
+const MOST_SENT: usize = 256;
 /// The default port of socketcand.
 const DEFAULT_PORT: u16 = 29536;
 
@@ -30,6 +33,9 @@ pub struct Socketcand {
     messages: Messages,
     /// What the error frames have reported.
     health: Health,
+    /// What was sent, until another node is heard.
+    sent: Echoes<MOST_SENT>,
+    hears_others: bool,
 }
 
 impl Socketcand {
@@ -51,6 +57,8 @@ impl Socketcand {
             opened: Instant::now(),
             messages: Messages::default(),
             health: Health::default(),
+            sent: Echoes::default(),
+            hears_others: false,
         };
         adapter.expect("hi")?;
         adapter.send_text(&format!("< open {bus} >"))?;
@@ -86,6 +94,14 @@ impl Socketcand {
             self.health.error_frame(*class, data);
         }
         frame.is_some()
+    }
+
+    /// A server may return the client's own frames. Notes whether it sends any others.
+    fn note(&mut self, frame: &Frame) {
+        if !self.hears_others {
+            self.hears_others = !self.sent.takes(frame);
+            self.health.only_echoes = !self.hears_others;
+        }
     }
 
     fn send_text(&mut self, message: &str) -> Result<(), AdapterError> {
@@ -147,6 +163,9 @@ impl Socketcand {
 
 impl Adapter for Socketcand {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if !self.hears_others {
+            self.sent.sent(frame);
+        }
         self.send_text(&send_message(frame))
     }
 
@@ -154,6 +173,7 @@ impl Adapter for Socketcand {
         let deadline = Instant::now() + timeout;
         while let Some(message) = self.message(deadline)? {
             if let Some(frame) = parse_frame(&message) {
+                self.note(&frame);
                 return Ok(Some(frame));
             }
             if !self.is_error_frame(&message) && message.starts_with("error") {
@@ -478,6 +498,37 @@ mod tests {
         // CAN_ERR_ACK is 20h.
         let health = bus.health().unwrap();
         assert_eq!((health.unacknowledged, health.unclear), (3, 1));
+    }
+
+    /// Lines of a server that returns what it gets: no other node is on its bus.
+    #[test]
+    fn a_server_that_only_returns_our_frames_is_told() {
+        const READ: &str = "< send 605 8 40 00 10 00 00 00 00 00 >";
+        let request = Frame::of(CobId::new(0x605).unwrap(), &[0x40, 0, 0x10, 0, 0, 0, 0, 0]);
+        let long = Duration::from_secs(20);
+        for (other, trouble) in [
+            ("< frame 605 1.2 4000100000000000 >", Some(Trouble::Echo)),
+            ("< frame 705 1.2 7F >", None),
+            // The request of another tool: it comes twice, and was sent once.
+            ("< frame 605 1.2 4000180100000000 >", None),
+        ] {
+            let script = [
+                LOG_IN[0],
+                LOG_IN[1],
+                ("< rawmode >", "< ok >"),
+                (READ, "< frame 605 1.1 4000100000000000 >"),
+                (READ, other),
+                ("never", ""),
+            ];
+            let mut bus = Socketcand::connect(&server(script.to_vec().leak()), "can0").unwrap();
+            assert_eq!(bus.health().unwrap().trouble(), None);
+            bus.send(&request).unwrap();
+            assert_eq!(bus.receive(long).unwrap(), Some(request));
+            assert_eq!(bus.health().unwrap().trouble(), Some(Trouble::Echo));
+            bus.send(&request).unwrap();
+            bus.receive(long).unwrap().unwrap();
+            assert_eq!(bus.health().unwrap().trouble(), trouble, "{other}");
+        }
     }
 
     /// The server sends while the client waits, until its connection is closed.

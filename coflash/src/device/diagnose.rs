@@ -10,6 +10,7 @@ use canopen::NodeId;
 use super::error::Error;
 use super::session::Session;
 use crate::bus::decode::state_words;
+use crate::bus::health::Trouble;
 use crate::bus::Health;
 
 /// How long to listen: in most networks, heartbeats come once a second.
@@ -52,8 +53,9 @@ pub fn diagnose(session: &mut Session<'_>) -> Result<Diagnosis, Error> {
 
 impl fmt::Display for Diagnosis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { node, frames, health, .. } = self;
-        if *frames == 0 {
+        let Self { node, frames, heard, health } = self;
+        let is_echo = health.and_then(|health| health.trouble()) == Some(Trouble::Echo);
+        if *frames == 0 || is_echo && heard.is_empty() {
             if let Some(advice) = health.and_then(|health| health.advice()) {
                 return f.write_str(&advice);
             }

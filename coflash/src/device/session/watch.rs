@@ -1,7 +1,6 @@
 //! What a session observes besides its transfers: how long its node has been silent, and whether
 //! another tool talks to the node.
 
-use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::emcy::code;
@@ -9,6 +8,7 @@ use canopen::nmt::parse_boot_up;
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
+use crate::bus::echo::Echoes;
 use crate::device::doing::Doing;
 
 /// A silence of this length is reported while it lasts.
@@ -38,7 +38,7 @@ pub(super) struct Watch {
     /// Whether this silence was reported.
     pub(super) told: bool,
     /// The session's own requests without an echo, in their order.
-    own: VecDeque<Frame>,
+    own: Echoes<OWN_MAX>,
     /// Whether an echo has arrived since the last answer.
     echoed: bool,
     /// The time and the object of the last request of another tool.
@@ -66,10 +66,7 @@ impl Watch {
 
     pub(super) fn sent(&mut self, frame: &Frame, node: NodeId) {
         if frame.cob_id() == Some(CobId::sdo_request(node)) {
-            if self.own.len() == OWN_MAX {
-                self.own.pop_front();
-            }
-            self.own.push_back(*frame);
+            self.own.sent(frame);
         }
     }
 
@@ -85,9 +82,7 @@ impl Watch {
     pub(super) fn received(&mut self, frame: &Frame, node: NodeId, now: Duration) {
         let Some(id) = frame.cob_id() else { return };
         if id == CobId::sdo_request(node) {
-            // An adapter that returns sent frames returns all of them, in their order.
-            if let Some(at) = self.own.iter().position(|own| own == frame) {
-                self.own.drain(..=at);
+            if self.own.takes(frame) {
                 self.echoed = true;
             } else {
                 self.foreign = Some((now, object_of(frame)));

@@ -1,5 +1,6 @@
 //! Several devices, interruption and diagnosis, with the tool as a separate process.
 
+use std::collections::VecDeque;
 use std::fs;
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -234,6 +235,52 @@ fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
     ] {
         let said = advice(frames);
         assert!(said.contains(words), "{said}\n not {words}");
+    }
+}
+
+/// A bus that returns what it gets, and nothing else.
+struct Mirror {
+    fake: Fake,
+    back: VecDeque<Frame>,
+}
+
+impl coflash::Adapter for Mirror {
+    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
+        self.back.push_back(*frame);
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+        match self.back.pop_front() {
+            None => self.fake.receive(timeout),
+            frame => Ok(frame),
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+#[test]
+fn a_bus_with_nobody_but_the_tool_is_told() {
+    let file = data("plain-400.blk");
+    let short = ["--sdo-timeout", "20", "--boot-timeout", "20"];
+    let scan = ["scan", "--sdo-timeout", "20", "--listen", "20"];
+    for (command, exit) in [
+        ([&["info", "-N", "5"][..], &short].concat(), 5),
+        ([&["flash", &file, "-N", "5"][..], &short].concat(), 5),
+        ([&["flash", &file, "-N", "5,6"][..], &short].concat(), 8),
+        (scan.to_vec(), 0),
+    ] {
+        let mut fake = device(5, BOOTLOADER);
+        fake.running = None;
+        let (url, server) = serve(Mirror { fake, back: VecDeque::new() });
+        let done = coflash(&[&["--bus", &url][..], &command].concat());
+        server.join().unwrap();
+        let said = format!("{}{}", done.out, done.err);
+        assert_eq!(done.exit, exit, "{said}");
+        assert!(said.contains("the server returns our own frames and nothing else"), "{said}");
     }
 }
 
