@@ -325,7 +325,8 @@ fn text_of(frame: &Frame) -> String {
     format!("{kind}{id}{}{data}\r", frame.dlc())
 }
 
-/// The frame in a message. Four digits of a time stamp may follow it (the adapter's command `Z1`).
+/// The frame in a message. A time stamp may follow it: four digits (the command `Z1`), or eight in
+/// firmwares that count microseconds (`Z2`).
 fn parse_frame(text: &[u8]) -> Option<Frame> {
     let text = std::str::from_utf8(text).ok().filter(|text| text.is_ascii())?;
     let kind = text.chars().next()?;
@@ -341,15 +342,16 @@ fn parse_frame(text: &[u8]) -> Option<Frame> {
         ExtendedId::new(number)?.into()
     };
     let dlc: usize = text.get(digits + 1..digits + 2)?.parse().ok().filter(|dlc| *dlc <= 8)?;
+    let is_remote = kind.eq_ignore_ascii_case(&'r');
     let rest = text.get(digits + 2..)?;
-    if kind.eq_ignore_ascii_case(&'r') {
-        return Frame::new_remote(id, dlc);
-    }
-    let data = rest.get(..2 * dlc)?;
-    if !matches!(rest.len() - data.len(), 0 | 4) {
+    let (data, time) = rest.split_at_checked(if is_remote { 0 } else { 2 * dlc })?;
+    if !matches!(time.len(), 0 | 4 | 8) || !time.bytes().all(|digit| digit.is_ascii_hexdigit()) {
         return None;
     }
-    Frame::new(id, &hex_bytes(data)?)
+    match is_remote {
+        true => Frame::new_remote(id, dlc),
+        false => Frame::new(id, &hex_bytes(data)?),
+    }
 }
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
 use super::adapter::{Adapter, AdapterError};
 use super::echo::Echoes;
+use super::found::shown;
 use super::health::Health;
 use super::hex::{hex_bytes, hex_number};
 use super::tcp::{connect, PATIENCE};
@@ -21,6 +22,8 @@ const LONGEST_MESSAGE: usize = 4096;
 const ERROR_CLASS: u32 = 0x1FFF_FFFF;
 /// More frames than are sent before their echoes come.
 const MOST_SENT: usize = 256;
+/// The most bytes of a server's text that an error shows.
+const SHOWN: usize = 80;
 /// The default port of socketcand.
 const DEFAULT_PORT: u16 = 29536;
 
@@ -68,11 +71,12 @@ impl Socketcand {
         Ok(adapter)
     }
 
-    /// Waits for a message of one word during the log-in.
+    /// Waits for the message with this first word during the log-in.
     fn expect(&mut self, word: &str) -> Result<(), AdapterError> {
         let deadline = Instant::now() + PATIENCE;
         while let Some(message) = self.message(deadline)? {
-            if message == word {
+            let first = message.split_ascii_whitespace().next();
+            if first.is_some_and(|first| first.eq_ignore_ascii_case(word)) {
                 return Ok(());
             }
             // Frames may arrive as soon as the bus is open.
@@ -84,7 +88,11 @@ impl Socketcand {
                 break;
             }
         }
-        Err(self.unexpected(format!("nothing instead of '< {word} >'")))
+        let said = match shown(&self.messages.stray) {
+            said if said.is_empty() => "nothing".to_string(),
+            said => format!("'{said}'"),
+        };
+        Err(self.unexpected(format!("{said} instead of '< {word} >'")))
     }
 
     /// Adds an error frame of the bus to what is known about it. `false` for any other message.
@@ -283,6 +291,8 @@ pub struct Messages {
     overlong: bool,
     /// Bytes between messages that are no blanks.
     strays: u32,
+    /// The first text between messages.
+    stray: Vec<u8>,
 }
 
 impl Messages {
@@ -299,7 +309,10 @@ impl Messages {
                 (_, Some(_)) => self.overlong = true,
                 // A byte between two messages.
                 (byte, None) => {
-                    self.strays = self.strays.saturating_add(u32::from(!byte.is_ascii_whitespace()))
+                    self.strays = self.strays.saturating_add(u32::from(!byte.is_ascii_whitespace()));
+                    if self.stray.len() < SHOWN && !byte.is_ascii_control() {
+                        self.stray.push(byte);
+                    }
                 }
             }
         }
@@ -433,6 +446,18 @@ mod tests {
         let answer = frame(0x581, &[0x43, 0, 0x10, 0, 0, 0, 0, 0x10]);
         assert_eq!(bus.receive(long).unwrap(), Some(answer));
         assert!(matches!(bus.receive(long), Err(AdapterError::Lost { .. })));
+    }
+
+    /// What a server adds to its greeting, or writes in capitals, is still its greeting.
+    #[test]
+    fn a_server_greets_as_it_likes() {
+        for script in [
+            [("", "< hi socketcand 0.6.1 >"), ("< open can0 >", "< ok can0 >"), ("< rawmode >", "< ok >")],
+            [("", "<HI>\r\n"), ("< open can0 >", "<OK>\r\n"), ("< rawmode >", "<Ok>\r\n")],
+            [("", "Welcome\r\n<\thi\t>"), ("< open can0 >", "<  ok  >"), ("< rawmode >", "< ok\n>")],
+        ] {
+            Socketcand::connect(&server(script.to_vec().leak()), "can0").unwrap();
+        }
     }
 
     /// linux-can/socketcand, pull request 67: the class of the error in hexadecimal, and the time.
@@ -581,6 +606,11 @@ mod tests {
                 "'< error could not open bus >' instead of '< ok >'",
             ),
             (&[("", "<html>")][..], "'< html >' instead of '< hi >'"),
+            (
+                &[("", "SSH-2.0-OpenSSH_9.6\r\n\x07"), ("never", "")][..],
+                "'SSH-2.0-OpenSSH_9.6' instead of '< hi >'",
+            ),
+            (&[("", "< high >")][..], "'< high >' instead of '< hi >'"),
         ] {
             let error = Socketcand::connect(&server(script), "can0").unwrap_err();
             assert!(error.to_string().contains(words), "{error}");

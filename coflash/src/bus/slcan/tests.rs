@@ -18,10 +18,13 @@ fn messages_are_those_of_the_protocol() {
     assert_eq!(text_of(&frame(0x7FF, &[])), "t7FF0\r");
     assert_eq!(parse_frame(b"t10021133"), Some(frame(0x100, &[0x11, 0x33])));
     assert_eq!(parse_frame(b"t100211330A1B"), Some(frame(0x100, &[0x11, 0x33])), "with time");
+    assert_eq!(parse_frame(b"t100211330001A2B3"), Some(frame(0x100, &[0x11, 0x33])), "in microseconds");
     let extended = Frame::new(ExtendedId::new(0x100).unwrap(), &[0x11, 0x33]).unwrap();
     assert_eq!(parse_frame(b"T0000010021133"), Some(extended));
     assert_eq!(text_of(&extended), "T0000010021133\r");
+    assert_eq!(parse_frame(b"T00000100211330A1B"), Some(extended));
     let remote = Frame::new_remote(StandardId::new(0x100).unwrap(), 2).unwrap();
+    assert_eq!(parse_frame(b"r10020A1B"), Some(remote));
     assert_eq!((parse_frame(b"r1002"), text_of(&remote)), (Some(remote), "r1002\r".to_string()));
     for bad in [
         &b""[..],
@@ -34,6 +37,9 @@ fn messages_are_those_of_the_protocol() {
         b"t1009",
         b"t10011",
         b"t100111223",
+        b"t1001110A1",
+        b"t100111time",
+        b"r10020A1",
         b"t8000",
         b"txyz0",
         b"T200000000",
