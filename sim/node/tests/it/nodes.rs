@@ -61,6 +61,18 @@ fn the_file_holds_the_program_and_nothing_else() {
     assert!(folder.read("1.flash")[0x2_0000..] == flashed());
 }
 
+/// The checks that install a program send it with the CRC of the product.
+#[test]
+fn conform_installs_into_a_node_with_crc_16() {
+    let folder = folder("crc16-conform");
+    let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in", "--crc16"]);
+    let image = ["--install", "--image", "program.bin", "-I", "binary", "--board", "stm32f407g-disc1"];
+    let done = Coflash::new(&folder, &nodes).run(&[&["conform", "-N", "7"], &image[..]].concat());
+    let updates = done.out.lines().filter(|line| line.starts_with("UPD-"));
+    let bad: Vec<_> = updates.filter(|line| line.contains("FAILED")).collect();
+    assert!(bad.is_empty() && done.out.contains("UPD-011   passed"), "{bad:?}\n{}", done.out);
+}
+
 #[test]
 fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     let folder = folder("stand-in");
