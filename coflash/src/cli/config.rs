@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use clap::builder::FalseyValueParser;
 use clap::parser::ValueSource;
 use clap::{Arg, ArgAction, ArgMatches, Command};
+use coflash::file::limit::read_text;
 use coflash::update::config::{parse, Fault, Setting};
 
-use super::objects::bytes_of;
 use super::output::Failure;
 
 /// The path of the file: the value of `--config` or `COFLASH_CONFIG`, otherwise `coflash.toml` in
@@ -41,8 +41,7 @@ fn settings(command: &Command) -> impl Iterator<Item = &Arg> {
 /// The command line with the file's values as defaults. `given` holds the options that the user
 /// gave, as far as they can be read.
 pub(super) fn apply(command: Command, path: &Path, given: &ArgMatches) -> Result<Command, Failure> {
-    let text = bytes_of(path, MAX)?;
-    let text = String::from_utf8_lossy(&text);
+    let text = read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
     let is_switch = |key: &str| {
         let argument = settings(&command).find(|argument| argument.get_long() == Some(key))?;
         Some(!argument.get_action().takes_values())
@@ -74,9 +73,6 @@ pub(super) fn apply(command: Command, path: &Path, given: &ArgMatches) -> Result
     let said = said(given);
     Ok(settings.iter().fold(command, |command, (key, value)| with_default(command, key, value, &said)))
 }
-
-/// The most bytes of a configuration file.
-const MAX: u64 = 1024 * 1024;
 
 /// The options that the user gave on the command line or in the environment.
 fn said(given: &ArgMatches) -> Vec<String> {

@@ -12,7 +12,6 @@ use coflash::update::JOINED_BLOCKS;
 use shared_abi::layout;
 
 use super::context::Context;
-use super::objects::bytes_of;
 use super::output::Failure;
 use super::values::number;
 
@@ -271,8 +270,7 @@ impl Place {
 
 /// Reads the memory map from a file.
 fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
-    let bytes = bytes_of(path, file::board::MAX as u64)?;
-    let text = String::from_utf8_lossy(&bytes);
+    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
     file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))
 }
 

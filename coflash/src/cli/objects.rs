@@ -8,6 +8,7 @@ use canopen::Address;
 use clap::Args;
 use coflash::device::eds::{Eds, Entry};
 use coflash::device::value::DataType;
+use coflash::file::limit::read_text;
 use serde_json::{json, Value};
 
 use super::output::Failure;
@@ -29,13 +30,9 @@ pub(super) struct Object {
     pub(super) entry: Option<Entry>,
 }
 
-/// The most bytes of a file with a list of objects.
-const LIST_MAX: u64 = 1024 * 1024;
-
 /// The objects that a file lists.
 pub(super) fn list(path: &Path) -> Result<Vec<String>, Failure> {
-    let bytes = bytes_of(path, LIST_MAX)?;
-    let text = String::from_utf8_lossy(&bytes);
+    let text = read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
     // A number sign may be part of a name, but a blank and a number sign begin a comment.
     let object = |line: &str| {
         let end = line

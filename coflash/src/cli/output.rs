@@ -470,6 +470,7 @@ impl From<FileError> for Failure {
             },
             Cause::Empty => "the file is empty: build the program again, or copy the file again",
             Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
+            Cause::Foreign { advice, .. } => advice,
             Cause::NoData => {
                 "name the linker's output: an object file, or one without loadable sections, has nothing for the flash"
             }

@@ -10,6 +10,7 @@ use canopen::Address;
 use configparser::ini::Ini;
 
 use super::value::{integer, DataType};
+use crate::file::text::unicode;
 
 /// The most bytes of a sheet. Sheets of drives with hundreds of objects have about 300 KiB.
 pub const MAX: usize = 8 * 1024 * 1024;
@@ -199,21 +200,11 @@ impl Eds {
     }
 }
 
-/// The text of a sheet. CiA 306-1 wants ASCII, and does not name another encoding.
+/// The text of a sheet, with LF at the end of each line. CiA 306-1 wants ASCII, and does not name
+/// another encoding.
 fn text_of(bytes: &[u8]) -> String {
-    let utf_16 = |of: fn([u8; 2]) -> u16, bytes: &[u8]| {
-        let units: Vec<u16> = bytes.chunks_exact(2).map(|pair| of([pair[0], pair[1]])).collect();
-        String::from_utf16_lossy(&units)
-    };
-    match bytes {
-        [0xFF, 0xFE, rest @ ..] => utf_16(u16::from_le_bytes, rest),
-        [0xFE, 0xFF, rest @ ..] => utf_16(u16::from_be_bytes, rest),
-        bytes => {
-            let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-            let windows = || bytes.iter().copied().map(windows_1252).collect();
-            std::str::from_utf8(bytes).map_or_else(|_| windows(), str::to_owned)
-        }
-    }
+    let text = unicode(bytes).unwrap_or_else(|| bytes.iter().copied().map(windows_1252).collect());
+    text.replace("\r\n", "\n").replace('\r', "\n")
 }
 
 /// A character of Windows-1252: ISO 8859-1 with other characters from 80h to 9Fh (Unicode's mapping
@@ -353,6 +344,15 @@ mod tests {
             let path = format!("Identity object/{name}");
             assert_eq!(eds.find(&path).map(|entry| entry.at), Ok(address(0x1018, 1)), "{name}");
             assert_eq!(eds.find(name).map(|entry| entry.at), Ok(address(0x1018, 1)), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_sheet_has_any_line_end() {
+        for end in ["\n", "\r\n", "\r"] {
+            let sheet = "[1018]\nParameterName=Identity\nObjectType=7\nDataType=7\n".replace('\n', end);
+            let eds = Eds::parse(sheet.as_bytes()).unwrap();
+            assert_eq!(eds.find("Identity").map(|entry| entry.at), Ok(address(0x1018, 0)), "{end:?}");
         }
     }
 

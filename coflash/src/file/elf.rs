@@ -3,7 +3,8 @@
 use std::ops::Range;
 
 use object::elf::{
-    FileHeader32, ProgramHeader32, SectionHeader32, EM_ARM, ET_EXEC, PT_LOAD, SHF_ALLOC, SHT_NOBITS,
+    FileHeader32, ProgramHeader32, SectionHeader32, EM_ARM, ET_CORE, ET_DYN, ET_EXEC, ET_REL, PT_LOAD,
+    SHF_ALLOC, SHT_NOBITS,
 };
 use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::Endianness;
@@ -50,8 +51,17 @@ pub fn read(bytes: &[u8]) -> Result<Image, ReadError> {
     if machine != EM_ARM {
         return Err(Place::Offset(18).fault(Cause::WrongMachine(machine)));
     }
-    if header.e_type(endian) != ET_EXEC {
-        let words = "is not a linked program (it is an object file or library): give the linker's output";
+    let words = match header.e_type(endian) {
+        ET_EXEC => None,
+        ET_REL => Some("is not a linked program (it is an object file): give the linker's output"),
+        ET_DYN => Some(
+            "is linked for no address (it is a library, or a position-independent program): link it for the \
+             flash of the device (-no-pie)",
+        ),
+        ET_CORE => Some("is not a linked program (it is a dump of the memory): give the linker's output"),
+        _ => Some("is not a linked program: give the linker's output"),
+    };
+    if let Some(words) = words {
         return Err(Place::Offset(16).fault(Cause::WrongElf(words)));
     }
     let header_size = header.e_phentsize(endian);
@@ -344,7 +354,10 @@ mod tests {
             ("offset 0x4: is not a 32-bit ELF file", fault(|b| b[4] = 2)),
             ("offset 0x5: is not little-endian", fault(|b| b[5] = 2)),
             ("offset 0x12: is an ELF file for machine 62 and not for Arm", fault(|b| b[18] = 62)),
-            ("offset 0x10: is not a linked program", fault(|b| b[16] = 1)),
+            ("offset 0x10: is not a linked program (it is an object file)", fault(|b| b[16] = 1)),
+            ("offset 0x10: is linked for no address", fault(|b| b[16] = 3)),
+            ("offset 0x10: is not a linked program (it is a dump", fault(|b| b[16] = 4)),
+            ("offset 0x10: is not a linked program:", fault(|b| b[16] = 9)),
             ("offset 0x0: is not an ELF file", fault(|b| b[0] = 0)),
             (
                 "offset 0x78: the data at 0x08010003 overlaps that of offset 0x74",

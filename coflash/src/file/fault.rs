@@ -126,6 +126,14 @@ pub enum Cause {
     /// A file in none of the known formats.
     #[error("is not a firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
     NotFirmware,
+    /// A file of another kind, which its first bytes name.
+    #[error("is not a firmware file but {what}")]
+    Foreign {
+        /// The kind.
+        what: &'static str,
+        /// What to do.
+        advice: &'static str,
+    },
     /// A text in another encoding than ASCII.
     #[error("{0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
     Encoding(Encoding),
@@ -329,6 +337,7 @@ impl Cause {
             | Self::NoRegularFile(_)
             | Self::TooLarge { .. }
             | Self::NotFirmware
+            | Self::Foreign { .. }
             | Self::Encoding(_)
             | Self::Sealed
             | Self::NoAddress

@@ -6,6 +6,7 @@ pub use coboot_linker::board;
 pub mod convert;
 pub mod elf;
 pub mod fault;
+mod foreign;
 pub mod ihex;
 pub mod image;
 pub mod inspect;
@@ -18,7 +19,7 @@ pub mod raw;
 pub mod read;
 pub mod sealed;
 pub mod srec;
-mod text;
+pub(crate) mod text;
 
 pub use self::block_file::BlockFile;
 pub use self::convert::{blocks_of, convert};

@@ -9,7 +9,7 @@ use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
 use super::sealed::{blocks, Sealed};
 use super::text::encoding;
-use super::{elf, ihex, limit, raw, srec};
+use super::{elf, foreign, ihex, limit, raw, srec};
 
 /// The formats of a firmware file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -127,7 +127,11 @@ fn read_telling(
             return Err(Place::File.fault(Cause::Encoding(encoding)));
         }
     }
-    let format = format.ok_or(Place::File.fault(Cause::NotFirmware))?;
+    let not_firmware = || match foreign::name(bytes) {
+        Some((what, advice)) => Cause::Foreign { what, advice },
+        None => Cause::NotFirmware,
+    };
+    let format = format.ok_or_else(|| Place::File.fault(not_firmware()))?;
     let firmware = match format {
         Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
         Format::SRecord => srec::read(bytes).map(Firmware::Image),

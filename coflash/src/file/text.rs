@@ -68,15 +68,32 @@ fn is_first_letter(letter: Option<&u8>) -> bool {
     matches!(letter, Some(b':' | b'S'))
 }
 
-/// Whether a text begins with characters of `width` bytes, one of which is not 0: the first or the last.
+/// Whether a text begins, after blanks, with characters of `width` bytes, one of which is not 0: the
+/// first or the last.
 fn is_wide(bytes: &[u8], width: usize) -> bool {
     const LOOKED_AT: usize = 4;
     [0, width - 1].into_iter().any(|place| {
-        let is_ascii = |(at, byte): (usize, &u8)| (at % width == place) == (*byte != 0);
-        bytes.len() >= LOOKED_AT * width
-            && is_first_letter(bytes.get(place))
-            && bytes[..LOOKED_AT * width].iter().enumerate().all(is_ascii)
+        let is_ascii = |unit: &&[u8]| unit.iter().enumerate().all(|(at, byte)| (at == place) == (*byte != 0));
+        let is_blank = |unit: &&[u8]| is_ascii(unit) && unit[place].is_ascii_whitespace();
+        let mut units = bytes.chunks_exact(width).skip_while(is_blank).take_while(is_ascii);
+        is_first_letter(units.next().map(|unit| &unit[place]))
+            && units.take(LOOKED_AT - 1).count() == LOOKED_AT - 1
     })
+}
+
+/// A text in Unicode: UTF-8, with or without a byte order mark, or UTF-16 with one.
+pub(crate) fn unicode(bytes: &[u8]) -> Option<String> {
+    let utf_16 = |of: fn([u8; 2]) -> u16, bytes: &[u8]| {
+        let units: Vec<u16> = bytes.chunks_exact(2).map(|pair| of([pair[0], pair[1]])).collect();
+        String::from_utf16(&units).ok().filter(|_| bytes.len().is_multiple_of(2))
+    };
+    let text = match bytes {
+        [0xFF, 0xFE, rest @ ..] => utf_16(u16::from_le_bytes, rest),
+        [0xFE, 0xFF, rest @ ..] => utf_16(u16::from_be_bytes, rest),
+        [0xEF, 0xBB, 0xBF, rest @ ..] => std::str::from_utf8(rest).map(str::to_owned).ok(),
+        bytes => std::str::from_utf8(bytes).map(str::to_owned).ok(),
+    };
+    text.filter(|text| !text.contains('\0'))
 }
 
 /// Checks that a record of `found` bytes has the announced length.

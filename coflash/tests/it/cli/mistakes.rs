@@ -339,7 +339,7 @@ const MISTAKES: &[Mistake] = &[
         "flash {html} --bus {bus}",
         Device(absent),
         3,
-        &["not a firmware file", "name the linker's output"],
+        &["not a firmware file but a page of the web", "fetch the file itself"],
     ),
     Mistake(
         "flash {top} --board nucleo-f446re --bus {bus}",

@@ -75,6 +75,27 @@ fn an_empty_or_foreign_file_is_named_so() {
     }
 }
 
+/// What other tools make around a program: the file says itself what it is.
+#[test]
+fn a_container_is_named_with_what_to_do() {
+    for (bytes, words) in [
+        (&b"\x1F\x8B\x08\0"[..], "a gzip archive"),
+        (b"PK\x03\x04\x14\0", "a zip archive"),
+        (b"7z\xBC\xAF\x27\x1C", "a 7z archive"),
+        (b"\xFD7zXZ\0", "an xz archive"),
+        (b"!<arch>\n", "a library of object files"),
+        (b"DfuSe\x01", "a DfuSe file"),
+        (b"UF2\nWQ]\x9E", "a UF2 file"),
+        (b"@08010000\n", "a TI-TXT or Verilog file"),
+        (b"-----BEGIN PGP", "a text in PEM"),
+        (b"<!DOCTYPE html>", "a page of the web"),
+        (b"\r\n<HTML>", "a page of the web"),
+    ] {
+        let error = meaning(bytes, None).unwrap_err();
+        assert!(error.contains("is not a firmware file") && error.contains(words), "{error}");
+    }
+}
+
 /// Texts in 16 and 32 bits, with and without a byte order mark.
 #[test]
 fn a_text_of_wide_characters_is_named_with_what_to_do() {
@@ -94,6 +115,8 @@ fn a_text_of_wide_characters_is_named_with_what_to_do() {
     };
     for text in [text, records] {
         for (marked, little, width, name) in [
+            (" \r\n\t", true, 2, "UTF-16"),
+            ("\n\n\n\n\n", false, 4, "UTF-32"),
             ("\u{FEFF}", true, 2, "UTF-16"),
             ("\u{FEFF}", false, 2, "UTF-16"),
             ("\u{FEFF}", true, 4, "UTF-32"),
@@ -106,7 +129,7 @@ fn a_text_of_wide_characters_is_named_with_what_to_do() {
             let bytes = wide(&format!("{marked}{text}"), little, width);
             let error = meaning(&bytes, None).unwrap_err();
             assert!(error.contains(name) && error.contains("plain ASCII"), "{error}");
-            assert_eq!(error.contains("byte order mark"), !marked.is_empty(), "{error}");
+            assert_eq!(error.contains("byte order mark"), marked == "\u{FEFF}", "{error}");
         }
     }
 }
