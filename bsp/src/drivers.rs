@@ -124,7 +124,7 @@ fn pulled<T>(port: char, pin: u8, resistor: u32, action: impl FnOnce() -> T) -> 
     // SAFETY: it enables the clock of the port and leaves the others on.
     clocks.write(|w| unsafe { w.bits(before | 1 << (port as u32 - 'A' as u32)) });
     let _ = clocks.read();
-    // SAFETY: the register belongs to a port of the chip (`Strap::is_possible`), and the port has
+    // SAFETY: the register belongs to a port of the chip (`Wiring::check`), and the port has
     // its clock.
     let resistors = unsafe { pupdr.read_volatile() };
     let at = 2 * u32::from(pin);

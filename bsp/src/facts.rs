@@ -1,7 +1,11 @@
 //! The facts of the board, and what follows from them.
 
+use canopen::BitRate;
 use shared_abi::geometry::Geometry;
+pub use shared_abi::geometry::Pin;
 use shared_abi::layout::Layout;
+pub use shared_abi::wiring::Pins;
+use shared_abi::wiring::Wiring;
 
 use crate::can::BitTiming;
 use crate::clock::ClockTree;
@@ -78,18 +82,6 @@ pub struct Facts {
     pub uart_bit_rate: u32,
 }
 
-/// A pin of the chip: its port, `'A'` and on, and its number in the port, 0 to 15.
-pub type Pin = (char, u8);
-
-/// The pins of a controller with two lines.
-#[derive(Clone, Copy, Debug)]
-pub struct Pins {
-    /// The line that the chip drives.
-    pub transmit: Pin,
-    /// The line that the chip reads.
-    pub receive: Pin,
-}
-
 /// The entry strap: a pin that asks for the bootloader after a reset.
 ///
 /// It is read [`Strap::SAMPLES`] times, some microseconds apart, and asks for the bootloader only
@@ -123,14 +115,14 @@ impl Strap {
     /// How often the strap is read.
     pub const SAMPLES: u32 = 4;
 
-    /// Whether the chip has this pin, and the resistor does not hold it at the pressed level.
+    /// Whether the resistor does not hold the pin at the pressed level.
     const fn is_possible(&self) -> bool {
         let holds = match self.pull {
             Pull::None => !self.pressed,
             Pull::Up => true,
             Pull::Down => false,
         };
-        exists((self.port, self.pin)) && holds != self.pressed
+        holds != self.pressed
     }
 }
 
@@ -143,7 +135,8 @@ pub const BIT_RATE: u32 = FACTS.bit_rate;
 /// How the clocks are made; the chip can run with them.
 pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&CHIP.line.limits());
 /// The same with HSI in place of the crystal.
-pub const INTERNAL: ClockTree = CLOCK_TREE.internal(&CHIP.line.limits()).checked(&CHIP.line.limits());
+pub const INTERNAL: ClockTree =
+    CLOCK_TREE.internal(&CHIP.line.limits(), &BitRate::TABLE).checked(&CHIP.line.limits());
 /// The pin that asks for the bootloader after a reset.
 pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
 
@@ -174,54 +167,28 @@ const _: () = assert!(
     matches!(NODE_ID, 1..=127 | 255),
     "board: node_id must be 1 to 127, or 255 for a device that waits for layer setting services"
 );
-const _: () = {
-    let led = FACTS.led;
-    assert!(exists(led), "board: the chip has no such pin as led names");
-    assert!(!is_debug(led), "board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-    assert!(
-        exists(FACTS.can_pins.transmit) && exists(FACTS.can_pins.receive),
-        "board: the chip has no such pins as can_pins names"
-    );
-    assert!(!is_can(led), "board: led is a pin of the CAN controller");
-    if let Some(Strap { port, pin, .. }) = ENTRY_STRAP {
-        let strap = (port, pin);
-        assert!(!is_debug(strap), "board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-        assert!(!is_can(strap), "board: entry_strap is a pin of the CAN controller");
-        assert!(!is_same(strap, led), "board: entry_strap is the pin of the LED");
-    }
-    if let Some((standby, _)) = FACTS.can_standby {
-        assert!(exists(standby), "board: the chip has no such pin as can_standby names");
-        assert!(!is_debug(standby), "board: can_standby is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-        assert!(!is_can(standby), "board: can_standby is a pin of the CAN controller");
-        assert!(!is_same(standby, led), "board: can_standby is the pin of the LED");
-    }
-};
-
-const fn is_same(a: Pin, b: Pin) -> bool {
-    a.0 == b.0 && a.1 == b.1
+const _: Wiring = Wiring {
+    can_controller: CAN_CONTROLLER,
+    can: FACTS.can_pins,
+    led: FACTS.led,
+    strap: match ENTRY_STRAP {
+        Some(Strap { port, pin, .. }) => Some((port, pin)),
+        None => None,
+    },
+    standby: match FACTS.can_standby {
+        Some((pin, _)) => Some(pin),
+        None => None,
+    },
+    uart: FACTS.uart_pins,
+    hse_bypass: CLOCK_TREE.hse_bypass,
 }
-
-/// Whether the chip has this pin.
-const fn exists(pin: Pin) -> bool {
-    (pin.0 as u32).wrapping_sub('A' as u32) < CHIP.ports as u32 && pin.1 < 16
-}
-
-/// Whether the debugger has this pin after a reset (RM0090 section 38.4.1).
-const fn is_debug(pin: Pin) -> bool {
-    matches!(pin, ('A', 13..=15) | ('B', 3..=4))
-}
-
-/// Whether the CAN controller has this pin.
-const fn is_can(pin: Pin) -> bool {
-    is_same(pin, FACTS.can_pins.transmit) || is_same(pin, FACTS.can_pins.receive)
-}
-
+.checked(CHIP);
 const _: () = assert!(
     match ENTRY_STRAP {
         Some(strap) => strap.is_possible(),
         None => true,
     },
-    "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`"
+    "board: the chip's resistor pulls entry_strap to `pressed`"
 );
 
 /// Compares the chip of the HAL and its PAC with the chip of the board.

@@ -9,9 +9,9 @@
 //! | file | what it does |
 //! |---|---|
 //! | `boards/` | the facts of each board |
-//! | `facts.rs` | what a board says about itself, what follows from it, and the checks of it |
+//! | `facts.rs` | what a board says about itself, and what follows from it; the rules are in shared-abi |
 //! | `identity.rs` | who the device is: 1008h to 100Ah, 1018h, and the chip's unique identifier |
-//! | [`clock`] | the clock tree: its rules |
+//! | [`clock`] | the source of the clocks |
 //! | `pll.rs` | the clock tree in the registers of the chip, and the regulator |
 //! | `drivers.rs` | the set-up that is the same for every board: clocks, pins, entry strap |
 //! | [`can`] | bxCAN: bit timing, filters, send, receive, errors |

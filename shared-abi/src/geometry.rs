@@ -9,10 +9,12 @@
 mod chip;
 mod chips;
 mod line;
+mod pins;
 
 pub use chip::{Geometry, Region, Sector, SectorRun, CORE_VECTORS, CORE_VECTORS_SIZE};
 pub use chips::*;
 pub use line::{Limits, Line};
+pub use pins::{is_debug_pin, CanLine, Pin};
 
 /// The chip with this name, in the usual spellings ([`Geometry::is_named`]).
 #[must_use]

@@ -4,6 +4,8 @@
 //! |---|---|
 //! | [`geometry`] | the silicon: flash sectors, RAM, number of interrupts |
 //! | [`layout`] | **the numbers** of each board: who owns which address |
+//! | [`clock_tree`] | the clocks of a board, and their rules |
+//! | [`wiring`] | the pins of a board, and their rules |
 //! | [`memory_map`] | the addresses of a chip that may be read without side effects |
 //! | [`warm_start`] | the last RAM cell: requests of the application to the bootloader across a
 //! reset |
@@ -27,6 +29,7 @@ pub mod bit_timing;
 pub mod block_file;
 pub mod boot_report;
 pub mod callgate;
+pub mod clock_tree;
 pub mod geometry;
 pub mod handoff;
 pub mod label;
@@ -42,6 +45,7 @@ pub mod reset;
 pub mod services;
 pub mod vectors;
 pub mod warm_start;
+pub mod wiring;
 
 /// The password of a lift device (6005h), which permits the call to the bootloader in the
 /// application and unlocks 1F50h in the bootloader: choose your own.

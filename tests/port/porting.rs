@@ -112,12 +112,16 @@ fn synchronise(from: &Path, to: &Path) {
 }
 
 /// From `new-board` to an update on the emulated board: the guide's example, an STM32F405RG with
-/// CAN1 on PB8 and PB9, a crystal of 8 MHz, its LED on PC13 and no strap.
+/// CAN1 on PA11 and PA12, a crystal of 25 MHz, its LED on PB0 and a strap on PC13.
 #[test]
 fn a_board_is_made_as_the_guide_says() {
     let copy = Copy::new();
     let before = files(&copy.root);
-    copy.xtask(&["new-board", "my-board", "--chip", "STM32F405RGT6"]);
+    let page = fs::read_to_string(copy.root.join("docs/porting.md")).expect("the guide");
+    let command =
+        page.lines().find_map(|line| line.strip_prefix("cargo xtask new-board ")).expect("the command");
+    let words = [&["new-board"][..], &command.split_whitespace().collect::<Vec<_>>()].concat();
+    copy.xtask(&words);
     let new = [
         "examples/c/boards/my-board.h",
         "bsp/src/boards/my_board.rs",
@@ -133,6 +137,11 @@ fn a_board_is_made_as_the_guide_says() {
 
     // The created files already have the memory map, clocks, pins and LED of the example.
     let board = new[1];
+    let text = fs::read_to_string(copy.root.join(board)).expect(board);
+    for line in ["hse: 25_000_000,", "pin: 13,", "led: ('B', 0),", "transmit: ('A', 12), receive: ('A', 11)"]
+    {
+        assert!(text.contains(line), "{line}:\n{text}");
+    }
     for (step, old, new) in [
         (5, "product_code: 0,", "product_code: 0x1234_5678,"),
         (5, "device_name: \"my-board\"", "device_name: \"a node of my own\""),
@@ -464,22 +473,44 @@ const MISTAKES: &[Mistake] = &[
         right: "port: 'C'",
         wrong: "port: 'I'",
         by: By::Board,
-        says: "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`",
+        says: "board: the chip has no such pin as entry_strap names",
     },
     Mistake {
         file: BOARD,
         right: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None })",
         wrong: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::Down })",
         by: By::Board,
-        says: "board: the chip has no such pin as entry_strap names, or its resistor pulls it to `pressed`",
+        says: "board: the chip's resistor pulls entry_strap to `pressed`",
     },
     // DS10693 table 11: PB7 has no CAN1.
     Mistake {
         file: BOARD,
         right: "transmit: ('B', 9)",
         wrong: "transmit: ('B', 7)",
-        by: By::Drivers,
-        says: "can1::Tx: From<stm32f4xx_hal::gpio::Pin<'B', 7>>",
+        by: By::Board,
+        says: "board: `transmit` of can_pins is no transmit pin of this CAN controller",
+    },
+    // DS10693 table 10: the package with 64 pins has no PB11.
+    Mistake {
+        file: BOARD,
+        right: "led: ('A', 5)",
+        wrong: "led: ('B', 11)",
+        by: By::Board,
+        says: "board: the chip has no such pin as led names",
+    },
+    Mistake {
+        file: BOARD,
+        right: "led: ('A', 5)",
+        wrong: "led: ('A', 2)",
+        by: By::Board,
+        says: "board: led is a pin of the UART",
+    },
+    Mistake {
+        file: BOARD,
+        right: "can_controller!(CAN1)",
+        wrong: "can_controller!(CAN2)",
+        by: By::Board,
+        says: "board: `transmit` of can_pins is no transmit pin of this CAN controller",
     },
     // DS10693, alternate functions: PA4 is the clock of USART2.
     Mistake {
@@ -617,6 +648,11 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
     let refused = copy.cargo(&["run", "-q", "-p", "xtask", "--", "new-board", "x", "--chip", "STM32F411RE"]);
     assert!(!refused.status.success());
     assert!(text(&refused).contains("an STM32F411 has no CAN controller"), "{}", text(&refused));
+    let led = "new-board x --chip STM32F407VGT6 --led PB3".split(' ');
+    let words: Vec<_> = ["run", "-q", "-p", "xtask", "--"].into_iter().chain(led).collect();
+    let refused = text(&copy.cargo(&words));
+    assert!(refused.contains("led is a pin of the debugger"), "{refused}");
+    assert!(!copy.root.join("bsp/src/boards/x.rs").exists(), "a file was written");
     let board = "nucleo-f446re";
     let triple = ["--target", TARGET, "--profile=firmware"];
     let look = |by: By| match by {
