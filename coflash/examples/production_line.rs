@@ -68,8 +68,7 @@ impl Order {
         };
         let node = node.parse().ok().and_then(NodeId::new);
         let node = node.ok_or_else(|| station("the node-ID must be 1 to 127".to_string()))?;
-        let layout = shared_abi::layout::by_name(board);
-        let layout = layout.ok_or_else(|| station(format!("there is no board '{board}'")))?;
+        let layout = file::board::named(board).map_err(|error| station(error.to_string()))?;
         let region = Region::Strict(layout.programs[0].into());
         let firmware = file::load(Path::new(path), None, None).map_err(|error| station(error.to_string()))?;
         let blocks = blocks_of(firmware, &Options::default().region(region));

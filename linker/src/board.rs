@@ -1,14 +1,77 @@
-//! Reads a board's memory map from a file, for boards that are not built into the tool.
+//! The board that a user names: one that is built into the tool, or a file with its memory map.
 //!
 //! `cargo xtask layout --toml` writes such a file. It must meet the same rules as the compiled
 //! layouts of this repository.
 
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
 use serde::Deserialize;
 use shared_abi::geometry::{self, Geometry, Line, SectorRun};
-use shared_abi::layout::Layout;
+use shared_abi::layout::{self, Layout, BOARDS};
 
 /// The largest size of such a file, in bytes.
 pub const MAX: usize = 64 * 1024;
+
+/// Why there is no board.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NamedError {
+    /// No board that is built in has this name.
+    #[error(
+        "there is no board '{0}'; known boards: {boards}. For another one give the file with its memory map, \
+         NAME.toml, as `cargo xtask layout --toml` writes it",
+        boards = BOARDS.iter().map(|board| board.board).collect::<Vec<_>>().join(", ")
+    )]
+    Unknown(String),
+    /// The file cannot be read, or has a mistake.
+    #[error("{0}: {1}")]
+    File(String, String),
+}
+
+/// Checks a word after `--board` without a look at the file that it may name.
+///
+/// # Errors
+/// [`NamedError::Unknown`].
+pub fn word(word: &str) -> Result<String, NamedError> {
+    if is_file(word) {
+        return Ok(word.to_owned());
+    }
+    named(word).map(|_| word.to_owned())
+}
+
+/// Whether a word names a file and no board: it has a dot or is a path, which no board's name has.
+#[must_use]
+pub fn is_file(word: &str) -> bool {
+    word.contains(['.', '/', '\\'])
+}
+
+/// The word of a settings file, whose paths are relative to its folder.
+#[must_use]
+pub fn in_folder(word: &str, folder: &Path) -> String {
+    if is_file(word) {
+        folder.join(word).to_string_lossy().into_owned()
+    } else {
+        word.to_owned()
+    }
+}
+
+/// The board of a word after `--board`: its name, or the path of a file with its memory map.
+///
+/// # Errors
+/// [`NamedError`]: no such board, or what is wrong with the file.
+pub fn named(word: &str) -> Result<&'static Layout, NamedError> {
+    if !is_file(word) {
+        return layout::by_name(word).ok_or_else(|| NamedError::Unknown(word.to_owned()));
+    }
+    let told = |error: &dyn std::fmt::Display| NamedError::File(word.to_owned(), error.to_string());
+    let mut bytes = Vec::new();
+    // It may be a pipe, which may never end.
+    File::open(Path::new(word))
+        .and_then(|file| file.take(MAX as u64 + 1).read_to_end(&mut bytes))
+        .map_err(|error| told(&error))?;
+    parse(&String::from_utf8_lossy(&bytes)).map_err(|error| told(&error))
+}
 
 /// An error in a memory map.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -36,7 +99,7 @@ impl From<Region> for geometry::Region {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
-struct File {
+struct Map {
     board: String,
     bootloader: Region,
     callgate_offset: u32,
@@ -72,12 +135,18 @@ struct Sectors {
 }
 
 /// Parses and checks a memory map. The result lives as long as the program.
+///
 /// # Errors
 /// [`BoardError`]: the line that cannot be read, or the rule that is broken.
 pub fn parse(text: &str) -> Result<&'static Layout, BoardError> {
-    let file: File = toml::from_str(text).map_err(|error| {
+    if text.len() > MAX {
+        return Err(BoardError::Rule("a memory map has 64 KiB at most; this is another file"));
+    }
+    let file: Map = toml::from_str(text).map_err(|error| {
         let before = error.span().and_then(|span| text.get(..span.start)).unwrap_or_default();
-        BoardError::Syntax(1 + before.matches('\n').count(), error.message().to_string())
+        // The message may quote the file.
+        let message = error.message().replace(char::is_control, " ");
+        BoardError::Syntax(1 + before.matches('\n').count(), message)
     })?;
     let runs: Vec<SectorRun> =
         file.chip.sectors.iter().map(|run| SectorRun { count: run.count, size: run.size }).collect();
@@ -208,5 +277,33 @@ mod tests {
             assert!(error.contains(words), "{to}: {error}");
         }
         assert!(parse("").is_err() && parse("board = [").is_err());
+        let quoted = parse("\"\\u001b[2J\" = 1").unwrap_err().to_string();
+        assert!(quoted.starts_with("line 1: ") && !quoted.contains(char::is_control), "{quoted:?}");
+        assert!(parse(&" ".repeat(MAX + 1)).unwrap_err().to_string().contains("64 KiB at most"));
+    }
+
+    #[test]
+    fn a_board_is_named_or_a_file() {
+        let own = Toml(&stm32f429i_disc1::LAYOUT).to_string().replace("stm32f429i-disc1", "my-board");
+        let path = std::env::temp_dir().join(format!("coboot-board-{}.toml", std::process::id()));
+        let word = path.to_str().unwrap();
+        std::fs::write(&path, &own).unwrap();
+        assert_eq!(named(word).unwrap().board, "my-board");
+        assert_eq!(named("stm32f429i-disc1"), Ok(&stm32f429i_disc1::LAYOUT));
+        std::fs::write(&path, own.replace("[chip]", "[chap]")).unwrap();
+        let wrong = named(word).unwrap_err().to_string();
+        assert!(wrong.starts_with(word) && wrong.contains(": line "), "{wrong}");
+        std::fs::remove_file(&path).unwrap();
+        for (word, says) in [
+            ("arduino", "there is no board 'arduino'; known boards: nucleo-f446re, stm32f407g-disc1"),
+            ("none.toml", "none.toml: "),
+            ("/", "/: "),
+            ("", "there is no board ''"),
+        ] {
+            let said = named(word).unwrap_err().to_string();
+            assert!(said.starts_with(says), "{word}: {said}");
+        }
+        #[cfg(unix)]
+        assert!(named("/dev/zero").unwrap_err().to_string().contains("64 KiB at most"));
     }
 }

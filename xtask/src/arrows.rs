@@ -46,7 +46,8 @@ const RULES: &[(&str, &str)] = &[
     ("coflash", "canopen coboot-linker seal shared-abi vendor-can kit"),
     ("coflash-native", "canopen coflash shared-abi"),
     ("coboot-node", "boot-core canopen coboot-app coflash shared-abi kit"),
-    ("emulator", "shared-abi"),
+    // Its command line reads memory maps.
+    ("emulator", "coboot-linker shared-abi"),
     (KIT, "boot-core canopen coboot-app shared-abi"),
     (
         "coboot-tests",

@@ -1,5 +1,7 @@
 //! `cargo xtask emulate`: runs an emulated board for other programs.
 
+use shared_abi::layout;
+
 use crate::args::Args;
 use crate::setup::{self, Part};
 use crate::{build, process, workspace, Outcome};
@@ -9,7 +11,8 @@ usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [OPTION
 
 Sets the machine up, builds a bootloader and runs the emulated board with it in its flash.
 
-  --board BOARD   the board (default: stm32f407g-disc1)
+  --board BOARD   the board (default: stm32f407g-disc1), or with --bootloader the file with its memory map,
+                  NAME.toml
   --log[=WAY]     the bootloader that tells what it does, and what it tells. WAY: rtt (text for a debug
                   probe; the default), defmt (the same by defmt), uart (text out of the board's UART)
   --virtual-can   the bootloader that speaks CAN over the board's UART, which a pseudo-terminal leads to
@@ -28,21 +31,25 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
 ";
 
 pub fn run(mut args: Args) -> Outcome {
-    let board = workspace::board(&mut args)?;
+    let word = args.value("--board")?.unwrap_or_else(|| layout::DEFAULT.board.to_owned());
     let log = log(&mut args)?;
     let virtual_can = args.flag("--virtual-can");
     let options = args.rest();
     let another = options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader="));
-    let needed: &[Part] = if another { &[Part::Emulator] } else { &[Part::Firmware, Part::Emulator] };
-    setup::prepare(needed)?;
 
     let mut emulator = process::cargo("run");
-    emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board", board.board]);
-    if !another {
+    emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board"]);
+    if another {
+        // The emulator reads the memory map of any board.
+        setup::prepare(&[Part::Emulator])?;
+        emulator.arg(&word);
+    } else {
+        let board = workspace::board_named(&word)?;
+        setup::prepare(&[Part::Firmware, Part::Emulator])?;
         let standard = if virtual_can { "bootloader-virtual-can" } else { "bootloader" };
         let bootloader = log.as_deref().unwrap_or(standard);
         let dir = build::images(board, &[bootloader])?;
-        emulator.arg("--bootloader").arg(dir.join(format!("{bootloader}.elf")));
+        emulator.args([board.board, "--bootloader"]).arg(dir.join(format!("{bootloader}.elf")));
     }
     if virtual_can && !options.iter().any(|word| word == "--serial" || word.starts_with("--serial=")) {
         emulator.args(["--serial", "pty"]);

@@ -14,7 +14,7 @@ Prints the memory map of a board from the one source of truth, shared-abi/src/la
   --board BOARD   the board (default: stm32f407g-disc1)
   --ld IMAGE      prints the linker's MEMORY and border symbols instead, for an IMAGE of
                   `bootloader` or `program-N` (N from 1); a C application includes it too
-  --toml          prints the map for `coflash --layout FILE` instead: for a coflash that was built
+  --toml          prints the map for `coflash --board FILE.toml` instead: for a coflash that was built
                   without the board
 ";
 

@@ -4,10 +4,11 @@ use std::env;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
+use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
-use crate::Outcome;
+use crate::{files, Outcome};
 
 /// The target of the firmware: Armv7E-M with the single-precision FPU.
 pub const TARGET: &str = "thumbv7em-none-eabihf";
@@ -38,10 +39,24 @@ pub fn firmware_dir(board: &Layout) -> PathBuf {
     target_dir().join("firmware").join(board.board)
 }
 
-/// Takes `--board`.
+/// Takes `--board`: a name, or the file that `cargo xtask layout --toml` wrote for one of the boards.
 pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
-    let Some(name) = args.value("--board")? else { return Ok(layout::DEFAULT) };
-    layout::by_name(&name).ok_or_else(|| {
+    args.value("--board")?.map_or(Ok(layout::DEFAULT), |name| board_named(&name))
+}
+
+/// The board of a word after `--board`.
+pub fn board_named(name: &str) -> Outcome<&'static Layout> {
+    if name.ends_with(".toml") {
+        let map = files::text(Path::new(name))?;
+        let is_map_of = |board: &&&Layout| Toml(board).to_string().trim() == map.trim();
+        return layout::BOARDS.iter().find(is_map_of).copied().ok_or_else(|| {
+            format!(
+                "{name}: it is not the map of a board of this repository as `cargo xtask layout --toml` writes it, \
+                 and firmware is built for those alone. `emulate` takes another map with --bootloader FILE."
+            )
+        });
+    }
+    layout::by_name(name).ok_or_else(|| {
         let known: Vec<_> = layout::BOARDS.iter().map(|layout| layout.board).collect();
         format!("there is no board \"{name}\"; there is: {}.", known.join(", "))
     })
@@ -50,4 +65,24 @@ pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
 /// A path for messages: relative to the root if it is below the root.
 pub fn shown(path: &Path) -> String {
     path.strip_prefix(root()).unwrap_or(path).display().to_string()
+}
+
+#[cfg(test)]
+mod tests {
+    use shared_abi::layout::nucleo_f446re::LAYOUT;
+
+    use super::*;
+
+    #[test]
+    fn a_board_is_a_name_or_the_file_of_its_map() {
+        let file = target_dir().join(format!("tmp/board-{}.toml", std::process::id()));
+        let word = file.to_str().unwrap();
+        files::write(&file, Toml(&LAYOUT).to_string()).unwrap();
+        assert_eq!(board_named(word).unwrap().board, "nucleo-f446re");
+        files::write(&file, Toml(&LAYOUT).to_string().replace("nucleo", "own")).unwrap();
+        assert!(board_named(word).unwrap_err().contains("--bootloader FILE"));
+        std::fs::remove_file(&file).unwrap();
+        assert!(board_named(word).unwrap_err().contains("cannot be read"));
+        assert!(board_named("arduino").unwrap_err().contains("there is: nucleo-f446re"));
+    }
 }

@@ -213,8 +213,7 @@ fn program_of(
     let region = match board {
         None => Region::Unknown,
         Some(name) => {
-            let layout = shared_abi::layout::by_name(name)
-                .ok_or_else(|| Fault::Value(format!("there is no board '{name}'")))?;
+            let layout = file::board::named(name).map_err(|error| Fault::Value(error.to_string()))?;
             let region = layout.programs.get(usize::from(program) - 1);
             let region = region.ok_or_else(|| Fault::Value(format!("{name} has no program {program}")))?;
             Region::Strict((*region).into())

@@ -6,9 +6,10 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use serde::Deserialize;
-use shared_abi::layout::{self, Layout};
+use shared_abi::layout::Layout;
 
 use super::url::Server;
+use crate::file::board;
 
 /// The server, and the devices that get updates from it.
 #[derive(Clone, Debug)]
@@ -228,7 +229,7 @@ impl Config {
                 scheme: "TargetToken",
             })
             .map_err(|why| of(format!("its token: {why}")))?;
-            let device = entry.device(&file, own.or_else(|| gateway.clone())).map_err(of)?;
+            let device = entry.device(&file, folder, own.or_else(|| gateway.clone())).map_err(of)?;
             if let Some(other) = devices.iter().find(|other| {
                 other.controller == device.controller
                     || (&other.bus, other.node) == (&device.bus, device.node)
@@ -249,14 +250,12 @@ impl Config {
 }
 
 impl Entry {
-    fn device(&self, file: &File, token: Option<Token>) -> Result<Device, String> {
+    fn device(&self, file: &File, folder: &Path, token: Option<Token>) -> Result<Device, String> {
         let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
         let bus = self.bus.as_ref().or(file.bus.as_ref()).ok_or("it has no bus")?;
         crate::bus::check(bus).map_err(|error| error.to_string())?;
-        let board = match self.board.as_ref().or(file.board.as_ref()) {
-            Some(name) => Some(layout::by_name(name).ok_or_else(|| format!("there is no board '{name}'"))?),
-            None => None,
-        };
+        let board = self.board.as_ref().or(file.board.as_ref()).map(|word| board::in_folder(word, folder));
+        let board = board.map(|word| board::named(&word)).transpose().map_err(|error| error.to_string())?;
         if !(1..=254).contains(&self.program) {
             return Err("programs are 1 to 254".to_string());
         }

@@ -18,16 +18,12 @@ use super::values::number;
 /// The board, by its name or by a file.
 #[derive(Clone, Debug, Default, Args)]
 pub(super) struct MemoryMap {
-    /// The board whose memory map applies; data outside its program region are refused.
-    #[arg(long, value_name = "BOARD", value_parser = board)]
-    board: Option<&'static layout::Layout>,
+    /// The board whose memory map applies; data outside its program region are refused. A board that this
+    /// tool was not built with is a file, NAME.toml, as `cargo xtask layout --toml` writes it.
+    #[arg(long, alias = "layout", value_name = "BOARD|FILE", value_parser = file::board::word)]
+    board: Option<String>,
 
-    /// The memory map of a board that this tool was not built with, as `cargo xtask layout --toml`
-    /// writes it.
-    #[arg(long, value_name = "FILE", conflicts_with = "board")]
-    layout: Option<PathBuf>,
-
-    /// The contents of that file, after it was read.
+    /// Its memory map, after it was found.
     #[arg(skip)]
     loaded: OnceLock<&'static layout::Layout>,
 }
@@ -35,11 +31,11 @@ pub(super) struct MemoryMap {
 impl MemoryMap {
     /// The memory map, if the user named one.
     pub(super) fn layout(&self) -> Result<Option<&'static layout::Layout>, Failure> {
-        let Some(path) = &self.layout else { return Ok(self.board) };
+        let Some(word) = &self.board else { return Ok(None) };
         if let Some(layout) = self.loaded.get() {
             return Ok(Some(layout));
         }
-        let layout = board_of_file(path)?;
+        let layout = file::board::named(word).map_err(Failure::board)?;
         Ok(Some(self.loaded.get_or_init(|| layout)))
     }
 }
@@ -51,11 +47,11 @@ pub(super) struct Place {
     map: MemoryMap,
 
     /// The first address of the program's region; data below it are left out.
-    #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
+    #[arg(long, alias = "start_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
     start_address: Option<u32>,
 
     /// The last address of the program's region; data above it are left out.
-    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with_all = ["board", "layout"])]
+    #[arg(long, alias = "end_address", value_name = "ADDRESS", value_parser = number, conflicts_with = "board")]
     end_address: Option<u32>,
 
     /// The number that is added to every address of the file (0xF8000000 subtracts 0x08000000).
@@ -134,13 +130,6 @@ impl From<FormatName> for Format {
     }
 }
 
-fn board(name: &str) -> Result<&'static layout::Layout, String> {
-    layout::by_name(name).ok_or_else(|| {
-        let known: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
-        format!("known boards: {}", known.join(", "))
-    })
-}
-
 impl Source {
     /// Reads `file` for program `number` and converts it into blocks, without access to a device.
     pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
@@ -174,12 +163,10 @@ impl Source {
     }
 
     /// The same options for another board.
-    pub(super) fn for_board(&self, name: &str) -> Result<Self, Failure> {
-        let layout =
-            board(name).map_err(|known| Failure::usage(format!("there is no board '{name}'"), known))?;
-        let map = MemoryMap { board: Some(layout), ..MemoryMap::default() };
+    pub(super) fn for_board(&self, name: &str) -> Self {
+        let map = MemoryMap { board: Some(name.to_owned()), ..MemoryMap::default() };
         let place = Place { map, ..self.place.clone() };
-        Ok(Self { place, ..self.clone() })
+        Self { place, ..self.clone() }
     }
 
     /// The same options for a device that takes images without addresses.
@@ -211,8 +198,7 @@ impl Source {
     /// Whether the options give the program's region.
     pub(super) fn has_region(&self) -> bool {
         let Place { map, start_address, end_address, .. } = &self.place;
-        let has_map = map.board.is_some() || map.layout.is_some();
-        has_map || start_address.is_some() || end_address.is_some()
+        map.board.is_some() || start_address.is_some() || end_address.is_some()
     }
 }
 
@@ -266,12 +252,6 @@ impl Place {
             }
         }
     }
-}
-
-/// Reads the memory map from a file.
-fn board_of_file(path: &Path) -> Result<&'static layout::Layout, Failure> {
-    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-    file::board::parse(&text).map_err(|error| Failure::file(path, &error.to_string()))
 }
 
 /// The device's other program as it lies in flash: from a firmware file, or from the bytes of the

@@ -262,7 +262,7 @@ impl Flash {
                 Some((.., file)) => file.clone(),
                 None => {
                     let source = match &settings.board {
-                        Some(board) => self.source().for_board(board)?,
+                        Some(board) => self.source().for_board(board),
                         None => self.source(),
                     };
                     let file = self.program(context, &image, program, &source, Label::default())?;

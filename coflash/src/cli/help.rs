@@ -13,7 +13,6 @@ const GROUPS: [(&str, &[&str]); 5] = [
         "Firmware file",
         &[
             "board",
-            "layout",
             "start_address",
             "end_address",
             "block_size",
@@ -128,7 +127,7 @@ coflash COMMAND -h has a command's options in short, --help all of them.",
 Examples:
   coflash flash app.elf --board stm32f407g-disc1 --node 5
   coflash flash app.blk --node 5-9 --check-target --verify
-  coflash flash app.hex --layout my-board.toml
+  coflash flash app.hex --board my-board.toml
   coflash flash --job line.toml --report result.json",
     ),
     (

@@ -11,6 +11,7 @@ use coflash::bus::AdapterError;
 use coflash::device::diagnose::{diagnose, Diagnosis};
 use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};
+use coflash::file::board::NamedError;
 use coflash::file::convert::ConvertError;
 use coflash::file::sealed::Refusal;
 use coflash::file::{judge, Cause, FileError};
@@ -388,6 +389,14 @@ impl Failure {
     /// A file, other than firmware, with invalid contents.
     pub(super) fn file(path: &Path, why: &str) -> Self {
         Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
+    }
+
+    /// There is no such board, or its file has a mistake.
+    pub(super) fn board(error: NamedError) -> Self {
+        match error {
+            NamedError::File(path, why) => Self::file(Path::new(&path), &why),
+            unknown @ NamedError::Unknown(_) => Self::bare_usage(unknown.to_string()),
+        }
     }
 
     /// An error in a line of a file, other than firmware.

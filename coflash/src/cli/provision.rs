@@ -42,7 +42,7 @@ pub(super) struct Provision {
 impl Provision {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
-        let unnamed = || Failure::usage("the address of the keys is unknown", "give --board or --layout");
+        let unnamed = || Failure::usage("the address of the keys is unknown", "give --board");
         let layout = self.map.layout()?.ok_or_else(unnamed)?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("hex"));
         // A raw image would fill the parameters between the two parts of the bootloader.

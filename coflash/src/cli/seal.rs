@@ -335,7 +335,7 @@ impl Seal {
             let unknown = || {
                 let what =
                     "a block file needs the program's start address, which a sealed image does not contain";
-                Failure::usage(what, "give --board, --layout or --start-address")
+                Failure::usage(what, "give --board or --start-address")
             };
             self.place.start(self.program)?.ok_or_else(unknown)
         })?;

@@ -4,7 +4,6 @@ use std::path::Path;
 use std::sync::Arc;
 
 use shared_abi::block_file::ProgramVersion;
-use shared_abi::layout::{self, Layout};
 
 use super::state::{Firmware, Notice, Seal, Settings};
 use crate::file::convert::{blocks_of, ConvertError, Options, Region};
@@ -53,7 +52,7 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         return Err(Notice::failed(words, "choose the board"));
     }
     let firmware = file::read(&bytes, format, start).map_err(|error| bad(&error.of(&name)))?;
-    let board = board(settings);
+    let board = settings.board;
     let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
     let converted = blocks_of(firmware, &options).map_err(|error| match error {
@@ -126,14 +125,9 @@ fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     }
 }
 
-/// The selected board.
-fn board(settings: &Settings) -> Option<&'static Layout> {
-    settings.board.and_then(layout::by_name)
-}
-
 /// The region of the program on the selected board, if there is one.
 fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
-    let Some(layout) = board(settings) else { return Ok(None) };
+    let Some(layout) = settings.board else { return Ok(None) };
     match layout.program(settings.program) {
         Some(region) => Ok(Some(region.into())),
         None => {
@@ -145,7 +139,7 @@ fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
 
 /// A name from outside as safe text: one line of limited length, without control or direction
 /// characters.
-fn printable(name: &str) -> String {
+pub(super) fn printable(name: &str) -> String {
     let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
     let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
     let name: String = base.chars().take(NAME_MAX).map(visible).collect();
@@ -184,7 +178,7 @@ mod tests {
         assert_eq!((loaded.shown.name.as_str(), loaded.shown.program_size), ("app.hex", 4));
         assert!(loaded.shown.inspection.starts_with("Intel HEX, well-formed"), "{}", loaded.shown.inspection);
         assert_eq!(loaded.shown.vendor_id, None);
-        let board = Settings { board: Some("stm32f407g-disc1"), program: 1 };
+        let board = Settings { board: Some(shared_abi::layout::DEFAULT), program: 1 };
         assert!(load(Arc::new(hex), "app.hex", &board).is_ok());
         let outside = b":020000040800F2\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
         let refused = load(Arc::new(outside), "app.hex", &board).unwrap_err();

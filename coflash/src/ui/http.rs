@@ -1,6 +1,6 @@
 //! The requests of the page and their answers.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use axum::body::{Body, Bytes};
 use axum::extract::{DefaultBodyLimit, Query, State};
@@ -13,7 +13,7 @@ use canopen::NodeId;
 use serde::de::DeserializeOwned;
 use serde::Deserialize;
 use serde_json::{json, Value};
-use shared_abi::layout;
+use shared_abi::layout::{self, Layout};
 use tokio::sync::Semaphore;
 
 use super::adapters;
@@ -28,10 +28,13 @@ use super::upload::{self, Room, Upload};
 
 use crate::bus::Kind;
 use crate::device::lss::{BitRate, LssAddress};
+use crate::file::board;
 use crate::update::FlashOptions;
 
 /// The most bytes of a request without a file.
 const BODY_MAX: usize = 64 * 1024;
+/// The most memory maps that are taken: each stays in memory.
+const BOARDS_MAX: usize = 100;
 
 /// The state that the handlers share.
 #[derive(Clone)]
@@ -44,6 +47,8 @@ pub(super) struct Site {
     pub(super) room: Room,
     /// Only one file is judged at a time: it may be large.
     pub(super) reading: Arc<Semaphore>,
+    /// The boards of the user's files; the last one can be chosen.
+    pub(super) own_boards: Arc<Mutex<Vec<&'static Layout>>>,
 }
 
 /// An error in place of the requested answer.
@@ -169,8 +174,8 @@ async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> 
 }
 
 async fn list(State(site): State<Site>) -> Response {
+    let boards: Vec<&str> = boards(&site).iter().map(|layout| layout.board).collect();
     let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
-    let boards: Vec<&str> = layout::BOARDS.iter().map(|layout| layout.board).collect();
     let value = json!({
         "adapters": found,
         "boards": boards,
@@ -246,6 +251,9 @@ async fn take_file(
 ) -> Answer {
     idle(&site)?;
     let Upload { bytes, room } = site.room.read(&headers, body).await?;
+    if named.name.to_ascii_lowercase().ends_with(".toml") {
+        return own_board(&site, &named.name, &bytes).await;
+    }
     let settings = site.shared.look(|state| state.settings.clone());
     let answer = load(&site, Arc::new(bytes), named.name, settings).await;
     drop(room);
@@ -264,22 +272,49 @@ async fn settings(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) ->
     idle(&site)?;
     let board = match board.as_deref().filter(|board| !board.is_empty()) {
         None => None,
-        Some(name) => match layout::by_name(name) {
-            Some(layout) => Some(layout.board),
+        Some(name) => match boards(&site).into_iter().find(|layout| layout.board == name) {
+            Some(layout) => Some(layout),
             None => return Err(bad(format!("there is no board '{name}'"), "reload the page")),
         },
     };
     if !(1..=254).contains(&program) {
         return Err(bad("programs are 1 to 254", "choose another program"));
     }
-    let settings = Settings { board, program };
+    choose(&site, Settings { board, program }).await
+}
+
+/// The boards to choose from: that of the user's file, then those that are built in.
+fn boards(site: &Site) -> Vec<&'static Layout> {
+    lock(&site.own_boards).last().copied().into_iter().chain(layout::BOARDS.iter().copied()).collect()
+}
+
+/// Takes the file with the memory map of a board, and chooses that board.
+async fn own_board(site: &Site, name: &str, bytes: &[u8]) -> Answer {
+    let name = firmware::printable(name);
+    let is_full = lock(&site.own_boards).len() >= BOARDS_MAX;
+    if is_full {
+        return Err(bad("this coflash has taken too many memory maps", "start it again"));
+    }
+    let layout = board::parse(&String::from_utf8_lossy(bytes)).map_err(|error| {
+        bad(
+            format!("{name}: {error}"),
+            "choose the file that `cargo xtask layout --toml` wrote for the board",
+        )
+    })?;
+    lock(&site.own_boards).push(layout);
+    let program = site.shared.look(|state| state.settings.program);
+    choose(site, Settings { board: Some(layout), program }).await
+}
+
+/// Applies settings; the firmware file is converted again.
+async fn choose(site: &Site, settings: Settings) -> Answer {
     site.shared.change(|state| {
         state.settings = settings.clone();
         state.judge();
     });
     let loaded = lock(&site.shared.firmware).clone();
     match loaded {
-        Some(loaded) => load(&site, loaded.bytes.clone(), loaded.shown.name.clone(), settings).await,
+        Some(loaded) => load(site, loaded.bytes.clone(), loaded.shown.name.clone(), settings).await,
         None => done(),
     }
 }

@@ -151,6 +151,7 @@ impl Server {
             let _ = shared.order(Order::Open(bus));
         }
         let site = Site {
+            own_boards: Arc::default(),
             shared: shared.clone(),
             readers: self.readers,
             kinds: self.options.kinds.clone(),

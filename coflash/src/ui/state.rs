@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 
 use canopen::program::ProgramState;
 use canopen::NodeId;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
+use shared_abi::layout::Layout;
 
 use crate::bus::decode::state_words;
 use crate::device::info::{DeviceInfo, ProgramInfo};
@@ -67,10 +68,15 @@ pub(super) enum Connection {
 /// The settings for reading files, and the program number.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Settings {
-    /// The board that gives the region of a program.
-    pub(super) board: Option<&'static str>,
+    /// The board that gives the region of a program: built in, or from a file of the user.
+    #[serde(serialize_with = "name")]
+    pub(super) board: Option<&'static Layout>,
     /// Sub-index of 1F50h.
     pub(super) program: u8,
+}
+
+fn name<S: Serializer>(board: &Option<&'static Layout>, to: S) -> Result<S::Ok, S::Error> {
+    board.map(|board| board.board).serialize(to)
 }
 
 impl Default for Settings {

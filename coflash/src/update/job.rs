@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use super::toml_line::line_of;
 use crate::device::lss::LssAddress;
+use crate::file::board::in_folder;
 
 /// A job file. The settings at its top apply to every device without a setting of its own.
 #[derive(Debug, Deserialize)]
@@ -25,7 +26,7 @@ struct File {
 pub struct Settings {
     /// The firmware file, relative to the job file's folder.
     pub image: Option<PathBuf>,
-    /// The board, by its name.
+    /// The board: its name, or the file with its memory map, relative to the job file's folder.
     pub board: Option<String>,
     /// The program's number, 1 to 254.
     pub program: Option<u8>,
@@ -122,7 +123,7 @@ pub fn parse(text: &str, folder: &Path) -> Result<Vec<Entry>, Fault> {
         let image = own.image.or_else(|| defaults.image.clone());
         let settings = Settings {
             image: Some(folder.join(image.ok_or_else(|| wrong("it has no image".to_string()))?)),
-            board: own.board.or_else(|| defaults.board.clone()),
+            board: own.board.as_ref().or(defaults.board.as_ref()).map(|word| in_folder(word, folder)),
             program: own.program.or(defaults.program),
             check_target: own.check_target.or(defaults.check_target),
             trial_run: own.trial_run.or(defaults.trial_run),

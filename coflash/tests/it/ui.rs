@@ -286,6 +286,42 @@ fn the_page_keeps_to_itself() {
     }
 }
 
+/// A board that is not built in: its memory map is taken like a firmware file, and chosen.
+#[test]
+fn a_memory_map_is_taken_and_chosen_and_a_bad_one_is_refused_with_its_line() {
+    use shared_abi::layout::nucleo_f446re::LAYOUT;
+    let ui = Ui::new(None);
+    let map = shared_abi::layout::toml::Toml(&LAYOUT).to_string().replace("nucleo-f446re", "my-board");
+    assert_eq!(ui.file("my-board.toml", map.as_bytes()).status, 200);
+    ui.until("the board is chosen", |state| state["settings"]["board"] == "my-board");
+    let list = ui.get("adapters").json();
+    assert!(list["boards"].as_array().unwrap().contains(&json!("my-board")), "{list}");
+    // Its region is that of the map: a raw binary has its address, and it has one program.
+    assert_eq!(ui.file("app.bin", &[1, 2, 3, 4]).status, 200);
+    ui.until("the binary", |state| state["firmware"]["program_size"] == 4);
+    let other = ui.post("settings", &json!({ "board": "my-board", "program": 2 }));
+    assert!(other.body.contains("my-board has no program 2"), "{}", other.body);
+    // Another board and back.
+    for board in ["stm32f407g-disc1", "my-board"] {
+        assert_eq!(ui.post("settings", &json!({ "board": board, "program": 1 })).status, 200, "{board}");
+    }
+    for (bytes, says) in [
+        (&b"board = ["[..], "a.TOML: line 1: "),
+        (b"\xFF\xFE\x00", "a.TOML: line 1: "),
+        (b"", "a.TOML: line 1: missing field"),
+        (&[b'#'; 70_000], "64 KiB at most"),
+        (b"\"\\u001b\" = 1", "unknown field"),
+    ] {
+        let refused = ui.file("a.TOML", bytes);
+        assert!(refused.status == 400 && refused.body.contains(says), "{}: {}", refused.status, refused.body);
+        assert!(refused.json()["advice"].as_str().unwrap().contains("cargo xtask layout --toml"));
+    }
+    ui.until("the board stays", |state| state["settings"]["board"] == "my-board");
+    // Each map stays in memory.
+    while ui.file("x.toml", map.as_bytes()).status == 200 {}
+    assert!(ui.file("x.toml", map.as_bytes()).body.contains("too many memory maps"));
+}
+
 #[test]
 fn what_is_no_request_of_the_page_is_refused_with_words() {
     let ui = Ui::new(None);

@@ -1,4 +1,4 @@
-//! A layout as text for the host tool (`coflash --layout FILE`), for boards that the tool was not
+//! A layout as text for the host tool (`coflash --board FILE.toml`), for boards that the tool was not
 //! built with.
 
 use core::fmt;
@@ -51,7 +51,7 @@ impl fmt::Display for Toml<'_> {
             handoff,
             warm_start,
         } = self.0;
-        writeln!(f, "# The memory map of a board, for coflash --layout. Addresses and sizes are in bytes.")?;
+        writeln!(f, "# The memory map of a board, for coflash --board. Addresses and sizes are in bytes.")?;
         writeln!(f, "board = \"{board}\"")?;
         writeln!(f, "bootloader = {}", Table(*bootloader))?;
         writeln!(f, "callgate-offset = {callgate_offset:#x}")?;

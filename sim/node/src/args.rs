@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use boot_core::profile::Profile;
 use clap::{Parser, ValueEnum};
+use coflash::file::board;
 use shared_abi::layout::{self, Layout};
 
 use crate::file_flash::Speed;
@@ -45,8 +46,8 @@ pub struct Args {
     #[arg(long, default_value = ".", value_name = "DIR")]
     pub folder: PathBuf,
 
-    /// The board with the sectors and programs of the nodes
-    #[arg(long, default_value = layout::DEFAULT.board, value_parser = board)]
+    /// The board with the sectors and programs of the nodes: its name, or the file with its memory map
+    #[arg(long, value_name = "BOARD|FILE", default_value = layout::DEFAULT.board, value_parser = board::named)]
     pub board: &'static Layout,
 
     /// Vendor-ID; with vendor-ID and product code both 0 the nodes accept programs for any product
@@ -127,11 +128,6 @@ impl From<FlashSpeed> for Speed {
             FlashSpeed::Typical => Self::Typical,
         }
     }
-}
-
-fn board(name: &str) -> Result<&'static Layout, String> {
-    let names = || layout::BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
-    layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))
 }
 
 fn number(text: &str) -> Result<u32, String> {

@@ -38,6 +38,7 @@ function show(next) {
   }
   told = state.notices;
   file(state.firmware);
+  offer(state.settings.board);
   if (document.activeElement !== $("board")) $("board").value = state.settings.board ?? "";
   if (document.activeElement !== $("program")) $("program").value = state.settings.program;
   devices.show(state);
@@ -53,6 +54,12 @@ function show(next) {
       el("a", { href: "readback", download: true, class: "button" }, "Save it"));
   }
   reports.show(state.reports);
+}
+
+/** Adds a board to the list; that of the user's file is not there from the beginning. */
+function offer(board) {
+  const known = [...$("board").options].some((option) => option.value === (board ?? ""));
+  if (!known) $("board").append(el("option", { value: board }, board));
 }
 
 function file(firmware) {
@@ -131,7 +138,7 @@ async function adapters() {
   if (kept("trial") === undefined) $("trial").checked = found.trial;
   text($("version"), `version ${found.version}`);
   $("adapter-list").append(...found.adapters.map((one) => el("option", { value: one.url }, one.words)));
-  $("board").append(...found.boards.map((board) => el("option", { value: board }, board)));
+  found.boards.forEach(offer);
   if (state) $("board").value = state.settings.board ?? "";
 }
 

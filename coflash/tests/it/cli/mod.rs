@@ -1,6 +1,7 @@
 //! The tool as a separate process: files, exit codes, messages, and an update over a real socket.
 
 mod adapters;
+mod boards;
 mod commands;
 mod legacy;
 mod mistakes;

@@ -612,7 +612,7 @@ fn a_bootloader_gets_its_keys() {
     assert!(done.exit == 3 && done.err.contains("support for sealed images"), "{}", done.err);
     assert!(!Path::new(&out).exists());
     let done = coflash(&["provision", &boot, "--root", &root]);
-    assert!(done.exit == 2 && done.err.contains("give --board or --layout"), "{}", done.err);
+    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
 }
 
 /// Flashes this file; returns the output, the data for the device, and the other writes.

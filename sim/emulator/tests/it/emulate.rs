@@ -60,6 +60,40 @@ fn runs_for_the_time_it_is_told() {
     assert!(text.contains("board 1: power on") && text.contains("board 2: power on"), "{text}");
 }
 
+/// A board that the emulator was not built with.
+#[test]
+fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
+    use shared_abi::layout::{nucleo_f446re::LAYOUT, toml::Toml};
+    let folder = folder("board");
+    let image = program(&folder, FOREVER);
+    let board = |text: &str| {
+        let file = folder.join("my.toml");
+        std::fs::write(&file, text).unwrap();
+        emulate(&["--board", file.to_str().unwrap(), &image, "--speed", "max", "--for", "0.01"])
+    };
+    let map = Toml(&LAYOUT).to_string().replace("nucleo-f446re", "my-board");
+    let output = board(&map);
+    assert!(output.status.success(), "{output:?}");
+    let huge =
+        map.replace("ccm = { base = 0x10000000, size = 0x0", "ccm = { base = 0x10000000, size = 0xe0000000");
+    assert_ne!(huge, map);
+    let other = map.replace("name = \"stm32f446re\"", "name = \"stm32f446xx\"");
+    for (text, says) in [
+        ("", "my.toml: line 1: missing field"),
+        ("board = [", "my.toml: line 1: "),
+        (&huge, "my.toml: there is no stm32f446re with these memories"),
+        (&other, "my.toml: there is no stm32f446xx with these memories"),
+    ] {
+        let output = board(text);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(2) && said.contains(says), "{says}: {said}");
+    }
+    for (word, says) in [("arduino", "known boards: nucleo-f446re"), ("none.toml", "none.toml: ")] {
+        let output = emulate(&["--board", word, &image]);
+        assert!(String::from_utf8_lossy(&output.stderr).contains(says), "{word}: {output:?}");
+    }
+}
+
 /// A failure with a seed can be seen again: the seed and what it draws are printed. Without the option
 /// nothing is.
 #[test]

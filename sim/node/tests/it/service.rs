@@ -286,7 +286,7 @@ fn a_layout_comes_from_a_file() {
     let nodes = Nodes::start(&folder, &["--node", "5", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     let flash =
-        |layout: &str| coflash.run(&["flash", "program.bin", "-I", "binary", "--layout", layout, "-N", "5"]);
+        |layout: &str| coflash.run(&["flash", "program.bin", "-I", "binary", "--board", layout, "-N", "5"]);
     assert_eq!(flash("board.toml").exit, 0);
     let bad = flash("bad.toml");
     assert!(
@@ -295,6 +295,6 @@ fn a_layout_comes_from_a_file() {
         bad.err
     );
     assert_eq!(flash("none.toml").exit, 3);
-    let two = coflash.run(&["convert", "program.bin", "--layout", "board.toml", "-I", "binary", "-P", "2"]);
+    let two = coflash.run(&["convert", "program.bin", "--board", "board.toml", "-I", "binary", "-P", "2"]);
     assert!(two.err.contains("my-board has no program 2"), "{}", two.err);
 }

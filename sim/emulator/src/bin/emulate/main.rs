@@ -30,8 +30,7 @@ use emulator::socketcand::Server;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
 use flash_file::FlashFile;
-use shared_abi::geometry::{Geometry, Region};
-use shared_abi::layout::{self, BOARDS};
+use shared_abi::geometry::{self, Geometry, Region};
 
 /// Runs boards on a virtual CAN bus and shows in words what happens.
 ///
@@ -41,8 +40,8 @@ use shared_abi::layout::{self, BOARDS};
 #[derive(Debug, Parser)]
 #[command(name = "emulate", version)]
 struct Args {
-    /// The board
-    #[arg(long, default_value = "stm32f407g-disc1", value_parser = board)]
+    /// The board: its name, or the file with its memory map, as `cargo xtask layout --toml` writes it
+    #[arg(long, value_name = "BOARD|FILE", default_value = "stm32f407g-disc1", value_parser = board)]
     board: Board,
 
     /// The board's crystal or clock, in Hz
@@ -151,10 +150,18 @@ struct Board {
 /// A board has its serial port at USART2, its transceiver at CAN1 and no resistors at its pins,
 /// unless it is listed here.
 fn board(name: &str) -> Result<Board, String> {
-    let names = || BOARDS.iter().map(|layout| layout.board).collect::<Vec<_>>().join(", ");
-    let layout = layout::by_name(name).ok_or_else(|| format!("known boards: {}", names()))?;
+    let layout = coboot_linker::board::named(name).map_err(|error| error.to_string())?;
+    let chip = layout.chip;
+    // A file may contain a chip that nobody makes.
+    let memories = |chip: &Geometry| (chip.flash, chip.sram, chip.ccm);
+    if !geometry::by_name(chip.chip).is_some_and(|known| memories(known) == memories(chip)) {
+        return Err(format!(
+            "{name}: there is no {} with these memories; correct [chip] in the file",
+            chip.chip
+        ));
+    }
     let plain = Board { chip: layout.chip, pulled_up: &[], usart: "USART2", transceiver: 0 };
-    Ok(match name {
+    Ok(match layout.board {
         "stm32f407g-disc1-can2" => Board { transceiver: 1, ..plain },
         // B1 (UM1724).
         "nucleo-f446re" => Board { pulled_up: &[('C', 13)], ..plain },
