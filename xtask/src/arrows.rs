@@ -54,7 +54,8 @@ const RULES: &[(&str, &str)] = &[
         "app-template boot-core bsp canopen coboot-app coboot-node coflash emulator seal shared-abi kit",
     ),
     ("coboot-zencan", "bsp canopen coboot-tests coflash emulator"),
-    ("xtask", "shared-abi kit"),
+    ("new-board", "shared-abi"),
+    ("xtask", "new-board shared-abi kit"),
 ];
 
 /// What the tests share: in no package, and so a dev-dependency, of crates that have tests with it.
@@ -64,7 +65,7 @@ const TESTS: &str = "coboot-tests";
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
 const PURE: &[&str] =
-    &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "kit", "xtask"];
+    &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "kit", "new-board", "xtask"];
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 
