@@ -1,4 +1,4 @@
-//! `cargo xtask hil`: runs the main job and the update suite on a real board (hardware in the loop).
+//! `cargo xtask hil`: runs on a real board what nothing else can show (hardware in the loop).
 //!
 //! A probe puts the bootloader into the flash, a relay switches the power, and everything else goes
 //! over the bus by the command line of `coflash`, as a user of the product does it.
@@ -8,7 +8,7 @@ mod coflash;
 mod command;
 mod steps;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use serde_json::{json, Value};
@@ -16,25 +16,33 @@ use serde_json::{json, Value};
 use crate::args::Args;
 use crate::setup::{self, Part};
 use crate::{build, files, process, workspace, Outcome};
-use bench::{Bench, Done};
+use bench::{Bench, Done, HANDS};
 use coflash::Coflash;
 use command::CommandLine;
 
 pub const HELP: &str = "\
-usage: cargo xtask hil --bus URL [--board BOARD] [--probe COMMAND] [--power-command COMMAND] [--node N]
-                       [--json FILE]
+usage: cargo xtask hil --bus URL [--board BOARD] [--elf FILE [--coflash FILE]] [--probe COMMAND] [--node N]
+                       [--power-command COMMAND] [--strap-command COMMAND] [--short-command COMMAND]
+                       [--crystal-command COMMAND] [--json FILE]
 
 Hardware in the loop: builds the images, flashes the bootloader into a real board through a debug probe and plays
-the main job and the update suite on its CAN bus. Programs that are in the board are overwritten.
+on its CAN bus what nothing but a board can show. Programs that are in the board are overwritten. The first step
+that fails ends it. A step that needs a hand asks for it at the terminal, or is not run, and says so.
 
-  --bus URL       the bus, as coflash takes it, for example socketcan:can0
+  --bus URL       the bus, as coflash takes it: socketcan:can0. With {rate} in the place of the bit rate,
+                  gs_usb:0@{rate}k or slcan:/dev/ttyACM0@{rate}k, the bit rates are tried, too
   --board BOARD   the board (default: stm32f407g-disc1)
+  --elf FILE      builds nothing: this bootloader, and app-v1.elf, app-v2.elf and bootloader-watchdog.elf in the same
+                  folder (target/firmware/BOARD of a build, or of a release)
+  --coflash FILE  the host tool for --elf (default: the one of this repository if it is built, or that of PATH)
   --probe COMMAND the command line for the debug probe (default: 'probe-rs {action} --chip {chip} {elf}').
                   {action} becomes download or reset, {chip} the chip, {elf} the file; for a reset the
                   words with {elf} are left out. No shell reads it; quotes keep words together
   --power-command COMMAND
                   the command line that switches the board's supply: {state} becomes on or off.
                   Without it the probe resets the board, and the power is not cut in mid-update
+  --strap-command, --short-command, --crystal-command
+                  the same for the entry strap, a short of CAN_H and CAN_L, and one of OSC_IN to ground
   --node N        the node-ID of the board, 1 to 127 (default: 1)
   --json FILE     writes the report to FILE
 ";
@@ -45,38 +53,56 @@ pub fn run(mut args: Args) -> Outcome {
     let node = args.number("--node", 1..=127)?.unwrap_or(1);
     let probe = args.value("--probe")?.unwrap_or("probe-rs {action} --chip {chip} {elf}".into());
     let probe = CommandLine::new("--probe", &probe)?;
-    let power = args.value("--power-command")?;
-    if power.as_ref().is_some_and(|line| !line.contains("{state}")) {
-        return Err("--power-command needs {state}; on and off stand in its place.".into());
+    let mut hands = [const { None }; HANDS.len()];
+    let mut power_line = None;
+    for ((option, ..), hand) in HANDS.iter().zip(&mut hands).rev() {
+        power_line = args.value(option)?;
+        if power_line.as_ref().is_some_and(|line| !line.contains("{state}")) {
+            return Err(format!("{option} needs {{state}}; on and off stand in its place."));
+        }
+        *hand = power_line.as_ref().map(|line| CommandLine::new(option, line)).transpose()?;
     }
-    let power = power.map(|line| CommandLine::new("--power-command", &line)).transpose()?;
+    let (elf, own) = (args.value("--elf")?, args.value("--coflash")?);
     let report = args.value("--json")?;
     args.none_left()?;
-    setup::prepare(&[Part::Firmware])?;
 
     let started = Instant::now();
-    let images = build::images(board, &build::MAIN)?;
-    process::run(process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]))?;
-    let built = Done::Passed(workspace::shown(&images));
-    let mut lines = vec![line("build the images and coflash", started, Ok(built))];
-    let work = workspace::target_dir().join("hil").join(board.board);
-    let coflash = Coflash { bus, node };
-    let mut bench = Bench { board, probe, power, coflash, images, work, installed: None, conform: None };
-    let mut stopped_by = None;
-    for step in steps::STEPS {
-        let started = Instant::now();
-        let ended = match stopped_by {
-            Some(name) => Ok(Done::LeftOut(format!("\"{name}\" failed"))),
-            None => (step.run)(&mut bench),
-        };
-        if step.others_need_it && ended.is_err() {
-            stopped_by = Some(step.name);
+    let built = workspace::target_dir().join("debug/coflash");
+    let (bootloader, program) = match elf {
+        Some(elf) if !Path::new(&elf).is_file() => {
+            return Err(format!("--elf {elf}: there is no such file."))
         }
-        lines.push(line(step.name, started, ended));
+        Some(elf) => {
+            (elf.into(), own.map_or(if built.exists() { built } else { "coflash".into() }, PathBuf::from))
+        }
+        None => {
+            setup::prepare(&[Part::Firmware])?;
+            let images = build::images(board, &[&build::MAIN[..], &["bootloader-watchdog"]].concat())?;
+            process::run(
+                process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]),
+            )?;
+            (images.join("bootloader.elf"), built)
+        }
+    };
+    let images = bootloader.parent().unwrap_or(Path::new("")).to_owned();
+    let ready = Done::Passed(workspace::shown(&images));
+    let mut lines = vec![line("images and coflash", started, Ok(ready))];
+    let work = workspace::target_dir().join("hil").join(board.board);
+    let bootloader = bootloader.display().to_string();
+    let coflash = Coflash { program, bus, node, rate: 125 };
+    let (installed, conform) = (None, Vec::new());
+    let mut bench =
+        Bench { board, probe, hands, power_line, coflash, bootloader, images, work, installed, conform };
+    for (name, run) in steps::STEPS {
+        let started = Instant::now();
+        lines.push(line(name, started, run(&mut bench)));
+        if lines.last().is_some_and(|line| line["outcome"] == "failed") {
+            break;
+        }
     }
     let count = |outcome: &str| lines.iter().filter(|line| line["outcome"] == outcome).count();
     let failed = count("failed");
-    println!("{} passed, {failed} failed, {} left out", count("passed"), count("left out"));
+    println!("{} passed, {failed} failed, {} not run", count("passed"), count("not run"));
     if let Some(file) = report {
         let report = json!({
             "board": board.board,
@@ -90,8 +116,7 @@ pub fn run(mut args: Args) -> Outcome {
     }
     match failed {
         0 => Ok(()),
-        1 => Err("1 step failed; its line above says what to do.".into()),
-        failed => Err(format!("{failed} steps failed; their lines above say what to do.")),
+        _ => Err("a step failed; its line above says what to do. The steps after it were not run.".into()),
     }
 }
 
@@ -99,10 +124,10 @@ pub fn run(mut args: Args) -> Outcome {
 fn line(name: &str, started: Instant, ended: Outcome<Done>) -> Value {
     let (outcome, text) = match ended {
         Ok(Done::Passed(text)) => ("passed", text),
-        Ok(Done::LeftOut(text)) => ("left out", text),
+        Ok(Done::NotRun(text)) => ("not run", text),
         Err(text) => ("failed", text),
     };
     let seconds = (started.elapsed().as_secs_f64() * 10.0).round() / 10.0;
-    println!("{outcome:<8} {seconds:>6} s  {name}  {text}");
+    println!("{outcome:<7} {seconds:>6} s  {name}  {text}");
     json!({"step": name, "outcome": outcome, "text": text, "seconds": seconds})
 }

@@ -102,7 +102,7 @@ const JOBS: &[Job] = jobs! {
     "new-board" new_board "the three files of a port, with steps to go through"
     "docs" book "the pages as a site, its links checked"
 
-    "hil" hil "the main job and the update suite on a real board, through a debug probe"
+    "hil" hil "what only a real board can show, through a debug probe and its bus"
     "chips" chips "a board for every chip, built and updated in the emulator"
     "examples" examples "the programs in examples/, each built by its own tools"
     "diagrams" diagrams "the graphs of the documents, from text"

@@ -1,5 +1,5 @@
-//! `cargo xtask hil` with the emulated board behind it: gdb is the probe, the control socket the
-//! relay, socketcand the bus.
+//! `cargo xtask hil` with the emulated board behind it, with the worst chip that its manuals allow: gdb is
+//! the probe, the control socket the relay and the hand at the strap, socketcand the bus.
 #![cfg(unix)]
 
 use std::fs;
@@ -30,6 +30,7 @@ impl Board {
         let mut cargo = Command::new(env!("CARGO"));
         cargo.args(["run", "-q", "-p", "coboot-emulator", "--bin", "emulate", "--", "--board"]);
         cargo.arg(variable("COBOOT_BOARD")).arg("--bootloader").arg(bootloader);
+        cargo.args(["--silicon", "worst"]);
         cargo.args(["--socketcand", "127.0.0.1:0", "--control", "127.0.0.1:0", "--gdb", "127.0.0.1:0"]);
         let mut emulator = cargo.stdin(Stdio::null()).stdout(Stdio::piped()).spawn().expect("cargo starts");
         let mut lines = BufReader::new(emulator.stdout.take().expect("a pipe")).lines();
@@ -51,12 +52,12 @@ impl Board {
         format!("gdb-multiarch -nx -batch -x '{}/{{action}}.gdb' {{elf}}", folder.display())
     }
 
-    /// The command line for the control socket as the relay.
-    fn relay(&self) -> String {
+    /// A command line for the control socket: this command, in which words stand for on and off.
+    fn control(&self, command: &str, on: &str, off: &str) -> String {
         let address = self.control.replace(':', "/");
         format!(
-            "bash -c 'exec 3<>/dev/tcp/{address} && echo power {{state}} >&3 && read -r answer <&3 && \
-             [[ $answer == ok* ]]'"
+            "bash -c 'declare -A word=([on]={on} [off]={off}); exec 3<>/dev/tcp/{address} && \
+             echo {command} ${{word[{{state}}]}} >&3 && read -r answer <&3 && [[ $answer == ok* ]]'"
         )
     }
 }
@@ -82,14 +83,36 @@ fn hil(words: &[&str]) -> (bool, String) {
 fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
     let board = Board::new();
     let folder = Folder::below(env!("CARGO_TARGET_TMPDIR"), "hil");
-    let (probe, relay) = (board.probe(&folder), board.relay());
+    let (probe, relay) = (board.probe(&folder), board.control("power", "on", "off"));
+    // The button of the board's strap (UM1472: PA0, high when pressed).
+    let strap = board.control("pin PA0", "high", "open");
     let report = folder.join("report.json");
-    let words = ["--bus", &board.bus, "--probe", &probe, "--power-command", &relay, "--json"];
-    let (good, said) = hil(&[&words[..], &[report.to_str().unwrap()]].concat());
+    let words =
+        ["--bus", &board.bus, "--probe", &probe, "--power-command", &relay, "--strap-command", &strap];
+    let (good, said) = hil(&[&words[..], &["--json", report.to_str().unwrap()]].concat());
     assert!(good, "{said}");
-    assert!(said.contains(" 0 failed"), "{said}");
-    for step in ["flash the bootloader", "cut the power", "Ctrl-C", "another device", "damaged"] {
-        assert!(said.lines().any(|line| line.contains(step) && line.contains("passed")), "{step}: {said}");
+    let outcome = |step: &str| {
+        let line = said.lines().find(|line| line.contains(step)).unwrap_or_else(|| panic!("{step}: {said}"));
+        line.split("  ").next().unwrap().trim().to_owned()
+    };
+    for step in [
+        "flash the bootloader",
+        "by its crystal",
+        "conformance",
+        "update suite",
+        "way back by a reset",
+        "way back by the watchdog",
+        "way back by a jump",
+        "start version 2 by itself",
+        "store a node-ID",
+        "entry strap",
+        "a program that hangs",
+    ] {
+        assert_eq!(outcome(step), "passed", "{step}: {said}");
+    }
+    // Nobody shorts this bus, and its adapter has one bit rate.
+    for step in ["LSS: bit rates", "by listening", "bus-off", "the crystal stopped"] {
+        assert_eq!(outcome(step), "not run", "{step}: {said}");
     }
     let report = fs::read_to_string(report).unwrap();
     assert!(report.contains("\"passed\": true"), "{report}");
@@ -98,6 +121,8 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
     let failing = "sh -c 'test {state} = never'";
     for (words, told) in [
         (vec!["--bus", bus, "--probe", "no-such-probe {elf}"], "\"no-such-probe\" is not there"),
+        (vec!["--bus", bus, "--probe", "true", "--strap-command", "true"], "--strap-command needs {state}"),
+        (vec!["--bus", bus, "--probe", "true", "--elf", "none.elf"], "--elf none.elf: there is no such file"),
         (vec!["--bus", "socketcand://127.0.0.1:1/can0", "--probe", "true"], "cannot be opened"),
         (vec!["--bus", bus, "--probe", "true", "--power-command", failing], "cannot be switched off"),
         (vec!["--bus", bus, "--node", "9", "--probe", "true"], "node 9 does not answer"),

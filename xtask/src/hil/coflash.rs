@@ -1,22 +1,25 @@
 //! The host tool, as a user calls it: an external program that answers in JSON.
 
-use std::io::{BufRead, BufReader};
-use std::path::PathBuf;
-use std::process::{Command, Output, Stdio};
+use std::path::{Path, PathBuf};
+use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use serde_json::Value;
 
 use super::command::within;
-use crate::{process, workspace, Outcome};
+use crate::{files, process, Outcome};
 
 /// The time for any call. The longest one is a download in segments at 10 kbit/s.
 const LIMIT: Duration = Duration::from_secs(600);
 
 /// coflash for one device.
 pub struct Coflash {
+    pub program: PathBuf,
+    /// The bus; `{rate}` in it becomes the bit rate.
     pub bus: String,
     pub node: u64,
+    /// The bit rate in kbit/s.
+    pub rate: u32,
 }
 
 /// The answer of a call.
@@ -59,55 +62,57 @@ impl Answer {
     }
 }
 
-/// The program.
-pub fn program() -> PathBuf {
-    workspace::target_dir().join("debug/coflash")
+/// A frame in a trace.
+pub struct Heard {
+    /// The adapter's time, in seconds.
+    pub seconds: f64,
+    /// As candump writes it: `701#00`.
+    pub frame: String,
+}
+
+/// The frames of a candump log.
+fn heard(log: &str) -> Vec<Heard> {
+    let frame = |line: &str| {
+        let mut words = line.split_whitespace();
+        let seconds = words.next()?.trim_matches(['(', ')']).parse().ok()?;
+        Some(Heard { seconds, frame: words.nth(1)?.to_owned() })
+    };
+    log.lines().filter_map(frame).collect()
+}
+
+/// The seconds from the last frame that begins like this to the frame `end` that follows.
+pub fn between(heard: &[Heard], start: &str, end: &str) -> Option<f64> {
+    let at = heard.iter().rposition(|one| one.frame == end)?;
+    let from = heard[..at].iter().rfind(|one| one.frame.starts_with(start))?;
+    Some(heard[at].seconds - from.seconds)
 }
 
 impl Coflash {
-    fn command(&self, words: &[&str], json: &str) -> Command {
-        let mut command = within(LIMIT, program());
-        command.args(words).args(["--bus", &self.bus, "--node", &self.node.to_string(), json]);
-        command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
-        command
-    }
-
     /// Calls coflash, which prints one document.
     pub fn call(&self, words: &[&str]) -> Outcome<Answer> {
-        let mut command = self.command(words, "--json");
+        let bus = self.bus.replace("{rate}", &self.rate.to_string());
+        let mut command = within(LIMIT, &self.program);
+        command.args(words).args(["--bus", &bus, "--json"]);
+        if words[0] != "monitor" {
+            command.args(["--node", &self.node.to_string()]);
+        }
+        command.stdin(Stdio::null());
         let output = command.output().map_err(|error| process::not_started(&command, &error))?;
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
         Ok(Answer::new(&output, said))
     }
 
-    /// Flashes a program, and does `act` in the middle, when a third of the bytes is in the device;
-    /// `act` gets the number of the process.
-    pub fn flash_until_middle(&self, words: &[&str], act: impl Fn(u32) -> Outcome) -> Outcome<Answer> {
-        let mut command = self.command(words, "--json-events");
-        let failed = |error| format!("coflash: {error}.");
-        let mut running = command.spawn().map_err(failed)?;
-        let (mut acted, mut said) = (None, String::new());
-        // The lines end with the program.
-        for line in running.stdout.take().into_iter().flat_map(|pipe| BufReader::new(pipe).lines()) {
-            let line = line.map_err(failed)?;
-            if acted.is_none() && is_middle(&process::json(&line)?) {
-                acted = Some(act(running.id()));
-            }
-            said = said + &line + "\n";
-        }
-        let answer = Answer::new(&running.wait_with_output().map_err(failed)?, said);
-        match acted {
-            Some(acted) => acted.map(|()| answer),
-            None => Err(format!("the update never came to its middle. {}", answer.problem())),
-        }
+    /// The same, with the frames that were on the bus meanwhile; a file in `folder` gets them.
+    pub fn traced(&self, words: &[&str], folder: &Path) -> Outcome<(Answer, Vec<Heard>)> {
+        files::make(folder)?;
+        let file = folder.join("trace.log");
+        let answer = self.call(&[words, &["--trace", &file.display().to_string()]].concat())?;
+        Ok((answer, heard(&files::text(&file)?)))
     }
-}
 
-/// Whether an event reports that more than a third is in the device, and not all of it.
-fn is_middle(event: &Value) -> bool {
-    match (event["done"].as_u64(), event["total"].as_u64()) {
-        (Some(done), Some(total)) => event["event"] == "progress" && done < total && done >= total / 3,
-        _ => false,
+    /// Whether `--bus` leaves the adapter's bit rate to the job.
+    pub fn can_change_rate(&self) -> bool {
+        self.bus.contains("{rate}")
     }
 }
 
@@ -116,16 +121,14 @@ mod tests {
     use std::os::unix::process::ExitStatusExt;
     use std::process::ExitStatus;
 
-    use serde_json::json;
-
     use super::*;
 
     #[test]
-    fn the_middle_is_a_third_and_never_the_end() {
-        assert!(is_middle(&json!({"event": "progress", "done": 4, "total": 12})));
-        assert!(!is_middle(&json!({"event": "progress", "done": 3, "total": 12})));
-        assert!(!is_middle(&json!({"event": "progress", "done": 12, "total": 12})));
-        assert!(!is_middle(&json!({"event": "phase", "done": 4, "total": 12})));
+    fn the_time_between_two_frames_is_that_of_the_log() {
+        let log = "(1.000000) can0 581#60511F0100000000 R\n(1.5) can0 701#05\n\n(2.012500) can0 701#00 R\n";
+        assert_eq!(between(&heard(log), "581#60511F01", "701#00"), Some(2.0125 - 1.0));
+        assert_eq!(between(&heard(log), "701#00", "581#60511F01"), None);
+        assert_eq!(between(&heard("x\n(a) b c\n"), "581", "701#00"), None);
     }
 
     #[test]

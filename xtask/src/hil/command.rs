@@ -13,7 +13,9 @@ pub struct CommandLine {
 impl CommandLine {
     /// Reads the line of an option, and looks whether its program is there.
     pub fn new(option: &str, line: &str) -> Outcome<Self> {
-        let words = words(line).map_err(|problem| format!("{option} `{line}`: {problem}"))?;
+        let words = shlex::split(line).filter(|words| !words.is_empty());
+        let words =
+            words.ok_or_else(|| format!("{option} `{line}`: it is empty, or a quote is not closed."))?;
         // `command` is a word of the shell; its argument is $0 here.
         if process::succeeds("sh", &["-c", "command -v \"$0\"", &words[0]]) {
             return Ok(Self { words });
@@ -50,37 +52,15 @@ pub fn within(limit: Duration, program: impl AsRef<std::ffi::OsStr>) -> Command 
     command
 }
 
-/// The words of a command line.
-fn words(line: &str) -> Outcome<Vec<String>> {
-    let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
-    for character in line.chars() {
-        match (quote, character) {
-            (Some(end), _) if end == character => quote = None,
-            (None, '\'' | '"') => {
-                quote = Some(character);
-                word.get_or_insert_default();
-            }
-            (None, ' ' | '\t') => words.extend(word.take()),
-            _ => word.get_or_insert_default().push(character),
-        }
-    }
-    words.extend(word);
-    match quote {
-        Some(quote) => Err(format!("a quote {quote} is not closed.")),
-        None if words.is_empty() => Err("it is empty.".into()),
-        None => Ok(words),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn a_line_becomes_words_with_values_in_their_places() {
-        assert_eq!(words("a  'b c' \"d 'e\" f''"), Ok(["a", "b c", "d 'e", "f"].map(str::to_owned).into()));
-        assert!(words("a 'b").unwrap_err().contains("not closed"));
-        assert!(words("  ").is_err());
+        for wrong in ["sh 'b", "  ", ""] {
+            assert!(CommandLine::new("--probe", wrong).err().unwrap().contains("not closed"), "{wrong}");
+        }
         let probe = CommandLine::new("--probe", "sh {action} --chip {chip} {elf}").ok().unwrap();
         let line = |elf| probe.with(&[("{action}", "reset"), ("{chip}", "STM32F407VG"), ("{elf}", elf)]);
         assert_eq!(line("a b.elf"), ["sh", "reset", "--chip", "STM32F407VG", "a b.elf"]);

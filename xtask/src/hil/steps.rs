@@ -1,68 +1,64 @@
-//! The steps, in their order: the set-up, the conformance checks, the main job, the update suite.
+//! The steps, in their order: the set-up, the conformance checks with the update suite, the ways back, and
+//! what only a board can show. The first one that fails ends the job.
 
-use std::process::Command;
-use std::thread;
+use std::thread::sleep;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
-use super::bench::{switch, Bench, Done};
-use super::coflash::{self, Answer};
+use super::bench::{Bench, Done, Hand};
+use super::coflash::{between, Answer, Heard};
 use crate::{files, process, Outcome};
 
-/// A step.
-pub struct Step {
-    /// Its name in the report.
-    pub name: &'static str,
-    /// Whether the steps after it make no sense without it.
-    pub others_need_it: bool,
-    /// Carries it out. The error says why it failed and what to do.
-    pub run: fn(&mut Bench) -> Outcome<Done>,
-}
-
-const fn needed(name: &'static str, run: fn(&mut Bench) -> Outcome<Done>) -> Step {
-    Step { name, others_need_it: true, run }
-}
-
-const fn step(name: &'static str, run: fn(&mut Bench) -> Outcome<Done>) -> Step {
-    Step { name, others_need_it: false, run }
-}
+/// A step: its name in the report, and what carries it out. The error says why it failed and what to do.
+pub type Step = (&'static str, fn(&mut Bench) -> Outcome<Done>);
 
 /// All steps after the build.
-pub const STEPS: &[Step] = &[
-    needed("open the bus", open_bus),
-    needed("flash the bootloader by the probe", flash_bootloader),
-    needed("power off and on, or reset", restart),
-    needed("the device answers", device_answers),
-    step("conformance: coflash conform", conform),
+pub const STEPS: [Step; 20] = [
+    ("open the bus", open_bus),
+    ("flash the bootloader by the probe", |bench| flash_bootloader(bench, "bootloader.elf")),
+    ("power off and on, or reset", |bench| bench.restart().map(|how| Done::Passed(how.into()))),
+    ("the device answers, by its crystal", device_answers),
+    ("option bytes: 2007h/6", option_bytes),
+    ("conformance: coflash conform --reset", conform),
+    ("the update suite: coflash conform UPD --install", update_suite),
     // The main job, as `cargo xtask demo` shows it.
-    needed("install version 1", |bench| install(bench, V1, &[])),
-    step("call the application back: 1F51h = 80h", call_back),
-    step("update to version 2", |bench| install(bench, V2, &[])),
-    step("start version 2 by itself after a restart", starts_by_itself),
-    step("cut the power in mid-update, and recover", power_cut),
-    // The update suite.
-    step("block file by block transfers", |bench| install(bench, V1, &[])),
-    step("block file by segments", |bench| install(bench, V2, &["--segmented"])),
-    step("raw image (CiA 302-3)", |bench| install(bench, V1, &["--dialect", "raw"])),
-    step("refuse a damaged file", damaged_file),
-    step("refuse a program for another device", wrong_identity),
-    step("interrupt an update by Ctrl-C, and repeat it", interrupted),
+    ("install version 1", |bench| install(bench, V1)),
+    ("way back by a reset", |bench| way_back(bench, "0")),
+    ("way back by the watchdog", |bench| way_back(bench, "1")),
+    ("way back by a jump", |bench| way_back(bench, "2")),
+    ("update to version 2", |bench| install(bench, V2)),
+    ("start version 2 by itself after a restart", starts_by_itself),
+    ("LSS: store a node-ID", store_node_id),
+    ("entry strap", strap),
+    ("LSS: bit rates", bit_rates),
+    ("find the bit rate by listening", auto_bit_rate),
+    ("bus-off: CAN_H and CAN_L shorted", bus_off),
+    ("the crystal stopped", crystal),
+    ("a program that hangs, with program_watchdog_ms", hung_program),
 ];
 
 const V1: &str = "app-v1.elf";
 const V2: &str = "app-v2.elf";
+/// The bootloader of the product with `program_watchdog_ms: Some(1000)`.
+const WITH_WATCHDOG: &str = "bootloader-watchdog.elf";
 
 /// The time for the device to answer after its power is on or it was reset.
 const START: Duration = Duration::from_secs(15);
-/// The exit codes of coflash (`coflash --help`).
-const BAD_FILE: i32 = 3;
+/// The exit code of coflash for a bus that cannot be opened (`coflash --help`).
 const NO_BUS: i32 = 4;
-const REFUSED: i32 = 6;
-const CANCELLED: i32 = 130;
+/// The LSI has 17 to 47 kHz (DS8626, LSI oscillator characteristics): a second of its nominal 32 kHz, in
+/// seconds.
+const SECOND: (f64, f64) = (32.0 / 47.0, 32.0 / 17.0);
+/// What host and adapter add to a time between two frames, at most, in seconds.
+const LATE: f64 = 0.2;
 
 fn passed(text: impl Into<String>) -> Outcome<Done> {
     Ok(Done::Passed(text.into()))
+}
+
+fn not_run(why: impl Into<String>) -> Outcome<Done> {
+    Ok(Done::NotRun(why.into()))
 }
 
 fn open_bus(bench: &mut Bench) -> Outcome<Done> {
@@ -74,57 +70,78 @@ fn open_bus(bench: &mut Bench) -> Outcome<Done> {
     passed("")
 }
 
-fn flash_bootloader(bench: &mut Bench) -> Outcome<Done> {
-    bench.probe("download", &image(bench, "bootloader.elf"))?;
+fn flash_bootloader(bench: &mut Bench, name: &str) -> Outcome<Done> {
+    let file = if name == "bootloader.elf" { bench.bootloader.clone() } else { bench.image(name) };
+    bench.probe("download", &file)?;
     passed("")
 }
 
-fn restart(bench: &mut Bench) -> Outcome<Done> {
-    bench.restart().and_then(passed)
-}
-
 fn device_answers(bench: &mut Bench) -> Outcome<Done> {
-    let info = info_after_start(bench).map_err(|error| {
-        format!("{error} The probe has flashed the bootloader: look at bit rate, termination and node-ID.")
+    let info = bootloader(bench).map_err(|error| {
+        format!("{error} The probe has flashed the bootloader: look at pins, transceiver, bit rate and termination.")
     })?;
+    if info["state"]["clock"] == 2 {
+        return Err(
+            "it runs from its internal oscillator: look at the crystal, and at `hse` of the board file."
+                .into(),
+        );
+    }
+    // The conformance checks reset the device, and have more to check in its bootloader.
+    bench.coflash.call(&["erase"])?.good()?;
     let word = |key: &str| info[key].as_str().unwrap_or("?").to_owned();
     passed(format!("\"{}\", version \"{}\"", word("name"), word("software_version")))
 }
 
-fn conform(bench: &mut Bench) -> Outcome<Done> {
-    let answer = bench.coflash.call(&["conform"])?;
-    bench.conform = process::json(&answer.said).ok();
-    match (answer.code, &bench.conform) {
-        (Some(0), _) => passed(""),
-        (_, Some(_)) if answer.value["error"].is_null() => {
-            Err("checks failed: `coflash conform` tells which, and so does the report of --json.".into())
-        }
-        _ => Err(answer.problem()),
+fn option_bytes(bench: &mut Bench) -> Outcome<Done> {
+    let answer = bench.coflash.call(&["read", "2007/6"])?;
+    match answer.code {
+        Some(0) => passed(format!("{} (docs/protocol.md)", answer.value["objects"][0]["value"])),
+        _ => not_run("this bootloader has no 2007h/6; read them by the probe"),
     }
 }
 
-/// Flashes a program, compares its CRC with the file, and sees it run.
-fn install(bench: &mut Bench, image: &str, options: &[&str]) -> Outcome<Done> {
-    let answer = flash(bench, image, options)?.good()?;
-    let crc = number(&answer.value["crc"]).ok_or("coflash told no CRC of the program.")?;
-    bench.installed = Some(crc);
+fn conform(bench: &mut Bench) -> Outcome<Done> {
+    run_conform(bench, &["conform", "--reset"])
+}
+
+fn update_suite(bench: &mut Bench) -> Outcome<Done> {
+    let image = bench.image(V1);
+    let mut words = vec!["conform", "UPD", "--install", "--image", &image, "--board", bench.board.board];
+    let power = bench.power_line.clone();
+    words.extend(power.iter().flat_map(|line| ["--power-command", line]));
+    let done = run_conform(bench, &words)?;
+    Ok(if power.is_some() {
+        done
+    } else {
+        Done::Passed("without a power cut: there is no --power-command".into())
+    })
+}
+
+fn run_conform(bench: &mut Bench, words: &[&str]) -> Outcome<Done> {
+    // A board answers in milliseconds; the host may have other things to do.
+    let answer = bench.coflash.call(&[words, &["--answer-timeout", "2000"]].concat())?;
+    let Some(document) = process::json(&answer.said).ok().filter(|value| value["checks"].is_array()) else {
+        return Err(answer.problem());
+    };
+    let failed: Vec<_> =
+        process::list(&document, "checks").filter(|check| check["outcome"] == "failed").collect();
+    let first = failed.first().map(|check| format!("{} {}: {}", check["id"], check["title"], check["why"]));
+    let passed = format!("{} checks", document["passed"]);
+    bench.conform.push(document);
+    match first {
+        Some(first) => Err(format!("checks failed, first {first}. docs/conform.md has their documents.")),
+        None => Ok(Done::Passed(passed)),
+    }
+}
+
+/// Flashes a program, and sees it run.
+fn install(bench: &mut Bench, image: &str) -> Outcome<Done> {
+    let file = bench.image(image);
+    let words = ["flash", &file, "--board", bench.board.board, "--verify"];
+    let answer = bench.coflash.call(&words)?.good()?;
+    bench.installed = answer.value["crc"].as_number().map(ToString::to_string);
     runs_installed(bench)?;
-    let seconds = number(&answer.value["seconds"]).unwrap_or_default();
-    passed(format!("{image} in {seconds} s"))
-}
-
-fn flash(bench: &Bench, image: &str, options: &[&str]) -> Outcome<Answer> {
-    bench.coflash.call(&[&flash_words(bench, &self::image(bench, image)), options].concat())
-}
-
-/// The words of a download with a comparison at its end.
-fn flash_words<'w>(bench: &Bench, file: &'w str) -> [&'w str; 5] {
-    ["flash", file, "--board", bench.board.board, "--verify"]
-}
-
-/// The path of an image of the board.
-fn image(bench: &Bench, name: &str) -> String {
-    bench.images.join(name).display().to_string()
+    passed(format!("{image} in {} s", answer.value["seconds"]))
 }
 
 /// Checks that the application runs, and that it is the last one that was installed.
@@ -133,110 +150,213 @@ fn runs_installed(bench: &Bench) -> Outcome {
     if info["bootloader"] != Value::Bool(false) {
         return Err("the bootloader answers where the application should run.".into());
     }
-    holds_installed(bench, &info)
-}
-
-/// Checks that the device holds the last program that was installed.
-fn holds_installed(bench: &Bench, info: &Value) -> Outcome {
-    let Some(wanted) = &bench.installed else { return Ok(()) };
-    let held = info["programs"].get(0).and_then(|program| number(&program["crc"]));
-    if held.as_ref() == Some(wanted) {
+    let held = info["programs"][0]["crc"].as_number().map(ToString::to_string);
+    if held == bench.installed {
         return Ok(());
     }
-    let held = held.unwrap_or("none".into());
-    Err(format!("the program in the device has CRC {held}, and the one that was installed {wanted}."))
+    Err(format!("the program in the device has CRC {held:?}, and the installed one {:?}.", bench.installed))
 }
 
-fn call_back(bench: &mut Bench) -> Outcome<Done> {
-    bench.coflash.call(&["enter", "--within", "10000"])?.good()?;
-    let info = bench.coflash.call(&["info"])?.good()?.value;
-    if info["bootloader"] != Value::Bool(true) {
-        return Err("the application still answers: it has not gone back to the bootloader.".into());
+/// Calls the application back by this way (2000h of the template), and measures it. The answer is on the bus
+/// 10 ms before the device leaves, and the bootloader comes within milliseconds by each way (docs/bench.md); the watchdog's time after a reset, 349 to 964 ms, would be a mistake.
+fn way_back(bench: &mut Bench, way: &str) -> Outcome<Done> {
+    bench.coflash.call(&["write", "2000", way, "--type", "u8"])?.good()?;
+    let (answer, heard) = bench.coflash.traced(&["enter", "--within", "10000"], &bench.work)?;
+    answer.good()?;
+    let node = bench.coflash.node;
+    let (said, up) = (format!("{:X}#60511F01", 0x580 + node), format!("{:X}#00", 0x700 + node));
+    let seconds = between(&heard, &said, &up)
+        .ok_or("the trace has no answer to 1F51h = 80h with a boot-up after it.")?;
+    if !(0.008..=0.05 + LATE).contains(&seconds) {
+        return Err(format!("{seconds:.3} s from the answer to the boot-up: it must be 0.010 to 0.05 s."));
     }
-    passed("")
+    bench.coflash.call(&["start"])?.good()?;
+    passed(format!("{:.0} ms from the answer to the boot-up", seconds * 1000.0))
 }
 
 fn starts_by_itself(bench: &mut Bench) -> Outcome<Done> {
-    let how = restart(bench)?;
+    let how = bench.restart()?;
     runs_installed(bench)?;
-    Ok(how)
+    passed(how)
 }
 
-fn power_cut(bench: &mut Bench) -> Outcome<Done> {
-    let Some(power) = &bench.power else {
-        return Ok(Done::LeftOut("there is no --power-command".into()));
-    };
-    let image = image(bench, V1);
-    let cut = bench.coflash.flash_until_middle(&flash_words(bench, &image), |_| switch(power, "off"));
-    // The board gets its power back, whatever happened.
-    switch(power, "on")?;
-    if cut?.code == Some(0) {
-        return Err("the update ended well without power: --power-command does not reach this board.".into());
+/// Gives the device another node-ID, which it keeps over a restart, and its own one back.
+fn store_node_id(bench: &mut Bench) -> Outcome<Done> {
+    let own = bench.coflash.node;
+    let other = if own == 127 { 126 } else { own + 1 };
+    for node in [other, own] {
+        bench.coflash.node = node;
+        let stored = bench.coflash.call(&["lss", "assign", "--store", "--reset"])?.good().map(drop);
+        let kept = stored.and_then(|()| bench.restart()).and_then(|_| info_after_start(bench));
+        if let Err(error) = kept {
+            bench.coflash.node = own;
+            return Err(format!("node-ID {node}: {error} `coflash lss fastscan` finds the device."));
+        }
     }
-    let info = info_after_start(bench)?;
-    if info["bootloader"] != Value::Bool(true) {
-        return Err("after a cut update an application runs, where the bootloader should wait.".into());
+    passed(format!("{other}, and {own} again"))
+}
+
+fn strap(bench: &mut Bench) -> Outcome<Done> {
+    if !bench.hand(Hand::Strap, true)? {
+        return not_run("nobody holds the strap: --strap-command, or a terminal to ask at");
     }
-    install(bench, V1, &[])
-}
-
-fn damaged_file(bench: &mut Bench) -> Outcome<Done> {
-    // A block file with one bit changed in its middle.
-    files::make(&bench.work)?;
-    let file = bench.work.join("damaged.blk");
-    let mut convert = Command::new(coflash::program());
-    convert.args(["convert", &image(bench, V2), "--board", bench.board.board]).arg(&file);
-    process::output(&mut convert)?;
-    let mut bytes = files::bytes(&file)?;
-    let middle = bytes.len() / 2;
-    *bytes.get_mut(middle).ok_or("the block file is empty.")? ^= 1;
-    files::write(&file, bytes)?;
-    let answer = bench.coflash.call(&["flash", &file.display().to_string()])?;
-    refused(bench, &answer, BAD_FILE)
-}
-
-fn wrong_identity(bench: &mut Bench) -> Outcome<Done> {
-    let answer = flash(bench, V2, &["--vid", "0x7FFFFFFF", "--pid", "1"])?;
-    refused(bench, &answer, REFUSED)
-}
-
-/// Checks that a download was refused with this exit code, and that the device holds the old
-/// program.
-fn refused(bench: &Bench, answer: &Answer, code: i32) -> Outcome<Done> {
-    match answer.code {
-        Some(0) => return Err("it was accepted, and must not be.".into()),
-        Some(found) if found == code => {}
-        _ => return Err(format!("it ended for another reason: {}", answer.problem())),
+    bench.restart()?;
+    let info = info_after_start(bench);
+    bench.hand(Hand::Strap, false)?;
+    if info?["state"]["reason"] != 1 {
+        return Err(
+            "the strap did not keep it in the bootloader: look at `entry_strap` of the board file.".into()
+        );
     }
-    holds_installed(bench, &bench.coflash.call(&["info"])?.good()?.value)?;
-    passed(answer.value["error"]["what"].as_str().unwrap_or_default())
-}
-
-fn interrupted(bench: &mut Bench) -> Outcome<Done> {
-    let ctrl_c = |process: u32| process::run(Command::new("kill").args(["-INT", &process.to_string()]));
-    let answer = bench.coflash.flash_until_middle(&flash_words(bench, &image(bench, V2)), ctrl_c)?;
-    if answer.code != Some(CANCELLED) {
-        return Err(format!("Ctrl-C did not cancel the update: {}", answer.problem()));
-    }
-    let again = flash(bench, V2, &[])?.good()?;
-    bench.installed = number(&again.value["crc"]);
+    bench.restart()?;
     runs_installed(bench)?;
     passed("")
+}
+
+/// Changes the bit rate of device and adapter until the next restart.
+fn bit_rates(bench: &mut Bench) -> Outcome<Done> {
+    if !bench.coflash.can_change_rate() {
+        return not_run("--bus has no {rate}: write it in the place of the bit rate, gs_usb:0@{rate}k");
+    }
+    let tried = [1000, 500, 250, 50, 20, 125].into_iter().try_for_each(|rate| {
+        let changed = bench.coflash.call(&["lss", "bit-rate", &rate.to_string(), "--activate"])?.good();
+        bench.coflash.rate = rate;
+        changed
+            .and_then(|_| info_after_start(bench))
+            .map(drop)
+            .map_err(|error| format!("{rate} kbit/s: {error}"))
+    });
+    bench.coflash.rate = 125;
+    tried.and_then(|()| passed("1000, 500, 250, 50 and 20 kbit/s"))
+}
+
+fn auto_bit_rate(bench: &mut Bench) -> Outcome<Done> {
+    if !bench.coflash.can_change_rate() {
+        return not_run("--bus has no {rate}");
+    }
+    bench.coflash.rate = 250;
+    let found = bench.restart().and_then(|_| info_after_start(bench));
+    bench.coflash.rate = 125;
+    bench.restart()?;
+    info_after_start(bench)?;
+    match found {
+        Ok(_) => passed("250 kbit/s, and 125 again"),
+        Err(_) => not_run("it has a bit rate of its own: only `bit_rate: 0` of the board file listens"),
+    }
+}
+
+/// A short for three seconds: 200 ms, 400, 800 and 1600 after it went off the device tries again. So its
+/// heartbeat (1 s) is back within some three seconds after the end of the short, and 8140h with it.
+fn bus_off(bench: &mut Bench) -> Outcome<Done> {
+    bootloader(bench)?;
+    if !bench.hand(Hand::Short, true)? {
+        return not_run("nobody shorts the bus: --short-command, or a terminal to ask at");
+    }
+    sleep(Duration::from_secs(3));
+    bench.hand(Hand::Short, false)?;
+    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "6000"], &bench.work)?;
+    let node = bench.coflash.node;
+    let told = format!("{:03X}#4081", 0x80 + node);
+    if !heard.iter().any(|heard| heard.frame.starts_with(&told)) {
+        return Err("no emergency 8140h within 6 s after the short. On SocketCAN the adapter may be off the bus itself: \
+                    `ip link set can0 type can restart-ms 100`."
+            .into());
+    }
+    info_after_start(bench)?;
+    passed("")
+}
+
+/// A device without its crystal only listens, or says that it runs from the internal oscillator.
+fn crystal(bench: &mut Bench) -> Outcome<Done> {
+    if !bench.hand(Hand::Crystal, true)? {
+        return not_run("nobody stops the crystal: --crystal-command, or a terminal to ask at");
+    }
+    bench.restart()?;
+    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "5000"], &bench.work)?;
+    let info = if heard.is_empty() { Value::Null } else { info_after_start(bench)? };
+    bench.hand(Hand::Crystal, false)?;
+    bench.restart()?;
+    info_after_start(bench)?;
+    match info["state"]["clock"].as_u64() {
+        None if heard.is_empty() => passed("it is silent"),
+        Some(2) => passed("2007h/5 = 2: it runs from the internal oscillator"),
+        _ => Err("it speaks and does not say that its crystal has failed (2007h/5).".into()),
+    }
+}
+
+/// A program that switches its interrupts off and loops is reset by the watchdog each time, and given up
+/// after three resets. Between two boot-ups are the rescue window of 300 ms and a second of the LSI.
+fn hung_program(bench: &mut Bench) -> Outcome<Done> {
+    if !std::path::Path::new(&bench.image(WITH_WATCHDOG)).exists() {
+        return not_run(format!("there is no {WITH_WATCHDOG} beside --elf"));
+    }
+    bench.coflash.call(&["erase"])?.good()?;
+    flash_bootloader(bench, WITH_WATCHDOG)?;
+    bench.restart()?;
+    info_after_start(bench)?;
+    let file = bench.work.join("hung.bin");
+    files::write(&file, hung(bench))?;
+    let words =
+        ["flash", &file.display().to_string(), "-I", "binary", "--board", bench.board.board, "--no-trial"];
+    bench.coflash.call(&[&words[..], &["--no-start"]].concat())?.good()?;
+    bench.coflash.call(&["release"])?.good()?;
+    bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
+    let (_, heard) = bench.coflash.traced(&["monitor", "--for", "9000"], &bench.work)?;
+    let node = bench.coflash.node;
+    let ups: Vec<&Heard> = heard.iter().filter(|one| one.frame == format!("{:X}#00", 0x700 + node)).collect();
+    let given_up = format!("{:03X}#00600102", 0x80 + node);
+    if ups.len() != 3 || !heard.iter().any(|one| one.frame.starts_with(&given_up)) {
+        return Err(format!(
+            "{} boot-ups in 9 s, and not three with an emergency 6000h/02h: the watchdog is late, or does not bite.",
+            ups.len()
+        ));
+    }
+    for pair in ups.windows(2) {
+        let seconds = pair[1].seconds - pair[0].seconds - 0.3;
+        if !(SECOND.0 - LATE..=SECOND.1 + LATE).contains(&seconds) {
+            return Err(format!(
+                "it was reset after {seconds:.2} s; 1000 ms are {:.2} to {:.2} s.",
+                SECOND.0, SECOND.1
+            ));
+        }
+    }
+    let seconds = ups[1].seconds - ups[0].seconds - 0.3;
+    bench.coflash.call(&["erase"])?.good()?;
+    flash_bootloader(bench, "bootloader.elf")?;
+    bench.restart()?;
+    info_after_start(bench)?;
+    passed(format!("reset after {seconds:.2} s, given up after three"))
+}
+
+/// A vector table, then `cpsid i` and a branch to itself (ARMv7-M A7.7.29 and A7.7.12).
+fn hung(bench: &Bench) -> Vec<u8> {
+    const CODE: usize = 0x200;
+    let mut bytes = vec![0; CODE];
+    bytes[..4].copy_from_slice(&bench.board.ram.end().to_le_bytes());
+    let reset = bench.board.programs[0].base + CODE as u32 + 1;
+    bytes[4..8].copy_from_slice(&reset.to_le_bytes());
+    bytes.extend([0x72, 0xB6, 0xFE, 0xE7]);
+    bytes
+}
+
+/// The bootloader's answer: a program is called back.
+fn bootloader(bench: &Bench) -> Outcome<Value> {
+    let info = info_after_start(bench)?;
+    if info["bootloader"] == Value::Bool(true) {
+        return Ok(info);
+    }
+    bench.coflash.call(&["enter", "--within", "10000"])?.good()?;
+    info_after_start(bench)
 }
 
 /// What runs on the device, as soon as it answers.
 fn info_after_start(bench: &Bench) -> Outcome<Value> {
     let started = Instant::now();
     loop {
-        let answer = bench.coflash.call(&["info"])?;
+        let answer: Answer = bench.coflash.call(&["info"])?;
         if answer.code == Some(0) || answer.code == Some(NO_BUS) || started.elapsed() > START {
             return Ok(answer.good()?.value);
         }
-        thread::sleep(Duration::from_millis(100));
+        sleep(Duration::from_millis(100));
     }
-}
-
-/// A number as its text.
-fn number(value: &Value) -> Option<String> {
-    value.as_number().map(ToString::to_string)
 }
