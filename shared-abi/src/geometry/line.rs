@@ -22,8 +22,7 @@ pub enum Line {
     F479,
 }
 
-/// The highest clocks of a chip at 2.7 to 3.6 V. (The bootloader programs the flash by words, which
-/// needs at least 2.7 V: RM0090 table 7. So it cannot run on a board with a lower voltage.)
+/// The highest clocks of a chip at a supply voltage.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// The core's clock in Hz. Over-drive is off: this firmware does not use it.
@@ -156,7 +155,13 @@ impl Line {
         }
     }
 
-    /// The highest clocks.
+    /// The highest clocks at 2.7 to 3.6 V.
+    #[must_use]
+    pub const fn limits(self) -> Limits {
+        self.limits_at(3_300)
+    }
+
+    /// The highest clocks at a supply of `supply_mv` mV, 1800 to 3600.
     ///
     /// "General operating conditions" of the datasheets DS8626 and DS8597 (F405 to F417, table 14),
     /// DS11139 (F412), DS11581 and DS11582 (F413, F423), DS9405 and DS9484 (F42x, F43x), DS10693
@@ -164,14 +169,19 @@ impl Line {
     /// and flash memory read time" of the reference manuals. With over-drive, the chips from F427 on
     /// reach 180, 45 and 90 MHz.
     #[must_use]
-    pub const fn limits(self) -> Limits {
+    pub const fn limits_at(self, supply_mv: u32) -> Limits {
         const MHZ: u32 = 1_000_000;
+        let per_wait_state = self.mhz_per_wait_state(supply_mv) * MHZ;
         let fast = Limits {
-            sysclk: 168 * MHZ,
+            // With their seven wait states, F405 to F417 do not reach 168 MHz below 2.1 V.
+            sysclk: match self {
+                Self::F405 | Self::F407 | Self::F415 | Self::F417 if supply_mv < 2_100 => 160 * MHZ,
+                _ => 168 * MHZ,
+            },
             sysclk_after_reset: 168 * MHZ,
             apb1: 42 * MHZ,
             apb2: 84 * MHZ,
-            per_wait_state: 30 * MHZ,
+            per_wait_state,
         };
         // After a reset their regulator is at scale 2 (RM0402 and RM0430, PWR_CR).
         let slow = Limits {
@@ -179,12 +189,27 @@ impl Line {
             sysclk_after_reset: 84 * MHZ,
             apb1: 50 * MHZ,
             apb2: 100 * MHZ,
-            per_wait_state: 30 * MHZ,
+            per_wait_state,
         };
         match self {
-            Self::F412 => slow,
-            Self::F413 | Self::F423 => Limits { per_wait_state: 25 * MHZ, ..slow },
+            Self::F412 | Self::F413 | Self::F423 => slow,
             _ => fast,
+        }
+    }
+
+    /// By how many MHz a wait state of the flash raises the core's clock at this supply: "Number of wait
+    /// states according to CPU clock frequency" (RM0090 tables 10 and 11, RM0402, RM0430, RM0390, RM0386).
+    const fn mhz_per_wait_state(self, supply_mv: u32) -> u32 {
+        let [from_2700, from_2400, from_2100, below] = match self {
+            Self::F412 => [30, 24, 18, 16],
+            Self::F413 | Self::F423 => [25, 20, 18, 16],
+            _ => [30, 24, 22, 20],
+        };
+        match supply_mv {
+            2_700.. => from_2700,
+            2_400.. => from_2400,
+            2_100.. => from_2100,
+            _ => below,
         }
     }
 }

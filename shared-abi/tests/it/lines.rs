@@ -27,6 +27,27 @@ fn clocks_are_those_of_the_datasheets() {
     }
 }
 
+/// Wait states at a lower supply: RM0090 tables 10 and 11 (F405 to F439), RM0390, RM0386: 24, 22 and 20 MHz
+/// each; RM0402 (F412): 24, 18, 16; RM0430 (F413, F423): 20, 18, 16. With seven of them, F405 to F417 reach
+/// 160 MHz below 2.1 V.
+#[test]
+fn a_lower_supply_needs_more_wait_states() {
+    for line in Line::ALL {
+        let each = match line {
+            Line::F412 => [30, 24, 24, 18, 18, 16, 16],
+            Line::F413 | Line::F423 => [25, 20, 20, 18, 18, 16, 16],
+            _ => [30, 24, 24, 22, 22, 20, 20],
+        };
+        for (mv, wait) in [2_700, 2_699, 2_400, 2_399, 2_100, 2_099, 1_800].into_iter().zip(each) {
+            let limits = line.limits_at(mv);
+            assert_eq!(limits.per_wait_state, wait * MHZ, "{} at {mv} mV", line.name());
+            let is_slow = matches!(line, Line::F405 | Line::F407 | Line::F415 | Line::F417) && mv < 2_100;
+            let sysclk = if is_slow { 160 * MHZ } else { line.limits().sysclk };
+            assert_eq!(limits.sysclk, sysclk, "{} at {mv} mV", line.name());
+        }
+    }
+}
+
 /// CAN controllers, ports (register boundary addresses) and interrupts (the vector table's last
 /// position and one), from RM0090, RM0402, RM0430, RM0390 and RM0386.
 #[test]
