@@ -24,7 +24,8 @@ use crate::peripheral::{Peripheral, Unmodelled};
 use crate::report::{Access, Report, Reports};
 use crate::silicon::Silicon;
 use crate::slice::Slice;
-use crate::time::Time;
+use crate::supply::{self, Supervisor, Supply};
+use crate::time::{Span, Time};
 use crate::variant::{self, Variant};
 
 /// Where flash (or whatever the boot pins choose) shows up for the reset vector.
@@ -175,10 +176,12 @@ pub struct Counters {
     pub units_programmed: u64,
     /// Flash operations refused with an error flag.
     pub flash_refused: u64,
+    /// Flash operations with a supply too low for their width: what they leave does not last.
+    pub flash_weak: u64,
     /// How often the CPU was stalled because it wanted the flash while that was busy.
     pub flash_stalls: u64,
     /// How long it was stalled for that, altogether.
-    pub flash_stall_time: crate::time::Span,
+    pub flash_stall_time: Span,
 }
 
 /// The chip around the CPU.
@@ -187,6 +190,11 @@ pub struct Chip {
     pub geometry: &'static Geometry,
     variant: &'static Variant,
     silicon: Silicon,
+    /// VDD.
+    supply: Supply,
+    supervisor: Supervisor,
+    /// VDD in mV, as the blocks know it.
+    vdd: u32,
     /// From cycles to time.
     pub clock: CycleClock,
     /// Core registers and exceptions.
@@ -225,6 +233,8 @@ pub struct Chip {
     /// What the chip and the CPU loop have to say to each other.
     pub slice: Slice,
     clocks: Clocks,
+    /// The crystal of the board, in Hz; 0 for none.
+    hse_hz: u32,
     /// The core sleeps, and some blocks that it uses have no clock meanwhile.
     is_halved: bool,
     lines: Vec<u16>,
@@ -251,6 +261,9 @@ impl Chip {
             geometry,
             variant,
             silicon,
+            supply: Supply::new(options.vdd_mv),
+            supervisor: Supervisor::default(),
+            vdd: supply::NOMINAL,
             clock: CycleClock::new(Time(0), silicon.hsi_hz),
             scs: Scs::new(geometry.interrupts, silicon.hsi_hz.into(), silicon.systick_value),
             flash: Flash::new(geometry, options.flash_times),
@@ -279,10 +292,12 @@ impl Chip {
                 sectors_erased: 0,
                 units_programmed: 0,
                 flash_refused: 0,
+                flash_weak: 0,
                 flash_stalls: 0,
-                flash_stall_time: crate::time::Span(0),
+                flash_stall_time: Span(0),
             },
             slice: Slice::default(),
+            hse_hz: options.hse_hz,
             is_halved: false,
             lines: Vec::new(),
         }
@@ -324,6 +339,64 @@ impl Chip {
     pub fn wake_up(&mut self) {
         self.pwr.wake_up();
         self.slice.reset_request = Some(ResetCause::Standby);
+    }
+
+    /// VDD in mV.
+    #[must_use]
+    pub fn vdd(&self) -> u32 {
+        self.supply.at(self.now())
+    }
+
+    /// Lets VDD go to `mv` within a time, from `now` on.
+    pub fn set_supply(&mut self, mv: u32, within: Span, now: Time) {
+        self.supply.go_to(mv, within, now);
+        self.slice.leave = true;
+    }
+
+    /// The supply holds the chip in reset: what is in the core domain is as after a reset, and the watchdog
+    /// stands (section 7.1.2).
+    pub fn hold_in_reset(&mut self) {
+        self.iwdg.reset();
+        self.pwr.lose_supply();
+        self.reset_core_domain(ResetCause::BrownOut);
+        self.follow_watchdog();
+    }
+
+    /// The supply is back, for a reset. After a power-down it is a power-on.
+    pub fn leave_reset(&mut self, powered_down: bool) {
+        if powered_down {
+            self.lose_power();
+        }
+        self.slice.reset_request =
+            Some(if powered_down { ResetCause::PowerOn } else { ResetCause::BrownOut });
+    }
+
+    /// Only a power-down resets this.
+    fn lose_power(&mut self) {
+        self.rcc = Rcc::new(self.variant, self.hse_hz, self.silicon);
+        self.pwr.lose_supply();
+        self.dbgmcu = [0; 3];
+    }
+
+    /// Follows VDD.
+    fn follow_supply(&mut self, now: Time) {
+        let mv = self.supply.at(now);
+        if let Some(change) = self.supervisor.watch(mv, self.flash.brown_out_level(), now) {
+            self.slice.supply = Some(change);
+            self.slice.leave = true;
+        }
+        if mv == self.vdd {
+            return;
+        }
+        let limits = |mv| self.geometry.line.limits_at(mv);
+        let is_slower = limits(mv).per_wait_state < limits(self.vdd).per_wait_state;
+        self.vdd = mv;
+        self.pwr.set_supply(mv);
+        self.flash.set_supply(mv);
+        self.show_pins();
+        if is_slower && !self.supervisor.holds() {
+            self.check_clocks();
+        }
     }
 
     /// See [`Iwdg::preset`]; the prescaler stays.
@@ -385,17 +458,17 @@ impl Chip {
         self.slice.leave = false;
         self.slice.check_exceptions = false;
         self.slice.reset_request = None;
+        self.slice.supply = None;
         self.slice.hold_until = None;
         self.slice.bus_error = None;
         self.take_flash_changes();
     }
 
     /// Power-on: as a reset, but all state is lost.
-    pub fn power_on(&mut self, now: Time, hse_hz: u32) {
+    pub fn power_on(&mut self, now: Time) {
         self.clock = CycleClock::new(now, self.silicon.hsi_hz);
-        self.rcc = Rcc::new(self.variant, hse_hz, self.silicon);
-        self.pwr = Pwr::new(self.variant);
-        self.dbgmcu = [0; 3];
+        self.lose_power();
+        self.supervisor = Supervisor::default();
         self.counters.resets = 0;
         self.slice.attention = false;
         self.reset(ResetCause::PowerOn);
@@ -452,12 +525,13 @@ impl Chip {
     fn check_clocks(&mut self) {
         let Clocks { hclk, pclk1, pclk2, .. } = self.clocks;
         let latency = self.flash.latency();
-        let limits = self.geometry.line.limits();
+        let limits = self.geometry.line.limits_at(self.vdd);
         let needed = (hclk - 1) / limits.per_wait_state;
         let mut wrong = Vec::new();
         if latency < needed {
+            let at = if self.vdd < 2_700 { format!(" at VDD {} mV", self.vdd) } else { String::new() };
             wrong.push(format!(
-                "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}, to be set before (FLASH_ACR)"
+                "HCLK is {hclk} Hz with {latency} flash wait states: it needs {needed}{at}, to be set before (FLASH_ACR)"
             ));
         }
         if hclk > limits.sysclk_after_reset && !self.pwr.is_at_scale_1() {
@@ -485,6 +559,7 @@ impl Chip {
     /// Processes all events that are due, and derives the interrupts.
     pub fn advance(&mut self) {
         let now = self.now();
+        self.follow_supply(now);
         let hclk = self.clocks;
         self.rcc.advance(now);
         if self.rcc.clocks() != hclk {
@@ -542,6 +617,7 @@ impl Chip {
         self.counters.sectors_erased = self.flash.counters.sectors_erased;
         self.counters.units_programmed = self.flash.counters.units_programmed;
         self.counters.flash_refused = self.flash.counters.refused;
+        self.counters.flash_weak = self.flash.counters.weak;
     }
 
     /// The time of the next event that the CPU does not cause.
@@ -554,6 +630,7 @@ impl Chip {
             self.can[1].next_event(),
             self.rcc.next_event(),
             self.scs.systick.next_event(),
+            self.supply.next_change(self.now()),
         ]
         .into_iter()
         .chain(self.usarts.iter().map(Peripheral::next_event))
@@ -817,7 +894,7 @@ impl Chip {
                 self.wire_usarts();
                 self.show_pins();
             }
-            Block::Syscfg => self.show_pins(),
+            Block::Syscfg | Block::Pwr => self.show_pins(),
             Block::Can1 | Block::Can2 => {
                 if block == Block::Can1 {
                     self.tell_slave();
@@ -832,15 +909,15 @@ impl Chip {
         result
     }
 
-    /// The levels at the pins that EXTI lines 0 to 15 follow.
-    fn exti_levels(&self) -> u16 {
-        (0..16).fold(0, |levels, line| {
+    /// The levels that EXTI lines 0 to 16 follow: pins, and the voltage detector.
+    fn exti_levels(&self) -> u32 {
+        (0..16).fold(u32::from(self.pwr.supply_is_low()) << 16, |levels, line| {
             let port = self.gpio.get(self.syscfg.port_of(line));
-            levels | u16::from(port.is_some_and(|port| port.level(line))) << line
+            levels | u32::from(port.is_some_and(|port| port.level(line))) << line
         })
     }
 
-    /// Updates the levels at the pins, which may have changed.
+    /// Updates the levels at the EXTI lines, which may have changed.
     pub fn show_pins(&mut self) {
         if self.exti.listens() {
             let levels = self.exti_levels();
@@ -928,7 +1005,11 @@ impl Chip {
                 let what = "programs a 1 over a 0: the bit stays 0".into();
                 self.report(Access::Write, address, size, value, pc, what);
             }
-            Store::Started => {}
+            Store::Started => {
+                if let Some(what) = self.flash.weakness() {
+                    self.report(Access::Write, address, size, value, pc, what);
+                }
+            }
             Store::Refused(why) => {
                 self.report(Access::Write, address, size, value, pc, format!("flash not programmed: {why}"));
             }

@@ -1,7 +1,7 @@
 //! The control socket: power, reset and pins for other programs, in lines of text over TCP.
 //!
 //! ```text
-//! power off|on | reset | pin PC13 low|high|open | status
+//! power off|on | vdd 2400 [in 100] | reset | pin PC13 low|high|open | status
 //! ```
 //!
 //! Each line gets one line back, which begins with `ok` or `error`. A prefix `board 2` selects a
@@ -32,6 +32,13 @@ pub enum Action {
     Power(bool),
     /// Switches the power on if it is off, and off if it is on.
     TogglePower,
+    /// Lets the supply go to another voltage.
+    Supply {
+        /// In mV, up to [`MOST_MV`].
+        mv: u32,
+        /// In ms.
+        within_ms: u32,
+    },
     /// Pulls NRST low for a moment.
     Reset,
     /// Drives a pin from outside; `None` releases it.
@@ -56,7 +63,10 @@ pub struct Command {
     pub action: Action,
 }
 
-const KNOWN: &str = "known: power off|on, reset, pin PC13 low|high|open, status; `board 2` may be in front";
+/// The highest supply, in mV (datasheet, general operating conditions).
+pub const MOST_MV: u32 = 3_600;
+
+const KNOWN: &str = "known: power off|on, vdd 2400 (mV) in 100 (ms), reset, pin PC13 low|high|open, status; `board 2` may be in front";
 
 impl std::str::FromStr for Command {
     type Err = String;
@@ -73,6 +83,8 @@ impl std::str::FromStr for Command {
             ["power", "on"] => Action::Power(true),
             ["power", "off"] => Action::Power(false),
             ["p"] => Action::TogglePower,
+            ["vdd", mv] => supply(mv, "0")?,
+            ["vdd", mv, "in", ms] => supply(mv, ms)?,
             ["reset" | "r"] => Action::Reset,
             ["status" | "s"] => Action::Status,
             ["pin", name, level] => {
@@ -89,6 +101,14 @@ impl std::str::FromStr for Command {
         };
         Ok(Self { board, action })
     }
+}
+
+/// The supply goes to `mv` mV within `ms` ms.
+fn supply(mv: &str, ms: &str) -> Result<Action, String> {
+    let mv = mv.parse().ok().filter(|mv| *mv <= MOST_MV);
+    let mv = mv.ok_or(format!("`vdd` is a number of mV from 0 to {MOST_MV}"))?;
+    let within_ms = ms.parse().map_err(|_| "`in` needs a number of ms".to_owned())?;
+    Ok(Action::Supply { mv, within_ms })
 }
 
 /// `PC13` or `pc13`.
@@ -282,6 +302,8 @@ mod tests {
         assert_eq!((action("reset"), action("r")), (Ok(Action::Reset), Ok(Action::Reset)));
         assert_eq!(action("pin PC13 low"), Ok(Action::Pin { port: 'C', pin: 13, level: Some(false) }));
         assert_eq!(action("pin pa0 open"), Ok(Action::Pin { port: 'A', pin: 0, level: None }));
+        assert_eq!(action("vdd 2400"), Ok(Action::Supply { mv: 2_400, within_ms: 0 }));
+        assert_eq!(action("vdd 0 in 3600000"), Ok(Action::Supply { mv: 0, within_ms: 3_600_000 }));
         assert_eq!("board 2 reset".parse(), Ok(Command { board: 1, action: Action::Reset }));
         for line in [
             "",
@@ -294,6 +316,13 @@ mod tests {
             "pin PC+1 low",
             "pin PC1 up",
             "reset now",
+            "vdd",
+            "vdd 3601",
+            "vdd -1",
+            "vdd 2.4",
+            "vdd 2400 in",
+            "vdd 2400 in 99999999999",
+            "vdd 2400 within 5",
             "board",
             "board 0 reset",
             "board x reset",

@@ -12,6 +12,7 @@
 //! | [`bxcan`] | the CAN controllers |
 //! | [`variant`] | how the lines of the family differ |
 //! | [`silicon`] | what the manuals leave open: the values of one chip |
+//! | [`supply`] | VDD, and the resets by it |
 //! | [`memory`], [`clock`], [`noise`] | memory of host and chip, cycles as time, random values by a seed |
 //! | [`options`], [`error`], [`report`] | set-up, errors, accesses that are wrong or not modelled |
 //! | [`bus`], [`frame`] | the CAN bus: arbitration, errors, faults; frames and their bits |
@@ -46,6 +47,7 @@ pub mod serial;
 pub mod silicon;
 pub mod slice;
 pub mod socketcand;
+pub mod supply;
 pub mod time;
 pub mod variant;
 pub mod world;

@@ -21,6 +21,7 @@ use crate::peripheral::Peripheral;
 pub use crate::report::{Access, Report};
 use crate::silicon::Silicon;
 use crate::slice::Watch;
+use crate::supply::Change;
 use crate::time::{Span, Time};
 use debugger::Debugger;
 pub use debugger::Halt;
@@ -57,6 +58,8 @@ enum Activity {
     },
     /// The core domain has no supply: only a reset or a wake-up ends it.
     Standby,
+    /// The supply is too low: it holds the chip in reset.
+    Held,
     LockedUp,
 }
 
@@ -151,21 +154,64 @@ impl Machine {
 
     /// Power comes up at `now`: RAM holds noise, the chip starts at its reset vector.
     pub fn power_on(&mut self, now: Time) {
-        self.lose_ram();
-        let hse_hz = self.options.hse_hz;
-        self.cpu.chip_mut().power_on(now, hse_hz);
-        self.cpu.forget_translations();
+        self.lose_ram(1_000);
+        self.cpu.chip_mut().power_on(now);
         self.start();
     }
 
-    /// The supply of the RAM was off.
-    fn lose_ram(&mut self) {
+    /// The RAM had no supply, and so many per mille of it have lost their contents.
+    fn lose_ram(&mut self, per_mille: u32) {
         self.power_cycles += 1;
         let mut noise = Noise(self.options.seed ^ self.power_cycles.wrapping_mul(0xA24B_AED4_963E_E407));
         let chip = self.cpu.chip_mut();
         for memory in [&mut chip.sram, &mut chip.ccm] {
             for word in memory.bytes_mut().chunks_exact_mut(8) {
-                word.copy_from_slice(&noise.word().to_le_bytes());
+                if per_mille >= 1_000 || noise.word() % 1_000 < per_mille.into() {
+                    word.copy_from_slice(&noise.word().to_le_bytes());
+                }
+            }
+        }
+        self.cpu.forget_translations();
+    }
+
+    /// Lets VDD go to `mv` within a time, in a straight line; at once within 0. While the power is off, it is
+    /// the voltage at the next power-on.
+    pub fn set_supply(&mut self, mv: u32, within: Span) {
+        let now = self.now();
+        self.cpu.chip_mut().set_supply(mv, within, now);
+    }
+
+    /// VDD in mV; 0 while the power is off.
+    #[must_use]
+    pub fn supply(&self) -> u32 {
+        if self.is_powered() {
+            self.cpu.chip().vdd()
+        } else {
+            0
+        }
+    }
+
+    /// Whether the supply is too low, so that it holds the chip in reset.
+    #[must_use]
+    pub fn is_held_in_reset(&self) -> bool {
+        self.activity == Activity::Held
+    }
+
+    /// The supply takes the chip into reset, or out of it.
+    fn follow_supply(&mut self, change: Change) {
+        match change {
+            Change::Falls => {
+                if self.activity == Activity::Standby {
+                    self.lose_ram(1_000);
+                }
+                self.cpu.chip_mut().hold_in_reset();
+                self.activity = Activity::Held;
+            }
+            Change::Rises { powered_down, ram_lost } => {
+                if ram_lost > 0 {
+                    self.lose_ram(ram_lost);
+                }
+                self.cpu.chip_mut().leave_reset(powered_down);
             }
         }
     }
@@ -190,7 +236,7 @@ impl Machine {
 
     /// NRST is pulled low and released.
     pub fn reset_pin(&mut self) {
-        if self.is_powered() {
+        if self.is_powered() && !self.is_held_in_reset() {
             self.reset(ResetCause::Pin);
         }
     }
@@ -222,8 +268,7 @@ impl Machine {
 
     fn reset(&mut self, cause: ResetCause) {
         if self.activity == Activity::Standby {
-            self.lose_ram();
-            self.cpu.forget_translations();
+            self.lose_ram(1_000);
         }
         let chip = self.cpu.chip_mut();
         chip.reset(cause);
@@ -305,6 +350,10 @@ impl Machine {
                 self.power_off();
                 return Stop::PowerCut;
             }
+            if let Some(change) = chip.slice.supply.take() {
+                self.follow_supply(change);
+            }
+            let chip = self.cpu.chip_mut();
             if let Some(cause) = chip.slice.reset_request.take() {
                 self.reset(cause);
                 return Stop::Reset(cause);
@@ -349,7 +398,7 @@ impl Machine {
                 self.skip_to(target);
                 Entry::Taken
             }
-            Activity::Sleeps | Activity::Standby | Activity::LockedUp | Activity::Off => {
+            Activity::Sleeps | Activity::Standby | Activity::Held | Activity::LockedUp | Activity::Off => {
                 let target = self.cpu.chip().next_stop();
                 self.skip_to(target);
                 Entry::Taken
@@ -531,6 +580,20 @@ impl Machine {
     /// For a sector of a second bank, whose option bytes are not modelled.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
+    }
+
+    /// Sets all option bytes as a debug probe does, in the form of FLASH_OPTCR; BFB2 and DB1M are shown and
+    /// have no effect.
+    pub fn set_option_bytes(&mut self, optcr: u32) {
+        self.cpu.chip_mut().flash.preset_options(optcr);
+    }
+
+    /// Sets the option bits BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
+    ///
+    /// # Panics
+    /// For another level.
+    pub fn set_brown_out_level(&mut self, level: u8) {
+        self.cpu.chip_mut().flash.preset_brown_out_level(level);
     }
 
     /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.

@@ -2,6 +2,7 @@
 
 use crate::periph::flash::FlashTimes;
 use crate::silicon::{self, Silicon};
+use crate::supply;
 
 /// How a machine is set up.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -19,6 +20,8 @@ pub struct Options {
     pub transceiver: usize,
     /// What the manuals leave open: the values of this chip.
     pub silicon: Silicon,
+    /// VDD at power-on, in mV.
+    pub vdd_mv: u32,
 }
 
 impl Default for Options {
@@ -30,6 +33,7 @@ impl Default for Options {
             unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
             transceiver: 0,
             silicon: silicon::TYPICAL,
+            vdd_mv: supply::NOMINAL,
         }
     }
 }

@@ -9,6 +9,7 @@ use shared_abi::geometry::Region;
 
 use crate::periph::rcc::ResetCause;
 use crate::report::Report;
+use crate::supply::Change;
 use crate::time::Time;
 
 /// The record of the RAM that a piece of code accesses.
@@ -36,6 +37,8 @@ pub struct Slice {
     pub attention: bool,
     /// A system reset was asked for.
     pub reset_request: Option<ResetCause>,
+    /// The supply takes the chip into reset, or out of it.
+    pub supply: Option<Change>,
     /// The CPU is stalled until this time, because the bus to the flash is held.
     pub hold_until: Option<Time>,
     /// A bus error came back for the last store, to this address.

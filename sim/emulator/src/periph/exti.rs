@@ -1,5 +1,5 @@
 //! External interrupt controller (RM0090 section 12.2): lines 0 to 15 follow the pins that SYSCFG
-//! chooses; all 23 can be raised by software.
+//! chooses, line 16 the voltage detector; all 23 can be raised by software.
 //!
 //! A wake-up by an event (EMR) needs nothing here: WFE ends by itself in this model.
 
@@ -14,8 +14,8 @@ const SWIER: u32 = 0x10;
 const PR: u32 = 0x14;
 
 const LINES: u32 = 0x007F_FFFF;
-/// The lines that come from pins.
-const PINS: u32 = 0xFFFF;
+/// The lines that come from pins, and from the voltage detector.
+const FOLLOWED: u32 = 0x1_FFFF;
 
 /// The interrupt lines of the NVIC, by EXTI line (RM0090 table 62).
 const NVIC: [u16; 23] = [6, 7, 8, 9, 10, 23, 23, 23, 23, 23, 40, 40, 40, 40, 40, 40, 1, 41, 42, 62, 76, 2, 3];
@@ -29,26 +29,26 @@ pub struct Exti {
     ftsr: u32,
     swier: u32,
     pr: u32,
-    /// The levels at lines 0 to 15 when they were last looked at.
-    levels: u16,
+    /// The levels at lines 0 to 16 when they were last looked at.
+    levels: u32,
 }
 
 impl Exti {
-    /// Whether an edge at a pin has an effect. Only then the pins need to be shown.
+    /// Whether an edge at lines 0 to 16 has an effect. Only then their levels need to be shown.
     #[must_use]
     pub fn listens(&self) -> bool {
-        (self.rtsr | self.ftsr) & PINS != 0
+        (self.rtsr | self.ftsr) & FOLLOWED != 0
     }
 
-    /// Sets the present levels at lines 0 to 15; edges since the last call count.
-    pub fn show(&mut self, levels: u16) {
-        let (new, old) = (u32::from(levels), u32::from(self.levels));
+    /// Sets the present levels at lines 0 to 16; edges since the last call count.
+    pub fn show(&mut self, levels: u32) {
+        let (new, old) = (levels, self.levels);
         self.pr |= new & !old & self.rtsr | old & !new & self.ftsr;
         self.levels = levels;
     }
 
-    /// Sets the present levels at lines 0 to 15 without an edge.
-    pub fn settle(&mut self, levels: u16) {
+    /// Sets the present levels at lines 0 to 16 without an edge.
+    pub fn settle(&mut self, levels: u32) {
         self.levels = levels;
     }
 }
@@ -89,9 +89,9 @@ impl Peripheral for Exti {
             }
             _ => return Err(Unmodelled("EXTI has no such register".into())),
         }
-        if matches!(offset, RTSR | FTSR) && value & !PINS != 0 {
+        if matches!(offset, RTSR | FTSR) && value & !FOLLOWED != 0 {
             return Err(Unmodelled(
-                "what is behind EXTI lines 16 to 22 (PVD, RTC, USB, Ethernet) is not modelled".into(),
+                "what is behind EXTI lines 17 to 22 (RTC, USB, Ethernet) is not modelled".into(),
             ));
         }
         Ok(())
@@ -145,6 +145,18 @@ mod tests {
         exti.write(PR, 1 << 7, Time(0)).unwrap();
         exti.show(0);
         assert_eq!(exti.read(PR, Time(0)), Ok(1 << 13 | 1 << 7), "the other edge");
+    }
+
+    /// Section 12.2.5: line 16 is the output of the voltage detector, interrupt 1 (table 62).
+    #[test]
+    fn the_voltage_detector_is_line_16() {
+        let mut exti = Exti::default();
+        exti.write(IMR, LINES, Time(0)).unwrap();
+        exti.write(RTSR, 1 << 16, Time(0)).unwrap();
+        assert!(exti.listens());
+        exti.show(1 << 16);
+        assert_eq!((exti.read(PR, Time(0)), lines(&exti)), (Ok(1 << 16), vec![1]));
+        assert!(exti.write(RTSR, 1 << 17, Time(0)).is_err());
     }
 
     /// Section 12.3.5: SWIER.

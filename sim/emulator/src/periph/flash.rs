@@ -15,8 +15,9 @@ use shared_abi::geometry::{Geometry, Sector};
 use crate::memory::HostMemory;
 use crate::noise::Noise;
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::supply::NOMINAL;
 use crate::time::{Span, Time};
-use cells::carry_out;
+use cells::{carry_out, weak_bits};
 pub use cells::{Cells, Cut, Operation};
 use lock::Lock;
 use options::{OptionBytes, Request};
@@ -75,6 +76,10 @@ const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000,
 /// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
+/// The lowest supply for programming and erasing by parallelism x8, x16, x32, in mV (RM0090 table 7). x64
+/// needs the external voltage, too, which no board here has.
+const SUPPLY: [u32; 3] = [1_800, 2_100, 2_700];
+
 /// How long a bit between 0 and 1 reads the same, at most.
 const REDRAW: Span = Span::from_millis(20);
 
@@ -96,12 +101,16 @@ pub struct FlashCounters {
     pub units_programmed: u64,
     /// Operations refused with an error flag.
     pub refused: u64,
+    /// Operations with a supply too low for their width.
+    pub weak: u64,
 }
 
 #[derive(Clone, Debug)]
 struct Running {
     operation: Operation,
     ends: Time,
+    /// The supply was too low when it began.
+    is_weak: bool,
 }
 
 /// The result of a store by the CPU to the array.
@@ -139,6 +148,8 @@ pub struct Flash {
     noise: Noise,
     /// When they read otherwise.
     redraw_at: Time,
+    /// VDD in mV.
+    supply: u32,
     /// The operations that have started since somebody wants to know them.
     log: Option<Vec<Operation>>,
     /// Usage.
@@ -167,6 +178,7 @@ impl Flash {
             unstable: BTreeMap::new(),
             noise: Noise(0),
             redraw_at: Time(0),
+            supply: NOMINAL,
             log: None,
             counters: FlashCounters::default(),
         }
@@ -198,6 +210,49 @@ impl Flash {
     /// operation.
     pub fn take_wait(&mut self) -> Option<Time> {
         self.waited_until.take()
+    }
+
+    /// VDD has this voltage in mV.
+    pub fn set_supply(&mut self, mv: u32) {
+        self.supply = mv;
+    }
+
+    /// What a supply that is too low means for the operations that start now.
+    #[must_use]
+    pub fn weakness(&self) -> Option<String> {
+        let psize = self.psize();
+        let bits = 8 << psize;
+        match SUPPLY.get(psize) {
+            None => Some(format!(
+                "FLASH_CR.PSIZE is {bits} bits, which needs the external voltage VPP: what is written or erased may                  not last"
+            )),
+            Some(needed) if self.supply < *needed => Some(format!(
+                "VDD is {} mV, and FLASH_CR.PSIZE of {bits} bits needs {needed} mV: what is written or erased may \
+                 not last",
+                self.supply
+            )),
+            Some(_) => None,
+        }
+    }
+
+    fn psize(&self) -> usize {
+        ((self.cr & CR_PSIZE) >> 8) as usize
+    }
+
+    /// BOR_LEV of the option bytes: 0 to 2 are levels 3 to 1, 3 is off.
+    #[must_use]
+    pub fn brown_out_level(&self) -> u8 {
+        self.options.brown_out_level()
+    }
+
+    /// Sets all option bytes as a debug probe does, in the form of OPTCR.
+    pub fn preset_options(&mut self, optcr: u32) {
+        self.options.preset_all(optcr);
+    }
+
+    /// Sets BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
+    pub fn preset_brown_out_level(&mut self, level: u8) {
+        self.options.preset_brown_out_level(level);
     }
 
     /// Arms a power cut; operations are counted from now on.
@@ -272,7 +327,7 @@ impl Flash {
     }
 
     fn width(&self) -> u32 {
-        1 << ((self.cr & CR_PSIZE) >> 8)
+        1 << self.psize()
     }
 
     fn pick(&self, (typical, worst): (u64, u64)) -> u64 {
@@ -283,14 +338,13 @@ impl Flash {
     }
 
     fn erase_time(&self, sectors: &[Sector]) -> Span {
-        let width = ((self.cr & CR_PSIZE) >> 8) as usize;
         let table = match sectors {
             [one] if one.region.size <= 16 * 1024 => ERASE_16_KIB,
             [one] if one.region.size <= 64 * 1024 => ERASE_64_KIB,
             [_] => ERASE_128_KIB,
             _ => ERASE_MASS,
         };
-        Span::from_millis(self.pick(table[width]))
+        Span::from_millis(self.pick(table[self.psize()]))
     }
 
     /// nWRP: a zero protects the sector (section 3.6.5).
@@ -379,7 +433,8 @@ impl Flash {
             }
             cut.operation -= 1;
         }
-        self.running = Some(Running { operation, ends: now + takes });
+        let is_weak = self.weakness().is_some();
+        self.running = Some(Running { operation, ends: now + takes, is_weak });
     }
 
     fn start_erase(&mut self, now: Time) -> Result<(), Unmodelled> {
@@ -419,7 +474,7 @@ impl Flash {
         }
         let takes = self.erase_time(&sectors);
         self.start(Operation::Erase { sectors }, takes, now);
-        Ok(())
+        self.weakness().map_or(Ok(()), |what| Err(Unmodelled(what)))
     }
 
     /// The sector that a value of SNB names. With two banks bit 4 is the bank and the others count
@@ -450,6 +505,20 @@ impl Flash {
             }
         }
         self.carry_out(operation, Cut::After);
+    }
+
+    /// Completes an operation that had too little voltage: what it leaves reads right at first, and may not
+    /// last (section 3.6.2).
+    fn complete_weakly(&mut self, operation: &Operation, now: Time) {
+        self.counters.weak += 1;
+        let weak = weak_bits(operation, self.geometry, self.array.bytes(), &mut self.noise);
+        self.complete(operation);
+        if self.unstable.is_empty() {
+            self.redraw_at = now + REDRAW;
+        }
+        for (at, bits) in weak {
+            *self.unstable.entry(at).or_default() |= bits;
+        }
     }
 
     /// Carries an operation out in part.
@@ -579,8 +648,12 @@ impl Peripheral for Flash {
             self.redraw();
         }
         if self.busy_until().is_some_and(|ends| ends <= now) {
-            if let Some(Running { operation, .. }) = self.running.take() {
-                self.complete(&operation);
+            if let Some(running) = self.running.take() {
+                let is_weak = running.is_weak || self.weakness().is_some();
+                match is_weak {
+                    true => self.complete_weakly(&running.operation, now),
+                    false => self.complete(&running.operation),
+                }
                 if self.cr & CR_EOPIE != 0 {
                     self.sr |= SR_EOP;
                 }
@@ -652,6 +725,27 @@ mod tests {
         flash.advance(Time(40_000_000));
         assert_eq!(flash.array.bytes()[8..12], [0x08, 0x50, 0x34, 0x12]);
         assert_eq!(flash.take_changed(), [(8, 4), (8, 4)]);
+    }
+
+    /// RM0090 table 7: 8 bits from 1.8 V on, 16 from 2.1 V, 32 from 2.7 V, 64 with VPP alone.
+    #[test]
+    fn each_width_needs_its_supply() {
+        for (psize, lowest) in [(0, Some(1_800)), (1, Some(2_100)), (2, Some(2_700)), (3, None)] {
+            for mv in [1_799, 1_800, 2_099, 2_100, 2_699, 2_700, 3_600] {
+                let mut flash = unlocked();
+                flash.set_supply(mv);
+                flash.write(CR, CR_PG | psize << 8, Time(0)).unwrap();
+                let bytes = &[0x5A; 8][..1 << psize];
+                assert_eq!(flash.store(16, bytes, Time(0)), Store::Started);
+                flash.advance(Time(16_000_000));
+                assert_eq!(&flash.array.bytes()[16..16 + bytes.len()], bytes, "it is there, at first");
+                let lasts = lowest.is_some_and(|lowest| mv >= lowest);
+                assert_eq!(flash.unstable.is_empty(), lasts, "{mv} mV, PSIZE {psize}");
+                assert_eq!(flash.counters.weak, u64::from(!lasts));
+                let erase = CR_SER | 4 << 3 | psize << 8 | CR_STRT;
+                assert_eq!(flash.write(CR, erase, Time(20_000_000)).is_ok(), lasts, "{mv} mV, PSIZE {psize}");
+            }
+        }
     }
 
     #[test]

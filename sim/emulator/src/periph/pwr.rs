@@ -1,6 +1,7 @@
 //! Power controller (RM0090 section 5, RM0390 section 5).
 
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::supply::NOMINAL;
 use crate::time::Time;
 use crate::variant::Variant;
 
@@ -10,29 +11,84 @@ const CR_LOW_POWER: u32 = 0b11;
 const CR_PDDS: u32 = 1 << 1;
 const CR_CWUF: u32 = 1 << 2;
 const CR_CSBF: u32 = 1 << 3;
-const CR_PVD: u32 = 0b1111 << 4;
+const CR_PVDE: u32 = 1 << 4;
+const CR_PLS: u32 = 0b111 << 5;
 /// On chips that can do 180 MHz.
 const CR_OVER_DRIVE: u32 = 0b11 << 16;
 const CSR_WUF: u32 = 1 << 0;
 const CSR_SBF: u32 = 1 << 1;
+const CSR_PVDO: u32 = 1 << 2;
 /// The pin WKUP, PA0; some lines have more such pins, which are not modelled.
 const CSR_EWUP: u32 = 1 << 8;
 const CSR_VOSRDY: u32 = 1 << 14;
 
-/// Regulator scale, backup-domain access and Standby; Stop and the voltage detector are not modelled.
+/// The thresholds of the voltage detector by PLS, falling and rising, in mV: typical ones of the datasheet
+/// (DocID022152, "Embedded reset and power control block characteristics").
+const PVD: [(u32, u32); 8] = [
+    (2_040, 2_140),
+    (2_190, 2_300),
+    (2_350, 2_450),
+    (2_510, 2_600),
+    (2_660, 2_760),
+    (2_840, 2_930),
+    (2_930, 3_030),
+    (3_030, 3_140),
+];
+
+/// Regulator scale, voltage detector, backup-domain access and Standby; Stop is not modelled.
 #[derive(Clone, Debug)]
 pub struct Pwr {
     variant: &'static Variant,
     cr: u32,
     /// WUF, SBF and EWUP.
     csr: u32,
+    /// VDD in mV.
+    supply: u32,
+    /// PVDO.
+    is_low: bool,
 }
 
 impl Pwr {
     /// As after a reset, on this chip.
     #[must_use]
     pub fn new(variant: &'static Variant) -> Self {
-        Self { variant, cr: variant.voltage_scale.1, csr: 0 }
+        Self { variant, cr: variant.voltage_scale.1, csr: 0, supply: NOMINAL, is_low: false }
+    }
+
+    /// VDD has this voltage in mV.
+    pub fn set_supply(&mut self, mv: u32) {
+        self.supply = mv;
+        if self.cr & CR_PVDE != 0 {
+            let (falling, rising) = self.pvd();
+            self.is_low = mv < if self.is_low { rising } else { falling };
+        }
+    }
+
+    /// CSR.PVDO, which is EXTI line 16 too: whether the supply is below the threshold of the voltage
+    /// detector.
+    #[must_use]
+    pub fn supply_is_low(&self) -> bool {
+        self.is_low
+    }
+
+    fn pvd(&self) -> (u32, u32) {
+        PVD[((self.cr & CR_PLS) >> 5) as usize]
+    }
+
+    /// After a change of PVDE or PLS, the supply counts as one that rises: the manual has no time after which
+    /// the detector is right, nor what it shows until then.
+    fn restart_pvd(&mut self) {
+        self.is_low = self.cr & CR_PVDE != 0 && self.supply < self.pvd().1;
+    }
+
+    /// A reset by the supply: everything is as after power-on.
+    pub fn lose_supply(&mut self) {
+        *self = self.fresh();
+    }
+
+    /// As after a reset, at the same supply.
+    fn fresh(&self) -> Self {
+        Self { supply: self.supply, ..Self::new(self.variant) }
     }
 
     /// CR.VOS: whether the regulator is at scale 1, which the fastest clocks need.
@@ -57,7 +113,7 @@ impl Pwr {
     /// The core domain has its supply again: of these registers only CR is as after a reset (section
     /// 5.4).
     pub fn leave_standby(&mut self) {
-        *self = Self { csr: self.csr, ..Self::new(self.variant) };
+        *self = Self { csr: self.csr, ..self.fresh() };
     }
 
     /// Something asks for a wake-up.
@@ -89,7 +145,7 @@ impl Peripheral for Pwr {
     fn read(&mut self, offset: u32, _now: Time) -> Result<u32, Unmodelled> {
         match offset {
             0x00 => Ok(self.cr),
-            0x04 => Ok(self.csr | CSR_VOSRDY),
+            0x04 => Ok(self.csr | CSR_VOSRDY | if self.is_low { CSR_PVDO } else { 0 }),
             _ => Err(Unmodelled("PWR has no such register".into())),
         }
     }
@@ -102,9 +158,10 @@ impl Peripheral for Pwr {
                     self.csr &= if value & clear != 0 { !flag } else { u32::MAX };
                 }
                 let (voltage_scale, _) = self.variant.voltage_scale;
-                self.cr = value & (voltage_scale | CR_DBP | CR_FPDS | CR_LOW_POWER | CR_PVD);
-                if value & CR_PVD != 0 {
-                    return Err(Unmodelled("the voltage detector (PVD) is not modelled".into()));
+                let before = self.cr;
+                self.cr = value & (voltage_scale | CR_DBP | CR_FPDS | CR_LOW_POWER | CR_PVDE | CR_PLS);
+                if (before ^ self.cr) & (CR_PVDE | CR_PLS) != 0 {
+                    self.restart_pvd();
                 }
                 if value & CR_OVER_DRIVE != 0 {
                     return Err(Unmodelled("over-drive is not modelled, or the chip has none".into()));
@@ -131,7 +188,7 @@ impl Peripheral for Pwr {
 
     /// A system reset leaves SBF alone (section 5.4.2).
     fn reset(&mut self) {
-        *self = Self { csr: self.csr & CSR_SBF, ..Self::new(self.variant) };
+        *self = Self { csr: self.csr & CSR_SBF, ..self.fresh() };
     }
 }
 
@@ -144,6 +201,26 @@ mod tests {
 
     const CR: u32 = 0x00;
     const CSR: u32 = 0x04;
+
+    /// RM0090 section 5.2.3 and the datasheet: the threshold that PLS chooses, with its hysteresis.
+    #[test]
+    fn the_voltage_detector_compares_the_supply_with_its_threshold() {
+        for (pls, falling, rising) in [(0, 2_040, 2_140), (4, 2_660, 2_760), (7, 3_030, 3_140)] {
+            let mut pwr = Pwr::new(variant::of(&STM32F407VG));
+            let low = |pwr: &mut Pwr, mv| {
+                pwr.set_supply(mv);
+                pwr.read(CSR, Time(0)).unwrap() & 1 << 2 != 0
+            };
+            assert!(!low(&mut pwr, 1_800), "it is off");
+            pwr.write(CR, CR_PVDE | pls << 5, Time(0)).unwrap();
+            assert!(low(&mut pwr, rising - 1));
+            assert!(!low(&mut pwr, rising) && !low(&mut pwr, falling));
+            assert!(low(&mut pwr, falling - 1) && low(&mut pwr, rising - 1));
+            pwr.reset();
+            assert!(!low(&mut pwr, falling - 1), "off again");
+            assert_eq!(pwr.read(CR, Time(0)), Ok(0x4000));
+        }
+    }
 
     /// RM0090 sections 5.3.5, 5.4.1 and 5.4.2: CSBF and CWUF clear SBF and WUF; a system reset clears WUF and
     /// EWUP, too. With WUF set the chip does not stay in Standby.

@@ -52,6 +52,8 @@ pub enum ResetCause {
     IndependentWatchdog,
     /// A wake-up from Standby, which starts the chip as a reset does.
     Standby,
+    /// The supply is back after it was below the brown-out level of the option bytes.
+    BrownOut,
 }
 
 /// The frequencies that the program has set up, in Hz.
@@ -176,6 +178,7 @@ impl Rcc {
             ResetCause::IndependentWatchdog => CSR_IWDGRSTF | CSR_PINRSTF,
             ResetCause::Standby if self.silicon.flags_after_standby => POWER_ON,
             ResetCause::Standby => 0,
+            ResetCause::BrownOut => CSR_BORRSTF | CSR_PINRSTF,
         };
     }
 

@@ -2,6 +2,7 @@
 //! results come from the architecture and the reference manuals.
 
 mod programs;
+mod supply;
 
 use emulator::machine::{Access, Cut, FlashCut, FlashTimes, Machine, Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};

@@ -27,6 +27,7 @@ use emulator::rtt;
 use emulator::serial::Serial;
 use emulator::silicon::Choice;
 use emulator::socketcand::Server;
+use emulator::supply;
 use emulator::time::{Span, Time};
 use emulator::world::{MachineId, World};
 use flash_file::FlashFile;
@@ -79,8 +80,8 @@ struct Args {
     #[arg(long, value_name = "FILE", conflicts_with = "node_count")]
     flash: Option<PathBuf>,
 
-    /// Take commands at this address, a line each: `power off|on`, `reset`, `pin PC13
-    /// low|high|open`, `status`. On a terminal they can be typed as well, `r` for reset and `p` to
+    /// Take commands at this address, a line each: `power off|on`, `vdd 2400 in 100` (mV, ms),
+    /// `reset`, `pin PC13 low|high|open`, `status`. On a terminal they can be typed as well, `r` for reset and `p` to
     /// switch the power over among them
     #[arg(long, value_name = "HOST:PORT")]
     control: Option<String>,
@@ -130,6 +131,10 @@ struct Args {
     /// `typical`, `worst`, or a seed that draws it; the values are printed. Without it: typical
     #[arg(long, value_name = "SEED|worst|typical")]
     silicon: Option<Choice>,
+
+    /// The supply of the boards (VDD) in mV. The command `vdd` changes it
+    #[arg(long, value_name = "MILLIVOLT", default_value_t = supply::NOMINAL, value_parser = clap::value_parser!(u32).range(0..=i64::from(control::MOST_MV)))]
+    vdd: u32,
 
     /// End after so many seconds of virtual time
     #[arg(long = "for", value_name = "SECONDS", value_parser = seconds, allow_negative_numbers = true)]
@@ -380,6 +385,7 @@ impl Bench {
                     unique_id,
                     transceiver: args.can.map_or(args.board.transceiver, |can| usize::from(can) - 1),
                     silicon: args.silicon.unwrap_or(Choice::Typical).of_board(n.into()),
+                    vdd_mv: args.vdd,
                 },
             );
             let mut machine = machine.context("setting up the board")?;
@@ -616,7 +622,7 @@ impl Bench {
         let on = match action {
             Action::Power(on) => on,
             Action::TogglePower => !on,
-            Action::Reset | Action::Pin { .. } | Action::Status => on,
+            Action::Supply { .. } | Action::Reset | Action::Pin { .. } | Action::Status => on,
         };
         let said = match action {
             Action::Power(_) | Action::TogglePower if on => {
@@ -627,6 +633,11 @@ impl Bench {
                 self.world.power_off(id);
                 self.keep_flash()?;
                 Some("power off".to_owned())
+            }
+            Action::Supply { mv, within_ms } => {
+                self.world.machine_mut(id).set_supply(mv, Span::from_millis(within_ms.into()));
+                let within = if within_ms > 0 { format!(" within {within_ms} ms") } else { String::new() };
+                Some(format!("VDD goes to {mv} mV{within}"))
             }
             Action::Reset => {
                 if !on {
@@ -653,9 +664,11 @@ impl Bench {
             (false, _) => "power off",
             (true, Some(_)) => "halted by the debugger",
             (true, None) if machine.is_in_standby() => "in Standby",
+            (true, None) if machine.is_held_in_reset() => "held in reset by its supply",
             (true, None) => "runs",
         };
-        Ok(format!("{now} s, {}: {state}, pc {:08X}h", self.name(board), machine.pc()))
+        let (name, vdd, pc) = (self.name(board), machine.supply(), machine.pc());
+        Ok(format!("{now} s, {name}: {state}, pc {pc:08X}h, VDD {vdd} mV"))
     }
 
     fn keep_flash(&mut self) -> Result<()> {
@@ -725,7 +738,9 @@ impl Bench {
 /// The event of a board in words; `None` for an event that was requested.
 fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
     Some(match stop {
-        Stop::Deadline | Stop::Attention | Stop::Halted | Stop::Reset(ResetCause::PowerOn) => return None,
+        Stop::Deadline | Stop::Attention | Stop::Halted => return None,
+        Stop::Reset(ResetCause::PowerOn) => "the supply is back after a power-down".into(),
+        Stop::Reset(ResetCause::BrownOut) => "the supply is back after a brown-out".into(),
         Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
         Stop::Reset(ResetCause::Software) => "reset by its software".into(),
         Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),

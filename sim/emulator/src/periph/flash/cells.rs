@@ -136,3 +136,27 @@ pub(super) fn carry_out(
         Operation::Options { .. } => Vec::new(),
     }
 }
+
+/// The bits that an operation with too little voltage changes and that do not last: some of each byte that is
+/// programmed, and some cells of a sector that is erased. With the offset of their byte.
+pub(super) fn weak_bits(
+    operation: &Operation,
+    geometry: &Geometry,
+    array: &[u8],
+    noise: &mut Noise,
+) -> Vec<(u32, u8)> {
+    match operation {
+        Operation::Program { offset, bytes } => {
+            let bits = |(at, byte): (u32, &u8)| (at, array[at as usize] & !byte & noise.byte());
+            (*offset..).zip(bytes).map(bits).filter(|(_, bits)| *bits != 0).collect()
+        }
+        Operation::Erase { sectors } => {
+            let of_sector = |(start, len): (u32, u32)| {
+                let programmed = (start..start + len).filter(|at| array[*at as usize] != 0xFF);
+                programmed.step_by(len as usize / BETWEEN).map(|at| (at, !array[at as usize]))
+            };
+            sectors.iter().flat_map(|sector| of_sector(place(geometry, sector))).collect()
+        }
+        Operation::Options { .. } => Vec::new(),
+    }
+}

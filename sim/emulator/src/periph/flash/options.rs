@@ -18,6 +18,8 @@ const OPTLOCK: u32 = 1 << 0;
 const OPTSTRT: u32 = 1 << 1;
 /// What is kept of a value: nWRP, RDP, the user options, BOR_LEV.
 const KEPT: u32 = 0x0FFF_FFEC;
+/// nWRP means protection against reading, too (STM32F42x, F43x, F446, F469, F479).
+const SPRMOD: u32 = 1 << 31;
 /// From the factory: no protection, BOR off, software watchdog (section 3.9.9).
 const FACTORY: u32 = 0x0FFF_AAEC;
 /// What is left when the power fails while they are programmed: an erased cell reads as 1. That is
@@ -133,10 +135,15 @@ impl OptionBytes {
         }
     }
 
-    /// nWRP: a zero protects the sector (section 3.6.5). For sectors 0 to 11.
+    /// nWRP: a zero protects the sector, with SPRMOD a one (sections 3.7.4 and 3.9.10). For sectors 0 to 11.
     #[must_use]
     pub fn protects(&self, sector: u8) -> bool {
-        self.programmed >> 16 & 1 << sector == 0
+        (self.programmed >> 16 & 1 << sector == 0) != (self.programmed & SPRMOD != 0)
+    }
+
+    /// Sets all of them as a debug probe does, in the form of OPTCR, with bits that some lines alone have.
+    pub fn preset_all(&mut self, optcr: u32) {
+        self.preset(!(OPTLOCK | OPTSTRT), optcr & !(OPTLOCK | OPTSTRT));
     }
 
     /// Sets nWRP of a sector as a debug probe does: at once, and unnoticed by the running program.
@@ -153,6 +160,18 @@ impl OptionBytes {
     /// Sets WDG_SW as a debug probe does: the watchdog starts with each reset.
     pub fn preset_hardware_watchdog(&mut self, on: bool) {
         self.preset(1 << 5, u32::from(!on) << 5);
+    }
+
+    /// Sets BOR_LEV as a debug probe does: the level of the brown-out reset, 1 to 3; 0 for off.
+    pub fn preset_brown_out_level(&mut self, level: u8) {
+        assert!(level <= 3, "there are three levels");
+        self.preset(0b11 << 2, u32::from(3 - level) << 2);
+    }
+
+    /// BOR_LEV as programmed: 0 to 2 are levels 3 to 1, 3 is off (section 3.9.9).
+    #[must_use]
+    pub fn brown_out_level(&self) -> u8 {
+        (self.programmed >> 2 & 0b11) as u8
     }
 
     fn preset(&mut self, mask: u32, value: u32) {
@@ -202,6 +221,18 @@ mod tests {
         assert_eq!(options.level(), 0);
         assert!((0..12).all(|sector| !options.protects(sector)));
         assert!(!options.hardware_watchdog());
+    }
+
+    #[test]
+    fn with_sprmod_a_one_protects() {
+        let mut options = OptionBytes::default();
+        options.preset_all(0x8011_AAEF);
+        assert_eq!(options.read(false), 0x8011_AAED, "OPTLOCK is no option, OPTSTRT neither");
+        assert!((0..12).filter(|sector| options.protects(*sector)).eq([0, 4]));
+        for (bits, level) in [(0x0FFF_AAE0, 0), (0x0FFF_AAE4, 1), (0x0FFF_AAE8, 2), (0x0FFF_AAEC, 3)] {
+            options.preset_all(bits);
+            assert_eq!(options.brown_out_level(), level);
+        }
     }
 
     #[test]
