@@ -7,13 +7,15 @@
 use core::task::Poll;
 
 use boot_core::flash::{is_write_protected, FlashFault, Operation};
-use bsp::{pac, LAYOUT};
+use bsp::{pac, FLASH_WIDTH, LAYOUT};
 use shared_abi::geometry::Region;
 
 /// The two words that unlock the control register (section 3.6.1).
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
-/// `PSIZE` for 32-bit words: the supply voltage is 2.7 V or more (table 10).
-const WORDS: u8 = 0b10;
+/// `PSIZE`: as wide as the board's supply allows (table 7).
+const PSIZE: u8 = FLASH_WIDTH.trailing_zeros() as u8;
+/// Whether a word takes more than one store.
+const HAS_PARTS: bool = FLASH_WIDTH < 4;
 
 /// The memory-mapped flash.
 pub const FLASH: Region = LAYOUT.chip.flash;
@@ -22,6 +24,16 @@ pub const FLASH: Region = LAYOUT.chip.flash;
 /// operation runs.
 pub struct FlashController {
     registers: pac::FLASH,
+    /// What is left of the word that is being programmed.
+    rest: [Rest; HAS_PARTS as usize],
+}
+
+/// The part of a word that is not programmed yet, at the lower end of `word`; none if the address is that of a
+/// word.
+#[derive(Default)]
+struct Rest {
+    address: u32,
+    word: u32,
 }
 
 #[allow(dead_code, reason = "each of the two programs uses some of it")]
@@ -36,7 +48,10 @@ impl FlashController {
     /// Nothing else may use the controller until this value is dropped.
     pub unsafe fn steal() -> Self {
         // SAFETY: the caller guarantees it.
-        Self { registers: unsafe { pac::FLASH::steal() } }
+        Self {
+            registers: unsafe { pac::FLASH::steal() },
+            rest: [const { Rest { address: 0, word: 0 } }; HAS_PARTS as usize],
+        }
     }
 
     /// Whether an operation runs.
@@ -47,6 +62,11 @@ impl FlashController {
     /// Whether an operation runs, or other code has unlocked the control register.
     pub fn is_in_use(&self) -> bool {
         self.is_busy() || self.registers.cr().read().lock().bit_is_clear()
+    }
+
+    /// The option bytes, as the chip has them in `FLASH_OPTCR`.
+    pub fn option_bytes(&self) -> u32 {
+        self.registers.optcr().read().bits()
     }
 
     /// Whether the option bytes start the watchdog at each reset (WDG_SW, section 3.6.2).
@@ -61,7 +81,7 @@ impl FlashController {
         let has_two_banks = LAYOUT.chip.second_bank.is_some();
         // SAFETY: a register of the controller of these chips, which a read does not change.
         let optcr1 = if has_two_banks { unsafe { OPTCR1.read_volatile() } } else { 0 };
-        is_write_protected(sector, self.registers.optcr().read().bits(), optcr1)
+        is_write_protected(sector, self.option_bytes(), optcr1)
     }
 
     /// Copies bytes; addresses outside the flash read as FFh.
@@ -105,7 +125,7 @@ impl FlashController {
                     // SAFETY: the codes of the geometry are valid for SNB (sections 3.9.7 and
                     // 3.9.8).
                     unsafe { w.snb().bits(LAYOUT.chip.sector_code(sector.number)) };
-                    w.lock().clear_bit().psize().set(WORDS).ser().set_bit().strt().set_bit()
+                    w.lock().clear_bit().psize().set(PSIZE).ser().set_bit().strt().set_bit()
                 });
             }
             Operation::Program { address, word } => {
@@ -113,13 +133,27 @@ impl FlashController {
                     return Err(FlashFault::Failed);
                 }
                 self.unlock();
-                self.registers.cr().write(|w| w.lock().clear_bit().psize().set(WORDS).pg().set_bit());
-                // SAFETY: the address was checked to be a word of the flash; with PG set, the store
-                // starts the operation.
-                unsafe { (address as *mut u32).write_volatile(word) };
+                self.registers.cr().write(|w| w.lock().clear_bit().psize().set(PSIZE).pg().set_bit());
+                self.program(address, word);
             }
         }
         Ok(())
+    }
+
+    /// Starts to program a word, or the rest of one: as much as the board's supply allows at a time.
+    fn program(&mut self, address: u32, word: u32) {
+        // SAFETY: the address is in a word of the flash, and a multiple of the width; with PG set, the
+        // store starts the operation.
+        unsafe {
+            match FLASH_WIDTH {
+                4 => (address as *mut u32).write_volatile(word),
+                2 => (address as *mut u16).write_volatile(word as u16),
+                _ => (address as *mut u8).write_volatile(word as u8),
+            }
+        }
+        if let Some(rest) = self.rest.first_mut() {
+            *rest = Rest { address: address + FLASH_WIDTH, word: word >> (8 * FLASH_WIDTH % 32) };
+        }
     }
 
     /// The result of the operation that was started last. Call it until it is ready, and not again.
@@ -128,16 +162,23 @@ impl FlashController {
         if status.bsy().bit_is_set() {
             return Poll::Pending;
         }
-        self.clear_flags();
-        self.registers.cr().write(|w| w.lock().set_bit());
-        Poll::Ready(if status.wrperr().bit_is_set() {
+        let result = if status.wrperr().bit_is_set() {
             Err(FlashFault::Protected)
         } else if status.pgaerr().bit_is_set() || status.pgperr().bit_is_set() || status.pgserr().bit_is_set()
         {
             Err(FlashFault::Failed)
         } else {
             Ok(())
-        })
+        };
+        if let Some(Rest { address, word }) = self.rest.first_mut().map(core::mem::take) {
+            if result.is_ok() && !address.is_multiple_of(4) {
+                self.program(address, word);
+                return Poll::Pending;
+            }
+        }
+        self.clear_flags();
+        self.registers.cr().write(|w| w.lock().set_bit());
+        Poll::Ready(result)
     }
 
     /// Clears all flags.

@@ -3,9 +3,10 @@
 
 use core::task::Poll;
 
+use boot_core::canopen::program::Supply;
 use boot_core::flash::{Flash, FlashFault, Next, Operation};
 use boot_core::store::{Key, Parameters, StoreError, Value};
-use bsp::LAYOUT;
+use bsp::{supply, LAYOUT};
 use shared_abi::geometry::{Region, Sector};
 use shared_abi::services::{OperationResult, Services, Step, StoreState, ERASE, OFFSET};
 
@@ -58,6 +59,9 @@ impl Flash for BootFlash {
     }
 
     fn start(&mut self, operation: Operation) -> Result<(), FlashFault> {
+        if self.supply() == Supply::Low {
+            return Err(FlashFault::Supply);
+        }
         self.0.start(operation)
     }
 
@@ -67,6 +71,14 @@ impl Flash for BootFlash {
 
     fn is_protected(&self, sector: Sector) -> bool {
         self.0.is_protected(sector.number)
+    }
+
+    fn supply(&self) -> Supply {
+        supply::state()
+    }
+
+    fn option_bytes(&self) -> u32 {
+        self.0.option_bytes()
     }
 
     fn sector_at(&self, address: u32) -> Option<Sector> {
@@ -115,7 +127,8 @@ impl Parameters for Store {
         let result = match outcome {
             Ok(()) => OperationResult::Done,
             Err(FlashFault::Protected) => OperationResult::Protected,
-            Err(FlashFault::Failed) => OperationResult::Failed,
+            // The services know no reason but these.
+            Err(FlashFault::Failed | FlashFault::Supply) => OperationResult::Failed,
             Err(FlashFault::Verify) => OperationResult::NotVerified,
         };
         let mut operation = [0; 4];

@@ -1,8 +1,8 @@
 //! The facts of the board, and what follows from them.
 
 use canopen::BitRate;
-use shared_abi::geometry::Geometry;
 pub use shared_abi::geometry::Pin;
+use shared_abi::geometry::{Geometry, Limits};
 use shared_abi::layout::Layout;
 pub use shared_abi::wiring::Pins;
 use shared_abi::wiring::Wiring;
@@ -10,6 +10,7 @@ use shared_abi::wiring::Wiring;
 use crate::can::BitTiming;
 use crate::clock::ClockTree;
 use crate::identity::Identity;
+use crate::supply;
 
 /// Selects the board's CAN controller for coboot, CAN1 or CAN2.
 ///
@@ -65,6 +66,10 @@ pub struct Facts {
     /// Bit rate of a device that has no other one stored, in bit/s; 0 for a device that detects it
     /// by listening.
     pub bit_rate: u32,
+    /// The lowest supply of the chip (VDD) that the board guarantees, in mV, 1800 to 3600. How wide the flash
+    /// is programmed and the threshold of the voltage detector follow from it ([`supply`]), and the wait
+    /// states that the clocks need.
+    pub supply_mv: u32,
     /// How the clocks are made.
     pub clock_tree: ClockTree,
     /// The pin that asks for the bootloader after a reset, if the board has one.
@@ -132,11 +137,22 @@ pub const IDENTITY: Identity = FACTS.identity;
 pub const NODE_ID: u8 = FACTS.node_id;
 /// Bit rate of a device that has no other one stored ([`Facts::bit_rate`]).
 pub const BIT_RATE: u32 = FACTS.bit_rate;
+/// The lowest supply of the chip in mV ([`Facts::supply_mv`]).
+pub const SUPPLY_MV: u32 = {
+    assert!(
+        FACTS.supply_mv >= *supply::RANGE.start() && FACTS.supply_mv <= *supply::RANGE.end(),
+        "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)"
+    );
+    FACTS.supply_mv
+};
+/// How many bytes of the flash are programmed at a time: 1, 2 or 4.
+pub const FLASH_WIDTH: u32 = supply::flash_width(SUPPLY_MV);
+/// The highest clocks at this supply.
+const LIMITS: Limits = CHIP.line.limits_at(SUPPLY_MV);
 /// How the clocks are made; the chip can run with them.
-pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&CHIP.line.limits());
+pub const CLOCK_TREE: ClockTree = FACTS.clock_tree.checked(&LIMITS);
 /// The same with HSI in place of the crystal.
-pub const INTERNAL: ClockTree =
-    CLOCK_TREE.internal(&CHIP.line.limits(), &BitRate::TABLE).checked(&CHIP.line.limits());
+pub const INTERNAL: ClockTree = CLOCK_TREE.internal(&LIMITS, &BitRate::TABLE).checked(&LIMITS);
 /// The pin that asks for the bootloader after a reset.
 pub const ENTRY_STRAP: Option<Strap> = FACTS.entry_strap;
 

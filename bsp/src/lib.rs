@@ -22,6 +22,7 @@
 //! | `port.rs` | the port for frames: the CAN controller, or the UART |
 //! | [`line`](mod@line) | what a CANopen slave wants of its port |
 //! | `watchdog.rs` | the independent watchdog |
+//! | [`supply`] | the supply: how wide the flash is programmed, and when it is left alone |
 //! | `low_power.rs` | the wake-up from Standby, the clocks of the sleep mode |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
@@ -53,6 +54,7 @@ mod port;
 pub mod ring;
 #[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
+pub mod supply;
 #[macro_use]
 pub mod uart;
 // The facts use the macro of the UART.

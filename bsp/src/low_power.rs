@@ -1,9 +1,12 @@
-//! Low-power modes (RM0090 section 5): the wake-up from Standby, and the clocks of the sleep mode.
+//! The power controller (RM0090 section 5): the wake-up from Standby, the voltage detector, and the clocks of
+//! the sleep mode.
 
 use stm32f4xx_hal::pac;
 
-/// Whether the chip has woken up from Standby since the last call. It clears the flag, and leaves no clock of
-/// APB1 on, as after a reset.
+use crate::supply::{DETECTS, PVD};
+
+/// Whether the chip has woken up from Standby since the last call. It clears the flag, and leaves of APB1 the
+/// clock of the power controller on, with the voltage detector of the board ([`crate::supply`]).
 ///
 /// The flags of RCC_CSR do not tell: no manual names those of a wake-up, and some chips have none.
 #[must_use]
@@ -15,9 +18,16 @@ pub fn woke_up(rcc: &pac::RCC) -> bool {
     // SAFETY: nothing else uses the power controller at the same time.
     let pwr = unsafe { pac::PWR::steal() };
     let woke_up = pwr.csr().read().sbf().bit_is_set();
-    pwr.cr().modify(|_, w| w.csbf().set_bit());
-    rcc.apb1enr().reset();
+    // SAFETY: a level that the detector has; the other bits stay.
+    pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !PVD | DETECTS) }.csbf().set_bit());
     woke_up
+}
+
+/// Leaves the power controller as after a reset. The PLL must be off.
+pub fn release(rcc: &pac::RCC) {
+    // SAFETY: nothing else uses the power controller at the same time.
+    unsafe { pac::PWR::steal() }.cr().reset();
+    rcc.apb1enr().reset();
 }
 
 /// Gives every peripheral a clock in sleep mode, as after a reset: an application that jumped may have taken

@@ -21,7 +21,7 @@ pub struct ClockTree {
     pub apb1: u32,
     /// Divider of APB2.
     pub apb2: u32,
-    /// Wait states of the flash at this clock and 2.7 to 3.6 V (RM0090 table 10, RM0402, RM0430).
+    /// Wait states of the flash at this clock and the board's supply (RM0090 table 10, RM0402, RM0430).
     pub wait_states: u32,
 }
 
@@ -132,6 +132,8 @@ impl ClockTree {
         if self.sysclk() > limits.sysclk {
             return Err(if is_slow {
                 "board: the core is too fast: 100 MHz at most on this chip"
+            } else if limits.sysclk == 160_000_000 {
+                "board: the core is too fast: 160 MHz at most at this supply (supply_mv)"
             } else {
                 "board: the core is too fast: 168 MHz at most, without over-drive"
             });
@@ -151,10 +153,14 @@ impl ClockTree {
             });
         }
         if self.wait_states < (self.sysclk() - 1) / limits.per_wait_state || self.wait_states > 15 {
-            return Err(if limits.per_wait_state == 25_000_000 {
-                "board: the flash of this chip needs a wait state for every 25 MHz"
-            } else {
-                "board: the flash needs a wait state for every 30 MHz"
+            return Err(match limits.per_wait_state / 1_000_000 {
+                30 => "board: the flash needs a wait state for every 30 MHz",
+                25 => "board: the flash of this chip needs a wait state for every 25 MHz",
+                24 => "board: at this supply (supply_mv) the flash needs a wait state for every 24 MHz",
+                22 => "board: at this supply (supply_mv) the flash needs a wait state for every 22 MHz",
+                20 => "board: at this supply (supply_mv) the flash needs a wait state for every 20 MHz",
+                18 => "board: at this supply (supply_mv) the flash needs a wait state for every 18 MHz",
+                _ => "board: at this supply (supply_mv) the flash needs a wait state for every 16 MHz",
             });
         }
         Ok(())
@@ -230,6 +236,23 @@ mod tests {
         let tree = ClockTree { pll_n: 80, wait_states: 2, ..SLOW };
         assert_eq!(tree.check(&Line::F412.limits()), Ok(()));
         assert!(tree.check(&Line::F413.limits()).unwrap_err().contains("every 25 MHz"));
+    }
+
+    /// RM0090 table 10: at 2.4 V 168 MHz need 6 wait states (24 MHz each); below 2.1 V 160 MHz are the most, with
+    /// 7 (20 MHz each). RM0430, F413: 20 MHz each at 2.4 V.
+    #[test]
+    fn a_lower_supply_needs_more_wait_states() {
+        let limits = Line::F407.limits_at(2_400);
+        assert!(FAST
+            .check(&limits)
+            .unwrap_err()
+            .contains("supply_mv) the flash needs a wait state for every 24 MHz"));
+        assert_eq!(ClockTree { wait_states: 6, ..FAST }.check(&limits), Ok(()));
+        let limits = Line::F407.limits_at(1_800);
+        let most = ClockTree { wait_states: 7, ..FAST };
+        assert!(most.check(&limits).unwrap_err().contains("160 MHz at most at this supply"));
+        assert_eq!(ClockTree { pll_n: 160, ..most }.check(&limits), Ok(()));
+        assert!(SLOW.check(&Line::F413.limits_at(2_400)).unwrap_err().contains("every 20 MHz"));
     }
 
     /// With HSI 5 % too fast the core must not be above 168 or 100 MHz; by hand: 40 MHz make all bit rates

@@ -22,6 +22,7 @@ mod reentry;
 mod silicon;
 mod slcan;
 mod standby;
+mod supply;
 mod uart;
 mod virtual_can;
 mod watchdog;

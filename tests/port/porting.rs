@@ -424,6 +424,29 @@ const MISTAKES: &[Mistake] = &[
         by: By::Board,
         says: "board: the crystal is divided by 2 to 63 for the PLL (PLLM)",
     },
+    // DS10693: 1.8 to 3.6 V (1.7 V at reduced temperatures); RM0390 table 5: 24 MHz for each wait state below
+    // 2.7 V.
+    Mistake {
+        file: BOARD,
+        right: "supply_mv: 3_200",
+        wrong: "supply_mv: 1_700",
+        by: By::Board,
+        says: "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)",
+    },
+    Mistake {
+        file: BOARD,
+        right: "supply_mv: 3_200",
+        wrong: "supply_mv: 5_000",
+        by: By::Board,
+        says: "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)",
+    },
+    Mistake {
+        file: BOARD,
+        right: "supply_mv: 3_200",
+        wrong: "supply_mv: 2_400",
+        by: By::Board,
+        says: "board: at this supply (supply_mv) the flash needs a wait state for every 24 MHz",
+    },
     Mistake {
         file: BOARD,
         right: "node_id: 1",

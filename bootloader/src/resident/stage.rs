@@ -1,10 +1,11 @@
 //! The boot stage: from the reset to the jump into a program, or to the rest of the bootloader.
 //!
 //! Before it, nothing has used a peripheral. It uses only the reset flags, that of Standby among them, the
-//! warm-start cell, the watchdog, the flash controller, the CRC unit and the entry strap, and leaves the
+//! warm-start cell, the watchdog, the power and the flash controller, the CRC unit and the entry strap, and leaves the
 //! peripherals to a program in their reset state. The rest of the bootloader gets the CRC unit with its
 //! clock on, for the services.
 
+use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances};
 use boot_core::program::verify;
@@ -66,7 +67,7 @@ pub unsafe extern "C" fn stage() -> ! {
     // CRCs need speed, but no exact clock. The crystal would take time to start.
     Source::Internal.speed_up(&rcc);
     ResidentFlash::switch_crc_unit_on(&rcc);
-    if SEALED {
+    if SEALED && may_store() {
         crate::callgate::store_after_reset(&mut flash, request);
     }
     let mut parameters = product::parameters(&flash);
@@ -97,6 +98,7 @@ pub unsafe extern "C" fn stage() -> ! {
             drop(caches);
             flash.release(&rcc);
             bsp::slow_down(&rcc);
+            bsp::low_power::release(&rcc);
             let handoff = Handoff::new(&BootInfo {
                 node_id,
                 bit_rate: node.bit_rate.or_zero(),
@@ -188,6 +190,11 @@ fn boot_report(decision: &BootDecision, request: Option<BootRequest>, cause: Res
 /// The product's policy for the decision.
 const DECISION: boot_core::decision::Policy = PRODUCT.decision();
 
+/// Whether the supply is good enough for the journal. What is not stored is lost, and the start continues.
+fn may_store() -> bool {
+    bsp::supply::state() != Supply::Low
+}
+
 /// Updates the number of resets in a row by which an application ended without a request.
 fn count_crash_resets(
     parameters: &mut product::Parameters,
@@ -197,7 +204,7 @@ fn count_crash_resets(
 ) -> u32 {
     let before = storing::crash_count(parameters, flash);
     let now = DECISION.crash_resets(before, reset_cause, request);
-    if now != before {
+    if now != before && may_store() {
         // If the store fails, the count is lost, but the start continues.
         let _ = storing::store(parameters, flash, Key::CRASH_COUNT, [now, 0, 0, 0]);
     }

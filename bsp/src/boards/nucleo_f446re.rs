@@ -14,6 +14,8 @@ pub const FACTS: Facts = Facts {
     },
     node_id: 1,
     bit_rate: 125_000,
+    // A regulator of 3.3 V, LD39050PU33R (UM1724), to 3 %.
+    supply_mv: 3_200,
     // 8 MHz from the ST-LINK on OSC_IN (MCO; UM1724: as delivered). If the ST-LINK has been broken off
     // and no crystal X3 is fitted, the bootloader runs from HSI, whose error is too large for CAN at any
     // bit rate: it only listens (`crystal_failure` of the product).

@@ -14,6 +14,8 @@ pub const FACTS: Facts = Facts {
     },
     node_id: 1,
     bit_rate: 125_000,
+    // VDD comes from a regulator of 3.3 V through a diode (UM1472, "3V"): boards have 2.9 to 3.0 V.
+    supply_mv: 2_900,
     // A crystal of 8 MHz on OSC_IN and OSC_OUT; the fastest clocks that the chip allows at 3.3 V
     // (datasheet DS8626, table 14).
     clock_tree: ClockTree {

@@ -18,6 +18,8 @@ pub const FACTS: Facts = Facts {
     },
     node_id: 1,
     bit_rate: 125_000,
+    // VDD is the "3V" of the board (UM1670), from a regulator of 3.3 V through a diode.
+    supply_mv: 2_900,
     // A crystal of 8 MHz on OSC_IN and OSC_OUT (X3). The core runs at 160 MHz instead of 168 MHz (180
     // MHz with over-drive): APB1 at 40 MHz makes each bit rate of CiA 301; 42 MHz and 45 MHz do not
     // make 800 kbit/s.

@@ -13,8 +13,8 @@ use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, ClockSource, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS,
     IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
-    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_PROGRAM_WATCHDOG, UNLOCK,
-    UNLOCK_ENTRIES,
+    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES,
+    STATE_PROGRAM_WATCHDOG, STATE_SUPPLY, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -282,7 +282,9 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
                     self.signatures.fail(self.now);
                 }
                 let code = match error {
-                    FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
+                    FlashError::Write | FlashError::Secured | FlashError::NvData | FlashError::NoAccess => {
+                        emcy::code::HARDWARE
+                    }
                     _ => emcy::code::DATA_SET,
                 };
                 self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);
@@ -290,8 +292,11 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         }
     }
 
-    /// 2007h.
+    /// A value of 2007h that is a byte.
     fn state(&self, sub: u8) -> u8 {
+        if sub == STATE_SUPPLY {
+            return self.flash.supply() as u8;
+        }
         self.state.get(usize::from(sub).wrapping_sub(1)).copied().unwrap_or(0)
     }
 
@@ -380,6 +385,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             DEVICE_STATE if at.sub == STATE_PROGRAM_WATCHDOG => {
                 return put(buf, &self.config.program_watchdog_ms.to_le_bytes());
             }
+            DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
             PROGRAM_ID => self.download.identification(at.sub),
             SECOND_SERVER if C::EXTRAS.second_server => self.second_server.read(at.sub),

@@ -2,6 +2,7 @@
 
 use core::task::Poll;
 
+use canopen::program::Supply;
 use shared_abi::geometry::{Region, Sector};
 
 use crate::crc;
@@ -16,6 +17,8 @@ pub enum FlashFault {
     Failed,
     /// The word read back differs from the programmed word.
     Verify,
+    /// The supply is too low ([`Flash::supply`]): nothing was started.
+    Supply,
 }
 
 /// One operation of the flash controller.
@@ -80,6 +83,17 @@ pub trait Flash {
     fn is_protected(&self, sector: Sector) -> bool {
         let _ = sector;
         false
+    }
+
+    /// Whether the supply is good enough to erase and program now. With [`Supply::Low`],
+    /// [`start`](Self::start) refuses each operation with [`FlashFault::Supply`].
+    fn supply(&self) -> Supply {
+        Supply::Unknown
+    }
+
+    /// The option bytes as `FLASH_OPTCR` has them; 0 if there are none.
+    fn option_bytes(&self) -> u32 {
+        0
     }
 
     /// The word at a word-aligned address.
@@ -180,6 +194,14 @@ impl<F: Flash> Flash for &mut F {
 
     fn is_protected(&self, sector: Sector) -> bool {
         (**self).is_protected(sector)
+    }
+
+    fn supply(&self) -> Supply {
+        (**self).supply()
+    }
+
+    fn option_bytes(&self) -> u32 {
+        (**self).option_bytes()
     }
 
     fn read_word(&self, address: u32) -> u32 {

@@ -113,6 +113,11 @@ pub const STATE_PROGRAM_RESET: u8 = 3;
 pub const STATE_CRASH_RESETS: u8 = 4;
 /// In [`DEVICE_STATE`]: the [`ClockSource`]; 0 for a device without one.
 pub const STATE_CLOCK: u8 = 5;
+/// In [`DEVICE_STATE`]: the option bytes of the chip, as `FLASH_OPTCR` has them (RM0090 section 3.9.10);
+/// 0 for a device without them.
+pub const STATE_OPTION_BYTES: u8 = 6;
+/// In [`DEVICE_STATE`]: the [`Supply`].
+pub const STATE_SUPPLY: u8 = 7;
 /// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
 /// watchdog, which the bootloader starts; 0 if it does not.
 pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
@@ -126,8 +131,23 @@ pub enum ClockSource {
     Internal = 2,
 }
 
+/// The supply of a device ([`STATE_SUPPLY`]), as far as its flash is concerned.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum Supply {
+    /// The device does not watch it.
+    Unknown = 0,
+    /// It is good enough.
+    Good = 1,
+    /// It is too low to erase or program the flash.
+    Low = 2,
+}
+
+/// The detail of [`FlashError::NoAccess`] in 1F57h: the [supply](Supply) is too low.
+pub const SUPPLY_DETAIL: u8 = 1;
+
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 7] = [
+pub const STATE_ENTRIES: [Entry; 9] = [
     Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_WATCHDOG),
     Entry::sub(DEVICE_STATE, 1, "Program number of the bootloader", DataType::Unsigned8, Access::Const),
     Entry::sub(
@@ -146,6 +166,8 @@ pub const STATE_ENTRIES: [Entry; 7] = [
     ),
     Entry::sub(DEVICE_STATE, STATE_CRASH_RESETS, "Crash resets in a row", DataType::Unsigned8, Access::Ro),
     Entry::sub(DEVICE_STATE, STATE_CLOCK, "Source of the clock", DataType::Unsigned8, Access::Ro),
+    Entry::sub(DEVICE_STATE, STATE_OPTION_BYTES, "Option bytes", DataType::Unsigned32, Access::Ro),
+    Entry::sub(DEVICE_STATE, STATE_SUPPLY, "Supply", DataType::Unsigned8, Access::Ro),
     Entry::sub(
         DEVICE_STATE,
         STATE_PROGRAM_WATCHDOG,

@@ -8,6 +8,7 @@ use std::rc::Rc;
 use std::sync::Once;
 use std::task::Poll;
 
+use boot_core::canopen::program::Supply;
 use boot_core::flash::{Flash, FlashFault, Operation as Started};
 use shared_abi::geometry::{Geometry, Region, Sector, SectorRun, STM32F407VG};
 use shared_abi::layout::Layout;
@@ -92,6 +93,10 @@ pub struct ModelFlash {
     pub weak: Option<(u32, u64)>,
     /// The numbers of the sectors that are protected against writing.
     pub protected: Vec<u8>,
+    /// The supply is too low from the operation with this number on.
+    pub low_from: Option<u32>,
+    /// The option bytes.
+    pub option_bytes: u32,
     /// Every region that was written or erased.
     pub touched: Vec<Region>,
     /// The number of bytes that were read.
@@ -112,6 +117,8 @@ impl ModelFlash {
             fail: None,
             weak: None,
             protected: Vec::new(),
+            low_from: None,
+            option_bytes: 0,
             touched: Vec::new(),
             bytes_read: Cell::new(0),
         }
@@ -147,6 +154,9 @@ impl ModelFlash {
 
     fn begin(&mut self, operation: Operation) -> Result<(), FlashFault> {
         assert!(self.running.is_none(), "an operation was started while another one runs");
+        if self.supply() == Supply::Low {
+            return Err(FlashFault::Supply);
+        }
         self.operations += 1;
         let region = match operation {
             Operation::Erase(region) => region,
@@ -293,6 +303,17 @@ impl Flash for ModelFlash {
         self.protected.contains(&sector.number)
     }
 
+    fn supply(&self) -> Supply {
+        match self.low_from {
+            Some(number) if self.operations + 1 >= number => Supply::Low,
+            _ => Supply::Good,
+        }
+    }
+
+    fn option_bytes(&self) -> u32 {
+        self.option_bytes
+    }
+
     fn sector_at(&self, address: u32) -> Option<Sector> {
         assert!(self.running.is_none(), "the store was asked while the flash is busy");
         self.chip.sector_at(address)
@@ -383,6 +404,14 @@ impl Flash for Chip {
 
     fn is_protected(&self, sector: Sector) -> bool {
         self.0.borrow().is_protected(sector)
+    }
+
+    fn supply(&self) -> Supply {
+        self.0.borrow().supply()
+    }
+
+    fn option_bytes(&self) -> u32 {
+        self.0.borrow().option_bytes()
     }
 
     fn sector_at(&self, address: u32) -> Option<Sector> {

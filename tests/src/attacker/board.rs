@@ -95,7 +95,12 @@ impl Target for Board {
                 Stop::PowerCut => Happened::PowerCut,
                 // The power came on.
                 Stop::Reset(ResetCause::PowerOn) => continue,
-                Stop::Reset(ResetCause::IndependentWatchdog | ResetCause::Pin | ResetCause::Standby)
+                Stop::Reset(
+                    ResetCause::IndependentWatchdog
+                    | ResetCause::Pin
+                    | ResetCause::Standby
+                    | ResetCause::BrownOut,
+                )
                 | Stop::Lockup => Happened::Trouble,
                 Stop::Deadline | Stop::Attention | Stop::Halted => continue,
             };

@@ -6,7 +6,7 @@ use canopen::AbortCode;
 use seal::access::right;
 use shared_abi::warm_start::BootRequest;
 
-use super::{find, Downloader};
+use super::{find, Downloader, Failure};
 use crate::flash::Flash;
 use crate::policy::Erase;
 use crate::refusal::Refusal;
@@ -63,7 +63,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if changes && (state.locked || !(self.policy.allowed)()) {
             return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
         }
-        state.error = None;
+        state.failure = None;
         let fresh = core::mem::take(&mut state.streamed);
         let record = state.record.filter(|_| !data);
         match (command, record) {
@@ -88,7 +88,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 let record = ProgramRecord { signed, withdrawn, ..record };
                 self.programmer.record(&mut self.parameters, program, record, false);
             }
-            (Start | SetSignature, None) => state.error = Some(FlashError::NoValidProgram),
+            (Start | SetSignature, None) => {
+                state.failure = Some(Failure::of(FlashError::NoValidProgram));
+            }
             (Stop | StartBootloader | ResetStat | ClrSignature, _) => {}
         }
         Ok(())
@@ -132,7 +134,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.programmer.abort();
         if let Some(state) = find(&mut self.programs, program) {
             state.locked = false;
-            state.error = None;
+            state.failure = None;
             state.streamed = false;
             state.session = Session::Cleared { just: false };
         }

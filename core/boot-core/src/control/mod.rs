@@ -54,10 +54,8 @@ struct Program {
     record: Option<ProgramRecord>,
     /// 1F56h: the CRC that was computed last, or the stored one.
     identification: u32,
-    /// The result of the last block or command.
-    error: Option<FlashError>,
-    /// The sector that was protected, for [`FlashError::Secured`].
-    sector: u8,
+    /// Why the last block or command failed.
+    failure: Option<Failure>,
     session: Session,
     /// The download that was cut off or is going on, as stored; a copy for the same reason.
     partial: Partial,
@@ -69,6 +67,20 @@ struct Program {
     start_when_verified: bool,
     /// The client has not sent the password.
     locked: bool,
+}
+
+/// Why a block or a command failed.
+#[derive(Clone, Copy, Debug)]
+struct Failure {
+    error: FlashError,
+    /// [`FlashStatus::detail`].
+    detail: u8,
+}
+
+impl Failure {
+    const fn of(error: FlashError) -> Self {
+        Self { error, detail: 0 }
+    }
 }
 
 /// The open SDO transfer to 1F50h.
@@ -117,8 +129,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
                 identification: record.map_or(0, |record| record.crc),
-                error: None,
-                sector: 0,
+                failure: None,
                 session: Session::Idle,
                 partial,
                 version: 0,
@@ -146,7 +157,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// A damaged program is none any more.
     pub(crate) fn refused_to_start(&mut self, report: &BootReport) {
         let Some(state) = find(&mut self.programs, report.refused) else { return };
-        state.error = Some(FlashError::NoValidProgram);
+        state.failure = Some(Failure::of(FlashError::NoValidProgram));
         if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {
             state.record = None;
             state.identification = 0;
@@ -173,9 +184,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     #[must_use]
     pub fn status(&self, program: u8) -> FlashStatus {
         let busy = self.programmer.is_busy_with(program);
-        let Some(state) = self.program(program) else { return FlashStatus { busy, ..FlashStatus::OK } };
-        let is_secured = state.error == Some(FlashError::Secured);
-        FlashStatus { busy, error: state.error, detail: u16::from(state.sector) * u16::from(is_secured) }
+        match self.program(program).and_then(|state| state.failure) {
+            Some(Failure { error, detail }) => {
+                FlashStatus { busy, error: Some(error), detail: detail.into() }
+            }
+            None => FlashStatus { busy, ..FlashStatus::OK },
+        }
     }
 
     /// 1F51h: no program runs. The value shows whether a program exists.
@@ -420,8 +434,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.outcome = Some((program, outcome));
         let Some(state) = find(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
-        state.error = outcome.err();
-        state.sector = self.programmer.protected_sector();
+        state.failure = outcome.err().map(|error| Failure { error, detail: self.programmer.take_detail() });
         if outcome.is_err() {
             state.streamed = false;
             if !matches!(state.session, Session::Idle) {
@@ -465,9 +478,8 @@ fn find(programs: &mut [Program], number: u8) -> Option<&mut Program> {
 impl Program {
     /// Records the reason of a refusal. The error that ended a session stays visible.
     fn refuse(&mut self, Refusal(error, abort): Refusal) -> AbortCode {
-        if !matches!(self.session, Session::Failed) || self.error.is_none() {
-            self.error = Some(error);
-            self.sector = 0;
+        if !matches!(self.session, Session::Failed) || self.failure.is_none() {
+            self.failure = Some(Failure::of(error));
         }
         abort
     }

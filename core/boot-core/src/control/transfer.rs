@@ -4,7 +4,7 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
-use super::{find, Downloader, Transfer};
+use super::{find, Downloader, Failure, Transfer};
 use crate::intake::{Destination, Intake, Progress};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
@@ -77,7 +77,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let program = self.take(None)?;
         self.transfer = None;
         if let Some(state) = find(&mut self.programs, program) {
-            state.error = None;
+            state.failure = None;
         }
         Ok(())
     }
@@ -90,7 +90,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let Some(state) = find(&mut self.programs, program) else { return };
         if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
-            state.error.get_or_insert(FlashError::Format);
+            state.failure.get_or_insert(Failure::of(FlashError::Format));
             self.programmer.abort();
         }
     }

@@ -15,7 +15,7 @@ mod write;
 
 use core::task::Poll;
 
-use canopen::program::FlashError;
+use canopen::program::{FlashError, Supply, SUPPLY_DETAIL};
 use shared_abi::geometry::{Region, Sector};
 
 use crate::crc::CrcKind;
@@ -119,8 +119,8 @@ pub(crate) struct Programmer<'b> {
     voids: u32,
     /// The region of a program whose record is only removed if all of it may be written.
     unwritten: Option<Region>,
-    /// The number of the protected sector that was found last.
-    sector: u8,
+    /// See [`take_detail`](Self::take_detail).
+    detail: u8,
     /// Whether the counter proved by the next of these programs is already stored.
     kept: bool,
     job: Option<Job>,
@@ -138,7 +138,7 @@ impl<'b> Programmer<'b> {
             target: None,
             voids: 0,
             unwritten: None,
-            sector: 0,
+            detail: 0,
             kept: false,
             job: None,
             running: None,
@@ -202,7 +202,8 @@ impl<'b> Programmer<'b> {
         self.voids |= bit(program);
     }
 
-    /// The same for a password, which needs no data, if the program's flash may be written.
+    /// The same if this part of the program's flash may be written: for its first piece, or for a password,
+    /// which needs no data.
     pub(crate) fn void_if_writable(&mut self, program: u8, region: Region) {
         self.unwritten = Some(region);
         self.void(program);
@@ -251,9 +252,10 @@ impl<'b> Programmer<'b> {
         self.target.as_ref().is_none_or(|target| target.half_erased)
     }
 
-    /// The number of the protected sector that was found last.
-    pub(crate) fn protected_sector(&self) -> u8 {
-        self.sector
+    /// More about the error that ended the last work, once: the number of the protected sector, or
+    /// [`SUPPLY_DETAIL`]; 0 for other errors.
+    pub(crate) fn take_detail(&mut self) -> u8 {
+        core::mem::take(&mut self.detail)
     }
 
     /// The program that is being downloaded.
@@ -395,11 +397,18 @@ impl<'b> Programmer<'b> {
                     Some(Job::Write(write)) => write.address(),
                     _ => 0,
                 };
-                self.sector = flash.sector_at(at).map_or(0, |sector| sector.number);
+                self.detail = flash.sector_at(at).map_or(0, |sector| sector.number);
                 Next::Done(Err(FlashError::Secured))
             }
+            Err(FlashFault::Supply) => Next::Done(Err(self.low_supply())),
             Err(_) => Next::Done(Err(FlashError::Write)),
         }
+    }
+
+    /// The error of a supply that is too low: nothing was written.
+    fn low_supply(&mut self) -> FlashError {
+        self.detail = SUPPLY_DETAIL;
+        FlashError::NoAccess
     }
 
     /// Ends the job.
@@ -475,7 +484,9 @@ impl<'b> Programmer<'b> {
             return Ok(Some(job));
         }
         let piece = self.source.piece();
-        self.give_up_old::<F, P>(flash, piece)?;
+        if self.unwritten.is_none() {
+            self.give_up_old::<F, P>(flash, piece)?;
+        }
         if let Some(region) = self.unwritten.take() {
             self.check_writable(flash, region).inspect_err(|_| self.voids = 0)?;
         }
@@ -519,8 +530,6 @@ impl<'b> Programmer<'b> {
             (None, 0) => region.size,
             (None, told) => told,
         };
-        self.check_writable(flash, Region::new(region.base, size))?;
-        let Some(target) = &mut self.target else { return Ok(()) };
         target.untouched = None;
         target.ahead = target.ahead.max(ahead);
         if P::RESUMES && target.partial.is_resumed() {
@@ -532,17 +541,20 @@ impl<'b> Programmer<'b> {
             }
         }
         let program = target.program;
-        self.void(program);
+        self.void_if_writable(program, Region::new(region.base, size));
         Ok(())
     }
 
     /// Whether all sectors of a region may be written now.
     fn check_writable<F: Flash>(&mut self, flash: &F, region: Region) -> Result<(), FlashError> {
+        if flash.supply() == Supply::Low {
+            return Err(self.low_supply());
+        }
         let mut at = region.base;
         while at < region.end() {
             let sector = flash.sector_at(at).ok_or(FlashError::Address)?;
             if flash.is_protected(sector) {
-                self.sector = sector.number;
+                self.detail = sector.number;
                 return Err(FlashError::Secured);
             }
             at = sector.region.end();

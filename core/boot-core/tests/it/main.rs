@@ -14,3 +14,4 @@ mod parameters;
 mod protection;
 mod resume;
 mod streams;
+mod supply;
