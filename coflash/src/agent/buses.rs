@@ -18,7 +18,7 @@ use super::controller::{Flashed, News};
 use super::run::{Devices, Order};
 use crate::bus::Link;
 use crate::device::lock::Lock;
-use crate::device::state::{reason, source};
+use crate::device::state::{reason, source, supply};
 use crate::device::{info, DeviceInfo, Error, Session, Timing};
 use crate::update::event::Phase;
 use crate::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
@@ -224,6 +224,8 @@ fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
         all.push(("stays".to_string(), reason(state.reason)));
         all.extend(state.ended_by().map(|by| ("program_ended_by".to_string(), source(by).to_string())));
         all.push(("crash_resets".to_string(), state.crash_resets.to_string()));
+        all.extend(state.option_bytes.map(|options| ("option_bytes".to_string(), options.to_string())));
+        all.extend(supply(state.supply).map(|words| ("supply".to_string(), words.to_string())));
     }
     for program in &info.programs {
         let key = |what: &str| format!("program_{}_{what}", program.number);

@@ -7,7 +7,11 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
+use coflash::bus::Adapter;
 use coflash::conform::{checks, junit, run, Check, Means, Outcome, Power, Verdict};
+use coflash::device::option_bytes::OptionBytes;
+use coflash::device::read_state::read_state;
+use coflash::device::{Session, Timing};
 use coflash::file::convert::Label;
 use coflash::update::Program;
 use serde_json::json;
@@ -86,6 +90,8 @@ impl Conform {
         let image = self.image(context)?;
         let _lock = context.lock(context.bus.as_deref(), self.node)?;
         let mut adapter = context.open()?;
+        let warnings = self.warnings(&mut *adapter);
+        warnings.iter().for_each(|warning| context.out.warn(warning));
         let tell = &mut |verdict: &Verdict| {
             let (word, why) = words(&verdict.outcome);
             let why = if why.is_empty() { String::new() } else { format!(": {why}") };
@@ -111,7 +117,7 @@ impl Conform {
                 })
                 .collect();
             json!({ "command": "conform", "node": self.node.get(), "passed": passed, "failed": failed,
-                    "skipped": skipped, "checks": list })
+                    "skipped": skipped, "checks": list, "warnings": warnings })
         });
         if failed == 0 {
             Ok(())
@@ -126,6 +132,14 @@ impl Conform {
         let done = self.source.blocks(path, 1, Label::OfImage { date: 0 })?;
         warn(context, path, &done);
         Ok(Some(Arc::new(done.file).into()))
+    }
+
+    /// What a product needs beside a device that conforms: the option bytes of its chip.
+    fn warnings(&self, adapter: &mut dyn Adapter) -> Vec<&'static str> {
+        let mut session = Session::new(adapter, self.node, Timing::default());
+        // A device that does not say is judged by the checks.
+        let state = read_state(&mut session).ok().flatten();
+        state.and_then(|state| state.option_bytes).map(OptionBytes::warnings).unwrap_or_default()
     }
 
     /// The power of the device, by the user's command.

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use canopen::program::{FlashError, FlashStatus};
+use canopen::program::{FlashError, FlashStatus, SUPPLY_DETAIL};
 use canopen::AbortCode;
 use canopen::{Address, NodeId};
 use shared_abi::handoff::ResetCause;
@@ -428,7 +428,7 @@ impl fmt::Display for Error {
             Self::Failed { doing, error, detail, code } => {
                 let words = failure_words(*error, *detail);
                 write!(f, "{doing} failed: {words} (1F57h reads {:02X}h", error.code())?;
-                if *detail != 0 && *error != FlashError::Secured {
+                if has_number(Some(*error), *detail) {
                     write!(f, ", detail {detail:04X}h")?;
                 }
                 match code {
@@ -585,8 +585,21 @@ fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt
 pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
     match (error, detail) {
         (FlashError::Secured, 1..) => format!("sector {detail} of the flash is write-protected"),
+        (FlashError::NoAccess, LOW_SUPPLY) => {
+            "the supply of the device is too low to write its flash".to_string()
+        }
         _ => error.to_string(),
     }
+}
+
+/// The detail of [`FlashError::NoAccess`] for a supply that is too low.
+pub(crate) const LOW_SUPPLY: u16 = SUPPLY_DETAIL as u16;
+
+/// Whether the detail of an error of 1F57h is shown as a number: [`failure_words`] do not have it.
+pub(crate) fn has_number(error: Option<FlashError>, detail: u16) -> bool {
+    let is_in_words =
+        matches!((error, detail), (Some(FlashError::Secured), _) | (Some(FlashError::NoAccess), LOW_SUPPLY));
+    detail != 0 && !is_in_words
 }
 
 /// Why a device stays in its bootloader, and how its program ended.

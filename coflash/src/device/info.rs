@@ -2,7 +2,7 @@
 
 use std::fmt;
 
-use canopen::program::{self, FlashError, FlashStatus, ProgramState};
+use canopen::program::{self, FlashStatus, ProgramState};
 use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
@@ -11,11 +11,11 @@ use shared_abi::block_file::ProgramVersion;
 use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
-use super::error::{failure_words, told, Error};
+use super::error::{failure_words, has_number, told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
 use super::session::Session;
-use super::state::BootloaderState;
+use super::state::{supply, BootloaderState};
 use crate::json;
 
 /// What a device reports about itself; `None` for an object that it does not have.
@@ -242,6 +242,15 @@ impl fmt::Display for DeviceInfo {
         }
         if let Some(state) = &self.state {
             writeln!(f, "  {:<17} {state}", "state")?;
+            if let Some(words) = supply(state.supply) {
+                writeln!(f, "  {:<17} {words}", "supply")?;
+            }
+            if let Some(options) = state.option_bytes {
+                writeln!(f, "  {:<17} {options}", "option bytes")?;
+                for warning in options.warnings() {
+                    writeln!(f, "  {:<17} {warning}", "  warning")?;
+                }
+            }
         }
         self.programs.iter().try_for_each(|program| write!(f, "{program}"))
     }
@@ -291,7 +300,7 @@ impl fmt::Display for ProgramInfo {
                     write!(f, "{} ({:02X}h)", failure_words(error, status.detail), error.code())?;
                 }
             }
-            if status.detail != 0 && status.error != Some(FlashError::Secured) {
+            if has_number(status.error, status.detail) {
                 write!(f, ", detail {:04X}h", status.detail)?;
             }
             writeln!(f, "{}", if status.busy { ", busy" } else { "" })?;

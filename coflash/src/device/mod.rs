@@ -15,6 +15,7 @@ pub mod legacy;
 mod listen;
 pub mod lock;
 pub mod lss;
+pub mod option_bytes;
 pub mod partial_download;
 pub mod read_state;
 pub(crate) mod recognise;

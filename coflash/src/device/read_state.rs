@@ -3,11 +3,13 @@
 use std::time::Duration;
 
 use canopen::program::{
-    DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_PROGRAM_RESET, STATE_PROGRAM_WATCHDOG, STATE_REASON,
+    DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_OPTION_BYTES, STATE_PROGRAM_RESET,
+    STATE_PROGRAM_WATCHDOG, STATE_REASON, STATE_SUPPLY,
 };
 use canopen::Address;
 
 use super::error::{told, Error};
+use super::option_bytes::OptionBytes;
 use super::session::Session;
 use super::state::BootloaderState;
 
@@ -16,15 +18,15 @@ use super::state::BootloaderState;
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn read_state(session: &mut Session<'_>) -> Result<Option<BootloaderState>, Error> {
-    let mut byte = |sub| -> Result<Option<u8>, Error> {
-        let value = told(session.read_number(Address::new(DEVICE_STATE, sub)))?;
-        Ok(value.map(|value| value as u8))
-    };
+    let mut number = |sub| told(session.read_number(Address::new(DEVICE_STATE, sub)));
+    let mut byte = |sub| Ok::<_, Error>(number(sub)?.map(|value| value as u8));
     let Some(reason) = byte(STATE_REASON)? else { return Ok(None) };
     let program_reset = byte(STATE_PROGRAM_RESET)?.unwrap_or(0);
     let crash_resets = byte(STATE_CRASH_RESETS)?.unwrap_or(0);
     let clock = byte(STATE_CLOCK)?.unwrap_or(0);
-    Ok(Some(BootloaderState { reason, program_reset, crash_resets, clock }))
+    let supply = byte(STATE_SUPPLY)?.unwrap_or(0);
+    let option_bytes = number(STATE_OPTION_BYTES)?.filter(|value| *value != 0).map(OptionBytes);
+    Ok(Some(BootloaderState { reason, program_reset, crash_resets, clock, option_bytes, supply }))
 }
 
 /// The state of a device that is in trouble already: an error of the read is no news.

@@ -2,10 +2,12 @@
 
 use std::fmt;
 
-use canopen::program::ClockSource;
+use canopen::program::{ClockSource, Supply};
 use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
+
+use super::option_bytes::OptionBytes;
 
 /// Why a device stays in the bootloader, and how its program ended. `Display` shows it in one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -19,6 +21,10 @@ pub struct BootloaderState {
     pub crash_resets: u8,
     /// 2007h/5: the number of a [`ClockSource`]; 0 if it is not known.
     pub clock: u8,
+    /// 2007h/6; `None` if they are not known.
+    pub option_bytes: Option<OptionBytes>,
+    /// 2007h/7: the number of a [`Supply`]; 0 if it is not known.
+    pub supply: u8,
 }
 
 impl BootloaderState {
@@ -44,6 +50,18 @@ pub const fn source(cause: ResetCause) -> &'static str {
         ResetCause::LowPower => "a low-power mode that the option bytes forbid",
         ResetCause::BrownOut => "a supply below the brown-out level",
         ResetCause::Standby => "a wake-up from Standby",
+    }
+}
+
+/// The supply of a device, in words; `None` if it is not known.
+#[must_use]
+pub const fn supply(number: u8) -> Option<&'static str> {
+    const GOOD: u8 = Supply::Good as u8;
+    const LOW: u8 = Supply::Low as u8;
+    match number {
+        GOOD => Some("good"),
+        LOW => Some("too low to write its flash"),
+        _ => None,
     }
 }
 
@@ -85,6 +103,9 @@ impl fmt::Display for BootloaderState {
         if self.clock == ClockSource::Internal as u8 {
             write!(f, "; its crystal has failed, and it runs from its internal oscillator")?;
         }
+        if self.supply == Supply::Low as u8 {
+            write!(f, "; its supply is too low to write its flash")?;
+        }
         Ok(())
     }
 }
@@ -93,10 +114,19 @@ impl fmt::Display for BootloaderState {
 mod tests {
     use super::*;
 
+    const NOTHING: BootloaderState = BootloaderState {
+        reason: 0,
+        program_reset: 0,
+        crash_resets: 0,
+        clock: 1,
+        option_bytes: None,
+        supply: 1,
+    };
+
     #[test]
     fn each_state_has_its_words() {
         let state = |reason, program_reset, crash_resets| {
-            BootloaderState { reason, program_reset, crash_resets, clock: 1 }.to_string()
+            BootloaderState { reason, program_reset, crash_resets, ..NOTHING }.to_string()
         };
         assert_eq!(
             state(5, 4, 1),
@@ -111,11 +141,20 @@ mod tests {
             state(200, 200, 0),
             "stays in the bootloader: for a reason that this tool does not know (200)"
         );
-        let failed = BootloaderState { reason: 6, program_reset: 0, crash_resets: 0, clock: 2 };
+        let failed = BootloaderState { reason: 6, clock: 2, ..NOTHING };
         assert_eq!(
             failed.to_string(),
             "stays in the bootloader: it has no program; its crystal has failed, and it runs from its internal \
              oscillator"
+        );
+        for supply in [0, 1, 7] {
+            let state = BootloaderState { reason: 6, supply, ..NOTHING };
+            assert_eq!(state.to_string(), "stays in the bootloader: it has no program");
+        }
+        let low = BootloaderState { reason: 6, supply: 2, ..NOTHING };
+        assert_eq!(
+            low.to_string(),
+            "stays in the bootloader: it has no program; its supply is too low to write its flash"
         );
         // No two reasons share their words.
         let mut words: Vec<_> = (0..=12).map(reason).collect();

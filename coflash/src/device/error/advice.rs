@@ -7,7 +7,7 @@ use canopen::{AbortCode, NodeId};
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
 
-use super::{absent, Error, LssFailure, TrialFailure};
+use super::{absent, Error, LssFailure, TrialFailure, LOW_SUPPLY};
 use crate::device::doing::{Doing, LssDoing};
 use crate::device::state::BootloaderState;
 
@@ -60,6 +60,11 @@ impl Error {
                 "take the write protection of sector {sector} away with a debug probe (option bytes: nWRP, SPRMOD), and \
                  look whether the installed program sets it; nothing of that program is lost"
             ),
+            Self::Failed { error: FlashError::NoAccess, detail: LOW_SUPPLY, .. } => {
+                "check the supply of the device under load, from its source to the chip (coflash info says whether it \
+                 is good), and run the command again"
+                    .to_string()
+            }
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::SealedOnly { .. } => "seal the program with a key that a root of the device has certified (coflash seal), and \

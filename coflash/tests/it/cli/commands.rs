@@ -114,6 +114,48 @@ fn a_start_that_fails_is_told_with_the_device_s_reason() {
     }
 }
 
+/// 2007h/6 and 7 in words, with what to do. 0FFFAAEDh is the factory's value (RM0090 section 3.9.10).
+#[test]
+fn info_says_what_is_wrong_with_option_bytes_and_supply() {
+    let with = |options, supply| {
+        move || {
+            let mut fake = quick(BOOTLOADER);
+            fake.state = Some([6, 1, 0]);
+            fake.chip = Some((options, supply));
+            fake
+        }
+    };
+    let (said, json, _) = on(with(0x0FFF_AAED, 2), &["info"]);
+    for words in [
+        "  supply            too low to write its flash\n",
+        "  option bytes      brown-out reset off, no sector protected, read-out protection level 0 (0FFFAAEDh)\n",
+        "    warning         the brown-out reset is off",
+        "    warning         the bootloader is not write-protected",
+    ] {
+        assert!(said.out.contains(words), "{words:?}: {}", said.out);
+    }
+    assert_eq!((&json["state"]["option_bytes"], &json["state"]["supply"]), (&0x0FFF_AAED.into(), &2.into()));
+    let (said, ..) = on(with(0x0FFE_AAE1, 1), &["info"]);
+    assert!(said.out.contains("  supply            good\n") && !said.out.contains("warning"), "{}", said.out);
+    // A device without a chip, or that does not watch its supply, has neither.
+    let (said, ..) = on(with(0, 0), &["info"]);
+    assert!(!said.out.contains("supply") && !said.out.contains("option bytes"), "{}", said.out);
+}
+
+/// 1F57h is 84h with 1 in its upper half: the supply is too low (docs/protocol.md).
+#[test]
+fn a_supply_that_is_too_low_is_named_with_the_cure() {
+    let low = || {
+        let mut fake = quick(BOOTLOADER);
+        fake.on_command = Box::new(|_| Outcome::Status(0x0001_0084));
+        fake
+    };
+    let (said, json, _) = on(low, &["release"]);
+    assert_eq!((said.exit, &json["error"]["number"]), (6, &"0x60000184".into()));
+    assert!(said.err.contains("the supply of the device is too low to write its flash"), "{}", said.err);
+    assert!(said.err.contains("check the supply") && !said.err.contains("detail"), "{}", said.err);
+}
+
 #[test]
 fn status_shows_and_clears() {
     let failed = || {

@@ -110,6 +110,8 @@ pub struct Fake {
     pub ends: VecDeque<Option<End>>,
     /// 2007h/2 to 4, if the device has them.
     pub state: Option<[u8; 3]>,
+    /// 2007h/6 and 7, if the device has them: option bytes and supply.
+    pub chip: Option<(u32, u8)>,
     /// 2007h/10, if the device has it.
     pub watchdog_ms: Option<u16>,
     /// How long an answer takes.
@@ -184,6 +186,7 @@ impl Fake {
             starts: Some(APPLICATION),
             ends: VecDeque::new(),
             state: None,
+            chip: None,
             watchdog_ms: None,
             latency: Duration::from_micros(500),
             delays: VecDeque::new(),
@@ -482,6 +485,8 @@ impl Fake {
             (0x2007, sub @ 2..=4) => {
                 self.state.map(|state| vec![state[usize::from(sub) - 2]]).ok_or(0x0602_0000)
             }
+            (0x2007, 6) => self.chip.map(|(options, _)| options.to_le_bytes().to_vec()).ok_or(0x0602_0000),
+            (0x2007, 7) => self.chip.map(|(_, supply)| vec![supply]).ok_or(0x0602_0000),
             (0x2007, 10) => self.watchdog_ms.map(|ms| ms.to_le_bytes().to_vec()).ok_or(0x0602_0000),
             (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
             (0x1F50, 1) => self.readable.clone().ok_or(0x0601_0001),

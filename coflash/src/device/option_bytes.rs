@@ -1,0 +1,187 @@
+//! The option bytes of a device in words: 2007h/6 of coboot, which is the chip's FLASH_OPTCR.
+
+use std::fmt;
+
+use serde::{Serialize, Serializer};
+
+/// The option bytes as FLASH_OPTCR has them (RM0090 section 3.9.10). `Display` shows them in one line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OptionBytes(pub u32);
+
+impl OptionBytes {
+    /// The level of the brown-out reset, 1 to 3; `None` if it is off.
+    #[must_use]
+    pub fn brown_out_level(self) -> Option<u8> {
+        // BOR_LEV counts down: 00b is level 3, 11b is off.
+        match 3 - (self.0 >> 2 & 0b11) as u8 {
+            0 => None,
+            level => Some(level),
+        }
+    }
+
+    /// Whether the chip starts from its second bank (BFB2).
+    #[must_use]
+    pub const fn boots_from_bank_2(self) -> bool {
+        self.has(4)
+    }
+
+    /// Whether the watchdog starts with each reset (WDG_SW is 0).
+    #[must_use]
+    pub const fn starts_watchdog(self) -> bool {
+        !self.has(5)
+    }
+
+    /// Whether nWRP protects against reading, too (SPRMOD).
+    #[must_use]
+    pub const fn protects_from_reading(self) -> bool {
+        self.has(31)
+    }
+
+    /// The level of the read-out protection (RDP), 0 to 2.
+    #[must_use]
+    pub const fn read_out_level(self) -> u8 {
+        match (self.0 >> 8) as u8 {
+            0xAA => 0,
+            0xCC => 2,
+            _ => 1,
+        }
+    }
+
+    /// Whether a sector of the first bank is protected (nWRP), 0 to 11.
+    #[must_use]
+    pub const fn protects(self, sector: u8) -> bool {
+        // A zero protects; with SPRMOD a one does.
+        self.has(16 + sector) == self.protects_from_reading()
+    }
+
+    /// The protected sectors of the first bank.
+    fn protected(self) -> Vec<u8> {
+        (0..12).filter(|sector| self.protects(*sector)).collect()
+    }
+
+    const fn has(self, bit: u8) -> bool {
+        self.0 >> bit & 1 != 0
+    }
+
+    /// What of them is wrong for a product, or needs care: what it means, and what to do.
+    #[must_use]
+    pub fn warnings(self) -> Vec<&'static str> {
+        [
+            (
+                self.brown_out_level().is_none(),
+                "the brown-out reset is off, so that the chip runs on while its supply fails: set BOR_LEV with a \
+                 debug probe, to level 3 for a supply of 3.0 V and more, level 2 from 2.7 V, level 1 from 2.3 V",
+            ),
+            (
+                self.protects_from_reading(),
+                "SPRMOD is set: nWRP protects against reading, too, and what is protected cannot be checked or \
+                 replaced. To take it away erases the chip (read-out protection from level 1 to 0)",
+            ),
+            (
+                !self.protects(0),
+                "the bootloader is not write-protected: clear nWRP of its sectors with a debug probe (sector 0, and \
+                 the others that cargo xtask layout names), and of no others",
+            ),
+            (
+                self.starts_watchdog(),
+                "the watchdog starts with each reset (WDG_SW): a program has to feed it from its first instructions \
+                 on, within 349 ms",
+            ),
+            (
+                self.boots_from_bank_2(),
+                "BFB2 is set: the chip starts from its second bank if that begins with a stack pointer, and the \
+                 bootloader is in the first one. Clear it with a debug probe",
+            ),
+        ]
+        .into_iter()
+        .filter_map(|(is_so, warning)| is_so.then_some(warning))
+        .collect()
+    }
+}
+
+/// As the number.
+impl Serialize for OptionBytes {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_u32(self.0)
+    }
+}
+
+impl fmt::Display for OptionBytes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.brown_out_level() {
+            Some(level) => write!(f, "brown-out reset level {level}")?,
+            None => f.write_str("brown-out reset off")?,
+        }
+        match (self.protected().as_slice(), self.protects_from_reading()) {
+            ([], _) => f.write_str(", no sector protected")?,
+            (sectors, false) => write!(f, ", write-protected: {}", list(sectors))?,
+            (sectors, true) => write!(f, ", protected against reading and writing: {}", list(sectors))?,
+        }
+        write!(f, ", read-out protection level {}", self.read_out_level())?;
+        if self.starts_watchdog() {
+            f.write_str(", hardware watchdog")?;
+        }
+        if self.boots_from_bank_2() {
+            f.write_str(", start from bank 2")?;
+        }
+        write!(f, " ({:08X}h)", self.0)
+    }
+}
+
+/// Sectors as a list.
+fn list(sectors: &[u8]) -> String {
+    let numbers: Vec<_> = sectors.iter().map(u8::to_string).collect();
+    format!("sectors {}", numbers.join(", "))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// RM0090 section 3.9.10: the value after a reset of a chip from the factory, and each field.
+    #[test]
+    fn each_field_has_its_words() {
+        for (value, words) in [
+            (0x0FFF_AAED, "brown-out reset off, no sector protected, read-out protection level 0 (0FFFAAEDh)"),
+            (
+                0x0FEE_AAE1,
+                "brown-out reset level 3, write-protected: sectors 0, 4, read-out protection level 0 (0FEEAAE1h)",
+            ),
+            (0x0FFF_AAE5, "brown-out reset level 2, no sector protected, read-out protection level 0 (0FFFAAE5h)"),
+            (0x0FFF_55E9, "brown-out reset level 1, no sector protected, read-out protection level 1 (0FFF55E9h)"),
+            (
+                0x0FFF_CCCD,
+                "brown-out reset off, no sector protected, read-out protection level 2, hardware watchdog (0FFFCCCDh)",
+            ),
+            (
+                0x8001_AAFD,
+                "brown-out reset off, protected against reading and writing: sectors 0, read-out protection level 0, \
+                 start from bank 2 (8001AAFDh)",
+            ),
+        ] {
+            assert_eq!(OptionBytes(value).to_string(), words);
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_for_a_product_is_told_with_the_cure() {
+        let told = |value, words: &[&str]| {
+            let warnings = OptionBytes(value).warnings();
+            assert_eq!(warnings.len(), words.len(), "{value:08X}h: {warnings:?}");
+            for (warning, word) in warnings.iter().zip(words) {
+                assert!(warning.contains(word), "{value:08X}h: {warning}");
+            }
+        };
+        // Level 3 and sector 0 protected, all the same what else is protected.
+        told(0x0FFE_AAE1, &[]);
+        told(0x0000_CCE1, &[]);
+        told(0x0FFF_AAED, &["brown-out reset is off", "not write-protected"]);
+        told(0x0FFE_AAED, &["brown-out reset is off"]);
+        // Sector 4 alone.
+        told(0x0FEF_AAE1, &["not write-protected"]);
+        told(0x0FFE_AAC1, &["within 349 ms"]);
+        told(0x0FFE_AAF1, &["BFB2"]);
+        told(0x8001_AAE1, &["SPRMOD"]);
+        told(0x8000_AACD, &["brown-out", "SPRMOD", "not write-protected", "watchdog"]);
+    }
+}
