@@ -18,7 +18,10 @@
 //! - A node that leaves without warning (reset, power) in the middle of its frame makes a bad frame
 //!   of the same length.
 //! - A controller in loop-back mode without silent mode arbitrates like any other, while the
-//!   silicon would not listen. With both modes it plays with itself.
+//!   silicon would not listen. With both modes, or without a pin for TX, it plays with itself.
+//! - A controller without a pin for RX sees a bit error in the first bit that it sends, and its error
+//!   flag destroys the frames of the others; it starts only while the bus is idle, though it hears
+//!   nothing. Without a pin for TX it sees the same, and nobody is disturbed.
 //! - There are no overload frames.
 
 pub mod confinement;
@@ -35,7 +38,7 @@ use crate::frame::{ack_delimiter, Frame, INTERMISSION_BITS};
 use crate::time::{Span, Time};
 use confinement::ErrorState;
 use fault::{Fault, FaultAction, Faults};
-use node::{BusEvent, BusNode, ErrorKind, Line};
+use node::{BusEvent, BusNode, ErrorKind, Line, Route, Wait};
 
 /// Bits of an error flag that all nodes send together.
 const FLAG_BITS: u32 = 6;
@@ -161,12 +164,14 @@ struct DelayedFrame {
     bit: Span,
 }
 
-/// A frame that a controller in silent loop-back mode sends to itself.
+/// A frame that nobody sees but the controller that sends it.
 #[derive(Clone, Copy, Debug)]
 struct Inner {
     node: usize,
     epoch: u32,
     frame: Frame,
+    /// Acknowledged by loop-back, or given up after a bit error.
+    is_good: bool,
     end: Time,
     bit: Span,
 }
@@ -178,6 +183,12 @@ struct Contender {
     party: Option<Party>,
     frame: Frame,
     bit: Span,
+}
+
+impl Contender {
+    fn is_deaf(&self) -> bool {
+        self.party.is_some_and(|party| party.line.is_deaf())
+    }
 }
 
 type Sink = Box<dyn FnMut(&Record)>;
@@ -290,16 +301,19 @@ impl Bus {
         let busy = self.flight.as_ref().is_some_and(|flight| flight.involves(n))
             || self.inner.iter().any(|inner| inner.node == n);
         let leaves = node.leaving().filter(|_| !busy);
-        let joins = match (&self.flight, node.wait()) {
-            (None, Some(wait)) => {
-                let from = wait.since.max(self.recessive_since);
-                let sequence = wait.bit.0.saturating_mul(SEQUENCE_BITS);
-                Some(from + Span(sequence.saturating_mul(u64::from(wait.sequences))))
-            }
-            _ => None,
-        };
+        let joins = self.counted_wait(node).map(|(wait, from)| {
+            let sequence = wait.bit.0.saturating_mul(SEQUENCE_BITS);
+            from + Span(sequence.saturating_mul(u64::from(wait.sequences)))
+        });
         let starts = self.next_start(n, node);
         [leaves, joins, starts].into_iter().flatten().min()
+    }
+
+    /// The recessive bits that the node waits for, if any pass now, and since when they have.
+    fn counted_wait(&self, node: &dyn BusNode) -> Option<(Wait, Time)> {
+        let wait = node.wait().filter(|wait| self.flight.is_none() || !wait.hears)?;
+        let from = if wait.hears { wait.since.max(self.recessive_since) } else { wait.since };
+        Some((wait, from))
     }
 
     /// The earliest time at which the node could start a frame.
@@ -310,10 +324,13 @@ impl Bus {
             None => node.next_request(self.now)?,
         };
         let allowed = request.max(self.suspended.get(n).copied().unwrap_or_default());
-        match (line.silent, line.loopback) {
-            (true, true) => self.inner.iter().all(|inner| inner.node != n).then_some(allowed),
-            (true, false) => None,
-            (false, _) => self.flight.is_none().then_some(allowed.max(self.free_at)),
+        let at_rest = || self.flight.is_none().then_some(allowed.max(self.free_at));
+        match line.route() {
+            Route::Nowhere => None,
+            Route::Inside if self.inner.iter().any(|inner| inner.node == n) => None,
+            Route::Inside if line.hears() => at_rest(),
+            Route::Inside => Some(allowed),
+            Route::Bus => at_rest(),
         }
     }
 
@@ -349,9 +366,7 @@ impl Bus {
                 node.event(BusEvent::Released, now);
             }
         }
-        if self.flight.is_none() {
-            self.count_recessive(nodes);
-        }
+        self.count_recessive(nodes);
         self.start_inner(nodes);
         if self.flight.is_none() && now >= self.free_at {
             self.start(nodes);
@@ -361,8 +376,8 @@ impl Bus {
     /// Reports to the nodes that wait for recessive bits how many have passed.
     fn count_recessive(&mut self, nodes: &mut [&mut dyn BusNode]) {
         for node in nodes {
-            let Some(wait) = node.wait() else { continue };
-            let heard = self.now - wait.since.max(self.recessive_since);
+            let Some((wait, from)) = self.counted_wait(*node) else { continue };
+            let heard = self.now - from;
             let sequences = heard.0.checked_div(wait.bit.0.saturating_mul(SEQUENCE_BITS)).unwrap_or(0);
             let sequences = u32::try_from(sequences).unwrap_or(u32::MAX).min(wait.sequences);
             if sequences > 0 {
@@ -371,17 +386,20 @@ impl Bus {
         }
     }
 
-    // --- silent loop-back
-    // ------------------------------------------------------------------------------------------
+    // --- frames that nobody else sees
+    // ------------------------------------------------------------------------------
 
     fn start_inner(&mut self, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
         for (n, node) in nodes.iter_mut().enumerate() {
-            let Some(line) = node.line().filter(|line| line.silent && line.loopback) else { continue };
-            let free = self.inner.iter().all(|inner| inner.node != n) && self.suspended[n] <= now;
+            let Some(line) = node.line().filter(|line| line.route() == Route::Inside) else { continue };
+            let waits = line.hears() && (self.flight.is_some() || self.free_at > now);
+            let free = self.inner.iter().all(|inner| inner.node != n) && self.suspended[n] <= now && !waits;
             if let Some(frame) = node.request(now).filter(|_| free) {
-                let end = now + bits(line.bit, frame.wire_len());
-                self.inner.push(Inner { node: n, epoch: node.epoch(), frame, end, bit: line.bit });
+                let is_good = line.loopback;
+                let length = if is_good { frame.wire_len() } else { 1 + FLAG_BITS + DELIMITER_BITS };
+                let (epoch, end) = (node.epoch(), now + bits(line.bit, length));
+                self.inner.push(Inner { node: n, epoch, frame, is_good, end, bit: line.bit });
                 node.event(BusEvent::Started { own: true }, now);
             }
         }
@@ -395,8 +413,13 @@ impl Bus {
                 return true;
             }
             if let Some(node) = nodes.get_mut(inner.node).filter(|node| node.epoch() == inner.epoch) {
-                node.event(BusEvent::Received(inner.frame), now);
-                node.event(BusEvent::Transmitted, now);
+                if inner.is_good {
+                    node.event(BusEvent::Received(inner.frame), now);
+                    node.event(BusEvent::Transmitted, now);
+                } else {
+                    let kind = ErrorKind::BitDominant;
+                    node.event(BusEvent::TransmitFailed { kind, exempt: false }, now);
+                }
                 node.event(BusEvent::Ended, now);
             }
             suspended[inner.node] = now + bits(inner.bit, INTERMISSION_BITS);
@@ -410,7 +433,7 @@ impl Bus {
     fn contenders(&self, nodes: &[&mut dyn BusNode]) -> Vec<Contender> {
         let now = self.now;
         let from_nodes = nodes.iter().enumerate().filter_map(|(n, node)| {
-            let line = node.line().filter(|line| !line.silent)?;
+            let line = node.line().filter(|line| line.route() == Route::Bus)?;
             let frame = node.request(now).filter(|_| self.suspended[n] <= now)?;
             let party = Party { node: n, epoch: node.epoch(), line, in_tune: true, flags_at: None };
             Some(Contender { party: Some(party), frame, bit: line.bit })
@@ -431,7 +454,7 @@ impl Bus {
         let key = frame.arbitration_key();
         let clash = contenders.iter().any(|other| {
             let tolerance = other.party.map_or(port::TOLERANCE_PPM, |party| party.line.tolerance_ppm);
-            !in_tune(other.bit, bit, tolerance)
+            other.is_deaf() || !in_tune(other.bit, bit, tolerance)
         });
         // A node that does not read the others' bits as bits does not lose the arbitration against
         // them.
@@ -455,9 +478,9 @@ impl Bus {
             if !lost {
                 node.event(BusEvent::Started { own: sends }, now);
             }
-            if let Some(line) = node.line().filter(|line| !sends && !line.loopback) {
+            if let Some(line) = node.line().filter(|line| !sends && line.hears()) {
                 let in_tune = !clash && in_tune(line.bit, bit, line.tolerance_ppm);
-                let active = !line.silent && node.confinement().state() == ErrorState::Active;
+                let active = line.drives() && node.confinement().state() == ErrorState::Active;
                 let flags_at = (!in_tune && !clash && active).then(|| now + misread(&wire, bit, &line));
                 receivers.push(Party { node: n, epoch: node.epoch(), line, in_tune, flags_at });
             }
@@ -508,6 +531,14 @@ impl Bus {
     ) -> Option<Error> {
         let now = self.now;
         let (frame, bit) = (winners.first()?.frame, winners.first()?.bit);
+        if winners.iter().any(|winner| winner.is_deaf()) {
+            return Some(Error {
+                at: now + bits(bit, 1),
+                flag_bits: FLAG_AND_ECHO_BITS,
+                transmit: ErrorKind::BitDominant,
+                receive: ErrorKind::Stuff,
+            });
+        }
         if clash {
             let slowest = winners.iter().map(|winner| winner.bit).max()?;
             return Some(Error {
@@ -545,7 +576,7 @@ impl Bus {
         }
         let needs_acknowledge =
             winners.iter().any(|winner| winner.party.is_none_or(|party| !party.line.loopback));
-        if needs_acknowledge && !receivers.iter().any(|party| party.in_tune && !party.line.silent) {
+        if needs_acknowledge && !receivers.iter().any(|party| party.in_tune && party.line.drives()) {
             errors.push(self.no_acknowledge(now + bits(bit, ack_delimiter(wire_len))));
         }
         errors.into_iter().min_by_key(|error| error.at)
@@ -576,7 +607,7 @@ impl Bus {
         flight.receivers.retain(there);
         let sent = flight.gateway.is_some() || !flight.transmitters.is_empty();
         let acknowledged = flight.transmitters.iter().any(|party| party.line.loopback)
-            || flight.receivers.iter().any(|party| party.in_tune && !party.line.silent);
+            || flight.receivers.iter().any(|party| party.in_tune && party.line.drives());
         if !sent || !acknowledged {
             let mut error = self.no_acknowledge(now);
             if !sent {

@@ -8,20 +8,22 @@
 //! The controller does not decide which frame is on the wire. It offers frames and counters to the
 //! [`Bus`](crate::bus::Bus) through [`BusNode`], and the bus reports the events and their times.
 //! Before a bus has called it, the controller behaves as if its transceiver saw a recessive line:
-//! it can be set up and leaves initialisation, and its frames wait.
+//! it can be set up and leaves initialisation, and its frames wait, except in loop-back mode, which needs
+//! no bus.
 //!
 //! Not modelled, and reported when asked for: time-triggered mode. MSR.SAMP and MSR.RX always
 //! read recessive.
 
 pub mod filters;
+pub mod pins;
 #[cfg(test)]
 mod tests;
 
 use std::collections::VecDeque;
 
 use crate::bus::confinement::{Confinement, ErrorState};
-use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Wait};
-use crate::frame::{ExtendedId, Frame, Id, StandardId};
+use crate::bus::node::{BusEvent, BusNode, ErrorKind, Line, Pins, Wait};
+use crate::frame::{ExtendedId, Frame, Id, StandardId, INTERMISSION_BITS};
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::silicon::{self, Silicon};
 use crate::time::{Span, Time};
@@ -333,6 +335,7 @@ pub struct BxCan {
     master_clocked: bool,
     clock_hz: u32,
     on_bus: bool,
+    pins: Pins,
     attention: Option<Time>,
     epoch: u32,
     mode: Mode,
@@ -345,6 +348,8 @@ pub struct BxCan {
     silicon: Silicon,
     recovery: Recovery,
     activity: Activity,
+    /// Without a bus: when the frame that it sends to itself is over, with the intermission.
+    alone: Option<Time>,
     confinement: Confinement,
     mcr: u32,
     /// ERRI, WKUI, SLAKI.
@@ -365,7 +370,7 @@ impl Default for BxCan {
 }
 
 impl BxCan {
-    /// CAN1 after a reset, without a clock.
+    /// CAN1 after a reset, without a clock, its pins connected.
     #[must_use]
     pub fn new() -> Self {
         Self {
@@ -373,6 +378,7 @@ impl BxCan {
             master_clocked: true,
             clock_hz: 0,
             on_bus: false,
+            pins: Pins::BOTH,
             attention: None,
             epoch: 0,
             mode: Mode::Resting(Rest::Sleep),
@@ -382,6 +388,7 @@ impl BxCan {
             silicon: silicon::TYPICAL,
             recovery: Recovery::None,
             activity: Activity::Idle,
+            alone: None,
             confinement: Confinement::default(),
             mcr: mcr::AFTER_RESET,
             msr_flags: 0,
@@ -411,6 +418,20 @@ impl BxCan {
     pub fn follow(&mut self, master: &Self, clocked: bool) {
         self.filters.clone_from(&master.filters);
         self.master_clocked = clocked;
+    }
+
+    /// Which of the two it is.
+    #[must_use]
+    pub fn share(&self) -> Share {
+        self.share
+    }
+
+    /// The program connects pins to the controller, or takes them away.
+    pub fn connect(&mut self, pins: Pins, now: Time) {
+        if pins != self.pins {
+            self.pins = pins;
+            self.attend(now);
+        }
     }
 
     /// Its interrupt lines.
@@ -571,6 +592,7 @@ impl BxCan {
         self.frozen_aborts = 0;
         self.recovery = Recovery::None;
         self.activity = Activity::Idle;
+        self.alone = None;
         self.confinement = Confinement::default();
         self.msr_flags = 0;
         self.last_error = 0;
@@ -583,16 +605,53 @@ impl BxCan {
 
     /// Without a bus the line stays recessive.
     fn hear_nothing(&mut self, now: Time) {
-        if let Some((_, rest)) = self.leaving {
-            self.rest(rest);
-        }
-        if let Some(wait) = self.wait() {
-            if let Some(due) = self.next_event() {
-                if due <= now {
-                    self.event(BusEvent::Recessive { sequences: wait.sequences }, now);
-                }
+        if let Some((wait, due)) = self.wait_until() {
+            if due <= now {
+                self.event(BusEvent::Recessive { sequences: wait.sequences }, now);
             }
         }
+        self.play_alone(now);
+        if let Some((_, rest)) = self.leaving.filter(|_| self.alone.is_none()) {
+            self.rest(rest);
+        }
+    }
+
+    /// What it waits for without a bus, and when it has it.
+    fn wait_until(&self) -> Option<(Wait, Time)> {
+        let wait = self.wait()?;
+        Some((wait, wait.since + Span(wait.bit.0 * SEQUENCE_BITS * u64::from(wait.sequences))))
+    }
+
+    /// Sends frames to itself, without a bus.
+    fn play_alone(&mut self, now: Time) {
+        let mut free_at = now;
+        while let Some(due) = self.next_alone().filter(|&due| due <= now) {
+            if self.alone.take().is_some() {
+                let is_sent = |mailbox: &&Mailbox| matches!(mailbox.state, MailboxState::Transmit { .. });
+                if let Some(frame) = self.mailboxes.iter().find(is_sent).map(Mailbox::frame) {
+                    self.event(BusEvent::Received(frame), due);
+                    self.event(BusEvent::Transmitted, due);
+                }
+                self.event(BusEvent::Ended, due);
+                free_at = due;
+                continue;
+            }
+            // It may have waited for the controller to be ready.
+            let start = free_at.max(due);
+            let (Some(bit), Some(frame)) = (self.bit_time(), self.request(start)) else { return };
+            self.event(BusEvent::Started { own: true }, start);
+            self.alone = Some(start + Span(bit.0 * u64::from(frame.wire_len() + INTERMISSION_BITS)));
+        }
+    }
+
+    /// When the next frame to itself begins or ends, without a bus.
+    fn next_alone(&self) -> Option<Time> {
+        let plays = self.line().is_some_and(|line| line.loopback) && self.leaving.is_none();
+        let request = self.mailboxes.iter().filter_map(|mailbox| match mailbox.state {
+            MailboxState::Pending { since, .. } if plays => Some(since),
+            _ => None,
+        });
+        self.alone.or(request.min())
     }
 
     // --- transmission
@@ -687,6 +746,7 @@ impl BxCan {
                     mailbox.state = MailboxState::Pending { since: now, order };
                     self.requests += 1;
                     self.attend(now);
+                    self.check_pins()?;
                 }
             }
             0x4 => {
@@ -697,6 +757,25 @@ impl BxCan {
             }
             0x8 => mailbox.tdlr = value,
             _ => mailbox.tdhr = value,
+        }
+        Ok(())
+    }
+
+    /// Checks that what is to be sent comes to a transceiver.
+    fn check_pins(&self) -> Result<(), Unmodelled> {
+        let needed = self.btr & (btr::LBKM | btr::SILM) == 0;
+        let missing = match self.pins {
+            Pins { rx: false, tx: false } => "RX and TX",
+            Pins { rx: false, .. } => "RX",
+            Pins { tx: false, .. } => "TX",
+            Pins { .. } => return Ok(()),
+        };
+        if needed {
+            let name = self.name();
+            return Err(Unmodelled(format!(
+                "{name} sends, and no pin of this package has its {missing} (GPIO: MODER 10b and the alternate \
+                 function): set up a pin that the package has, nothing is received or heard until then"
+            )));
         }
         Ok(())
     }
@@ -933,8 +1012,7 @@ impl Peripheral for BxCan {
         if self.on_bus {
             return None; // the bus knows
         }
-        let wait = self.wait()?;
-        Some(wait.since + Span(wait.bit.0 * SEQUENCE_BITS * u64::from(wait.sequences)))
+        self.wait_until().map(|(_, due)| due).into_iter().chain(self.next_alone()).min()
     }
 
     fn interrupts(&self, active: &mut Vec<u16>) {
@@ -964,6 +1042,7 @@ impl Peripheral for BxCan {
             master_clocked: self.master_clocked,
             clock_hz: self.clock_hz,
             on_bus: self.on_bus,
+            pins: self.pins,
             epoch: self.epoch,
             silicon: self.silicon,
             filters,
@@ -983,6 +1062,7 @@ impl BusNode for BxCan {
             tolerance_ppm: self.tolerance_ppm(),
             silent: self.btr & btr::SILM != 0,
             loopback: self.btr & btr::LBKM != 0,
+            pins: self.pins,
         })
     }
 
@@ -1012,7 +1092,8 @@ impl BusNode for BxCan {
             (Mode::Normal, Recovery::Counting { since, left }) => (since, left),
             _ => return None,
         };
-        Some(Wait { since, sequences, bit: self.bit_time()? })
+        let hears = self.pins.rx && self.btr & btr::LBKM == 0;
+        Some(Wait { since, sequences, bit: self.bit_time()?, hears })
     }
 
     fn leaving(&self) -> Option<Time> {
@@ -1021,6 +1102,7 @@ impl BusNode for BxCan {
 
     fn event(&mut self, event: BusEvent, now: Time) {
         match event {
+            BusEvent::Started { own: false } if !self.pins.rx => {}
             BusEvent::Started { own } => {
                 if self.mode == Mode::Resting(Rest::Sleep) {
                     self.msr_flags |= msr::WKUI;

@@ -309,6 +309,11 @@ impl Chip {
         self.clock.now()
     }
 
+    /// The cycle of the access that the program makes to a counter of the core.
+    fn cycle_of_access(&self) -> u64 {
+        self.clock.cycles.saturating_sub(self.slice.ahead)
+    }
+
     /// A system reset of everything but the CPU: RAM stays, the flags in RCC_CSR gather.
     pub fn reset(&mut self, cause: ResetCause) {
         self.rcc.note_reset(cause);
@@ -444,7 +449,7 @@ impl Chip {
         for tim in &mut self.tims {
             tim.reset();
         }
-        self.wire_usarts();
+        self.wire_pins();
         let option_bytes = self.flash.option_bytes();
         self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
         self.apply_clocks();
@@ -850,8 +855,11 @@ impl Chip {
                 let name = self.block_mut(block).name();
                 Err(Unmodelled(format!("{name} has no clock (RCC enables it); the write is lost")))
             }
-            Place::Scs(offset) => self.store_scs(offset, value, now),
-            Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.clock.cycles),
+            Place::Scs(offset) => {
+                let now = self.clock.time_of(self.cycle_of_access());
+                self.store_scs(offset, value, now)
+            }
+            Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.cycle_of_access()),
             Place::Fpb(offset) => {
                 self.slice.breakpoints_changed = true;
                 self.slice.leave = true;
@@ -891,7 +899,8 @@ impl Chip {
                 self.settle_flash();
             }
             Block::Gpio(_) => {
-                self.wire_usarts();
+                self.wire_pins();
+                self.attend_bus();
                 self.show_pins();
             }
             Block::Syscfg | Block::Pwr => self.show_pins(),
@@ -899,10 +908,7 @@ impl Chip {
                 if block == Block::Can1 {
                     self.tell_slave();
                 }
-                if self.can.iter().any(BxCan::wants_attention) {
-                    self.slice.attention = true;
-                    self.slice.leave = true;
-                }
+                self.attend_bus();
             }
             _ => {}
         }

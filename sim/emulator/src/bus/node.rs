@@ -4,6 +4,34 @@ use crate::bus::confinement::Confinement;
 use crate::frame::Frame;
 use crate::time::{Span, Time};
 
+/// Which of its two pins a node has on the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pins {
+    /// What it hears; without it, a recessive line for ever.
+    pub rx: bool,
+    /// What the others hear of it.
+    pub tx: bool,
+}
+
+impl Pins {
+    /// Both.
+    pub const BOTH: Self = Self { rx: true, tx: true };
+    /// Neither.
+    pub const NONE: Self = Self { rx: false, tx: false };
+}
+
+/// Where a node's frames go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Route {
+    /// It sends none.
+    Nowhere,
+    /// Nobody but the node itself sees them: it has them acknowledged in loop-back mode, and sees a bit
+    /// error in the first of their bits otherwise.
+    Inside,
+    /// The bus.
+    Bus,
+}
+
 /// How a node that takes part drives and reads the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Line {
@@ -17,9 +45,39 @@ pub struct Line {
     pub silent: bool,
     /// It receives its own frames and nothing else, and needs no acknowledge.
     pub loopback: bool,
+    /// Its pins.
+    pub pins: Pins,
 }
 
 impl Line {
+    /// Whether the others hear what it sends.
+    #[must_use]
+    pub fn drives(&self) -> bool {
+        !self.silent && self.pins.tx
+    }
+
+    /// Whether it hears the others.
+    #[must_use]
+    pub fn hears(&self) -> bool {
+        !self.loopback && self.pins.rx
+    }
+
+    /// Whether it sends onto the bus and hears nothing of it, which it takes for bit errors.
+    #[must_use]
+    pub fn is_deaf(&self) -> bool {
+        !self.loopback && !self.pins.rx
+    }
+
+    /// Where its frames go.
+    #[must_use]
+    pub fn route(&self) -> Route {
+        match (self.silent, self.loopback) {
+            (true, false) => Route::Nowhere,
+            _ if self.drives() => Route::Bus,
+            _ => Route::Inside,
+        }
+    }
+
     /// The bit rate in bit/s, rounded.
     #[must_use]
     pub fn bit_rate(&self) -> u32 {
@@ -44,6 +102,8 @@ pub struct Wait {
     pub sequences: u32,
     /// Its bit time.
     pub bit: Span,
+    /// Whether it hears the bus; what it hears is recessive otherwise.
+    pub hears: bool,
 }
 
 /// The error of a frame, as the node that counts it sees it.

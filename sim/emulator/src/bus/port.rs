@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use crate::bus::confinement::{Confinement, ErrorState};
-use crate::bus::node::{BusEvent, BusNode, Line, Wait};
+use crate::bus::node::{BusEvent, BusNode, Line, Pins, Wait};
 use crate::frame::Frame;
 use crate::time::{Span, Time};
 
@@ -134,6 +134,7 @@ impl BusNode for HostPort {
             tolerance_ppm: TOLERANCE_PPM,
             silent: self.silent,
             loopback: false,
+            pins: Pins::BOTH,
         })
     }
 
@@ -154,7 +155,7 @@ impl BusNode for HostPort {
     }
 
     fn wait(&self) -> Option<Wait> {
-        self.recovery.map(|(since, sequences)| Wait { since, sequences, bit: self.bit })
+        self.recovery.map(|(since, sequences)| Wait { since, sequences, bit: self.bit, hears: true })
     }
 
     fn leaving(&self) -> Option<Time> {

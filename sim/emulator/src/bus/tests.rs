@@ -6,6 +6,7 @@ use std::cell::RefCell;
 use std::rc::Rc;
 
 use super::fault::{FrameMatch, When};
+use super::node::Pins;
 use super::port::{HostPort, Unplugged};
 use super::*;
 use crate::bxcan::BxCan;
@@ -546,4 +547,100 @@ fn steps_do_not_matter() {
     assert!(once.len() > 120, "{}", once.len());
     assert_eq!(once, run(1));
     assert_eq!(once, run(777).into_iter().filter(|record| record.end.0 <= 30_000 * US).collect::<Vec<_>>());
+}
+
+// --- pins
+// ------------------------------------------------------------------------------------------------
+
+fn with_pins(btr: u32, pins: Pins) -> Node {
+    let mut node = controller(btr, 0x10);
+    if let Node::Can(can) = &mut node {
+        can.connect(pins, Time(0));
+    }
+    node
+}
+
+fn request(bench: &mut Bench, n: usize) {
+    let now = bench.bus.now();
+    // What is reported is tested beside the controller.
+    let _ = bench.can(n).write(0x180, 0x080 << 21 | 1, now);
+}
+
+fn bench_with(node: Node) -> Bench {
+    let mut bench =
+        Bench::new(vec![node, Node::Port(HostPort::new(1_000_000)), Node::Port(HostPort::new(1_000_000))]);
+    bench.run(100);
+    bench
+}
+
+/// Without NART: 32 bit errors count 8 each up to 256, bus-off (RM0090 section 32.7.6). Nobody sees them.
+#[test]
+fn who_has_no_pin_for_tx_is_not_heard_and_goes_bus_off() {
+    for rx in [true, false] {
+        let mut bench = bench_with(controller(0, 0));
+        bench.can(0).connect(Pins { rx, tx: false }, Time(100 * US));
+        request(&mut bench, 0);
+        bench.run(5_000);
+        assert_eq!(bench.log(), []);
+        assert_eq!(bench.read(0, 0x18) & 0x7, 0x7, "rx {rx}: BOFF");
+        // It acknowledges nothing, either.
+        bench.send(1, 6_000, boot_up());
+        bench.run(7_000);
+        assert!(bench.received(2) == [(6_055, "701#00".into())], "node 2 acknowledges");
+    }
+    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    bench.run(100);
+    bench.can(0).connect(Pins { rx: true, tx: false }, Time(100 * US));
+    bench.send(1, 200, boot_up());
+    bench.run(300);
+    assert_eq!(bench.log()[0].3, Outcome::Bad(ErrorKind::Acknowledge));
+}
+
+#[test]
+fn who_has_no_pin_for_rx_hears_nothing_and_destroys_the_frames_of_others_until_bus_off() {
+    let mut bench = bench_with(with_pins(0, Pins { rx: false, tx: true }));
+    bench.send(1, 200, boot_up());
+    bench.run(300);
+    assert_eq!(bench.read(0, 0x0C) & 3, 0, "nothing received");
+    assert_eq!(bench.log()[0].3, Outcome::Good);
+    // One attempt: the first bit and the flag are a stuff error to the others.
+    request(&mut bench, 0);
+    bench.run(400);
+    assert_eq!(bench.log()[1].3, Outcome::Bad(ErrorKind::BitDominant));
+    assert_eq!(bench.read(0, 0x18) >> 16 & 0xFF, 8);
+    assert!(bench.port(2).error_counters().rec() > 0);
+}
+
+/// RM0090 section 32.4.2: it waits for 11 recessive bits. One that hears nothing has them at once; so has one
+/// in loop-back mode (section 32.5.2), on a bus on which others speak.
+#[test]
+fn who_hears_nothing_is_synchronised_on_a_busy_bus() {
+    for (btr, pins, hears) in [
+        (0, Pins::BOTH, true),
+        (0, Pins { rx: false, tx: true }, false),
+        (0x4000_0000, Pins::BOTH, false),
+        (0x4000_0000, Pins::NONE, false),
+    ] {
+        let mut bench = Bench::new(vec![
+            with_pins(btr, pins),
+            Node::Port(HostPort::new(1_000_000)),
+            Node::Port(HostPort::new(1_000_000)),
+        ]);
+        bench.send(1, 0, boot_up());
+        bench.run(20);
+        assert_eq!(bench.read(0, 0x04) & 1, u32::from(hears), "{btr:08X} {pins:?}: INAK");
+        bench.run(100);
+        assert_eq!(bench.read(0, 0x04) & 1, 0);
+    }
+}
+
+/// Loop-back without silent mode sends onto the bus; without a pin it is heard by itself alone.
+#[test]
+fn in_loop_back_mode_without_a_pin_it_plays_with_itself() {
+    let mut bench = bench_with(with_pins(0x4000_0000, Pins::NONE));
+    request(&mut bench, 0);
+    bench.run(200);
+    assert_eq!(bench.log(), []);
+    assert_eq!(bench.read(0, 0x08) & 3, 3, "RQCP and TXOK");
+    assert_eq!(bench.read(0, 0x0C) & 3, 1);
 }

@@ -509,6 +509,53 @@ fn without_a_bus_it_still_comes_out_of_initialisation() {
     assert_eq!(can.read(MSR, due).unwrap() & 1, 1);
 }
 
+/// RM0090 section 32.5.2: in loop-back mode the controller disregards CANRX and acknowledges itself, so it
+/// needs neither a pin nor a transceiver.
+#[test]
+fn in_loop_back_mode_it_needs_neither_a_bus_nor_pins() {
+    let mut can = BxCan::new();
+    can.set_clock(42_000_000);
+    can.connect(Pins::NONE, Time(0));
+    can.write(MCR, 0x1_0001, Time(0)).unwrap();
+    // LBKM; 3 x 14 cycles of 42 MHz.
+    can.write(BTR, 0x401A_0002, Time(0)).unwrap();
+    for (offset, value) in [(0x20C, 1), (0x21C, 1), (0x200, 0x2A1C_0E00)] {
+        can.write(offset, value, Time(0)).unwrap();
+    }
+    can.write(MCR, 0x1_0000, Time(0)).unwrap();
+    // Both before it is synchronised.
+    can.write(0x180, 0x080 << 21 | 1, Time(0)).unwrap();
+    can.write(0x190, 0x080 << 21 | 1, Time(0)).unwrap();
+    let us = |n: u64| Time(n * 1_000_000);
+    let mut ends = Vec::new();
+    while let Some(next) = can.next_event() {
+        assert!(next <= us(200), "{next}");
+        can.advance(next);
+        ends.push(next);
+    }
+    // 11 bits, then 48 bits and the intermission of three, twice: 1 µs each.
+    assert_eq!(ends, [us(11), us(11 + 51), us(11 + 51 + 51)]);
+    assert_eq!(can.read(MSR, us(200)).unwrap() & 3, 0);
+    assert_eq!(can.read(TSR, us(200)).unwrap() & 0x0303, 0x0303, "RQCP and TXOK");
+    assert_eq!(can.read(RF0R, us(200)).unwrap() & 3, 2);
+    assert_eq!(can.read(0x1B0, us(200)).unwrap() >> 21, 0x080);
+}
+
+#[test]
+fn who_sends_without_a_pin_is_told() {
+    for (pins, words) in [
+        (Pins { rx: true, tx: false }, "has its TX"),
+        (Pins { rx: false, tx: true }, "has its RX"),
+        (Pins::NONE, "has its RX and TX"),
+    ] {
+        let mut bench = Bench::running(0x1_0000);
+        bench.can.connect(pins, bench.now);
+        let Unmodelled(what) = bench.can.write(0x180, 0x080 << 21 | 1, bench.now).unwrap_err();
+        assert!(what.contains(words) && what.contains("alternate function"), "{what}");
+        assert!(bench.can.request(bench.now).is_some(), "it is sent all the same");
+    }
+}
+
 #[test]
 fn what_is_not_there_says_so() {
     let mut bench = Bench::running(0x1_0000);

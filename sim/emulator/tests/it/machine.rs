@@ -1,6 +1,7 @@
 //! Tests of the machine through its public interface. The programs are in `programs/`; the expected
 //! results come from the architecture and the reference manuals.
 
+mod can_pins;
 mod programs;
 mod supply;
 
