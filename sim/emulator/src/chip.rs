@@ -3,7 +3,8 @@
 
 use shared_abi::geometry::{Geometry, Region};
 
-use crate::bxcan::BxCan;
+use crate::bus::node::Pins;
+use crate::bxcan::{self, BxCan};
 use crate::clock::CycleClock;
 use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
@@ -512,16 +513,28 @@ impl Chip {
         slave.follow(master, clocked);
     }
 
-    /// Finds the pins that the program has assigned to the USARTs.
-    fn wire_usarts(&mut self) {
-        let Self { gpio, usarts, .. } = self;
-        let is_given = |&(port, pin, function): &(char, u8, u8)| {
-            let port = gpio.get(port as usize - 'A' as usize);
-            port.is_some_and(|port| port.alternate(pin) == Some(function))
-        };
+    /// Finds the pins that the program has assigned to the USARTs and the CAN controllers.
+    fn wire_pins(&mut self) {
+        let now = self.now();
+        let Self { gpio, usarts, can, geometry, .. } = self;
+        let function_of =
+            |port: char, pin: u8| gpio.get(port as usize - 'A' as usize).and_then(|port| port.alternate(pin));
+        let is_given = |&(port, pin, function): &(char, u8, u8)| function_of(port, pin) == Some(function);
         for usart in usarts {
             let usart::Instance { tx, rx, .. } = usart.instance();
             usart.set_wired(tx.iter().any(is_given), rx.iter().any(is_given));
+        }
+        for can in can {
+            let (rx, tx) = bxcan::pins::connected(geometry, can.share(), function_of);
+            can.connect(Pins { rx, tx }, now);
+        }
+    }
+
+    /// The CPU leaves for a CAN controller that needs the bus.
+    fn attend_bus(&mut self) {
+        if self.can.iter().any(BxCan::wants_attention) {
+            self.slice.attention = true;
+            self.slice.leave = true;
         }
     }
 
@@ -818,12 +831,13 @@ impl Chip {
                 Err(Unmodelled(format!("{name} has no clock (RCC enables it); it reads as 0")))
             }
             Place::Scs(offset) => {
+                let now = self.clock.time_of(self.cycle_of_access());
                 if self.scs.systick.advance(now) {
                     self.scs.exceptions.pend(SYS_TICK);
                 }
                 self.scs.read(offset, now)
             }
-            Place::Dwt(offset) => self.scs.read_dwt(offset, self.clock.cycles),
+            Place::Dwt(offset) => self.scs.read_dwt(offset, self.cycle_of_access()),
             Place::Fpb(offset) => self.scs.debug.read_fpb(offset),
             Place::Dbgmcu(0) => Ok(self.variant.idcode),
             Place::Dbgmcu(offset) => Ok(self.dbgmcu[offset as usize / 4 - 1]),
@@ -988,6 +1002,7 @@ impl Chip {
             if after[index] && !before[index] {
                 self.block_mut(block).reset();
                 self.tell_slave();
+                self.wire_pins();
             }
         }
     }
@@ -1023,6 +1038,13 @@ impl Chip {
         self.settle_flash();
         self.after_write();
     }
+}
+
+/// Whether a register belongs to a counter that counts the core's cycles: SysTick, or the cycle counter of
+/// the DWT.
+#[must_use]
+pub fn counts_cycles(address: u32) -> bool {
+    Region::new(SCS + 0x10, 0x10).contains(address, 1) || Region::new(DWT, 8).contains(address, 1)
 }
 
 /// The byte-in-word address and bit that a bit-band alias offset stands for.

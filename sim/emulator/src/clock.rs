@@ -54,7 +54,14 @@ impl CycleClock {
     /// The virtual time of the present cycle.
     #[must_use]
     pub fn now(&self) -> Time {
-        Time(self.anchor.0.saturating_add(picos_of(self.cycles - self.anchor_cycles, self.hz)))
+        self.time_of(self.cycles)
+    }
+
+    /// The virtual time of a cycle since the last change of the clock.
+    #[must_use]
+    pub fn time_of(&self, cycle: u64) -> Time {
+        let since = cycle.saturating_sub(self.anchor_cycles);
+        Time(self.anchor.0.saturating_add(picos_of(since, self.hz)))
     }
 
     /// From here on a cycle takes 1/`hz` seconds.

@@ -6,7 +6,8 @@
 //!
 //! **Time.** One instruction takes one cycle, charged when its block (a straight run of code up to
 //! a branch) starts; entering an exception takes 12 cycles, leaving one 10. Code stops at block
-//! borders only, so an interrupt comes at most one block late. A CPU with wait states takes some
+//! borders only, so an interrupt comes at most one block late; SysTick and the cycle counter are read
+//! and written at the cycle of the instruction. A CPU with wait states takes some
 //! 1.3 cycles an instruction; budgets measured here want that much reserve.
 //!
 //! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting unless
@@ -25,8 +26,8 @@ use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Pro
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
-    Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS,
-    SYSTEM_PAGE,
+    counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE,
+    SRAM_ALIAS, SYSTEM_PAGE,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
@@ -144,6 +145,8 @@ struct Notes {
     single: bool,
     /// Blocks looked at.
     blocks: Blocks,
+    /// Bytes of the block up to the end of the last instruction that accessed a counter of the core.
+    located: u32,
     /// Pages of RAM that code was fetched from.
     executed: Vec<bool>,
     /// Pages of flash that code was fetched from.
@@ -241,12 +244,16 @@ impl Cpu {
                     u64::from(base),
                     u64::from(region.size.next_multiple_of(PAGE)),
                     Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize| {
-                        let value = uc.get_data_mut().chip.load(base + offset as u32, size as u8);
+                        let address = base + offset as u32;
+                        note_moment(uc, Access::Read, address);
+                        let value = uc.get_data_mut().chip.load(address, size as u8);
                         locate_reports(uc);
                         u64::from(value)
                     }),
                     Some(move |uc: &mut Unicorn<'_, State>, offset: u64, size: usize, value: u64| {
-                        uc.get_data_mut().chip.store(base + offset as u32, size as u8, value as u32);
+                        let address = base + offset as u32;
+                        note_moment(uc, Access::Write, address);
+                        uc.get_data_mut().chip.store(address, size as u8, value as u32);
                         settle_bus_error(uc);
                         locate_reports(uc);
                     }),
@@ -1157,16 +1164,39 @@ fn settle_bus_error(uc: &mut Unicorn<'_, State>) {
 /// Finds the instruction of each access to a peripheral that is to be reported.
 fn locate_reports(uc: &mut Unicorn<'_, State>) {
     while let Some(mut report) = uc.get_data_mut().chip.slice.unlocated.pop() {
-        let chip = &uc.get_data().chip;
-        let (start, size) = chip.slice.block;
-        let code = Cpu::memory(chip, start)
-            .and_then(|(memory, offset)| memory.bytes().get(offset..offset + size as usize))
-            .unwrap_or(&[]);
-        let registers = std::array::from_fn(|n| base_register(uc, n as u32));
-        let offset = accesses::find(code, &registers, report.access, report.address).unwrap_or(0);
-        report.pc = start.wrapping_add(offset);
-        uc.get_data_mut().chip.reports.add(report);
+        let offset = locate(uc, 0, report.access, report.address).unwrap_or(0);
+        let chip = &mut uc.get_data_mut().chip;
+        report.pc = chip.slice.block.0.wrapping_add(offset);
+        chip.reports.add(report);
     }
+}
+
+/// The instruction of the block, from this one on, that makes an access: its offset in the block.
+fn locate(uc: &Unicorn<'_, State>, from: u32, access: Access, address: u32) -> Option<u32> {
+    let chip = &uc.get_data().chip;
+    let (start, size) = chip.slice.block;
+    let (memory, offset) = Cpu::memory(chip, start)?;
+    let code = memory.bytes().get(offset + from as usize..offset + size as usize)?;
+    let registers = std::array::from_fn(|n| base_register(uc, n as u32));
+    accesses::find(code, &registers, access, address).map(|offset| from + offset)
+}
+
+/// The program accesses a register. If it belongs to a counter of the core, the chip has to know the cycle.
+/// An instruction that is not found counts as the last one that was, so that time never goes back.
+fn note_moment(uc: &mut Unicorn<'_, State>, access: Access, address: u32) {
+    let State { chip, notes } = uc.get_data_mut();
+    chip.slice.ahead = 0;
+    // The cycle of a single instruction is counted after it.
+    if !counts_cycles(address) || notes.single {
+        return;
+    }
+    let ((start, size), from) = (chip.slice.block, notes.located);
+    let found = locate(uc, from, access, address)
+        .and_then(|offset| Some(offset + instruction(&uc.get_data().chip, start + offset)?.len()));
+    let State { chip, notes } = uc.get_data_mut();
+    notes.located = found.unwrap_or(from).min(size);
+    let (next, rest) = (start + notes.located, size - notes.located);
+    chip.slice.ahead = count_instructions(chip, next, rest).instructions;
 }
 
 // --- hooks
@@ -1222,6 +1252,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         state.notes.fpu_instruction = block.fpu;
         return stop(uc);
     }
+    state.notes.located = 0;
     chip.slice.block = (address, size);
     chip.clock.cycles += block.instructions;
     chip.counters.instructions += block.instructions;

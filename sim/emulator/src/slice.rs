@@ -58,6 +58,9 @@ pub struct Slice {
     pub entries: u64,
     /// The block that runs: address and length in bytes.
     pub block: (u32, u32),
+    /// How many cycles of the block come after the access that the program makes to a counter of the
+    /// core: all its cycles are counted when it starts.
+    pub ahead: u64,
     /// Code that is watched.
     pub watch: Option<Watch>,
     /// Reports of accesses to peripherals whose instruction is still to be found; their address is

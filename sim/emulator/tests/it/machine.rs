@@ -176,6 +176,19 @@ fn ram_is_noise_at_power_on_and_kept_over_a_reset() {
     assert!(snapshot(&other) != first);
 }
 
+/// One cycle for each instruction. SysTick counts from the reload value with the clock after the store that
+/// starts it (ARMv7-M B3.3.1).
+#[test]
+fn time_passes_inside_a_straight_run_of_code() {
+    let mut machine = machine(&programs::TIME_IN_A_BLOCK);
+    machine.run_until(ms(1));
+    let [distance, count, first, second, border] = words(&machine, 5)[..] else { panic!() };
+    assert_eq!([distance, count], [100, 10]);
+    assert!((979..=981).contains(&first), "{first}: 1000 is loaded, and 20 instructions passed");
+    assert_eq!(first - second, 50);
+    assert_eq!(border, 2, "the branch, and the load");
+}
+
 // --- timers and pins
 // -------------------------------------------------------------------------------------------------
 

@@ -70,4 +70,5 @@ programs! {
     BUTTON,
     STANDBY,
     SLEEPS_WITH_A_TIMER,
+    TIME_IN_A_BLOCK,
 }
