@@ -1,64 +1,27 @@
-//! The main job on chips that differ in what the manuals leave open: drawn by seeds, and the worst.
+//! The main scenarios on chips that differ in what the manuals leave open: drawn by seeds, and the worst.
 
-use canopen::program::ProgramControl;
-use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::firmware;
-use coflash::device::Doing;
-use coflash::update::{flash, FlashOptions};
+use coboot_tests::silicon::{play, play_on, SCENARIOS};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
 use emulator::silicon::{Choice, Silicon, TYPICAL};
 use emulator::time::Time;
 
-/// Seeds of each run; `COBOOT_SEEDS` is the number for a night.
+/// Seeds of the tests with a scenario of their own.
 const SEEDS: u64 = 6;
-const VERSION: Address = Address::new(0x100A, 0);
-/// Object 2000h of the application template: the way back.
-const REENTRY_PATH: Address = Address::new(0x2000, 0);
 
-fn install(bench: &mut Bench, image: &str) {
-    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
-}
-
-/// Download, start, way back, download again. The chip is printed before, so that a failure can be seen
-/// again.
-fn main_job(choice: Choice, way: u8) {
-    let silicon = choice.of_board(0);
-    println!("silicon {choice}, way back {way}: {silicon}");
-    let mut bench = Bench::with(Options { silicon, ..Options::default() });
-    bench.power_on();
-    bench.await_boot_up(100);
-    install(&mut bench, firmware::APP_V1);
-    let write = Doing::Write(REENTRY_PATH);
-    bench.session().write(REENTRY_PATH, &[way], write, &mut |_| {}).unwrap();
-    bench.events();
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(100);
-    assert!(bench.is_bootloader(NODE));
-    install(&mut bench, firmware::APP_V2);
-    assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
-    // A request for the bootloader, a start: no crash, and no watchdog that bites a program that lives.
-    bench.power_off();
-    bench.run_ms(100);
-    bench.power_on();
-    bench.await_program(1000);
-    assert!(!bench.is_bootloader(NODE));
-}
-
+/// Each scenario twice; `cargo xtask attack --silicon N` plays as many as a night allows.
 #[test]
-fn the_main_job_works_with_every_chip_that_a_seed_draws() {
-    let seeds =
-        std::env::var("COBOOT_SEEDS").map_or(SEEDS, |text| text.parse().expect("COBOOT_SEEDS: a number"));
-    for seed in 0..seeds {
-        main_job(Choice::Seed(seed), (seed % 3) as u8);
+fn each_scenario_works_with_the_chips_that_seeds_draw() {
+    for seed in 0..2 * SCENARIOS.len() as u64 {
+        play(seed);
     }
 }
 
 #[test]
-fn the_main_job_works_with_the_worst_chip() {
-    for way in 0..3 {
-        main_job(Choice::Worst, way);
+fn each_scenario_works_with_the_worst_chip() {
+    for (scenario, seed) in SCENARIOS.iter().zip(1_000..) {
+        play_on(scenario, Choice::Worst.of_board(0), seed);
     }
 }
 

@@ -15,4 +15,5 @@ pub mod script;
 pub mod sealed;
 pub mod sealed_board;
 pub mod serial;
+pub mod silicon;
 pub mod throughput;

@@ -1,4 +1,4 @@
-//! `cargo xtask attack`: the standing attacker of the bus.
+//! `cargo xtask attack`: the standing attacker of the bus, and the main scenarios on drawn chips.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use crate::setup::{self, Part};
 use crate::{build, evidence, process, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask attack [--frames N] [--seed S]
+usage: cargo xtask attack [--frames N | --silicon N] [--seed S]
 
 Attacks emulated boards with the built firmware, and nodes without a chip, in virtual time: two
 masters that do what masters do, mixed with noise, floods, frames that are nearly right, errors on
@@ -20,6 +20,8 @@ attack. The counts go to target/evidence/attacker.json.
 
   --frames N      the frames of the masters on the boards (default: 200000, about two minutes); the
                   nodes, which are faster, get twenty times as many
+  --silicon N     plays the main job, ways back, trials, hangs, stores and power cuts on N chips that
+                  seeds draw, in place of the attack; the counts go to target/evidence/silicon.json
   --seed S        the first seed (default: 1)
 ";
 
@@ -30,16 +32,18 @@ const IMAGES: &str =
 
 pub fn run(mut args: Args) -> Outcome {
     let (frames, seed) = (args.value("--frames")?, args.value("--seed")?);
+    let silicon = args.value("--silicon")?;
     args.none_left()?;
+    let record = if silicon.is_some() { "silicon" } else { "attacker" };
     setup::prepare(&[Part::Firmware, Part::Emulator])?;
     build::images(&TWO, &IMAGES.split(' ').collect::<Vec<_>>())?;
-    evidence::begin("attacker")?;
+    evidence::begin(record)?;
     let mut attack = build::tests_program(DEFAULT, "attack");
-    for (option, value) in [("--frames", frames), ("--seed", seed)] {
+    for (option, value) in [("--frames", frames), ("--seed", seed), ("--silicon", silicon)] {
         attack.args(value.map(|value| [option.to_owned(), value]).into_iter().flatten());
     }
     let run = |file: &Path| process::run(attack.arg("--evidence").arg(file));
-    let (facts, ended) = evidence::facts_of("attacker", run)?;
-    evidence::record("attacker", facts)?;
+    let (facts, ended) = evidence::facts_of(record, run)?;
+    evidence::record(record, facts)?;
     ended
 }

@@ -41,10 +41,11 @@ const fn part(name: &'static str, counts: &'static str, job: &'static str, about
     Part { name, counts, job, about }
 }
 
-const PARTS: [Part; 11] = [
+const PARTS: [Part; 12] = [
     part("tests", "passed", "test", "All host crates, and the built firmware in the emulator."),
     part("powercut", "states", "powercut --full", "After a cut the device answers or runs a whole program."),
     part("attacker", "frames", "attack", "A seeded attacker and a legal master on one bus."),
+    part("silicon", "chips", "attack --silicon 2000", "The main scenarios on chips that seeds draw."),
     part("fuzz", "inputs", "fuzz", "Random inputs for what meets the bus or a file."),
     part("cpu", "words", "opinion --json", "The same programs on QEMU's Cortex-M4 and on the emulator."),
     part("coverage", "percent", "coverage", "Lines of the device's crates that tests reach."),

@@ -1,11 +1,16 @@
-//! `cargo xtask attack`: the standing attacker of the bus, for as many frames as you like.
+//! `cargo xtask attack`: the standing attacker of the bus, for as many frames as you like; and the main
+//! scenarios on as many chips as you like.
 
+use std::panic::catch_unwind;
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::Mutex;
 use std::thread;
+use std::time::Instant;
 
 use coboot_tests::attacker::setup::Setup;
 use coboot_tests::attacker::{run, Found, Summary};
+use coboot_tests::silicon;
 
 /// The frames of an attack on one board, and many times as many on a node; then a new one is attacked
 /// with the next seed.
@@ -14,11 +19,13 @@ const EACH: u64 = 50_000;
 struct Options {
     frames: u64,
     seed: u64,
+    /// Chips to play scenarios on, in place of the attack.
+    silicon: Option<u64>,
     evidence: Option<String>,
 }
 
 fn options() -> Result<Options, String> {
-    let mut options = Options { frames: 200_000, seed: 1, evidence: None };
+    let mut options = Options { frames: 200_000, seed: 1, silicon: None, evidence: None };
     let mut words = std::env::args().skip(1);
     while let Some(word) = words.next() {
         let mut value = || words.next().ok_or_else(|| format!("{word} wants a value."));
@@ -26,8 +33,13 @@ fn options() -> Result<Options, String> {
         match word.as_str() {
             "--frames" => options.frames = number(value()?)?,
             "--seed" => options.seed = number(value()?)?,
+            "--silicon" => options.silicon = Some(number(value()?)?),
             "--evidence" => options.evidence = Some(value()?),
-            other => return Err(format!("{other:?} is no option; there are --frames, --seed, --evidence.")),
+            other => {
+                return Err(format!(
+                    "{other:?} is no option; there are --frames, --seed, --silicon, --evidence."
+                ))
+            }
         }
     }
     Ok(options)
@@ -53,6 +65,9 @@ fn main() -> ExitCode {
         Ok(options) => options,
         Err(why) => return refuse(&why),
     };
+    if let Some(count) = options.silicon {
+        return play_silicon(&options, count);
+    }
     let setups = Setup::all();
     if setups.is_empty() {
         return refuse("there is nothing to attack: choose the board stm32f407g-disc1.");
@@ -113,6 +128,46 @@ fn main() -> ExitCode {
         }
     }
     if work.found.is_empty() {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
+}
+
+/// Plays the scenarios with so many seeds, the first one given, on all cores. A failure was printed by its
+/// panic; here is which seeds failed.
+fn play_silicon(options: &Options, count: u64) -> ExitCode {
+    let (next, failed) = (AtomicU64::new(0), Mutex::new(Vec::new()));
+    let began = Instant::now();
+    let threads = thread::available_parallelism().map_or(1, usize::from);
+    thread::scope(|scope| {
+        for _ in 0..threads {
+            scope.spawn(|| loop {
+                let n = next.fetch_add(1, Ordering::Relaxed);
+                if n >= count {
+                    return;
+                }
+                let seed = options.seed.wrapping_add(n);
+                if catch_unwind(|| silicon::play(seed)).is_err() {
+                    failed.lock().expect("pushing does not panic").push(seed);
+                }
+            });
+        }
+    });
+    let mut failed = failed.into_inner().expect("pushing does not panic");
+    failed.sort_unstable();
+    let each = began.elapsed().as_secs_f64() * threads as f64 / count.max(1) as f64;
+    println!("{count} chips, {each:.1} s of a core each, {} failed", failed.len());
+    for seed in &failed {
+        println!("{seed} failed: see it again with --silicon 1 --seed {seed}");
+    }
+    if let Some(path) = &options.evidence {
+        let facts = format!("{{\"chips\": {count}, \"failed\": {}, \"seeds\": {failed:?}}}\n", failed.len());
+        if let Err(error) = std::fs::write(path, facts) {
+            return refuse(&format!("{path}: {error}"));
+        }
+    }
+    if failed.is_empty() {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
