@@ -11,8 +11,8 @@
 //! it can be set up and leaves initialisation, and its frames wait, except in loop-back mode, which needs
 //! no bus.
 //!
-//! Not modelled, and reported when asked for: time-triggered mode. MSR.SAMP and MSR.RX always
-//! read recessive.
+//! Time-triggered mode has the time stamps of both directions, and no transmission of them (TGT), which is
+//! reported when asked for. MSR.SAMP and MSR.RX always read recessive.
 
 pub mod filters;
 pub mod pins;
@@ -60,7 +60,7 @@ mod mcr {
     pub const RESET: u32 = 1 << 15;
     pub const DBF: u32 = 1 << 16;
     pub const AFTER_RESET: u32 = DBF | SLEEP;
-    pub const KEPT: u32 = INRQ | SLEEP | TXFP | RFLM | NART | AWUM | ABOM | DBF;
+    pub const KEPT: u32 = INRQ | SLEEP | TXFP | RFLM | NART | AWUM | ABOM | TTCM | DBF;
 }
 
 /// CAN_MSR.
@@ -248,7 +248,7 @@ struct RxMailbox {
 }
 
 impl RxMailbox {
-    fn new(frame: &Frame, filter_index: u8) -> Self {
+    fn new(frame: &Frame, filter_index: u8, stamp: u32) -> Self {
         let id = match frame.id() {
             Id::Standard(id) => u32::from(id.as_raw()) << 21,
             Id::Extended(id) => id.as_raw() << 3 | ir::IDE,
@@ -262,7 +262,7 @@ impl RxMailbox {
         };
         Self {
             rir: id | if frame.is_remote() { ir::RTR } else { 0 },
-            rdtr: u32::from(filter_index) << 8 | u32::from(frame.dlc()),
+            rdtr: stamp | u32::from(filter_index) << 8 | u32::from(frame.dlc()),
             rdlr: word(0),
             rdhr: word(4),
         }
@@ -348,6 +348,8 @@ pub struct BxCan {
     silicon: Silicon,
     recovery: Recovery,
     activity: Activity,
+    /// The start of the frame on the wire.
+    frame_start: Time,
     /// Without a bus: when the frame that it sends to itself is over, with the intermission.
     alone: Option<Time>,
     confinement: Confinement,
@@ -388,6 +390,7 @@ impl BxCan {
             silicon: silicon::TYPICAL,
             recovery: Recovery::None,
             activity: Activity::Idle,
+            frame_start: Time(0),
             alone: None,
             confinement: Confinement::default(),
             mcr: mcr::AFTER_RESET,
@@ -804,7 +807,17 @@ impl BxCan {
         }
         if let Some(found) = self.filters.accept(self.share, frame) {
             let locked = self.mcr & mcr::RFLM != 0;
-            self.fifos[found.fifo].store(RxMailbox::new(frame, found.index), locked);
+            let stamp = self.time_stamp();
+            self.fifos[found.fifo].store(RxMailbox::new(frame, found.index, stamp), locked);
+        }
+    }
+
+    /// TIME of RDTxR and TDTxR: the counter of bit times at the start of the frame, in time-triggered mode
+    /// (RM0090 section 32.7.2).
+    fn time_stamp(&self) -> u32 {
+        match self.bit_time() {
+            Some(bit) if self.mcr & mcr::TTCM != 0 => ((self.frame_start.0 / bit.0.max(1)) as u32) << 16,
+            _ => 0,
         }
     }
 
@@ -954,13 +967,7 @@ impl Peripheral for BxCan {
                     self.recovery = Recovery::Counting { since: now, left: RECOVERY_SEQUENCES };
                 }
                 self.follow_mode_bits(now);
-                if value & mcr::TTCM != 0 {
-                    return Err(Unmodelled(
-                        "MCR.TTCM: time triggered communication mode is not modelled, the bit stays clear"
-                            .into(),
-                    ));
-                }
-                if value & !(mcr::KEPT | mcr::TTCM | mcr::RESET) != 0 {
+                if value & !(mcr::KEPT | mcr::RESET) != 0 {
                     return Err(Unmodelled(format!("MCR: reserved bits set in {value:#010x}")));
                 }
             }
@@ -1104,6 +1111,7 @@ impl BusNode for BxCan {
         match event {
             BusEvent::Started { own: false } if !self.pins.rx => {}
             BusEvent::Started { own } => {
+                self.frame_start = now;
                 if self.mode == Mode::Resting(Rest::Sleep) {
                     self.msr_flags |= msr::WKUI;
                     if self.mcr & mcr::AWUM != 0 {
@@ -1126,9 +1134,11 @@ impl BusNode for BxCan {
                 self.transmission_failed(tsr::ALST);
             }
             BusEvent::Transmitted => {
+                let stamp = self.time_stamp();
                 for mailbox in &mut self.mailboxes {
                     if matches!(mailbox.state, MailboxState::Transmit { .. }) {
                         mailbox.flags = tsr::TXOK;
+                        mailbox.tdtr |= stamp;
                         mailbox.complete();
                     }
                 }

@@ -15,6 +15,7 @@ use crate::periph::crc::Crc;
 use crate::periph::exti::Exti;
 use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
+use crate::periph::i2c::I2c;
 use crate::periph::iwdg::Iwdg;
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
@@ -70,6 +71,7 @@ enum Block {
     Can2,
     Usart(usize),
     Tim(usize),
+    I2c(usize),
 }
 
 /// The block that answers at an address, with the offset in its registers.
@@ -88,7 +90,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 38] = [
+const BLOCKS: [(u32, Block, ClockEnable); 41] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -103,6 +105,9 @@ const BLOCKS: [(u32, Block, ClockEnable); 38] = [
     (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
     (0x4000_4C00, Block::Usart(3), Some((rcc::APB1ENR, 19))),
     (0x4000_5000, Block::Usart(4), Some((rcc::APB1ENR, 20))),
+    (0x4000_5400, Block::I2c(0), Some((rcc::APB1ENR, 21))),
+    (0x4000_5800, Block::I2c(1), Some((rcc::APB1ENR, 22))),
+    (0x4000_5C00, Block::I2c(2), Some((rcc::APB1ENR, 23))),
     (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
     (0x4000_6800, Block::Can2, Some((rcc::APB1ENR, 26))),
     (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
@@ -133,16 +138,13 @@ const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 24] = [
+const UNMODELLED: [(u32, &str); 21] = [
     (0x4000_2800, "RTC"),
     (0x4000_2C00, "WWDG"),
     (0x4000_3400, "I2S2ext"),
     (0x4000_3800, "SPI2"),
     (0x4000_3C00, "SPI3"),
     (0x4000_4000, "I2S3ext"),
-    (0x4000_5400, "I2C1"),
-    (0x4000_5800, "I2C2"),
-    (0x4000_5C00, "I2C3"),
     (0x4000_7400, "DAC"),
     (0x4001_0000, "TIM1"),
     (0x4001_0400, "TIM8"),
@@ -214,6 +216,7 @@ pub struct Chip {
     pub usarts: [Usart; 6],
     /// The timers, as in [`tim::INSTANCES`].
     tims: [Tim; 12],
+    i2c: [I2c; 3],
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
@@ -267,7 +270,7 @@ impl Chip {
             vdd: supply::NOMINAL,
             clock: CycleClock::new(Time(0), silicon.hsi_hz),
             scs: Scs::new(geometry.interrupts, silicon.hsi_hz.into(), silicon.systick_value),
-            flash: Flash::new(geometry, options.flash_times),
+            flash: Flash::new(geometry, options.flash_times, silicon),
             clocks: rcc.clocks(),
             rcc,
             iwdg: Iwdg::new(silicon),
@@ -275,6 +278,7 @@ impl Chip {
             can: [BxCan::new().on(silicon), BxCan::slave().on(silicon)],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             tims: tim::INSTANCES.each_ref().map(Tim::new),
+            i2c: ["I2C1", "I2C2", "I2C3"].map(I2c::new),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
@@ -449,6 +453,9 @@ impl Chip {
         }
         for tim in &mut self.tims {
             tim.reset();
+        }
+        for i2c in &mut self.i2c {
+            i2c.reset();
         }
         self.wire_pins();
         let option_bytes = self.flash.option_bytes();
@@ -784,6 +791,7 @@ impl Chip {
             Block::Can2 => &mut self.can[1],
             Block::Usart(index) => &mut self.usarts[index],
             Block::Tim(index) => &mut self.tims[index],
+            Block::I2c(index) => &mut self.i2c[index],
         }
     }
 

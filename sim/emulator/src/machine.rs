@@ -741,6 +741,15 @@ impl Machine {
         self.cpu.chip().clocks().hclk
     }
 
+    /// Why the faults since the last reset were taken, in words: their kinds, the address of a load or store,
+    /// and the program counter of the last one's stack frame, or of the CPU that has locked up.
+    #[must_use]
+    pub fn fault_cause(&self) -> String {
+        let scs = &self.cpu.chip().scs;
+        let cause = crate::cortex::scs::cause(scs.cfsr, scs.hfsr, scs.bfar);
+        format!("{cause}; pc {:08X}h", self.pc())
+    }
+
     /// CFSR and HFSR: why a fault was taken.
     #[must_use]
     pub fn fault_status(&self) -> (u32, u32) {

@@ -38,6 +38,8 @@ pub struct Silicon {
     pub can_sleeps_deeply: bool,
     /// Whether a controller that is asked to leave a busy bus never does, until MCR.RESET: reported of an F469.
     pub can_sticks: bool,
+    /// How far the times of the flash are from the typical to the worst of the datasheet, in thousandths.
+    pub flash_slowness_permille: u32,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -51,6 +53,7 @@ pub const TYPICAL: Silicon = Silicon {
     can_mode_us: 0,
     can_sleeps_deeply: false,
     can_sticks: false,
+    flash_slowness_permille: 0,
 };
 
 /// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, and the first
@@ -65,6 +68,7 @@ pub const WORST: Silicon = Silicon {
     can_mode_us: *CAN_MODE.end(),
     can_sleeps_deeply: true,
     can_sticks: true,
+    flash_slowness_permille: *FLASH_SLOWNESS.end(),
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
@@ -73,6 +77,7 @@ const UPDATE: RangeInclusive<u32> = 1..=5;
 const SYSTICK: RangeInclusive<u32> = 0..=0x00FF_FFFF;
 const CRYSTAL_START: RangeInclusive<u32> = 300..=20_000;
 const CAN_MODE: RangeInclusive<u32> = 0..=30;
+const FLASH_SLOWNESS: RangeInclusive<u32> = 0..=1_000;
 
 impl Silicon {
     /// A chip that the seed chooses.
@@ -96,6 +101,7 @@ impl Silicon {
             can_mode_us: draw(CAN_MODE),
             can_sleeps_deeply: draw(0..=1) == 1,
             can_sticks: draw(0..=1) == 1,
+            flash_slowness_permille: draw(FLASH_SLOWNESS),
         }
     }
 }
@@ -110,13 +116,14 @@ impl fmt::Display for Silicon {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
         let Self { crystal_start_us, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
+        let slowness = self.flash_slowness_permille;
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
             f,
             "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
-             on a busy bus: {can_sticks}"
+             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst"
         )
     }
 }
@@ -184,6 +191,7 @@ mod tests {
             assert!(chip.systick_value < 1 << 24, "{seed}: {chip}");
             assert!((300..=20_000).contains(&chip.crystal_start_us), "{seed}: {chip}");
             assert!(chip.can_mode_us <= 30, "{seed}: {chip}");
+            assert!(chip.flash_slowness_permille <= 1_000, "{seed}: {chip}");
             assert_eq!(Silicon::drawn(seed), *chip, "{seed}");
         }
         // The ends are reached, or nearly.

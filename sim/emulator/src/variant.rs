@@ -42,6 +42,8 @@ static F407: Variant = Variant {
         (0x64, 0x0007_5F33, 0x0007_5F33), // APB2LPENR
         (0x80, 0, 0xFFFF_FFFF),           // SSCGR
         (0x84, 0x2000_3000, 0x7000_7FC0), // PLLI2SCFGR
+        // DCKCFGR: not there, and read by programs for the whole family, which look for TIMPRE.
+        (0x8C, 0, 0),
         (0x04, 0x2400_3010, 0x0F43_7FFF), // PLLCFGR
     ],
 };

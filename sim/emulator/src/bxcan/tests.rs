@@ -541,6 +541,21 @@ fn in_loop_back_mode_it_needs_neither_a_bus_nor_pins() {
     assert_eq!(can.read(0x1B0, us(200)).unwrap() >> 21, 0x080);
 }
 
+/// RM0090 section 32.7.2 and 32.9.4: TIME is the counter of bit times at the start of the frame, of 16 bits.
+#[test]
+fn a_frame_has_the_time_stamp_of_its_start_in_time_triggered_mode() {
+    for (mcr, stamp) in [(0x1_0000, 0), (0x1_0080, 0x0005)] {
+        let mut bench = Bench::running(mcr);
+        assert_eq!(bench.read(MCR) & 0x80, mcr & 0x80);
+        // 8 µs each.
+        bench.now = Time(0x1_0005 * 8_000_000);
+        bench.event(BusEvent::Started { own: false });
+        bench.now = Time(0x1_0040 * 8_000_000);
+        bench.receive(0x123);
+        assert_eq!(bench.read(RI0R + 4) >> 16, stamp);
+    }
+}
+
 #[test]
 fn who_sends_without_a_pin_is_told() {
     for (pins, words) in [
@@ -565,7 +580,6 @@ fn what_is_not_there_says_so() {
         (0x1D0, 0, "no register"),
         (0x3FC, 0, "no filter register"),
         (RI0R, 0, "read-only"),
-        (MCR, 0x1_0080, "time triggered"),
         (MCR, 0x1_0100, "reserved"),
         (TI0R + 4, 0x108, "global time"),
     ] {

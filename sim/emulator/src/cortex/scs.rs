@@ -50,6 +50,37 @@ pub mod hfsr {
     pub const DEBUGEVT: u32 = 1 << 31;
 }
 
+/// What the bits of CFSR and HFSR say, for people to read: in the order of the registers.
+const CAUSES: [(bool, u32, &str); 14] = [
+    (false, cfsr::IACCVIOL, "code in a place that is never executable"),
+    (false, cfsr::IBUSERR, "code where nothing is"),
+    (false, cfsr::PRECISERR, "a load or store where nothing is"),
+    (false, cfsr::IMPRECISERR, "a store where nothing is"),
+    (false, cfsr::UNSTKERR, "a stack outside the RAM on the return of an exception"),
+    (false, cfsr::STKERR, "a stack outside the RAM on the entry of an exception"),
+    (false, cfsr::UNDEFINSTR, "an undefined instruction"),
+    (false, cfsr::INVSTATE, "a branch to an even address"),
+    (false, cfsr::INVPC, "a wrong EXC_RETURN"),
+    (false, cfsr::NOCP, "an FPU instruction while the FPU is off"),
+    (false, cfsr::UNALIGNED, "an unaligned access"),
+    (false, cfsr::DIVBYZERO, "a division by zero"),
+    (true, hfsr::VECTTBL, "a vector table outside the memory"),
+    (true, hfsr::DEBUGEVT, "a breakpoint without a debugger"),
+];
+
+/// The cause of faults, from CFSR, HFSR and BFAR, in words.
+#[must_use]
+pub fn cause(cfsr: u32, hfsr: u32, bfar: u32) -> String {
+    let is_set = |&&(is_hard, bit, _): &&(bool, u32, &str)| bit & if is_hard { hfsr } else { cfsr } != 0;
+    let words: Vec<&str> = CAUSES.iter().filter(is_set).map(|&(.., words)| words).collect();
+    let words = if words.is_empty() { "a fault in the handler of a fault".into() } else { words.join(", ") };
+    if cfsr & self::cfsr::BFARVALID != 0 {
+        format!("{words} ({bfar:08X}h)")
+    } else {
+        words
+    }
+}
+
 const AIRCR_KEY: u32 = 0x05FA << 16;
 const AIRCR_KEY_READ: u32 = 0xFA05 << 16;
 const AIRCR_SYSRESETREQ: u32 = 1 << 2;

@@ -15,6 +15,7 @@ use shared_abi::geometry::{Geometry, Sector};
 use crate::memory::HostMemory;
 use crate::noise::Noise;
 use crate::peripheral::{Peripheral, Unmodelled};
+use crate::silicon::Silicon;
 use crate::supply::NOMINAL;
 use crate::time::{Span, Time};
 use cells::{carry_out, weak_bits};
@@ -126,6 +127,8 @@ pub enum Store {
 pub struct Flash {
     geometry: &'static Geometry,
     times: FlashTimes,
+    /// How far its times are from the typical to the worst, in thousandths.
+    slowness_permille: u64,
     /// The array.
     pub array: HostMemory,
     acr: u32,
@@ -159,10 +162,11 @@ pub struct Flash {
 impl Flash {
     /// An erased flash of the chip.
     #[must_use]
-    pub fn new(geometry: &'static Geometry, times: FlashTimes) -> Self {
+    pub fn new(geometry: &'static Geometry, times: FlashTimes, silicon: Silicon) -> Self {
         Self {
             geometry,
             times,
+            slowness_permille: silicon.flash_slowness_permille.into(),
             array: HostMemory::new(geometry.flash.size, 0xFF),
             acr: 0,
             sr: 0,
@@ -188,6 +192,12 @@ impl Flash {
     #[must_use]
     pub fn busy_until(&self) -> Option<Time> {
         self.running.as_ref().map(|running| running.ends)
+    }
+
+    /// FLASH_ACR: wait states, prefetch and caches.
+    #[must_use]
+    pub fn acr(&self) -> u32 {
+        self.acr
     }
 
     /// The wait states that are set (ACR.LATENCY).
@@ -332,7 +342,7 @@ impl Flash {
 
     fn pick(&self, (typical, worst): (u64, u64)) -> u64 {
         match self.times {
-            FlashTimes::Typical => typical,
+            FlashTimes::Typical => typical + (worst - typical) * self.slowness_permille / 1000,
             FlashTimes::Worst => worst,
         }
     }
@@ -694,6 +704,7 @@ impl Peripheral for Flash {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::silicon::TYPICAL;
     use shared_abi::geometry::{STM32F407VG, STM32F429ZI};
 
     const KEYR: u32 = 0x04;
@@ -702,7 +713,7 @@ mod tests {
     const X32: u32 = 2 << 8;
 
     fn unlocked() -> Flash {
-        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
         flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
         flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
         flash
@@ -766,6 +777,22 @@ mod tests {
         }
     }
 
+    /// A chip is as slow as it is drawn, and the choice of the longest times wins.
+    #[test]
+    fn times_lie_between_the_typical_and_the_worst_as_the_chip_is() {
+        for (times, flash_slowness_permille, ms) in
+            [(FlashTimes::Typical, 0, 250), (FlashTimes::Typical, 500, 375), (FlashTimes::Worst, 0, 500)]
+        {
+            let silicon = Silicon { flash_slowness_permille, ..TYPICAL };
+            let mut flash = Flash::new(&STM32F407VG, times, silicon);
+            for key in KEYS {
+                flash.write(KEYR, key, Time(0)).unwrap();
+            }
+            flash.write(CR, CR_SER | X32 | CR_STRT, Time(0)).unwrap();
+            assert_eq!(flash.next_event(), Some(Time(ms * 1_000_000_000)));
+        }
+    }
+
     #[test]
     fn an_erase_fills_its_sector_and_no_other() {
         let mut flash = unlocked();
@@ -791,7 +818,7 @@ mod tests {
             (0b01111, None),
             (0b11100, None),
         ] {
-            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical);
+            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
             flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
             flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
             flash.array.bytes_mut().fill(0);
@@ -815,7 +842,7 @@ mod tests {
         for (bits, erased) in
             [(1 << 2, [true, false]), (1 << 15, [false, true]), (1 << 2 | 1 << 15, [true, true])]
         {
-            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical);
+            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
             flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
             flash.write(KEYR, 0xCDEF_89AB, Time(0)).unwrap();
             flash.array.bytes_mut().fill(0);
@@ -830,7 +857,7 @@ mod tests {
 
     #[test]
     fn a_wrong_key_locks_until_reset_with_a_bus_error() {
-        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
         flash.write(KEYR, 0x4567_0123, Time(0)).unwrap();
         assert!(flash.write(KEYR, 0, Time(0)).is_err());
         assert!(flash.take_bus_error());
@@ -894,7 +921,7 @@ mod tests {
 
     #[test]
     fn a_locked_register_does_not_change() {
-        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical);
+        let mut flash = Flash::new(&STM32F407VG, FlashTimes::Typical, TYPICAL);
         assert!(flash.write(CR, CR_PG, Time(0)).is_err());
         assert_eq!(flash.read(CR, Time(0)), Ok(CR_LOCK));
     }

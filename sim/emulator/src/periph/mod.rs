@@ -4,6 +4,7 @@ pub mod crc;
 pub mod exti;
 pub mod flash;
 pub mod gpio;
+pub mod i2c;
 pub mod iwdg;
 pub mod pwr;
 pub mod rcc;

@@ -381,6 +381,9 @@ impl Peripheral for Rcc {
                 // Reserved bits stay what they are after a reset.
                 let (_, reset, bits) = self.variant.rcc[index];
                 self.plain[index] = value & bits | reset & !bits;
+                if bits == 0 && value != 0 {
+                    return Err(self.unknown());
+                }
             }
         }
         Ok(())

@@ -95,6 +95,9 @@ fn without_a_program_the_chip_locks_up() {
     assert_eq!(machine.run_until(ms(1)), Stop::Deadline, "no power, no program");
     machine.power_on(ms(1));
     assert_eq!(machine.run_until(ms(2)), Stop::Lockup);
+    let cause = machine.fault_cause();
+    assert!(cause.starts_with("code in a place that is never executable, "), "{cause}");
+    assert!(cause.ends_with("; pc FFFFFFFEh"), "{cause}");
     assert_eq!(machine.run_until(ms(3)), Stop::Deadline);
     load(&mut machine, &programs::STORES_AND_SLEEPS);
     machine.reset_pin();

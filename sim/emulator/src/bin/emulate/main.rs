@@ -683,7 +683,7 @@ impl Bench {
         let mut lines = std::mem::take(&mut *self.said.borrow_mut());
         while let Some(news) = self.world.news() {
             let n = self.boards.iter().position(|board| board.id == news.machine).unwrap_or(0);
-            if let Some(text) = happened(news.stop, self.world.machine(news.machine).fault_status()) {
+            if let Some(text) = happened(news.stop, || self.world.machine(news.machine).fault_cause()) {
                 lines.push((news.at, format!("{}: {text}", self.name(n))));
             }
         }
@@ -736,7 +736,7 @@ impl Bench {
 }
 
 /// The event of a board in words; `None` for an event that was requested.
-fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
+fn happened(stop: Stop, cause: impl Fn() -> String) -> Option<String> {
     Some(match stop {
         Stop::Deadline | Stop::Attention | Stop::Halted => return None,
         Stop::Reset(ResetCause::PowerOn) => "the supply is back after a power-down".into(),
@@ -747,7 +747,7 @@ fn happened(stop: Stop, (cfsr, hfsr): (u32, u32)) -> Option<String> {
         Stop::Reset(ResetCause::Standby) => "woke up from Standby".into(),
         Stop::PowerCut => "the power is cut".into(),
         Stop::Lockup => {
-            format!("the CPU has locked up (CFSR {cfsr:08X}h, HFSR {hfsr:08X}h): only a reset helps it")
+            format!("the CPU has locked up by {}: only a reset helps it", cause())
         }
     })
 }
