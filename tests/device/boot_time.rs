@@ -55,6 +55,38 @@ fn the_bootloader_is_there_soon_after_a_power_on_and_a_call_back() {
     start_times(TYPICAL);
 }
 
+/// With the cycles of the manuals for loads, branches, and code in flash and SRAM: the times of
+/// docs/bench.md. Nothing gets faster by it, and it stays below the budget and a half.
+#[test]
+fn the_times_with_the_costs_of_code_are_longer_and_not_by_half() {
+    let measured = [false, true].map(|costs| {
+        let mut bench = Bench::with(ChipOptions { costs, ..ChipOptions::default() });
+        bench.power_on();
+        let power_on = bench.await_boot_up(100) - Time(0);
+        let program = large_program();
+        let options = FlashOptions::default().trial_run(false);
+        flash(&mut bench.session(), &program, &options, &mut |_| {}).unwrap();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+        let answered = bench.time();
+        let call_back = bench.await_boot_up(1000) - answered;
+        bench.run_ms(20);
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_boot_up(1000);
+        bench.power_off();
+        bench.run_ms(10);
+        let program = bench.power_on_to_first_instruction();
+        println!("costs {costs}: {} us to the boot-up", micros(power_on));
+        println!("costs {costs}: {} us from the answer to 80h to the boot-up", micros(call_back));
+        println!("costs {costs}: {} us to the first instruction of 400 KiB", micros(program));
+        [power_on, call_back, program]
+    });
+    let budgets = [4_500, 18_000, 5_000].map(Span::from_micros);
+    for ((plain, with_costs), budget) in measured[0].into_iter().zip(measured[1]).zip(budgets) {
+        assert!(plain <= with_costs, "{} us, {} us", micros(plain), micros(with_costs));
+        assert!(with_costs <= Span(budget.0 * 3 / 2), "{} us", micros(with_costs));
+    }
+}
+
 /// SysTick holds anything after a reset (ARMv7-M B3.3.5). From FFFFFFh the first period is a tenth of a second.
 /// The watchdog's values take longest with the slowest LSI.
 #[test]

@@ -9,6 +9,7 @@ use crate::clock::CycleClock;
 use crate::cortex::debug::Debug;
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::{Effect, Scs};
+use crate::costs::CRC_WORD;
 use crate::memory::{HostMemory, PAGE};
 use crate::options::Options;
 use crate::periph::crc::Crc;
@@ -198,6 +199,8 @@ pub struct Chip {
     supervisor: Supervisor,
     /// VDD in mV, as the blocks know it.
     vdd: u32,
+    /// Whether code costs what the manuals say.
+    pub costs: bool,
     /// From cycles to time.
     pub clock: CycleClock,
     /// Core registers and exceptions.
@@ -268,6 +271,7 @@ impl Chip {
             supply: Supply::new(options.vdd_mv),
             supervisor: Supervisor::default(),
             vdd: supply::NOMINAL,
+            costs: options.costs,
             clock: CycleClock::new(Time(0), silicon.hsi_hz),
             scs: Scs::new(geometry.interrupts, silicon.hsi_hz.into(), silicon.systick_value),
             flash: Flash::new(geometry, options.flash_times, silicon),
@@ -917,6 +921,7 @@ impl Chip {
                 self.follow_watchdog();
             }
             Block::Iwdg => self.follow_watchdog(),
+            Block::Crc if self.costs => self.clock.cycles += CRC_WORD,
             Block::Flash => {
                 self.settle_flash();
             }

@@ -4,11 +4,10 @@
 //! This module enters and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn
 //! into an [`Exit`].
 //!
-//! **Time.** One instruction takes one cycle, charged when its block (a straight run of code up to
-//! a branch) starts; entering an exception takes 12 cycles, leaving one 10. Code stops at block
-//! borders only, so an interrupt comes at most one block late; SysTick and the cycle counter are read
-//! and written at the cycle of the instruction. A CPU with wait states takes some
-//! 1.3 cycles an instruction; budgets measured here want that much reserve.
+//! **Time.** One instruction takes one cycle, or what [`costs`](crate::costs) says if that is asked for,
+//! charged when its block (a straight run of code up to a branch) starts; entering an exception takes 12
+//! cycles, leaving one 10. Code stops at block borders only, so an interrupt comes at most one block late;
+//! SysTick and the cycle counter are read and written at the cycle of the instruction.
 //!
 //! **What is missing.** Unaligned LDM, STM, LDRD and STRD work instead of faulting unless
 //! CCR.UNALIGN_TRP is set; CCR.NONBASETHRDENA is ignored; FPDSCR does not reach a new FPU context;
@@ -20,7 +19,7 @@
 mod accesses;
 mod traps;
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
@@ -34,6 +33,7 @@ use crate::cortex::exceptions::{
     Masks, BUS_FAULT, DEBUG_MONITOR, HARD_FAULT, MEM_MANAGE, NMI, SV_CALL, USAGE_FAULT,
 };
 use crate::cortex::scs::{cfsr, hfsr, RefusedStore, Traps};
+use crate::costs::{self, InstructionCache};
 use crate::error::Error;
 use crate::memory::{HostMemory, PAGE};
 use crate::report::Access;
@@ -145,6 +145,8 @@ struct Notes {
     single: bool,
     /// Blocks looked at.
     blocks: Blocks,
+    /// What the flash has at hand, where code costs what the manuals say.
+    cache: InstructionCache,
     /// Bytes of the block up to the end of the last instruction that accessed a counter of the core.
     located: u32,
     /// Pages of RAM that code was fetched from.
@@ -881,9 +883,9 @@ impl Cpu {
         if pc < start || pc >= start.wrapping_add(size) {
             return;
         }
-        let rest = count_instructions(chip, pc, start + size - pc).instructions;
-        chip.clock.cycles = chip.clock.cycles.saturating_sub(rest);
-        chip.counters.instructions = chip.counters.instructions.saturating_sub(rest);
+        let rest = count_instructions(chip, pc, start + size - pc);
+        chip.clock.cycles = chip.clock.cycles.saturating_sub(rest.cycles);
+        chip.counters.instructions = chip.counters.instructions.saturating_sub(rest.instructions);
     }
 
     // --- exceptions
@@ -1191,12 +1193,20 @@ fn note_moment(uc: &mut Unicorn<'_, State>, access: Access, address: u32) {
         return;
     }
     let ((start, size), from) = (chip.slice.block, notes.located);
+    let key = (start, size, from, access, address);
+    if let Some(&(located, ahead)) = notes.blocks.moments.get(&key) {
+        notes.located = located;
+        chip.slice.ahead = ahead;
+        return;
+    }
     let found = locate(uc, from, access, address)
         .and_then(|offset| Some(offset + instruction(&uc.get_data().chip, start + offset)?.len()));
     let State { chip, notes } = uc.get_data_mut();
-    notes.located = found.unwrap_or(from).min(size);
-    let (next, rest) = (start + notes.located, size - notes.located);
-    chip.slice.ahead = count_instructions(chip, next, rest).instructions;
+    let located = found.unwrap_or(from).min(size);
+    let ahead = count_instructions(chip, start + located, size - located).cycles;
+    notes.located = located;
+    notes.blocks.moments.insert(key, (located, ahead));
+    chip.slice.ahead = ahead;
 }
 
 // --- hooks
@@ -1252,9 +1262,17 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
         state.notes.fpu_instruction = block.fpu;
         return stop(uc);
     }
+    let mut cycles = block.cycles;
+    if chip.costs {
+        let (before, len) = chip.slice.block;
+        cycles += if before.wrapping_add(len) == address { 0 } else { costs::REFILL };
+        if is_flash(chip, address) {
+            cycles += state.notes.cache.fetch(address, size, block.instructions, chip.flash.acr());
+        }
+    }
     state.notes.located = 0;
     chip.slice.block = (address, size);
-    chip.clock.cycles += block.instructions;
+    chip.clock.cycles += cycles;
     chip.counters.instructions += block.instructions;
 }
 
@@ -1343,6 +1361,8 @@ fn base_register(uc: &Unicorn<'_, State>, number: u32) -> u32 {
 #[derive(Clone, Copy, Debug, Default)]
 struct Block {
     instructions: u64,
+    /// What they take, but for what the cache of the flash decides.
+    cycles: u64,
     /// Address of the first FPU instruction.
     fpu: Option<u32>,
     /// Encoding of the last instruction; the upper half of a 16-bit one is zero.
@@ -1351,11 +1371,16 @@ struct Block {
 
 /// A cache of the blocks that were inspected. [`Cpu::drop_stale`] clears it when code changes. If a
 /// program changes its own code in RAM, the cycles of the old code are counted.
-struct Blocks(Vec<(u32, u32, Block)>);
+struct Blocks {
+    inspected: Vec<(u32, u32, Block)>,
+    /// By block (address and length), bytes of it before, access and address: where the instruction ends that accesses a
+    /// counter of the core, and how many instructions follow. A program may poll the counter.
+    moments: HashMap<(u32, u32, u32, Access, u32), (u32, u64)>,
+}
 
 impl Default for Blocks {
     fn default() -> Self {
-        Self(vec![(0, 0, Block::default()); Self::SIZE])
+        Self { inspected: vec![(0, 0, Block::default()); Self::SIZE], moments: HashMap::new() }
     }
 }
 
@@ -1363,7 +1388,7 @@ impl Blocks {
     const SIZE: usize = 4096;
 
     fn inspect_block(&mut self, chip: &Chip, address: u32, size: u32) -> Block {
-        let slot = &mut self.0[(address >> 1) as usize % Self::SIZE];
+        let slot = &mut self.inspected[(address >> 1) as usize % Self::SIZE];
         if (slot.0, slot.1) != (address, size) {
             *slot = (address, size, count_instructions(chip, address, size));
         }
@@ -1371,7 +1396,8 @@ impl Blocks {
     }
 
     fn clear(&mut self) {
-        self.0.fill((0, 0, Block::default()));
+        self.inspected.fill((0, 0, Block::default()));
+        self.moments.clear();
     }
 }
 
@@ -1394,11 +1420,16 @@ fn count_instructions(chip: &Chip, address: u32, size: u32) -> Block {
         block.instructions += 1;
         block.last = u32::from(first);
         at += 2;
+        let mut second = 0;
         if wide {
-            let second = code.get(at..at + 2).map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
+            second = code.get(at..at + 2).map_or(0, |half| u16::from_le_bytes([half[0], half[1]]));
             block.last = block.last << 16 | u32::from(second);
             at += 2;
         }
+        block.cycles += if chip.costs { costs::of_instruction(first, second) } else { 1 };
+    }
+    if chip.costs && chip.geometry.sram.contains(address, 1) {
+        block.cycles += costs::of_fetch_from_sram(size);
     }
     block
 }

@@ -5,6 +5,7 @@
 //! | [`world`] | machines and host ports on one bus, in one virtual time |
 //! | [`machine`] | one board: power, reset, time, images, the debugger's control |
 //! | [`cpu`] | the Cortex-M4: Unicorn runs the instructions, the module handles the exceptions |
+//! | [`costs`] | what code costs in cycles, if the manuals are asked |
 //! | [`chip`] | the chip around the CPU: memories, peripherals, clocks, the address map |
 //! | [`slice`](mod@slice) | what chip and CPU loop have to say to each other |
 //! | [`cortex`] | exceptions, system control block, SysTick, breakpoint unit |
@@ -28,6 +29,7 @@ pub mod chip;
 pub mod clock;
 pub mod control;
 pub mod cortex;
+pub mod costs;
 pub mod cpu;
 pub mod defmt;
 pub mod error;

@@ -18,6 +18,9 @@ pub struct Options {
     /// The CAN controller whose pins the board's transceiver is at: 0 is CAN1, 1 is CAN2. The other
     /// one hears a recessive line.
     pub transceiver: usize,
+    /// Whether code costs what the manuals say (loads, branches, fetches from flash and SRAM) or a cycle
+    /// for each instruction.
+    pub costs: bool,
     /// What the manuals leave open: the values of this chip.
     pub silicon: Silicon,
     /// VDD at power-on, in mV.
@@ -32,6 +35,7 @@ impl Default for Options {
             flash_times: FlashTimes::Typical,
             unique_id: [0x0034_0025, 0x3137_470C, 0x3338_3235],
             transceiver: 0,
+            costs: false,
             silicon: silicon::TYPICAL,
             vdd_mv: supply::NOMINAL,
         }

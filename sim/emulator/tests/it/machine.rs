@@ -192,6 +192,23 @@ fn time_passes_inside_a_straight_run_of_code() {
     assert_eq!(border, 2, "the branch, and the load");
 }
 
+/// A loop in flash without wait states, 1 024 instructions in 512 rounds: `subs` takes a cycle, `bne` one and
+/// two for the refill (DDI 0439, table 3-1). Code costs more from SRAM, by a cycle for each word (section 2.3.1).
+#[test]
+fn code_costs_what_the_manuals_say_if_it_is_asked_for() {
+    let cycles = |costs: bool| {
+        let mut machine = with_options(&programs::COUNTS_DOWN, Options { costs, ..Options::default() });
+        machine.run_until(ms(1));
+        words(&machine, 2)
+    };
+    let (plain, with_costs) = (cycles(false), cycles(true));
+    let about = |value: u32, expected: u32| assert!(value.abs_diff(expected) < 24, "{value}, not {expected}");
+    about(plain[0], 2 * 512);
+    about(plain[1], 2 * 512);
+    about(with_costs[0], 4 * 512);
+    about(with_costs[1], 5 * 512);
+}
+
 // --- timers and pins
 // -------------------------------------------------------------------------------------------------
 

@@ -127,6 +127,11 @@ struct Args {
     #[arg(long)]
     worst_flash: bool,
 
+    /// Code takes the cycles that the manuals say: loads, branches, fetches from flash and SRAM. Without
+    /// it, each instruction takes one
+    #[arg(long)]
+    costs: bool,
+
     /// The chip, in what the manuals leave open or give as a range, such as the frequency of the LSI:
     /// `typical`, `worst`, or a seed that draws it; the values are printed. Without it: typical
     #[arg(long, value_name = "SEED|worst|typical")]
@@ -383,6 +388,7 @@ impl Bench {
                     hse_hz: args.hse,
                     flash_times: if args.worst_flash { FlashTimes::Worst } else { FlashTimes::Typical },
                     unique_id,
+                    costs: args.costs,
                     transceiver: args.can.map_or(args.board.transceiver, |can| usize::from(can) - 1),
                     silicon: args.silicon.unwrap_or(Choice::Typical).of_board(n.into()),
                     vdd_mv: args.vdd,

@@ -71,4 +71,5 @@ programs! {
     STANDBY,
     SLEEPS_WITH_A_TIMER,
     TIME_IN_A_BLOCK,
+    COUNTS_DOWN,
 }
