@@ -23,10 +23,12 @@ pub fn woke_up(rcc: &pac::RCC) -> bool {
     woke_up
 }
 
-/// Leaves the power controller as after a reset. The PLL must be off.
+/// Switches voltage detector and power controller off, as after a reset; the regulator keeps its scale.
 pub fn release(rcc: &pac::RCC) {
     // SAFETY: nothing else uses the power controller at the same time.
-    unsafe { pac::PWR::steal() }.cr().reset();
+    let pwr = unsafe { pac::PWR::steal() };
+    // SAFETY: the detector is off; the other bits stay.
+    pwr.cr().modify(|r, w| unsafe { w.bits(r.bits() & !PVD) });
     rcc.apb1enr().reset();
 }
 

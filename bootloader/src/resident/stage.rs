@@ -97,8 +97,8 @@ pub unsafe extern "C" fn stage() -> ! {
             let has_watchdog = flash.starts_watchdog();
             drop(caches);
             flash.release(&rcc);
-            bsp::slow_down(&rcc);
             bsp::low_power::release(&rcc);
+            bsp::slow_down(&rcc);
             let handoff = Handoff::new(&BootInfo {
                 node_id,
                 bit_rate: node.bit_rate.or_zero(),
