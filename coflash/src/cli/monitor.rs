@@ -1,7 +1,7 @@
 //! `coflash monitor`: shows the bus in words.
 
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::io::{self, BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -68,17 +68,23 @@ impl Monitor {
 }
 
 fn replay(path: &Path, show: &mut Show<'_>) -> Result<(), Failure> {
-    let unreadable = |error| Failure::unreadable(path, &error);
+    let unreadable = |error: io::Error| match error.kind() {
+        io::ErrorKind::InvalidData => Failure::file(path, "it is not a text in UTF-8: store it as UTF-8"),
+        _ => Failure::unreadable(path, &error),
+    };
     let file = BufReader::new(File::open(path).map_err(unreadable)?);
     let mut first = None;
     for (number, line) in (1..).zip(file.lines()) {
         let line = line.map_err(unreadable)?;
-        let read = Line::parse(&line).map_err(|why| Failure::line(path, number, why))?;
-        let Some(Line { time, frame, .. }) = read else { continue };
-        let first = *first.get_or_insert(time);
-        show.frame(time.saturating_sub(first), &frame);
-        if show.left == 0 {
-            break;
+        // Lines may end with CR alone, and a byte order mark may come before the first one.
+        for line in line.trim_start_matches('\u{FEFF}').split('\r') {
+            let read = Line::parse(line).map_err(|why| Failure::line(path, number, why))?;
+            let Some(Line { time, frame, .. }) = read else { continue };
+            let first = *first.get_or_insert(time);
+            show.frame(time.saturating_sub(first), &frame);
+            if show.left == 0 {
+                return Ok(());
+            }
         }
     }
     Ok(())

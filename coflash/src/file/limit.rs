@@ -55,7 +55,7 @@ pub fn read_text(path: &Path) -> io::Result<String> {
     File::open(path)?.take(MAX_TEXT_SIZE + 1).read_to_end(&mut bytes)?;
     let invalid = |words: String| io::Error::new(io::ErrorKind::InvalidData, words);
     if bytes.len() as u64 > MAX_TEXT_SIZE {
-        return Err(invalid(format!("it has more than {MAX_TEXT_SIZE} bytes, too much for settings")));
+        return Err(invalid(format!("it has more than {MAX_TEXT_SIZE} bytes, the limit for this file")));
     }
     unicode(&bytes).ok_or_else(|| invalid("it is not a text in UTF-8: store it as UTF-8".to_string()))
 }

@@ -367,8 +367,16 @@ fn monitor_shows_a_log() {
     let done = coflash(&["monitor", "--replay", &bad]);
     assert_eq!(done.exit, 3);
     assert!(done.err.contains("bad, line 2: its data are not pairs"), "{}", done.err);
+    // As other programs store it: a byte order mark, and CR at the end of lines.
+    for end in ["\r\n", "\r"] {
+        let text =
+            format!("\u{FEFF}(1.0) can0 705#00{end}{end}(1.5) can0 706#7F T{end}(2.0) can0 707#05{end}");
+        let done = coflash(&["monitor", "--replay", &folder.file("stored", text.as_bytes())]);
+        assert!(done.exit == 0 && done.out.lines().count() == 3, "{end:?}: {}{}", done.out, done.err);
+    }
     let binary = folder.file("binary", &[0xFF, 0xFE, 0]);
-    assert_eq!(coflash(&["monitor", "--replay", &binary]).exit, 3);
+    let done = coflash(&["monitor", "--replay", &binary]);
+    assert!(done.exit == 3 && done.err.contains("store it as UTF-8"), "{}", done.err);
     assert_eq!(coflash(&["monitor", "--replay", &folder.path("none")]).exit, 3);
 }
 
