@@ -8,7 +8,7 @@ use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
-use crate::{files, Outcome};
+use crate::Outcome;
 
 /// The target of the firmware: Armv7E-M with the single-precision FPU.
 pub const TARGET: &str = "thumbv7em-none-eabihf";
@@ -47,7 +47,8 @@ pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
 /// The board of a word after `--board`.
 pub fn board_named(name: &str) -> Outcome<&'static Layout> {
     if name.ends_with(".toml") {
-        let map = files::text(Path::new(name))?;
+        let map =
+            std::fs::read_to_string(name).map_err(|error| format!("{name} cannot be read: {error}."))?;
         let is_map_of = |board: &&&Layout| Toml(board).to_string().trim() == map.trim();
         return layout::BOARDS.iter().find(is_map_of).copied().ok_or_else(|| {
             format!(
@@ -77,9 +78,10 @@ mod tests {
     fn a_board_is_a_name_or_the_file_of_its_map() {
         let file = target_dir().join(format!("tmp/board-{}.toml", std::process::id()));
         let word = file.to_str().unwrap();
-        files::write(&file, Toml(&LAYOUT).to_string()).unwrap();
+        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+        std::fs::write(&file, Toml(&LAYOUT).to_string()).unwrap();
         assert_eq!(board_named(word).unwrap().board, "nucleo-f446re");
-        files::write(&file, Toml(&LAYOUT).to_string().replace("nucleo", "own")).unwrap();
+        std::fs::write(&file, Toml(&LAYOUT).to_string().replace("nucleo", "own")).unwrap();
         assert!(board_named(word).unwrap_err().contains("--bootloader FILE"));
         std::fs::remove_file(&file).unwrap();
         assert!(board_named(word).unwrap_err().contains("cannot be read"));

@@ -63,7 +63,7 @@ fn runs_for_the_time_it_is_told() {
 /// A board that the emulator was not built with.
 #[test]
 fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
-    use shared_abi::layout::{nucleo_f446re::LAYOUT, toml::Toml};
+    const MAP: &str = include_str!("../../../../examples/no-stack/board.toml");
     let folder = folder("board");
     let image = program(&folder, FOREVER);
     let board = |text: &str| {
@@ -71,18 +71,18 @@ fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
         std::fs::write(&file, text).unwrap();
         emulate(&["--board", file.to_str().unwrap(), &image, "--speed", "max", "--for", "0.01"])
     };
-    let map = Toml(&LAYOUT).to_string().replace("nucleo-f446re", "my-board");
+    let map = MAP.replace("stm32f407g-disc1", "my-board");
     let output = board(&map);
     assert!(output.status.success(), "{output:?}");
-    let huge =
-        map.replace("ccm = { base = 0x10000000, size = 0x0", "ccm = { base = 0x10000000, size = 0xe0000000");
+    let huge = map
+        .replace("ccm = { base = 0x10000000, size = 0x10000", "ccm = { base = 0x10000000, size = 0xe0000000");
     assert_ne!(huge, map);
-    let other = map.replace("name = \"stm32f446re\"", "name = \"stm32f446xx\"");
+    let other = map.replace("name = \"stm32f407vg\"", "name = \"stm32f407xx\"");
     for (text, says) in [
         ("", "my.toml: line 1: missing field"),
         ("board = [", "my.toml: line 1: "),
-        (&huge, "my.toml: there is no stm32f446re with these memories"),
-        (&other, "my.toml: there is no stm32f446xx with these memories"),
+        (&huge, "my.toml: there is no stm32f407vg with these memories"),
+        (&other, "my.toml: there is no stm32f407xx with these memories"),
     ] {
         let output = board(text);
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
