@@ -31,6 +31,7 @@ mod files;
 #[cfg(test)]
 mod fleet;
 mod footprint;
+mod foreign;
 mod fuzz;
 mod hil;
 mod layout;
@@ -116,6 +117,7 @@ const JOBS: &[Job] = jobs! {
     "mutants" mutants "changes of the code that a test must notice"
     "evidence" evidence "one page of what the jobs have measured of this commit"
     "attack" attack "the standing attacker of the bus, for millions of frames"
+    "foreign" foreign "firmware of others, unmodified, in the emulator: Klipper, Katapult, ChibiOS and more"
     "opinion" opinion "the emulated CPU against QEMU's, word for word"
     "size" size "the bootloader's flash against its budget"
     "pairs" pairs "bootloaders with every pair of a product's choices: they build and fit"
