@@ -47,8 +47,8 @@ impl FlashController {
     /// # Safety
     /// Nothing else may use the controller until this value is dropped.
     pub unsafe fn steal() -> Self {
-        // SAFETY: the caller guarantees it.
         Self {
+            // SAFETY: the caller guarantees it.
             registers: unsafe { pac::FLASH::steal() },
             rest: [const { Rest { address: 0, word: 0 } }; HAS_PARTS as usize],
         }

@@ -98,7 +98,7 @@ impl InstructionCache {
 }
 
 /// A page of flash or RAM has whole lines.
-const _: () = assert!(PAGE % LINE == 0);
+const _: () = assert!(PAGE.is_multiple_of(LINE));
 
 #[cfg(test)]
 mod tests {

@@ -4,7 +4,7 @@
 //! This module enters and leaves exceptions (DDI 0403E section B1.5) and turns what stops Unicorn
 //! into an [`Exit`].
 //!
-//! **Time.** One instruction takes one cycle, or what [`costs`](crate::costs) says if that is asked for,
+//! **Time.** One instruction takes one cycle, or what [`costs`] says if that is asked for,
 //! charged when its block (a straight run of code up to a branch) starts; entering an exception takes 12
 //! cycles, leaving one 10. Code stops at block borders only, so an interrupt comes at most one block late;
 //! SysTick and the cycle counter are read and written at the cycle of the instruction.
@@ -1373,10 +1373,13 @@ struct Block {
 /// program changes its own code in RAM, the cycles of the old code are counted.
 struct Blocks {
     inspected: Vec<(u32, u32, Block)>,
-    /// By block (address and length), bytes of it before, access and address: where the instruction ends that accesses a
-    /// counter of the core, and how many instructions follow. A program may poll the counter.
-    moments: HashMap<(u32, u32, u32, Access, u32), (u32, u64)>,
+    /// Where the instruction ends that accesses a counter of the core, and how many instructions follow. A program
+    /// may poll the counter.
+    moments: HashMap<Moment, (u32, u64)>,
 }
+
+/// An access in a block: the block's address and length, the bytes of it before, access and address.
+type Moment = (u32, u32, u32, Access, u32);
 
 impl Default for Blocks {
     fn default() -> Self {
