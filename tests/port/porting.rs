@@ -7,6 +7,10 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
+use coboot_tests::bench::Bench;
+use coboot_tests::firmware;
+use coflash::update::{flash, FlashOptions};
+use emulator::machine::{Operation, Options};
 use kit::folder::Alone;
 use object::{Object, ObjectSection};
 use shared_abi::layout;
@@ -202,6 +206,41 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
     let built = product("heartbeat_ms: 2000");
     assert!(built.status.success(), "{}", text(&built));
     assert!(resident("later") != released, "a fresh one has changed");
+}
+
+/// RM0090 table 7: below 2.7 V the flash is programmed by half-words, below 2.1 V by bytes; table 10: the wait
+/// states, and 160 MHz at most below 2.1 V.
+#[test]
+fn a_board_with_a_low_supply_programs_no_wider_than_its_flash_takes() {
+    const BOARD: &str = "bsp/src/boards/stm32f407g_disc1.rs";
+    let copy = Copy::new();
+    for (supply_mv, pll_n, wait_states, width) in [(2_400, 168, 6, 2), (1_800, 160, 7, 1)] {
+        let before = copy.edit(BOARD, "supply_mv: 2_900", &format!("supply_mv: {supply_mv}"));
+        copy.edit(BOARD, "pll_n: 168", &format!("pll_n: {pll_n}"));
+        copy.edit(BOARD, "wait_states: 5", &format!("wait_states: {wait_states}"));
+        copy.xtask(&["build", "bootloader", "app-v1"]);
+        fs::write(copy.root.join(BOARD), before).expect("the copy can be written");
+        let image = |name: &str| {
+            copy.target.join("firmware/stm32f407g-disc1").join(name).to_str().expect("a name").to_owned()
+        };
+        let options = Options { vdd_mv: supply_mv, ..Options::default() };
+        let mut bench = Bench::of_image_with(&image(firmware::BOOTLOADER), options);
+        bench.power_on();
+        bench.await_boot_up(100);
+        bench.machine().keep_flash_log();
+        let update = FlashOptions::default().trial_run(false);
+        let blocks = firmware::blocks(&image(firmware::APP_V1));
+        flash(&mut bench.session(), &blocks, &update, &mut |_| {}).expect("an update");
+        let log = bench.machine().take_flash_log();
+        let mut words = log.iter().filter_map(|operation| match operation {
+            Operation::Program { bytes, .. } => Some(bytes.len()),
+            _ => None,
+        });
+        // 18 KiB.
+        assert!(words.clone().count() > 18_000 / width, "{supply_mv} mV");
+        assert!(words.all(|bytes| bytes == width), "{supply_mv} mV");
+        assert_eq!(bench.machine().counters().flash_weak, 0, "{supply_mv} mV");
+    }
 }
 
 /// A board for each chip in `COBOOT_CHIPS`, from `new-board` to the update on the emulated board.
