@@ -99,7 +99,11 @@ fn a_supply_that_falls_in_the_middle_of_an_update_leaves_no_weak_word() {
         bench.run_ms(1);
         update(&mut bench, firmware::APP_V2).unwrap();
         assert_eq!(bench.machine().counters().flash_weak, weak);
-        assert!(bench.machine().flash_cells().unstable.is_empty(), "after {after_ms} ms");
+        // In the journal a weak record may be left: it counts as one that a power cut has torn.
+        let (base, region) = (firmware::board().chip.flash.base, firmware::board().programs[0]);
+        let cells = bench.machine().flash_cells();
+        let left: Vec<_> = cells.unstable.keys().filter(|at| region.contains(base + **at, 1)).collect();
+        assert_eq!(left, [&0; 0], "after {after_ms} ms");
         assert_eq!(bench.events().iter().filter(|(_, stop)| is_by_supply(*stop)).count(), 0);
     }
 }
