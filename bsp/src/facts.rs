@@ -10,7 +10,7 @@ use shared_abi::wiring::Wiring;
 use crate::can::BitTiming;
 use crate::clock::ClockTree;
 use crate::identity::Identity;
-use crate::supply;
+use crate::voltage;
 
 /// Selects the board's CAN controller for coboot, CAN1 or CAN2.
 ///
@@ -67,7 +67,7 @@ pub struct Facts {
     /// by listening.
     pub bit_rate: u32,
     /// The lowest supply of the chip (VDD) that the board guarantees, in mV, 1800 to 3600. How wide the flash
-    /// is programmed and the threshold of the voltage detector follow from it ([`supply`]), and the wait
+    /// is programmed and the threshold of the voltage detector follow from it ([`voltage`]), and the wait
     /// states that the clocks need.
     pub supply_mv: u32,
     /// How the clocks are made.
@@ -140,13 +140,13 @@ pub const BIT_RATE: u32 = FACTS.bit_rate;
 /// The lowest supply of the chip in mV ([`Facts::supply_mv`]).
 pub const SUPPLY_MV: u32 = {
     assert!(
-        FACTS.supply_mv >= *supply::RANGE.start() && FACTS.supply_mv <= *supply::RANGE.end(),
+        FACTS.supply_mv >= *voltage::RANGE.start() && FACTS.supply_mv <= *voltage::RANGE.end(),
         "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)"
     );
     FACTS.supply_mv
 };
 /// How many bytes of the flash are programmed at a time: 1, 2 or 4.
-pub const FLASH_WIDTH: u32 = supply::flash_width(SUPPLY_MV);
+pub const FLASH_WIDTH: u32 = voltage::flash_width(SUPPLY_MV);
 /// The highest clocks at this supply.
 const LIMITS: Limits = CHIP.line.limits_at(SUPPLY_MV);
 /// How the clocks are made; the chip can run with them.

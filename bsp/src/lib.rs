@@ -22,7 +22,8 @@
 //! | `port.rs` | the port for frames: the CAN controller, or the UART |
 //! | [`line`](mod@line) | what a CANopen slave wants of its port |
 //! | `watchdog.rs` | the independent watchdog |
-//! | [`supply`] | the supply: how wide the flash is programmed, and when it is left alone |
+//! | [`voltage`] | what follows from the supply: how wide the flash is programmed, and when it is left alone |
+//! | [`supply`] | the voltage detector |
 //! | `low_power.rs` | the wake-up from Standby, the clocks of the sleep mode |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
@@ -54,6 +55,7 @@ mod port;
 pub mod ring;
 #[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
+#[cfg(target_arch = "arm")]
 pub mod supply;
 #[macro_use]
 pub mod uart;
@@ -61,6 +63,7 @@ pub mod uart;
 mod facts;
 #[cfg(all(target_arch = "arm", feature = "virtual-can"))]
 pub mod virtual_can;
+pub mod voltage;
 #[cfg(target_arch = "arm")]
 pub mod watchdog;
 

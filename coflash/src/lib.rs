@@ -42,6 +42,7 @@ extern crate self as coflash;
 mod json;
 #[macro_use]
 mod setters;
+mod unicode;
 
 #[cfg(feature = "agent")]
 pub mod agent;

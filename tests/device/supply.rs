@@ -92,7 +92,7 @@ fn a_supply_that_falls_in_the_middle_of_an_update_leaves_no_weak_word() {
         let weak = bench.machine().counters().flash_weak;
         // Level 4, for boards with 2.9 V, falls at 2.66 V: between that and 2.7 V words are written that may not
         // last. The next update erases them.
-        let is_tight = bsp::supply::detector_level(bsp::SUPPLY_MV) >= Some(5);
+        let is_tight = bsp::voltage::detector_level(bsp::SUPPLY_MV) >= Some(5);
         assert!(!is_tight || weak <= 1, "after {after_ms} ms: {weak}");
         bench.run_ms(for_ms);
         set_supply(&mut bench, 3_300);
@@ -163,7 +163,7 @@ fn a_word_is_programmed_as_wide_as_the_supply_allows() {
 #[test]
 fn a_program_gets_the_voltage_detector_switched_off() {
     let mut bench = board_with_a_program();
-    let level = bsp::supply::detector_level(bsp::SUPPLY_MV);
+    let level = bsp::voltage::detector_level(bsp::SUPPLY_MV);
     let watches = bench.machine().register(PWR_CR).unwrap() >> 4 & 0xF;
     assert_eq!(watches, level.map_or(0, |level| u32::from(level) << 1 | 1));
     bench.session().command(1, canopen::program::ProgramControl::Start).unwrap();

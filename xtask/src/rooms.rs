@@ -42,10 +42,11 @@ const BOOT_CORE: &[Rule] = &[
 /// which share an adapter.
 const COFLASH: &[Rule] = &[
     ("setters", ""),
+    ("unicode", ""),
     ("json", "canopen"),
     ("bus", "canopen"),
-    ("file", "setters shared_abi"),
-    ("device", "bus canopen json setters shared_abi"),
+    ("file", "setters shared_abi unicode"),
+    ("device", "bus canopen json setters shared_abi unicode"),
     ("update", "bus canopen device file json setters shared_abi"),
     ("agent", "bus canopen device file shared_abi update"),
     ("conform", "bus canopen device update"),

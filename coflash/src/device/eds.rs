@@ -10,7 +10,7 @@ use canopen::Address;
 use configparser::ini::Ini;
 
 use super::value::{integer, DataType};
-use crate::file::text::unicode;
+use crate::unicode;
 
 /// The most bytes of a sheet. Sheets of drives with hundreds of objects have about 300 KiB.
 pub const MAX: usize = 8 * 1024 * 1024;
@@ -203,7 +203,7 @@ impl Eds {
 /// The text of a sheet, with LF at the end of each line. CiA 306-1 wants ASCII, and does not name
 /// another encoding.
 fn text_of(bytes: &[u8]) -> String {
-    let text = unicode(bytes).unwrap_or_else(|| bytes.iter().copied().map(windows_1252).collect());
+    let text = unicode::text(bytes).unwrap_or_else(|| bytes.iter().copied().map(windows_1252).collect());
     text.replace("\r\n", "\n").replace('\r', "\n")
 }
 

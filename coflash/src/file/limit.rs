@@ -5,7 +5,7 @@ use std::io::{self, Read};
 use std::path::Path;
 
 use super::fault::Cause;
-use super::text::unicode;
+use crate::unicode;
 
 /// The most bytes of a firmware file: 64 MiB. The largest flash of the family has 2 MiB, which
 /// takes about 6 MiB as text; the rest is for the symbols of an ELF file.
@@ -57,7 +57,7 @@ pub fn read_text(path: &Path) -> io::Result<String> {
     if bytes.len() as u64 > MAX_TEXT_SIZE {
         return Err(invalid(format!("it has more than {MAX_TEXT_SIZE} bytes, the limit for this file")));
     }
-    unicode(&bytes).ok_or_else(|| invalid("it is not a text in UTF-8: store it as UTF-8".to_string()))
+    unicode::text(&bytes).ok_or_else(|| invalid("it is not a text in UTF-8: store it as UTF-8".to_string()))
 }
 
 #[cfg(test)]
