@@ -74,6 +74,12 @@ impl Wiring {
         if is_one_of(self.led, &self.uart) {
             return Err("board: led is a pin of the UART");
         }
+        if !chip.has_pin(self.uart.transmit) || !chip.has_pin(self.uart.receive) {
+            return Err("board: the chip has no such pins as the UART has");
+        }
+        if is_one_of(self.uart.transmit, &self.can) || is_one_of(self.uart.receive, &self.can) {
+            return Err("board: the UART has a pin of the CAN controller");
+        }
         if let Some(strap) = self.strap {
             if !chip.has_pin(strap) {
                 return Err("board: the chip has no such pin as entry_strap names");
@@ -106,6 +112,11 @@ impl Wiring {
             }
             if is_same(standby, self.led) {
                 return Err("board: can_standby is the pin of the LED");
+            }
+            if let Some(strap) = self.strap {
+                if is_same(standby, strap) {
+                    return Err("board: can_standby is the pin of entry_strap");
+                }
             }
             if is_one_of(standby, &self.uart) {
                 return Err("board: can_standby is a pin of the UART");

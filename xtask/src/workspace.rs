@@ -46,7 +46,7 @@ pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
 
 /// The board of a word after `--board`.
 pub fn board_named(name: &str) -> Outcome<&'static Layout> {
-    if name.ends_with(".toml") {
+    if name.contains(['.', '/', '\\']) {
         let map =
             std::fs::read_to_string(name).map_err(|error| format!("{name} cannot be read: {error}."))?;
         let is_map_of = |board: &&&Layout| Toml(board).to_string().trim() == map.trim();

@@ -1,4 +1,4 @@
-//! `cargo xtask hil` with the emulated board behind it, with the worst chip that its manuals allow: gdb is
+//! `cargo xtask hil` on the emulated board, with the worst chip that its manuals allow: gdb is
 //! the probe, the control socket the relay and the hand at the strap, socketcand the bus.
 #![cfg(unix)]
 

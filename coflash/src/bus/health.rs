@@ -158,8 +158,8 @@ impl Health {
                     .to_string()
             }
             Trouble::Echo => {
-                "the server returns our own frames and nothing else: no other node is on its bus; check that the bus in \
-                 --bus is that of the device, and that the device has power"
+                "the server returns our own frames, and no other node has sent any; check --node, that the bus in --bus is \
+                 that of the device, and that the device has power"
                     .to_string()
             }
         })

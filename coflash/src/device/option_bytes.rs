@@ -70,7 +70,7 @@ impl OptionBytes {
             (
                 self.brown_out_level().is_none(),
                 "the brown-out reset is off, so that the chip runs on while its supply fails: set BOR_LEV with a \
-                 debug probe, to level 3 for a supply of 3.0 V and more, level 2 from 2.7 V, level 1 from 2.3 V",
+                 debug probe, to level 3 for a supply of 3.0 V and more, level 2 from 2.7 V, level 1 from 2.4 V",
             ),
             (
                 self.protects_from_reading(),
