@@ -240,15 +240,25 @@ fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<BlockFile
     update.results.swap_remove(1).unwrap_err().error
 }
 
+/// A product with CRC-16 leaves the group with block 0, and gets its blocks by itself.
 #[test]
-fn a_device_with_another_checksum_refuses_alone() {
-    let error = assert_refuses_alone(
-        |machine| {
-            machine.load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap();
-        },
-        &file(KIB),
-    );
-    assert!(matches!(error, Error::Failed { doing: Doing::Block(0), error: FlashError::Crc, .. }), "{error}");
+fn a_device_with_another_checksum_is_updated_alone() {
+    let file = file(KIB);
+    let mut fleet = Fleet::new(3, BitRate::K1000);
+    let board = fleet.bench.boards()[1];
+    fleet.bench.world.power_off(board);
+    fleet.bench.world.machine_mut(board).load(&firmware::elf(firmware::BOOTLOADER_CRC_16)).unwrap();
+    fleet.bench.world.power_on(board);
+    fleet.bench.run_ms(50);
+    let update = fleet.update(3, &file, &ManyOptions::default());
+    assert_eq!(update.done(), 3, "{:?}", update.results);
+    assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
+    let program: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes).collect();
+    for (node, crc) in [(1, file.program_crc()), (2, kit::bench::crc16(&program)), (3, file.program_crc())] {
+        assert!(!fleet.bench.is_bootloader(node), "node {node}");
+        let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
+        assert_eq!(told.unwrap(), crc, "node {node}");
+    }
 }
 
 #[test]
