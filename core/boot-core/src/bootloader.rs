@@ -11,7 +11,7 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, ClockSource, FlashError, ProgramControl, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS,
+    control_count, ClockSource, FlashError, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS,
     IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
     SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES,
     STATE_PROGRAM_WATCHDOG, STATE_SUPPLY, UNLOCK, UNLOCK_ENTRIES,
@@ -282,9 +282,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
                     self.signatures.fail(self.now);
                 }
                 let code = match error {
-                    FlashError::Write | FlashError::Secured | FlashError::NvData | FlashError::NoAccess => {
-                        emcy::code::HARDWARE
-                    }
+                    FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
+                    FlashError::NoAccess if self.flash.supply() == Supply::Low => emcy::code::HARDWARE,
                     _ => emcy::code::DATA_SET,
                 };
                 self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);

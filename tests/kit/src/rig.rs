@@ -311,6 +311,33 @@ impl Rig {
         self.node.take_boot_request();
     }
 
+    /// Password or CLEAR, and a program in one download, which may be refused, with all work; the status that it
+    /// comes to.
+    pub fn status_of(&mut self, program: u8, data: &[u8]) -> u32 {
+        if self.setup.password(program).is_some() {
+            self.unlock(program).expect("the password is right");
+            self.settle();
+        } else {
+            self.command(program, 3).expect("CLEAR is taken");
+        }
+        let _ = self.send(program, data);
+        self.settle();
+        self.status(program)
+    }
+
+    /// After a reset, a program is installed as it was, by its CRC, and can be started.
+    pub fn assert_installed(&mut self, program: u8, image: &[u8], what: &str) {
+        self.reset();
+        assert_eq!(self.identification(program), crc32(image), "{what}");
+        self.command(program, 1).expect("START is taken");
+        let request = self.node.take_boot_request();
+        assert!(
+            matches!(request, Some(BootRequest::Start(of) | BootRequest::Trial(of)) if of == program),
+            "{what}: {request:?}"
+        );
+        self.reset();
+    }
+
     /// The contents of a program's flash, as seen by a debug probe.
     pub fn cells(&self, program: u8) -> Vec<u8> {
         self.chip.model().cells(self.setup.region(program)).to_vec()

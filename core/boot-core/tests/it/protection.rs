@@ -7,9 +7,7 @@ use canopen::AbortCode;
 use kit::rig::{
     block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
-use shared_abi::warm_start::BootRequest;
 
-const START: u8 = 0x01;
 const CLEAR: u8 = 0x03;
 /// Program 1 of the model: sector 4 with 400h bytes, then 5 to 11 with 800h each.
 const FIRST: u8 = 4;
@@ -27,27 +25,7 @@ fn secured(sector: u8) -> u32 {
 /// The program is there as it was, and starts.
 fn assert_stays(rig: &mut Rig, image: &[u8], what: &str) {
     assert_eq!(&rig.cells(1)[..image.len()], image, "{what}");
-    rig.reset();
-    assert_eq!(rig.identification(1), kit::rig::crc32(image), "{what}");
-    rig.command(1, START).unwrap();
-    assert!(
-        matches!(rig.node.take_boot_request(), Some(BootRequest::Start(1) | BootRequest::Trial(1))),
-        "{what}"
-    );
-    rig.reset();
-}
-
-/// Sends a program in one download; the status that it comes to.
-fn status_of(rig: &mut Rig, data: &[u8]) -> u32 {
-    if rig.setup.password(1).is_some() {
-        rig.unlock(1).unwrap();
-        rig.settle();
-    } else {
-        rig.command(1, CLEAR).unwrap();
-    }
-    let _ = rig.send(1, data);
-    rig.settle();
-    rig.status(1)
+    rig.assert_installed(1, image, what);
 }
 
 /// In each profile and form, for a protected sector at each place of the new program.
@@ -63,12 +41,12 @@ fn a_protected_sector_costs_nothing() {
                 rig.install(1, &old);
                 rig.chip.model().protected = vec![sector];
                 // A password gives up a program, unless its flash is protected; data then get nowhere.
-                let status = status_of(&mut rig, &data);
+                let status = rig.status_of(1, &data);
                 assert_eq!(status & 0xFFFF, 0x0E, "{what}");
                 assert_eq!(status >> 16, u32::from(sector), "{what}");
                 assert_stays(&mut rig, &old, &what);
                 rig.chip.model().protected.clear();
-                assert_eq!(status_of(&mut rig, &data), 0, "{what}");
+                assert_eq!(rig.status_of(1, &data), 0, "{what}");
                 assert_eq!(&rig.cells(1)[..new.len()], new, "{what}");
             }
         }
@@ -92,7 +70,7 @@ fn only_the_sectors_of_the_program_count_where_its_size_is_known() {
         let mut rig = Rig::new(&STANDARD_1, 8192);
         rig.install(1, &old);
         rig.chip.model().protected = vec![sector];
-        let status = status_of(&mut rig, &data);
+        let status = rig.status_of(1, &data);
         assert_eq!(status, if takes { 0 } else { secured(sector) }, "sector {sector}");
         if !takes {
             assert_stays(&mut rig, &old, "it is not taken");

@@ -1,16 +1,16 @@
 //! A supply that is too low for the flash: nothing is given up for it, and nothing is written.
 
 use boot_core::canopen::lss::StoreError;
-use canopen::od::Address;
-use canopen::NodeId;
+use boot_core::control::Policy;
+use canopen::od::{Address, Objects};
+use canopen::{AbortCode, NodeId};
+use kit::bench::Bench;
 use kit::model::{ModelFlash, CHIP};
 use kit::rig::{
     block, hex, program, Rig, Setup, AT_ONCE_2, ESACADEMY_1, LIFT_1, PAULUS_1, PRODUCT_CODE, STANDARD_1,
 };
-use shared_abi::warm_start::BootRequest;
 use std::task::Poll;
 
-const START: u8 = 0x01;
 const CLEAR: u8 = 0x03;
 const SET_SIGNATURE: u8 = 0x83;
 /// 1F57h: NO_ACCESS ("programming is not allowed at present", L-1112d_10 table 3); in the upper half, 1 for the
@@ -25,19 +25,6 @@ fn set_low(rig: &Rig, is_low: bool) {
     rig.chip.model().low_from = is_low.then_some(0);
 }
 
-/// Password or CLEAR, and a program in one download; the status that it comes to.
-fn status_of(rig: &mut Rig, data: &[u8]) -> u32 {
-    if rig.setup.password(1).is_some() {
-        rig.unlock(1).unwrap();
-        rig.settle();
-    } else {
-        rig.command(1, CLEAR).unwrap();
-    }
-    let _ = rig.send(1, data);
-    rig.settle();
-    rig.status(1)
-}
-
 /// In each profile and form. Not a word is written, in the journal neither.
 #[test]
 fn a_supply_that_is_too_low_costs_nothing() {
@@ -49,18 +36,13 @@ fn a_supply_that_is_too_low_costs_nothing() {
             rig.install(1, &old);
             set_low(&rig, true);
             rig.chip.model().touched.clear();
-            let status = status_of(&mut rig, &data);
+            let status = rig.status_of(1, &data);
             // A password gives up a program, unless its flash may not be written; data then get nowhere.
             assert_eq!(status & 0xFFFF, 0x84, "{what}");
             assert_eq!(rig.chip.model().touched, [], "{what}");
-            rig.reset();
-            assert_eq!(rig.identification(1), kit::rig::crc32(&old), "{what}");
-            rig.command(1, START).unwrap();
-            let request = rig.node.take_boot_request();
-            assert!(matches!(request, Some(BootRequest::Start(1) | BootRequest::Trial(1))), "{what}");
-            rig.reset();
+            rig.assert_installed(1, &old, &what);
             set_low(&rig, false);
-            assert_eq!(status_of(&mut rig, &data), 0, "{what}");
+            assert_eq!(rig.status_of(1, &data), 0, "{what}");
             assert_eq!(&rig.cells(1)[..new.len()], new, "{what}");
         }
     }
@@ -136,7 +118,7 @@ fn a_supply_that_falls_in_the_middle_loses_no_device() {
         rig.install(1, &old);
         let done = rig.chip.model().operations;
         rig.chip.model().low_from = Some(done + from);
-        let status = status_of(&mut rig, &new);
+        let status = rig.status_of(1, &new);
         if status == 0 {
             ends.push(from);
             break;
@@ -154,7 +136,7 @@ fn a_supply_that_falls_in_the_middle_loses_no_device() {
             assert!([0, kit::rig::crc32(&old)].contains(&id), "from operation {from} on: {id:08X}");
         }
         rig.chip.model().low_from = None;
-        assert_eq!(status_of(&mut rig, &new), 0, "from operation {from} on");
+        assert_eq!(rig.status_of(1, &new), 0, "from operation {from} on");
         assert_eq!(&rig.cells(1)[..new.len()], new, "from operation {from} on");
     }
     // A record, two sectors of 400h and 800h bytes, 750 words, a record.
@@ -177,4 +159,16 @@ fn the_device_says_what_its_supply_and_its_option_bytes_are() {
     assert_eq!(read(&mut rig, 7), (1, 2));
     rig.chip.model().option_bytes = 0x8FFE_CCC1;
     assert_eq!(read(&mut rig, 6), (4, 0x8FFE_CCC1));
+}
+
+/// 5000h is for the supply alone: a product that forbids programming refuses a file with the same status.
+#[test]
+fn a_refusal_for_another_reason_is_no_fault_of_the_hardware() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, Policy { allowed: || false, ..Policy::DEFAULT });
+    let (refused, status) = bench.stream(&kit::bench::program(300, 1), None, 7);
+    assert_eq!((refused, status), (Err(AbortCode::DEVICE_STATE), 0x84));
+    let emergencies: Vec<_> = std::iter::from_fn(|| bench.node.next_emergency()).collect();
+    // Code 6300h, status 84h, program 1.
+    assert_eq!(emergencies, [[0x00, 0x63, 0x81, 0x84, 1, 0, 0, 0]]);
 }
