@@ -152,6 +152,7 @@ impl FlashController {
             }
         }
         if let Some(rest) = self.rest.first_mut() {
+            // A width of 4 leaves no rest; `% 32` is for its arithmetic alone.
             *rest = Rest { address: address + FLASH_WIDTH, word: word >> (8 * FLASH_WIDTH % 32) };
         }
     }

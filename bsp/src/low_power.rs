@@ -5,12 +5,12 @@ use stm32f4xx_hal::pac;
 
 use crate::supply::{DETECTS, PVD};
 
-/// Whether the chip has woken up from Standby since the last call. It clears the flag, and leaves of APB1 the
-/// clock of the power controller on, with the voltage detector of the board ([`crate::supply`]).
+/// Switches power controller and voltage detector ([`crate::supply`]) on until [`release`]. Returns whether the chip
+/// has woken up from Standby since the last call, and clears the flag. No other clock of APB1 is on.
 ///
 /// The flags of RCC_CSR do not tell: no manual names those of a wake-up, and some chips have none.
 #[must_use]
-pub fn woke_up(rcc: &pac::RCC) -> bool {
+pub fn take(rcc: &pac::RCC) -> bool {
     rcc.apb1enr().write(|w| w.pwren().set_bit());
     // A peripheral needs some cycles after its clock is enabled (errata sheets, "Delay after an RCC peripheral
     // clock enabling").

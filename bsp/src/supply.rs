@@ -18,7 +18,7 @@ pub(crate) const DETECTS: u32 = match LEVEL {
 };
 
 /// Whether the supply is good enough to erase and program the flash. The power controller must be on
-/// ([`low_power::woke_up`](crate::low_power::woke_up)).
+/// ([`low_power::take`](crate::low_power::take)).
 #[must_use]
 pub fn state() -> Supply {
     if LEVEL.is_none() {

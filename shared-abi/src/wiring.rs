@@ -30,6 +30,25 @@ pub struct Wiring {
     pub hse_bypass: bool,
 }
 
+/// A pin that a board chooses exists, and is none of the debugger, of the crystal and of the CAN controller. (A
+/// macro: a constant cannot put the name into its message.)
+macro_rules! check_free {
+    ($wiring:expr, $chip:expr, $pin:expr, $name:literal) => {
+        if !$chip.has_pin($pin) {
+            return Err(concat!("board: the chip has no such pin as ", $name, " names"));
+        }
+        if is_debug_pin($pin) {
+            return Err(concat!("board: ", $name, " is a pin of the debugger (PA13 to PA15, PB3, PB4)"));
+        }
+        if $wiring.is_oscillator($pin) {
+            return Err(concat!("board: ", $name, " is a pin of the crystal (PH0, PH1)"));
+        }
+        if is_one_of($pin, &$wiring.can) {
+            return Err(concat!("board: ", $name, " is a pin of the CAN controller"));
+        }
+    };
+}
+
 impl Wiring {
     /// Returns the wiring if the chip has these pins for these uses.
     ///
@@ -59,57 +78,25 @@ impl Wiring {
             Some((number, CanLine::Receive)) if number == self.can_controller => {}
             _ => return Err("board: `receive` of can_pins is no receive pin of this CAN controller"),
         }
-        if !chip.has_pin(self.led) {
-            return Err("board: the chip has no such pin as led names");
-        }
-        if is_debug_pin(self.led) {
-            return Err("board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-        }
-        if self.is_oscillator(self.led) {
-            return Err("board: led is a pin of the crystal (PH0, PH1)");
-        }
-        if is_one_of(self.led, &self.can) {
-            return Err("board: led is a pin of the CAN controller");
-        }
-        if is_one_of(self.led, &self.uart) {
-            return Err("board: led is a pin of the UART");
-        }
         if !chip.has_pin(self.uart.transmit) || !chip.has_pin(self.uart.receive) {
             return Err("board: the chip has no such pins as the UART has");
         }
         if is_one_of(self.uart.transmit, &self.can) || is_one_of(self.uart.receive, &self.can) {
             return Err("board: the UART has a pin of the CAN controller");
         }
+        check_free!(self, chip, self.led, "led");
+        if is_one_of(self.led, &self.uart) {
+            return Err("board: led is a pin of the UART");
+        }
         if let Some(strap) = self.strap {
-            if !chip.has_pin(strap) {
-                return Err("board: the chip has no such pin as entry_strap names");
-            }
-            if is_debug_pin(strap) {
-                return Err("board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-            }
-            if self.is_oscillator(strap) {
-                return Err("board: entry_strap is a pin of the crystal (PH0, PH1)");
-            }
-            if is_one_of(strap, &self.can) {
-                return Err("board: entry_strap is a pin of the CAN controller");
-            }
+            // It is read before the UART is on, and may be one of its pins.
+            check_free!(self, chip, strap, "entry_strap");
             if is_same(strap, self.led) {
                 return Err("board: entry_strap is the pin of the LED");
             }
         }
         if let Some(standby) = self.standby {
-            if !chip.has_pin(standby) {
-                return Err("board: the chip has no such pin as can_standby names");
-            }
-            if is_debug_pin(standby) {
-                return Err("board: can_standby is a pin of the debugger (PA13 to PA15, PB3, PB4)");
-            }
-            if self.is_oscillator(standby) {
-                return Err("board: can_standby is a pin of the crystal (PH0, PH1)");
-            }
-            if is_one_of(standby, &self.can) {
-                return Err("board: can_standby is a pin of the CAN controller");
-            }
+            check_free!(self, chip, standby, "can_standby");
             if is_same(standby, self.led) {
                 return Err("board: can_standby is the pin of the LED");
             }
@@ -178,6 +165,19 @@ mod tests {
             (Wiring { standby: Some(('D', 1)), ..GOOD }, "can_standby is a pin of the CAN controller"),
             (Wiring { standby: Some(('D', 12)), ..GOOD }, "can_standby is the pin of the LED"),
             (Wiring { standby: Some(('A', 3)), ..GOOD }, "can_standby is a pin of the UART"),
+            (Wiring { standby: Some(('A', 0)), ..GOOD }, "can_standby is the pin of entry_strap"),
+            (
+                Wiring { uart: Pins { transmit: ('F', 6), receive: ('A', 3) }, ..GOOD },
+                "no such pins as the UART has",
+            ),
+            (
+                Wiring { uart: Pins { transmit: ('A', 2), receive: ('D', 0) }, ..GOOD },
+                "the UART has a pin of the CAN controller",
+            ),
+            (
+                Wiring { uart: Pins { transmit: ('D', 1), receive: ('A', 3) }, ..GOOD },
+                "the UART has a pin of the CAN controller",
+            ),
             (Wiring { can_controller: 2, ..GOOD }, "no transmit pin of this CAN controller"),
             (
                 Wiring { can: Pins { transmit: ('D', 0), receive: ('D', 1) }, ..GOOD },

@@ -52,7 +52,7 @@ pub unsafe extern "C" fn stage() -> ! {
     let status = rcc.csr().read();
     // SAFETY: it removes the flags, and leaves the LSI as it is.
     rcc.csr().write(|w| unsafe { w.bits(status.bits()).rmvf().set_bit() });
-    let reset_cause = ResetCause::from_flags(status.bits(), bsp::low_power::woke_up(&rcc));
+    let reset_cause = ResetCause::from_flags(status.bits(), bsp::low_power::take(&rcc));
 
     // Without a reset cause an application has jumped here. The flash may be locked, and the watchdog,
     // whose clock is the LSI, may run. A reset ends both; the request stays in the cell.

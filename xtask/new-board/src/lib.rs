@@ -173,9 +173,12 @@ impl Fit {
                 let pins = all_pins().filter(|pin| chip.can_line(*pin) == Some((can_controller, line)));
                 pins.map(shown).collect::<Vec<_>>().join(", ")
             };
+            let rule = format!("{}. No file was written.", rule.trim_start_matches("board: "));
+            if !rule.contains("can_pins") {
+                return rule;
+            }
             format!(
-                "{}. No file was written. ({} has CAN{can_controller} on these pins: transmit {}; receive {}.)",
-                rule.trim_start_matches("board: "),
+                "{rule} ({} has CAN{can_controller} on these pins: transmit {}; receive {}.)",
                 constant(chip),
                 pins(CanLine::Transmit),
                 pins(CanLine::Receive),

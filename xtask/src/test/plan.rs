@@ -108,6 +108,7 @@ pub const IMAGES: &[Images] = &[
 pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("device", "device::"),
     ("device", "watchdog::"),
+    ("device", "supply::"),
     ("device", "boot_time::"),
     ("device", "abi::"),
     ("device", "handover::"),

@@ -151,6 +151,8 @@ pub struct Fake {
     outbox: VecDeque<(Duration, Frame)>,
     emergency: Option<(Duration, Frame)>,
     pub sent: Vec<Frame>,
+    /// When each of them was sent.
+    pub sent_at: Vec<Duration>,
     /// The other manufacturer's objects, if there are any.
     pub maker: Option<Box<dyn Maker>>,
     next_node: u8,
@@ -210,6 +212,7 @@ impl Fake {
             outbox: VecDeque::new(),
             emergency: None,
             sent: Vec::new(),
+            sent_at: Vec::new(),
             maker: None,
             next_node: NODE,
         }
@@ -606,6 +609,7 @@ fn initiate(command: u8, (index, sub): (u16, u8), word: u32) -> [u8; 8] {
 
 impl Adapter for Fake {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        let began = self.now;
         // About what a frame takes at 500 kbit/s.
         self.now += Duration::from_micros(250);
         self.tick();
@@ -615,6 +619,7 @@ impl Adapter for Fake {
         }
         self.frames_left -= 1;
         self.sent.push(*frame);
+        self.sent_at.push(began);
         if frame.cob_id() == CobId::new(0) && self.running.is_some() {
             match frame.exactly().copied() {
                 Some([command @ (0x81 | 0x82), node]) if node == 0 || node == self.node => {

@@ -181,45 +181,25 @@ fn who_can_be_heard_before_the_call_back_costs_the_program_nothing() {
     }
 }
 
-/// Notes when each request was sent.
-struct Timed {
-    fake: Fake,
-    sent: Vec<(Duration, [u8; 8])>,
-}
-
-impl Adapter for Timed {
-    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
-        self.sent.extend(frame.exactly().map(|bytes| (self.fake.now, *bytes)));
-        self.fake.send(frame)
-    }
-
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
-        self.fake.receive(timeout)
-    }
-
-    fn now(&self) -> Duration {
-        self.fake.now
-    }
-}
-
 /// The 0.3 s for another tool, and the 0.3 s for a master after the call back, go on while the session
 /// asks what it has to ask anyway.
 #[test]
 fn listening_takes_no_time_of_its_own() {
     let mut fake = Fake::new(APPLICATION);
     fake.latency = ms(5);
-    let mut bus = Timed { fake, sent: Vec::new() };
-    let opened = bus.now();
-    let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
+    let opened = fake.now;
+    let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
     // The session has listened for a while when the update begins.
     session.wait(ms(200)).unwrap();
     let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
     flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
-    assert_eq!(bus.sent[0].0 - opened, ms(300));
-    let at = |bytes: [u8; 8]| bus.sent.iter().find(|(_, sent)| *sent == bytes).unwrap().0;
+    let requests =
+        || fake.sent.iter().zip(&fake.sent_at).filter_map(|(sent, at)| Some((sent.exactly::<8>()?, *at)));
+    assert_eq!(requests().next().unwrap().1 - opened, ms(300));
+    let at = |bytes: [u8; 8]| requests().find(|(sent, _)| **sent == bytes).unwrap().1;
     let called = at([0x2F, 0x51, 0x1F, 1, 0x80, 0, 0, 0]);
-    let booted = called + bus.fake.restart_time;
-    let asked = |from| bus.sent.iter().filter(|(time, _)| *time > from && *time < at(CLEAR)).count();
+    let booted = called + fake.restart_time;
+    let asked = |from| requests().filter(|(_, time)| *time > from && *time < at(CLEAR)).count();
     // Before that, 1000h, 2002h and 2004h; then 2004h, 2006h and 1F56h for the download itself.
-    assert_eq!((asked(booted), asked(booted + ms(300))), (6, 3), "{:?}", bus.sent);
+    assert_eq!((asked(booted), asked(booted + ms(300))), (6, 3), "{:?}", fake.sent);
 }

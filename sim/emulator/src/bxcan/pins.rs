@@ -125,4 +125,26 @@ mod tests {
             assert_eq!(pair(chip, controller, rx, tx, af), expected, "{}: {rx:?}, {tx:?}", chip.chip);
         }
     }
+
+    /// Two tables, written down by two people from the datasheets: this one, and that of shared-abi, by which a
+    /// board is built.
+    #[test]
+    fn every_chip_has_the_can_pins_that_the_geometry_has() {
+        use shared_abi::geometry::{CanLine, CHIPS};
+        for chip in CHIPS {
+            for pin in ('A'..='K').flat_map(|port| (0..16).map(move |number| (port, number))) {
+                let found =
+                    [(Share::Can1, 1), (Share::Can2, 2)].into_iter().find_map(|(controller, number)| {
+                        let line = |function| match pair(chip, controller, pin, pin, function) {
+                            (false, false) => None,
+                            (true, false) => Some((number, CanLine::Receive)),
+                            (false, true) => Some((number, CanLine::Transmit)),
+                            (true, true) => panic!("{pin:?} has both lines"),
+                        };
+                        line(9).or_else(|| line(8))
+                    });
+                assert_eq!(found, chip.can_line(pin), "{}: {pin:?}", chip.chip);
+            }
+        }
+    }
 }
