@@ -21,6 +21,7 @@ mod program_control;
 mod reentry;
 mod silicon;
 mod slcan;
+mod stack;
 mod standby;
 mod supply;
 mod uart;

@@ -16,4 +16,5 @@ pub mod sealed;
 pub mod sealed_board;
 pub mod serial;
 pub mod silicon;
+pub mod stack;
 pub mod throughput;

@@ -4,15 +4,13 @@
 use canopen::program::ProgramControl;
 use canopen::BitRate;
 use coboot_tests::bench::{Bench, REQUEST, RESPONSE};
-use coboot_tests::firmware;
+use coboot_tests::{firmware, stack};
 use coboot_tests::sealed_board::{board, open_board, provision, release, sealer, write, COUNTER, KEK};
 use coboot_tests::throughput::{change_over, code};
 use coflash::device::Transfers;
 use coflash::file::sealed::Sealer;
 use emulator::bus::Outcome;
 use emulator::time::{Span, Time};
-use object::read::elf::ElfFile32;
-use object::{Endianness, Object, ObjectSection, SectionFlags};
 use seal::access::{right, DOMAIN, SIGNED_CHALLENGE};
 
 use super::{call_back, kinds, start, status};
@@ -253,36 +251,21 @@ fn the_bootloader_is_there_as_soon_as_an_open_one() {
     assert!(call_back <= Span::from_millis(30), "{} us", micros(call_back));
 }
 
-/// The bytes of RAM after the statics of an image: its stack.
-fn stack(image: &str) -> u32 {
-    let elf = firmware::elf(image);
-    let file = ElfFile32::<Endianness>::parse(&*elf).expect("an ELF file");
-    let ram = firmware::board().ram;
-    let allocated = |section: &object::read::elf::ElfSection32<'_, '_, Endianness>| matches!(section.flags(), SectionFlags::Elf { sh_flags } if sh_flags & 2 != 0);
-    let ends = file.sections().filter(allocated).map(|section| (section.address() + section.size()) as u32);
-    ram.end() - ends.filter(|end| ram.contains(end - 1, 1)).max().expect("statics in RAM")
-}
-
-/// No update of any kind uses more than 4 KiB of the stack: a pattern is written below them, and is
-/// unchanged at the end.
+/// No update of any kind uses more than 4 KiB of the stack.
 #[test]
 fn updates_take_4_kib_of_the_stack_at_most() {
     const MOST: u32 = 4096;
-    let size = stack(firmware::BOOTLOADER_SEALED);
-    let end = firmware::board().ram.end();
-    assert!(size >= 4 * MOST, "the stack has {size} bytes");
+    let stack = stack::of_image(firmware::BOOTLOADER_SEALED);
+    assert!(stack.size >= 4 * MOST, "the stack has {} bytes", stack.size);
     let mut bench = board_at(BitRate::K1000);
-    let pattern = vec![0xA5; (size - MOST) as usize];
-    bench.machine().write_ram(end - size, &pattern).expect("it is in RAM");
+    stack::fill(bench.machine(), stack);
     for (what, sealer) in kinds_one_by_one() {
         let file = sealer.seal(&code(20), &release()).expect("it can be sealed");
         assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK), "{what}");
     }
-    let mut found = vec![0; pattern.len()];
-    bench.machine().read_memory(end - size, &mut found).expect("it is in RAM");
-    let unused = found.iter().take_while(|byte| **byte == 0xA5).count();
-    println!("the stack has {size} bytes, of which at most {MOST} are used");
-    assert_eq!(unused, pattern.len(), "more than {MOST} bytes of the stack are used");
+    let depth = stack::depth(bench.machine(), stack);
+    println!("the stack has {} bytes, of which {depth} are used", stack.size);
+    assert!(depth <= MOST, "{depth} bytes of the stack are used");
 }
 
 /// Eight bytes of the key, plain or as HMAC uses them (RFC 2104: exclusive-or 36h and 5Ch), in the

@@ -317,7 +317,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let unsealer = &mut self.programmer.source_mut().unsealer;
         let news = unsealer.take_news();
         let is_same = matches!(news.outcome, Outcome::Installed { same: true, .. });
-        self.rights.update(news, unsealer.label());
+        self.rights.update(news, unsealer.edition());
         match event {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,

@@ -18,7 +18,7 @@ use crate::flash::Flash;
 use crate::keys::{floor, is_sealed, is_sound, Images, Linked, OfSealed};
 use crate::policy::{Policy, SealPolicy};
 use crate::store::{Key, Parameters, Value};
-use crate::unseal::{Label, News, Outcome, Request, Unsealer};
+use crate::unseal::{Edition, News, Outcome, Request, Unsealer};
 
 /// The most programs of a layout whose counters are told.
 const PROGRAMS: usize = 2;
@@ -203,9 +203,9 @@ impl<'b> Rights<'b> {
         Ok(())
     }
 
-    /// Takes note of what the unsealer has found out. Events are recorded with the `label` of the
+    /// Takes note of what the unsealer has found out. Events are recorded with the `edition` of the
     /// last image.
-    pub(super) fn update(&mut self, news: News, label: Label) {
+    pub(super) fn update(&mut self, news: News, edition: Edition) {
         let Some(access) = self.0.get_mut() else { return };
         if news.accepted {
             // The right is valid for one image.
@@ -222,7 +222,7 @@ impl<'b> Rights<'b> {
                 event::UNLOCKED | request.rights & 0xFFFF
             }
         };
-        access.log.record(event, label);
+        access.log.record(event, edition);
     }
 
     /// Returns the next value to store, once.
@@ -299,7 +299,7 @@ impl Log {
     /// he must neither wear out the flash nor push the other events out of the log. So a refusal
     /// that the log contains is not recorded again, and no further one if there are
     /// [`MOST_REFUSALS`], except a wrong signature, which is more likely to be an attack.
-    fn record(&mut self, what: u32, Label { counter, version }: Label) {
+    fn record(&mut self, what: u32, Edition { counter, version }: Edition) {
         let is_refusal = |what: u32| what >> 16 == event::REFUSED >> 16;
         if is_refusal(what) {
             let is_attack = what == event::REFUSED | u32::from(FlashError::Signature.code());

@@ -5,7 +5,7 @@ use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
 use super::{find, Downloader, Failure, Transfer};
-use crate::intake::{Destination, Intake, Progress};
+use crate::intake::{Destination, Intake, Findings};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
@@ -114,22 +114,22 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let mut to = Destination {
             judge,
             queue: &mut self.programmer.source_mut().queue,
-            progress: Progress::default(),
+            findings: Findings::default(),
         };
         let outcome = match data {
             Some(bytes) => intake.data(bytes, &mut to),
             None => intake.end(&mut to),
         };
-        let progress = to.progress;
+        let findings = to.findings;
         let streaming = intake.may_be_stream();
         let is_stream = intake.is_stream();
         match outcome {
             Ok(()) => {
-                self.proceed(program, is_stream, progress);
+                self.proceed(program, is_stream, findings);
                 Ok(program)
             }
             Err(refusal) => {
-                if progress.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
+                if findings.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
                     // Its pieces belong to a download that does not start.
                     self.programmer.source_mut().queue.clear();
                 }
@@ -144,9 +144,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     }
 
     /// Carries out the results of accepted bytes.
-    fn proceed(&mut self, program: u8, is_stream: bool, progress: Progress) {
+    fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let Some(state) = find(&mut self.programs, program) else { return };
-        if let Some(begin) = progress.begins {
+        if let Some(begin) = findings.begins {
             state.version = begin.version;
             let mut next = 1;
             let goes_on = P::RESUMES && state.partial.is_same(begin.partial);
@@ -161,14 +161,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 }
             } else {
                 let mut partial = if P::RESUMES { begin.partial } else { begin.partial.disowned() };
-                if goes_on && matches!(state.session, Session::Idle) && progress.sealed.is_none() {
+                if goes_on && matches!(state.session, Session::Idle) && findings.sealed.is_none() {
                     partial = state.partial;
                     next = ANY;
                 }
                 self.programmer.source_mut().queue.last = LastBlock::none(partial.start());
                 let erases = next == ANY || self.policy.erases(state.session);
                 self.programmer.open(program, state.region, erases, begin.size, partial);
-                if progress.sealed.is_some() {
+                if findings.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
                     self.programmer.disown();
                     self.programmer.source_mut().unsealer.begin(Place {
@@ -183,10 +183,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             state.session = Session::Open { next };
         }
-        if let (true, Session::Open { next }) = (progress.block, &mut state.session) {
+        if let (true, Session::Open { next }) = (findings.block, &mut state.session) {
             *next = self.programmer.source_mut().queue.last.next();
         }
-        if let Some(expected) = progress.complete {
+        if let Some(expected) = findings.complete {
             self.programmer.complete(expected);
             if is_stream {
                 state.streamed = true;

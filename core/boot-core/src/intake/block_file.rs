@@ -124,26 +124,26 @@ impl Format for BlockFile {
                 // A control block without a size is the same for too many programs.
                 let id = if size == 0 { 0 } else { self.crc };
                 let partial = Partial::begin(id, to.judge.region.base);
-                to.progress.begins = Some(Begin { size, version, partial });
+                to.findings.begins = Some(Begin { size, version, partial });
                 if let Some(linked) = to.judge.images.only_sealed() {
                     // The sequence begins again over what was processed, if it is that of the same file.
                     if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
                         return Err(Refusal::untimely(FlashError::Sequence));
                     }
-                    to.progress.begins = Some(Begin { size: 0, version: 0, partial });
-                    to.progress.sealed = Some(linked);
+                    to.findings.begins = Some(Begin { size: 0, version: 0, partial });
+                    to.findings.sealed = Some(linked);
                 }
             }
             NUMBER_LAST if to.judge.images.only_sealed().is_some() => {
                 // The manifest of the sealed image describes the program.
-                to.progress.complete = Some(Expected { size: 0, crc: None });
+                to.findings.complete = Some(Expected { size: 0, crc: None });
             }
             _ if to.judge.images.only_sealed().is_some() => {
                 if header.number == 1 && to.queue.open_word() != u32::from_le_bytes(MAGIC) {
                     return Err(Refusal::unfit(FlashError::NoAccess));
                 }
                 to.queue.commit_bytes();
-                to.progress.block = true;
+                to.findings.block = true;
             }
             NUMBER_LAST => {
                 let last = fields.and_then(Last::parse).ok_or(malformed)?;
@@ -153,13 +153,13 @@ impl Format for BlockFile {
                 if last.program_size > to.judge.region.size {
                     return Err(Refusal::unfit(FlashError::Address));
                 }
-                to.progress.complete =
+                to.findings.complete =
                     Some(Expected { size: last.program_size, crc: Some(last.program_crc) });
             }
             _ => {
                 judge_start(to)?;
                 to.queue.commit();
-                to.progress.block = true;
+                to.findings.block = true;
             }
         }
         Ok(())

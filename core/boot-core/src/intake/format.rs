@@ -45,12 +45,12 @@ pub(crate) struct Destination<'a, 'b> {
     /// The pieces.
     pub queue: &'a mut Queue<'b>,
     /// The results so far.
-    pub progress: Progress,
+    pub findings: Findings,
 }
 
 /// The results of the bytes of a transfer.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Progress {
+pub(crate) struct Findings {
     /// The download begins: the data so far are for this device.
     pub begins: Option<Begin>,
     /// A block of data joined the queue.

@@ -8,7 +8,7 @@
 //! | [`raw`] | an initial stack pointer; any bytes if the program is data |
 //!
 //! A format gets its bytes, the rules ([`Judge`]) and the queue for the pieces. It has no access to
-//! the flash. It reports its results in a [`Progress`]. To add a format, add a file with an
+//! the flash. It reports its results in a [`Findings`]. To add a format, add a file with an
 //! implementation of [`Format`] and a line in the list below.
 
 mod block_file;
@@ -24,10 +24,10 @@ use canopen::AbortCode;
 use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-pub(crate) use format::{Destination, Format, Progress, Recognition};
+pub(crate) use format::{Destination, Format, Findings, Recognition};
 
 formats! {
-    Sealed(sealed::Sealed),
+    Sealed(sealed::SealedImage),
     BlockFile(block_file::BlockFile),
     IntelHex(ihex::IntelHex),
     Raw(raw::Raw),

@@ -13,9 +13,9 @@ use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
 
-pub(super) struct Sealed(Linked);
+pub(super) struct SealedImage(Linked);
 
-impl Format for Sealed {
+impl Format for SealedImage {
     const IS_STREAM: bool = true;
 
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {
@@ -37,16 +37,16 @@ impl Format for Sealed {
             return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
         }
         if !to.judge.has_begun() {
-            to.progress.begins =
+            to.findings.begins =
                 Some(Begin { size: 0, version: 0, partial: Partial::begin(0, to.judge.region.base) });
-            to.progress.sealed = Some(self.0);
+            to.findings.sealed = Some(self.0);
         }
         Ok(())
     }
 
     fn end(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
         // The manifest describes the program.
-        to.progress.complete = Some(Expected { size: 0, crc: None });
+        to.findings.complete = Some(Expected { size: 0, crc: None });
         Ok(())
     }
 }

@@ -93,15 +93,15 @@ impl Stream {
             return Err(Refusal::unfit(FlashError::Format));
         }
         self.close(to)?;
-        to.progress.complete = Some(Expected { size, crc: None });
+        to.findings.complete = Some(Expected { size, crc: None });
         Ok(())
     }
 
     fn close(&mut self, to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
-        if to.queue.open_size() > 0 && !to.judge.has_begun() && to.progress.begins.is_none() {
+        if to.queue.open_size() > 0 && !to.judge.has_begun() && to.findings.begins.is_none() {
             judge_start(to)?;
             let partial = Partial::begin(0, to.judge.region.base);
-            to.progress.begins = Some(Begin { size: self.size, version: 0, partial });
+            to.findings.begins = Some(Begin { size: self.size, version: 0, partial });
         }
         to.queue.commit();
         Ok(())

@@ -17,7 +17,7 @@ const STEP: usize = 1024;
 
 /// The device's decision about an image.
 #[derive(Clone, Copy)]
-pub(super) struct Verdict {
+pub(super) struct Acceptance {
     /// `Some`: the same image is already installed, with this record; the new one is checked and
     /// discarded.
     pub same: Option<Value>,
@@ -27,7 +27,7 @@ pub(super) struct Verdict {
 
 /// The image after its head.
 pub(super) struct Content {
-    verdict: Verdict,
+    acceptance: Acceptance,
     chain: Chain,
     phase: Phase,
 }
@@ -88,7 +88,7 @@ struct Payload {
 
 impl Content {
     pub(super) fn new(
-        verdict: Verdict,
+        acceptance: Acceptance,
         key: [u8; 32],
         dictionary: Option<Region>,
         buffers: &mut Buffers,
@@ -107,11 +107,11 @@ impl Content {
             Some(_) => Phase::Dictionary(Hashing { done: 0 }),
             None => chain.next_chunk(head, 0),
         };
-        Self { verdict, chain, phase }
+        Self { acceptance, chain, phase }
     }
 
-    pub(super) const fn verdict(&self) -> Verdict {
-        self.verdict
+    pub(super) const fn acceptance(&self) -> Acceptance {
+        self.acceptance
     }
 
     /// Whether there is nothing to do before more bytes arrive.
@@ -170,7 +170,7 @@ impl Content {
                     return Err(Fault::Signature);
                 }
                 chain.next.copy_from_slice(&buffers.bytes[CARRY..PAYLOAD]);
-                if self.verdict.same.is_none() {
+                if self.acceptance.same.is_none() {
                     self.phase = Phase::Payload(Payload::new(arrival, &mut buffers.bytes));
                     return Ok(false);
                 }

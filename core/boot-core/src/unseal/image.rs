@@ -8,7 +8,7 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use super::buffers::{start, Buffers};
-use super::content::{Content, Verdict};
+use super::content::{Content, Acceptance};
 use crate::flash::Flash;
 use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
@@ -49,7 +49,7 @@ enum Stage {
 
 /// An image that the flash contains.
 struct Installed {
-    verdict: Verdict,
+    acceptance: Acceptance,
     /// The new counter is not stored yet.
     raises: bool,
 }
@@ -68,7 +68,7 @@ pub(crate) enum Progress {
 /// An image that is for this device, if its signatures are good.
 #[derive(Clone, Copy)]
 struct Judged {
-    verdict: Verdict,
+    acceptance: Acceptance,
     /// For an encrypted image: the offset of the key-encryption key in the key block, and the
     /// offset of the recipient's record in the manifest.
     recipient: Option<(usize, usize)>,
@@ -89,14 +89,14 @@ impl Image {
             Stage::Head { .. } => Progress::Waits,
             Stage::Content(content) if content.waits() => Progress::Waits,
             Stage::Certificate(_) | Stage::Manifest(_) | Stage::Content(_) => Progress::Works,
-            Stage::Installed(installed) => Progress::Installed { same: installed.verdict.same },
+            Stage::Installed(installed) => Progress::Installed { same: installed.acceptance.same },
         }
     }
 
     /// Returns the new counter of an installed image, once.
     pub(super) fn take_counter(&mut self) -> Option<Value> {
-        let Stage::Installed(Installed { verdict, raises }) = &mut self.stage else { return None };
-        core::mem::take(raises).then_some(verdict.counter)
+        let Stage::Installed(Installed { acceptance, raises }) = &mut self.stage else { return None };
+        core::mem::take(raises).then_some(acceptance.counter)
     }
 
     /// The next bytes for the flash.
@@ -157,11 +157,11 @@ impl Image {
                 let key = judged.key(self.place.layout, buffers, flash)?;
                 *accepted = true;
                 let dictionary = self.place.dictionary(buffers, flash, parameters)?;
-                self.stage = Stage::Content(Content::new(judged.verdict, key, dictionary, buffers));
+                self.stage = Stage::Content(Content::new(judged.acceptance, key, dictionary, buffers));
             }
             Stage::Content(content) => {
                 if content.advance(self.place.region, buffers, flash, queue)? {
-                    self.stage = Stage::Installed(Installed { verdict: content.verdict(), raises: true });
+                    self.stage = Stage::Installed(Installed { acceptance: content.acceptance(), raises: true });
                 }
             }
             Stage::Installed(_) => {}
@@ -217,8 +217,8 @@ impl Place {
         };
         let same = record.filter(is_same).map(|record| record.value());
         let floor = if policy.counter_with_confirmation { counter } else { head.counter() };
-        let verdict = Verdict { same, counter: [floor, needs.epoch, head.counter(), 0] };
-        let judged = Judged { verdict, recipient: needs.recipient };
+        let acceptance = Acceptance { same, counter: [floor, needs.epoch, head.counter(), 0] };
+        let judged = Judged { acceptance, recipient: needs.recipient };
         let root = &keys[needs.root + 4..][..32];
         let root = root.try_into().map_err(|_| Fault::Key)?;
         match head.certificate() {

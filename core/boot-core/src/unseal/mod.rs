@@ -22,4 +22,4 @@ mod image;
 mod unsealer;
 
 pub(crate) use image::{proved, Place, Progress};
-pub(crate) use unsealer::{Label, News, Outcome, Request, Unsealer, Workshop};
+pub(crate) use unsealer::{Edition, News, Outcome, Request, Unsealer, Workshop};

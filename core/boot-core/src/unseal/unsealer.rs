@@ -70,7 +70,7 @@ pub(crate) enum Outcome {
 
 /// Security counter and version of an image.
 #[derive(Clone, Copy)]
-pub(crate) struct Label {
+pub(crate) struct Edition {
     pub counter: u32,
     pub version: u32,
 }
@@ -217,8 +217,8 @@ impl<'b> Unsealer<'b> {
     }
 
     /// Security counter and version of the last image.
-    pub(crate) fn label(&self) -> Label {
-        self.head().map_or(Label { counter: 0, version: 0 }, |head| Label {
+    pub(crate) fn edition(&self) -> Edition {
+        self.head().map_or(Edition { counter: 0, version: 0 }, |head| Edition {
             counter: head.counter(),
             version: head.version(),
         })
