@@ -8,7 +8,7 @@
 use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances};
-use boot_core::program::{verify, VerifiedProgram};
+use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
@@ -77,105 +77,81 @@ pub unsafe extern "C" fn stage() -> ! {
 
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
-    let chip = Chip { rcc, iwdg, flash, caches };
     let decide = |circumstances: &Circumstances| {
-        decide(circumstances, &DECISION, |number| {
-            verify(&chip.flash, &parameters, LAYOUT, PRODUCT.crc, number)
-        })
+        decide(circumstances, &DECISION, |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number))
     };
-    let info = |program: u8, trial| BootInfo {
+    let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
+    let mut decision = decide(&circumstances);
+    if !matches!(decision, BootDecision::Start { .. }) {
+        // SAFETY: only the stack uses the RAM.
+        match unsafe { ram_image::load(&flash) } {
+            Ok(vectors) => {
+                let report = BootReport {
+                    crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
+                    node_id,
+                    bit_rate: node.bit_rate as u8,
+                    ..boot_report(&decision, request, reset_cause)
+                };
+                drop(caches);
+                // The image changes the clock. The CRC unit keeps its clock, for the services.
+                // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
+                // image. Since the reset no interrupt was enabled and no bus master started.
+                unsafe {
+                    (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
+                    vectors.jump()
+                }
+            }
+            Err(damage) => cell.put(BootRequest::Damaged(damage)),
+        }
+        // There is no bootloader to stay in, neither for the entry strap nor for a rescue window: the
+        // program with autostart is resumed at once, or the next that may start.
+        circumstances.strap = false;
+        for turn in 1..=PROGRAMS {
+            let number = fallback(PRODUCT.autostart, PROGRAMS, turn);
+            circumstances.request = Some(BootRequest::Resume(number));
+            if PRODUCT.profile.download.data != Some(number) {
+                decision = decide(&circumstances);
+            }
+            if matches!(decision, BootDecision::Start { .. }) {
+                break;
+            }
+        }
+    }
+
+    let has_watchdog = flash.starts_watchdog();
+    drop(caches);
+    flash.release(&rcc);
+    bsp::low_power::release(&rcc);
+    bsp::slow_down(&rcc);
+    let BootDecision::Start { program, trial } = decision else {
+        // One pass of the loop takes three cycles.
+        cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
+        SCB::sys_reset()
+    };
+    let handoff = Handoff::new(&BootInfo {
         node_id,
         bit_rate: node.bit_rate.or_zero(),
-        program,
+        program: program.number(),
         reset_cause,
         trial,
         fresh: matches!(request, Some(BootRequest::Fresh(_))),
         bootloader_version: product::VERSION,
         serial_number: bsp::serial_number(),
-    };
-
-    let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
-    let decision = decide(&circumstances);
-    if let BootDecision::Start { program, trial } = decision {
-        // SAFETY: nothing else runs, no interrupt was enabled, and no bus master started.
-        unsafe { chip.start(program, &info(program.number(), trial)) }
+    });
+    if SEALED && program.locks_flash() {
+        // SAFETY: only this code runs, and it writes the flash no more.
+        unsafe { crate::flash_lock::lock_flash() };
     }
-    // SAFETY: only the stack uses the RAM.
-    match unsafe { ram_image::load(&chip.flash) } {
-        Ok(vectors) => {
-            let report = BootReport {
-                crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
-                node_id,
-                bit_rate: node.bit_rate as u8,
-                ..boot_report(&decision, request, reset_cause)
-            };
-            drop(chip.caches);
-            // The image changes the clock. The CRC unit keeps its clock, for the services.
-            // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
-            // image. Since the reset no interrupt was enabled and no bus master started.
-            unsafe {
-                (LAYOUT.handoff.base as *mut Words).write_volatile(report.words());
-                vectors.jump()
-            }
-        }
-        Err(damage) => cell.put(BootRequest::Damaged(damage)),
+    if let Some(ms) = PRODUCT.program_watchdog_ms {
+        bsp::watchdog::start(&iwdg, ms);
+    } else if has_watchdog {
+        bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
     }
-    // There is no bootloader to stay in: neither for the entry strap nor for a rescue window. The program
-    // with autostart is resumed at once, or the next that may start.
-    circumstances.strap = false;
-    for turn in 1..=PROGRAMS {
-        let number = fallback(PRODUCT.autostart, PROGRAMS, turn);
-        if PRODUCT.profile.download.data == Some(number) {
-            continue;
-        }
-        circumstances.request = Some(BootRequest::Resume(number));
-        if let BootDecision::Start { program, trial } = decide(&circumstances) {
-            // SAFETY: as above.
-            unsafe { chip.start(program, &info(program.number(), trial)) }
-        }
-    }
-    bsp::slow_down(&chip.rcc);
-    // One pass of the loop takes three cycles.
-    cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
-    SCB::sys_reset()
-}
-
-/// The parts of the chip that the boot stage has changed.
-struct Chip {
-    rcc: pac::RCC,
-    iwdg: pac::IWDG,
-    flash: ResidentFlash,
-    caches: Caches,
-}
-
-impl Chip {
-    /// Puts the chip back into its reset state, and starts a program.
-    ///
-    /// # Safety
-    /// Nothing else may run; no interrupt may be enabled, and no bus master may have been started.
-    unsafe fn start(self, program: VerifiedProgram, info: &BootInfo) -> ! {
-        let Self { rcc, iwdg, flash, caches } = self;
-        let has_watchdog = flash.starts_watchdog();
-        drop(caches);
-        flash.release(&rcc);
-        bsp::low_power::release(&rcc);
-        bsp::slow_down(&rcc);
-        let handoff = Handoff::new(info);
-        if SEALED && program.locks_flash() {
-            // SAFETY: only this code runs, and it writes the flash no more.
-            unsafe { crate::flash_lock::lock_flash() };
-        }
-        if let Some(ms) = PRODUCT.program_watchdog_ms {
-            bsp::watchdog::start(&iwdg, ms);
-        } else if has_watchdog {
-            bsp::watchdog::rescale(&iwdg, bsp::watchdog::AFTER_RESET);
-        }
-        // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. The
-        // caller guarantees the rest.
-        unsafe {
-            handoff.write(LAYOUT.handoff.base as *mut Handoff);
-            program.vectors().jump()
-        }
+    // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image. Since the
+    // reset no interrupt was enabled and no bus master started.
+    unsafe {
+        handoff.write(LAYOUT.handoff.base as *mut Handoff);
+        program.vectors().jump()
     }
 }
 

@@ -63,6 +63,7 @@ pub const LATER: &[Later] = &[
     later("foreign", "ui::", Tier::Ci, "Chromium"),
     later("port", "matrix::", Tier::Ci, TWO),
     later("port", "porting::", Tier::All, "builds a copy of the repository"),
+    later("coboot-emulator/it", "emulate::gdb_stops_steps_looks_and_changes", Tier::Ci, "gdb"),
     later("coboot-zencan/zencan", "", Tier::Ci, OTHERS),
     later("xtask", "", Tier::Ci, "the repository and its pages, not the product"),
     later("xtask/hil", "", Tier::All, "builds and flashes for 4 minutes"),
