@@ -329,7 +329,7 @@ fn ci(summary: &mut Summary) -> Outcome {
 
 /// The tests that take minutes.
 fn slow(summary: &mut Summary) -> Outcome {
-    build_images(Tier::Ci)?;
+    build_images(Tier::All)?;
     examples::all()?;
     runner::run(later(Tier::All, summary)?, summary);
     Ok(())

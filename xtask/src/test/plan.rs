@@ -35,6 +35,8 @@ const fn later(program: &'static str, tests: &'static str, tier: Tier, why: &'st
 
 /// The reason of tests on a board whose images `cargo xtask test` does not build.
 const TWO: &str = "images of the board with two programs";
+/// The same where it takes all of them.
+const ALL_OF_TWO: &str = "all images of the board with two programs";
 /// The reason of a second client of others.
 const OTHERS: &str = "one more client of others";
 
@@ -42,7 +44,7 @@ const OTHERS: &str = "one more client of others";
 pub const LATER: &[Later] = &[
     later("coboot-kit/abi", "header::it_compiles_for_the_chip", Tier::Ci, "arm-none-eabi-gcc"),
     later("device", "application::", Tier::Ci, "builds an application anew, 2 minutes"),
-    later("device", "c_application::the_other_program", Tier::Ci, TWO),
+    later("device", "c_application::the_other_program", Tier::All, ALL_OF_TWO),
     later("device", "image::gdb_loads_it", Tier::Ci, "gdb"),
     later("device", "silicon::each_scenario_works_with_the_chips", Tier::Ci, "more chips than the worst one"),
     later("update", "attacker::", Tier::All, "the standing attacker on boards, 2 minutes"),
@@ -69,7 +71,7 @@ pub const LATER: &[Later] = &[
     later("foreign", "peers::", Tier::Ci, OTHERS),
     later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
     later("foreign", "ui::", Tier::Ci, "Chromium"),
-    later("port", "matrix::", Tier::Ci, TWO),
+    later("port", "matrix::", Tier::All, ALL_OF_TWO),
     later("port", "porting::", Tier::All, "builds a copy of the repository"),
     later("coboot-emulator/it", "emulate::gdb_stops_steps_looks_and_changes", Tier::Ci, "gdb"),
     later("coboot-zencan/zencan", "", Tier::Ci, OTHERS),
@@ -99,6 +101,10 @@ pub struct Images {
 /// The images for a board of another chip.
 const OF_A_CHIP: &[&str] = &["bootloader", "bootloader-paulus", "bootloader-watchdog", "app-v1", "app-v2"];
 
+/// The images for the board with two programs.
+const OF_TWO_PROGRAMS: &[&str] =
+    &["bootloader", "bootloader-lift", "app-v1", "app-v2", "app-program-2", "app-lift", "app-lift-v2"];
+
 /// The images by tier.
 pub const IMAGES: &[Images] = &[
     Images { tier: Tier::Product, board: &stm32f407g_disc1::LAYOUT, names: &[] },
@@ -107,9 +113,10 @@ pub const IMAGES: &[Images] = &[
         board: &stm32f407g_disc1_can2::LAYOUT,
         names: &["bootloader", "app-v1", "app-v2"],
     },
-    Images { tier: Tier::Ci, board: &stm32f407g_disc1_two::LAYOUT, names: &[] },
+    Images { tier: Tier::Ci, board: &stm32f407g_disc1_two::LAYOUT, names: OF_TWO_PROGRAMS },
     Images { tier: Tier::Ci, board: &nucleo_f446re::LAYOUT, names: OF_A_CHIP },
     Images { tier: Tier::Ci, board: &stm32f429i_disc1::LAYOUT, names: OF_A_CHIP },
+    Images { tier: Tier::All, board: &stm32f407g_disc1_two::LAYOUT, names: &[] },
 ];
 
 /// Tests that run for a board of each chip in [`Tier::Ci`]: they show the mistakes that a port can
