@@ -94,8 +94,7 @@ impl<I: Controller> Port<I> {
     pub fn new(controller: I, clock: Source) -> Self {
         let mut modes = Modes::of(&controller);
         modes.initialise();
-        // It finds the controller in initialisation, and from there it sleeps without a look at the bus.
-        let can = Can::builder(controller).leave_disabled();
+        let can = Modes::driver(controller);
         let (waiting, lost) = (None, Lost::default());
         let mut port =
             Self { can, modes, clock, listens: false, waiting, heartbeat_waits: false, boot_up: false, lost };

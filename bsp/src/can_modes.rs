@@ -1,12 +1,12 @@
 //! The operating modes of bxCAN, register by register (RM0090 section 32.4). `bxcan` waits without a bound
 //! for a controller that does not follow, and goes from one mode to another through sleep, where status
 //! bits stand still. Here each wait is bounded, and the order is that of the drivers in the field:
-//! initialisation, bit timing, normal mode. What is left of `bxcan`'s waits is its start, from initialisation to
-//! sleep, which needs no bus.
+//! initialisation, bit timing, normal mode.
 
 use core::marker::PhantomData;
+use core::mem::{transmute_copy, ManuallyDrop};
 
-use bxcan::Instance;
+use bxcan::{Can, Instance};
 use shared_abi::bit_timing::BitTiming;
 
 /// The controller's mode on the bus.
@@ -57,6 +57,15 @@ impl<I: Instance> Modes<I> {
     /// Those of this controller, which has its clock. It exists once, and who has it has this, too.
     pub fn of(_: &I) -> Self {
         Self(PhantomData)
+    }
+
+    /// `bxcan`'s driver of this controller, which keeps its mode: the constructors of `bxcan` wait without a
+    /// bound, at first for initialisation and then for sleep.
+    pub fn driver(controller: I) -> Can<I> {
+        const { assert!(size_of::<Can<I>>() == size_of::<I>(), "bxcan: a driver is more than its controller") };
+        // SAFETY: the controller is the only field of bxcan's `Can`, which has its size, so it is at the
+        // beginning. It moves: nothing drops the original.
+        unsafe { transmute_copy(&ManuallyDrop::new(controller)) }
     }
 
     /// Enters initialisation (section 32.4.1). Returns false if the controller did not follow and was
@@ -114,5 +123,33 @@ impl<I: Instance> Modes<I> {
     pub fn write(&mut self, offset: usize, value: u32) {
         // SAFETY: as above; section 32.9.2 allows the values in these modes, and they are not addresses.
         unsafe { I::REGISTERS.cast::<u32>().byte_add(offset).write_volatile(value) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use bxcan::RegisterBlock;
+
+    use super::*;
+
+    /// The words of the registers, up to the filters (RM0090 section 32.9.5).
+    static mut REGISTERS: [u32; 0x200 / 4] = [0; _];
+
+    /// A controller that enters initialisation and never sleeps.
+    #[derive(Debug, PartialEq)]
+    struct Restless(u64);
+
+    // SAFETY: only one test has this controller. The registers beyond these words are those of the filters,
+    // which it does not use.
+    unsafe impl Instance for Restless {
+        const REGISTERS: *mut RegisterBlock = &raw mut REGISTERS as *mut RegisterBlock;
+    }
+
+    #[test]
+    fn a_controller_that_never_sleeps_gets_its_driver() {
+        let mut modes = Modes::of(&Restless(7));
+        modes.write(MSR, INAK);
+        assert!(modes.initialise());
+        assert_eq!(Modes::driver(Restless(7)).free(), Restless(7));
     }
 }
