@@ -9,7 +9,7 @@ use crate::can_controllers::Take;
 use crate::facts::{
     self, CanController, Facts, Pull, Strap, CAN_CLOCK, CLOCK_TREE, ENTRY_STRAP, FACTS, LAYOUT, SYSCLK,
 };
-use crate::pll::raise_voltage;
+use crate::pll::{raise_voltage, start_crystal};
 
 /// The LED that blinks while the device works.
 pub type Led = Pin<{ FACTS.led.0 }, { FACTS.led.1 }, Output>;
@@ -90,13 +90,17 @@ fn reset_ports(rcc: &mut Rcc) {
     rcc.ahb1rstr().modify(|r, w| unsafe { w.bits(r.bits() & !PORTS) });
 }
 
-/// The clocks in the HAL's types, for the HAL's drivers. The clocks must be in their reset state.
+/// The clocks in the HAL's types, for the HAL's drivers. The clocks must be in their reset state. `None` if the
+/// crystal does not start, for which the HAL would wait without a bound.
 #[must_use]
-pub fn clocks(rcc: pac::RCC) -> Rcc {
+pub fn clocks(rcc: pac::RCC) -> Option<Rcc> {
+    if !start_crystal(&rcc) {
+        return None;
+    }
     raise_voltage(&rcc);
     let hse = Config::hse(CLOCK_TREE.hse.Hz());
     let hse = if CLOCK_TREE.hse_bypass { hse.bypass_hse_oscillator() } else { hse };
-    rcc.freeze(hse.sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz()))
+    Some(rcc.freeze(hse.sysclk(SYSCLK.Hz()).pclk1(CAN_CLOCK.Hz())))
 }
 
 /// Whether the entry strap ([`ENTRY_STRAP`]) asks for the bootloader; always false on a board

@@ -41,12 +41,7 @@ impl Source {
         let tree = self.tree();
         let mut bit = 0;
         if self == Self::Crystal {
-            // The bypass can be selected only while the oscillator is off (section 7.3.1).
-            if tree.hse_bypass {
-                set(rcc, HSEBYP);
-            }
-            set(rcc, HSEON);
-            if !reaches(rcc.cr().as_ptr(), HSERDY, HSERDY) {
+            if !start_crystal(rcc) {
                 return Self::Internal.speed_up(rcc);
             }
             bit = PLLSRC_HSE;
@@ -77,6 +72,16 @@ impl Source {
         wait(rcc.cfgr().as_ptr(), SWS, SWS_PLL);
         self
     }
+}
+
+/// Switches the crystal on. Returns whether it runs before it is given up.
+pub(crate) fn start_crystal(rcc: &pac::RCC) -> bool {
+    // The bypass can be selected only while the oscillator is off (section 7.3.1).
+    if CLOCK_TREE.hse_bypass {
+        set(rcc, HSEBYP);
+    }
+    set(rcc, HSEON);
+    reaches(rcc.cr().as_ptr(), HSERDY, HSERDY)
 }
 
 /// Restores the clocks of the reset state.

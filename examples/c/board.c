@@ -3,8 +3,7 @@
 #include BOARD
 #include "registers.h"
 
-#define HSI_HZ UINT32_C(16000000)
-/* Number of checks whether the crystal runs: some 100 ms. */
+/* Number of checks whether the crystal runs, and whether the core runs from it: some 100 ms. */
 #define PATIENCE 200000
 
 static volatile uint32_t now_ms;
@@ -17,20 +16,28 @@ void tick(void)
     now_ms++;
 }
 
-/* Runs the core from the crystal, or from HSI if the crystal does not start. */
-static uint32_t start_clock(void)
+static void reset_unless(volatile uint32_t *from, uint32_t mask, uint32_t value)
+{
+    for (uint32_t i = 0; i < PATIENCE; i++) {
+        if ((*from & mask) == value) {
+            return;
+        }
+    }
+    SCB_AIRCR = SCB_AIRCR_RESET;
+    for (;;) {
+    }
+}
+
+/* Runs the core from the crystal. If it does not start, the chip is reset: HSI is not exact enough for
+ * CAN. After three such resets the bootloader keeps the device, and it can be reached.
+ */
+static void start_clock(void)
 {
     RCC_CR |= HSE_BYPASS ? RCC_CR_HSEBYP : 0;
     RCC_CR |= RCC_CR_HSEON;
-    for (uint32_t i = 0; i < PATIENCE; i++) {
-        if ((RCC_CR & RCC_CR_HSERDY) != 0) {
-            RCC_CFGR = RCC_CFGR_SW_HSE;
-            while ((RCC_CFGR & RCC_CFGR_SWS) != RCC_CFGR_SWS_HSE) {
-            }
-            return HSE_HZ;
-        }
-    }
-    return HSI_HZ;
+    reset_unless(&RCC_CR, RCC_CR_HSERDY, RCC_CR_HSERDY);
+    RCC_CFGR = RCC_CFGR_SW_HSE;
+    reset_unless(&RCC_CFGR, RCC_CFGR_SWS, RCC_CFGR_SWS_HSE);
 }
 
 static void set_up_pin(char port, unsigned pin, uint32_t mode, uint32_t alternate)
@@ -44,15 +51,14 @@ static void set_up_pin(char port, unsigned pin, uint32_t mode, uint32_t alternat
 
 uint32_t board_start(void)
 {
-    const uint32_t clock = start_clock();
-
+    start_clock();
     set_up_pin(CAN_PORT, CAN_RX_PIN, GPIO_MODE_ALTERNATE, GPIO_ALTERNATE_CAN1);
     set_up_pin(CAN_PORT, CAN_TX_PIN, GPIO_MODE_ALTERNATE, GPIO_ALTERNATE_CAN1);
     set_up_pin(LED_PORT, LED_PIN, GPIO_MODE_OUTPUT, 0);
-    SYST_RVR = clock / 1000 - 1;
+    SYST_RVR = HSE_HZ / 1000 - 1;
     SYST_CVR = 0;
     SYST_CSR = SYST_CSR_ENABLE_INTERRUPT_CORE;
-    return clock;
+    return HSE_HZ;
 }
 
 uint32_t board_now_ms(void)

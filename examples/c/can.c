@@ -105,7 +105,8 @@ bool can_receive(struct can_frame *frame)
         frame->data[i] = (uint8_t)(words[i / 4] >> 8 * (i % 4));
     }
     CAN_RF0R = CAN_RF0R_RFOM0;
-    while ((CAN_RF0R & CAN_RF0R_RFOM0) != 0) {
+    /* The controller clears the bit (section 32.9.2). If it never does, the frame is taken again. */
+    for (uint32_t patience = CAN_PATIENCE; (CAN_RF0R & CAN_RF0R_RFOM0) != 0 && patience > 0; patience--) {
     }
     return true;
 }

@@ -3,7 +3,7 @@
 
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
-use coboot_tests::firmware;
+use coboot_tests::{dead_crystal, firmware};
 use coflash::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
@@ -80,11 +80,24 @@ fn a_request_that_is_not_heard_does_not_keep_a_device_from_its_program() {
     bench.world.add_host_port(BIT_RATE);
     bench.machine().load_bin(firmware::board().chip.flash.base, &cells).unwrap();
     bench.power_on();
-    for _ in 0..20 {
+    // The program gives up its crystal after some 50 ms.
+    let mut runs = false;
+    for _ in 0..30 {
         bench.run_ms(20);
         bench.post(REQUEST, &READ_1000);
+        runs |= firmware::board().programs[0].contains(bench.machine().pc(), 2);
     }
-    assert!(firmware::board().programs[0].contains(bench.machine().pc(), 2), "the program runs");
+    assert!(runs, "the program is started");
+}
+
+#[test]
+fn the_template_leaves_for_the_bootloader_when_its_crystal_fails() {
+    dead_crystal::brings_the_bootloader(&firmware::blocks(firmware::APP_V1));
+}
+
+#[test]
+fn the_application_in_c_leaves_for_the_bootloader_when_its_crystal_fails() {
+    dead_crystal::brings_the_bootloader(&firmware::blocks(firmware::APP_C));
 }
 
 /// Nobody acknowledges the host: its frames are good only when it is error passive (ISO 11898-1).

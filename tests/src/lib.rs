@@ -3,6 +3,7 @@
 pub mod attacker;
 pub mod bench;
 pub mod call_back;
+pub mod dead_crystal;
 pub mod eds;
 pub mod endpoint;
 pub mod firmware;

@@ -95,7 +95,9 @@ mod app {
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let mut rcc = bsp::clocks(cx.device.RCC);
+        // The internal oscillator is not exact enough for CAN. After three such resets the bootloader keeps the
+        // device, and it can be reached.
+        let Some(mut rcc) = bsp::clocks(cx.device.RCC) else { cortex_m::peripheral::SCB::sys_reset() };
         let board = bsp::init(&mut rcc, cx.device.CAN1);
         #[cfg(not(feature = "virtual-can"))]
         let can = CanPort::new(board.can, Source::Crystal);
