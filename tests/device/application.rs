@@ -9,7 +9,7 @@ use std::process::Command;
 use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::firmware;
+use coboot_tests::{dead_crystal, firmware};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::file::label::label_of;
@@ -160,12 +160,18 @@ fn a_trial_confirms_itself_when_its_master_has_started_it() {
     }
 }
 
+#[test]
+fn it_leaves_for_the_bootloader_when_its_crystal_fails() {
+    let Some(elf) = built() else { return };
+    dead_crystal::brings_the_bootloader(&blocks(&elf));
+}
+
 const LABEL: &str = "coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);";
 /// The first statement of the program.
-const FIRST: &str = "    let mut rcc = ";
+const FIRST: &str = "    if !start_crystal(";
 /// It sets VTOR to the vectors of the bootloader, like the start-up code for a program at the start
 /// of the flash.
-const WRONG_VTOR: &str = "    unsafe { (*SCB::PTR).vtor.write(0x0800_0000) };\n    let mut rcc = ";
+const WRONG_VTOR: &str = "    unsafe { (*SCB::PTR).vtor.write(0x0800_0000) };\n    if !start_crystal(";
 
 /// The device accepts the program, because it does not name its target.
 #[test]

@@ -9,7 +9,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
-use coboot_tests::{call_back, firmware};
+use coboot_tests::{call_back, dead_crystal, firmware};
 use coflash::update::{flash, FlashOptions};
 use coflash::Error;
 use shared_abi::label::{self, Label};
@@ -122,6 +122,15 @@ fn install_and_update(versions: [&str; 2]) {
 fn each_can_be_called_back_at_every_bit_rate() {
     if is_board_of_examples() {
         EXAMPLES.concat().into_iter().for_each(|name| call_back::at_every_bit_rate(name, |_, _| {}));
+    }
+}
+
+/// The one on Embassy waits for its crystal without a bound, in the start of embassy-stm32.
+#[test]
+fn each_leaves_for_the_bootloader_when_its_crystal_fails() {
+    if is_board_of_examples() {
+        let without_embassy = EXAMPLES.into_iter().filter(|[name, _]| *name != "example-embassy.elf");
+        without_embassy.for_each(|[name, _]| dead_crystal::brings_the_bootloader(&firmware::blocks(name)));
     }
 }
 

@@ -16,7 +16,7 @@ use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{entry, exception, ExceptionFrame};
 use stm32f4xx_hal::can::CanExt;
-use stm32f4xx_hal::pac::{CorePeripherals, Peripherals};
+use stm32f4xx_hal::pac::{CorePeripherals, Peripherals, RCC};
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::rcc::Config;
 
@@ -26,6 +26,9 @@ use identity::{NAME, PRODUCT_CODE, REVISION, VENDOR_ID};
 
 /// Which version of the program this is: the last number of its label.
 const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
+
+/// Number of checks whether the crystal runs: some 100 ms at 16 MHz.
+const PATIENCE: u32 = 200_000;
 
 /// Where everything is on this board: `build.rs` names it.
 static LAYOUT: Layout = coboot_app::layout!();
@@ -39,6 +42,11 @@ fn main() -> ! {
     let (Some(core), Some(chip)) = (CorePeripherals::take(), Peripherals::take()) else {
         SCB::sys_reset();
     };
+    if !start_crystal(&chip.RCC) {
+        // The internal oscillator is not exact enough for CAN. After three such resets the bootloader keeps the
+        // device, and it can be reached.
+        SCB::sys_reset();
+    }
     let mut rcc = chip.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
     let can_clock = rcc.clocks.pclk1().raw();
     let mut systick = core.SYST;
@@ -110,6 +118,13 @@ fn main() -> ! {
         // Until the next millisecond.
         cortex_m::asm::wfi();
     }
+}
+
+/// Switches the crystal on. Returns whether it runs in time; the HAL would wait for it without a bound. With a
+/// clock on OSC_IN, set HSEBYP first.
+fn start_crystal(rcc: &RCC) -> bool {
+    rcc.cr().modify(|_, w| w.hseon().set_bit());
+    (0..PATIENCE).any(|_| rcc.cr().read().hserdy().bit_is_set())
 }
 
 /// A filter for data frames with this identifier of 11 bits.

@@ -17,7 +17,7 @@ use coboot_app::{Bootloader, Next, ReentryPath};
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{exception, ExceptionFrame};
 use rtic_monotonics::systick::prelude::*;
-use stm32f4xx_hal::pac::CAN1;
+use stm32f4xx_hal::pac::{CAN1, RCC};
 
 use crate::objects::Objects;
 use crate::stack::{Event, Node};
@@ -30,6 +30,8 @@ const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
 const HEARTBEAT_MS: u32 = 500;
 /// How often the protocol looks at the clock, in ms.
 const TICK_MS: u32 = 2;
+/// Number of checks whether the crystal runs: some 100 ms at 16 MHz.
+const PATIENCE: u32 = 200_000;
 
 /// Where everything is on this board: `build.rs` names it.
 static LAYOUT: Layout = coboot_app::layout!();
@@ -63,6 +65,11 @@ mod app {
 
     #[init]
     fn init(cx: init::Context) -> (Shared, Local) {
+        if !start_crystal(&cx.device.RCC) {
+            // The internal oscillator is not exact enough for CAN. After three such resets the bootloader keeps
+            // the device, and it can be reached.
+            SCB::sys_reset();
+        }
         let mut rcc = cx.device.RCC.freeze(Config::hse(8.MHz()).sysclk(168.MHz()));
         // Its counter holds anything after a reset: the first tick could be a tenth of a second late.
         let mut systick = cx.core.SYST;
@@ -173,6 +180,13 @@ impl Bus {
         // identifier.
         let _ = self.can.transmit(&Frame::new_data(id, data));
     }
+}
+
+/// Switches the crystal on. Returns whether it runs in time; the HAL would wait for it without a bound. With a
+/// clock on OSC_IN, set HSEBYP first.
+fn start_crystal(rcc: &RCC) -> bool {
+    rcc.cr().modify(|_, w| w.hseon().set_bit());
+    (0..PATIENCE).any(|_| rcc.cr().read().hserdy().bit_is_set())
 }
 
 /// A filter for data frames with this identifier of 11 bits.
