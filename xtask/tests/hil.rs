@@ -106,6 +106,7 @@ fn a_board_goes_through_all_steps_and_a_faulty_bench_is_told() {
         "start version 2 by itself",
         "store a node-ID",
         "entry strap",
+        "a jump that leaves",
         "a program that hangs",
     ] {
         assert_eq!(outcome(step), "passed", "{step}: {said}");

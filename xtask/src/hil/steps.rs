@@ -14,7 +14,7 @@ use crate::{files, process, Outcome};
 pub type Step = (&'static str, fn(&mut Bench) -> Outcome<Done>);
 
 /// All steps after the build.
-pub const STEPS: [Step; 20] = [
+pub const STEPS: [Step; 21] = [
     ("open the bus", open_bus),
     ("flash the bootloader by the probe", |bench| flash_bootloader(bench, "bootloader.elf")),
     ("power off and on, or reset", |bench| bench.restart().map(|how| Done::Passed(how.into()))),
@@ -35,6 +35,7 @@ pub const STEPS: [Step; 20] = [
     ("find the bit rate by listening", auto_bit_rate),
     ("bus-off: CAN_H and CAN_L shorted", bus_off),
     ("the crystal stopped", crystal),
+    ("a jump that leaves the clocks wrong", leftovers),
     ("a program that hangs, with program_watchdog_ms", hung_program),
 ];
 
@@ -310,11 +311,8 @@ fn hung_program(bench: &mut Bench) -> Outcome<Done> {
     flash_bootloader(bench, WITH_WATCHDOG)?;
     bench.restart()?;
     info_after_start(bench)?;
-    let file = bench.work.join("hung.bin");
-    files::write(&file, hung(bench))?;
-    let words =
-        ["flash", &file.display().to_string(), "-I", "binary", "--board", bench.board.board, "--no-trial"];
-    bench.coflash.call(&[&words[..], &["--no-start"]].concat())?.good()?;
+    // `cpsid i` and a branch to itself (ARMv7-M A7.7.29 and A7.7.12).
+    install_code(bench, &[0xB672, 0xE7FE])?;
     bench.coflash.call(&["release"])?.good()?;
     bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
     let (_, heard) = bench.coflash.traced(&["monitor", "--for", "9000"], &bench.work)?;
@@ -344,15 +342,33 @@ fn hung_program(bench: &mut Bench) -> Outcome<Done> {
     passed(format!("reset after {seconds:.2} s, given up after three"))
 }
 
-/// A vector table, then `cpsid i` and a branch to itself (ARMv7-M A7.7.29 and A7.7.12).
-fn hung(bench: &Bench) -> Vec<u8> {
+/// Takes all clocks of the sleep mode away, spreads that of the PLL by 3 % (RM0090 sections 7.3.15 to 7.3.23),
+/// and jumps; tests/device/leftovers.rs has it with the instructions beside it.
+const LEFTOVERS: [u16; 22] = [
+    0x4808, 0x2100, 0x6501, 0x6541, 0x6581, 0x6601, 0x6641, 0x4A06, 0xF8C0, 0x2080, 0xF04F, 0x6000, 0x6801,
+    0xF381, 0x8808, 0x6841, 0x4708, 0xBF00, 0x3800, 0x4002, 0x60FA, 0xC010,
+];
+
+fn leftovers(bench: &mut Bench) -> Outcome<Done> {
+    bootloader(bench)?;
+    install_code(bench, &LEFTOVERS)?;
+    bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
+    (0..20).try_for_each(|_| bootloader(bench).map(drop))?;
+    passed("it answers")
+}
+
+/// Puts a vector table and this code, the reset handler, into the place of the program.
+fn install_code(bench: &Bench, code: &[u16]) -> Outcome {
     const CODE: usize = 0x200;
     let mut bytes = vec![0; CODE];
     bytes[..4].copy_from_slice(&bench.board.ram.end().to_le_bytes());
-    let reset = bench.board.programs[0].base + CODE as u32 + 1;
-    bytes[4..8].copy_from_slice(&reset.to_le_bytes());
-    bytes.extend([0x72, 0xB6, 0xFE, 0xE7]);
-    bytes
+    bytes[4..8].copy_from_slice(&(bench.board.programs[0].base + CODE as u32 + 1).to_le_bytes());
+    bytes.extend(code.iter().flat_map(|half| half.to_le_bytes()));
+    let file = bench.work.join("code.bin");
+    files::write(&file, bytes)?;
+    let file = file.display().to_string();
+    let words = ["flash", &file, "-I", "binary", "--board", bench.board.board, "--no-trial", "--no-start"];
+    bench.coflash.call(&words)?.good().map(drop)
 }
 
 /// The bootloader's answer: a program is called back.
