@@ -283,12 +283,13 @@ fn silent_or_info(bench: &mut Bench) -> Outcome<Value> {
     info_after_start(bench)
 }
 
-/// A device without its crystal only listens, or says that it runs from the internal oscillator.
+/// A bootloader without its crystal only listens, or says that it runs from the internal oscillator.
 fn crystal(bench: &mut Bench) -> Outcome<Done> {
+    bootloader(bench)?;
+    bench.coflash.call(&["erase"])?.good()?;
     if !bench.hand(Hand::Crystal, true)? {
         return not_run("nobody stops the crystal: --crystal-command, or a terminal to ask at");
     }
-    // The crystal runs again whatever comes.
     let seen = silent_or_info(bench);
     bench.hand(Hand::Crystal, false)?;
     let info = seen?;
@@ -350,7 +351,6 @@ const LEFTOVERS: [u16; 22] = [
 ];
 
 fn leftovers(bench: &mut Bench) -> Outcome<Done> {
-    bootloader(bench)?;
     install_code(bench, &LEFTOVERS)?;
     bench.coflash.call(&["write", "1F51/1", "1", "--type", "u8"])?.good()?;
     (0..20).try_for_each(|_| bootloader(bench).map(drop))?;
