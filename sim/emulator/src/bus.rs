@@ -22,6 +22,9 @@
 //! - A controller without a pin for RX sees a bit error in the first bit that it sends, and its error
 //!   flag destroys the frames of the others; it starts only while the bus is idle, though it hears
 //!   nothing. Without a pin for TX it sees the same, and nobody is disturbed.
+//! - A line that something holds dominant ([`Bus::hold_dominant`]) breaks the frame on it, carries none, and
+//!   lets the counters of the nodes on it rise (12.1.4.2, rules b, d and f), each at its own bit time.
+//!   A frame that is broken in its arbitration field counts as a bit error, too.
 //! - There are no overload frames.
 
 pub mod confinement;
@@ -191,6 +194,15 @@ impl Contender {
     }
 }
 
+/// Something holds the line dominant.
+#[derive(Clone, Debug, Default)]
+struct Dominant {
+    /// The transmitters whose frame it has broken, as their places and epochs.
+    broken: Vec<(usize, u32)>,
+    /// When the counters of each node rise next.
+    next: Vec<Time>,
+}
+
 type Sink = Box<dyn FnMut(&Record)>;
 
 /// The wire and the state of its frames. The caller passes the nodes to each call, always in the
@@ -207,6 +219,7 @@ pub struct Bus {
     /// Until when each node must not start a frame.
     suspended: Vec<Time>,
     held: VecDeque<DelayedFrame>,
+    dominant: Option<Dominant>,
     faults: Faults,
     sinks: Vec<Sink>,
     frames: u64,
@@ -281,6 +294,76 @@ impl Bus {
         self.faults.clear();
     }
 
+    /// From now on something holds the line dominant (a short circuit, a transceiver without its supply), or
+    /// lets it go.
+    pub fn hold_dominant(&mut self, is_held: bool, nodes: &mut [&mut dyn BusNode]) {
+        let now = self.now;
+        match (is_held, self.dominant.take()) {
+            (true, None) => self.fall(nodes),
+            (true, dominant @ Some(_)) => self.dominant = dominant,
+            (false, None) => {}
+            (false, Some(_)) => {
+                let bit = nodes.iter().filter_map(|node| node.line()).map(|line| line.bit).max();
+                self.recessive_since = now;
+                self.free_at = now + bits(bit.unwrap_or_default(), DELIMITER_BITS + INTERMISSION_BITS);
+                for node in nodes {
+                    node.event(BusEvent::Ended, now);
+                }
+            }
+        }
+    }
+
+    /// The line falls for a long time: the frame on it is broken, and idle nodes take the edge for the start of
+    /// one.
+    fn fall(&mut self, nodes: &mut [&mut dyn BusNode]) {
+        let now = self.now;
+        let mut dominant = Dominant::default();
+        let is_idle = self.flight.is_none();
+        if let Some(flight) = self.flight.take() {
+            dominant.broken = flight.transmitters.iter().map(|party| (party.node, party.epoch)).collect();
+            let [transmit, receive] = [ErrorKind::BitRecessive, ErrorKind::Stuff];
+            let error = Error { at: now, flag_bits: FLAG_BITS, transmit, receive };
+            self.fail(flight, now, error, nodes);
+        }
+        // Fourteen bits from the beginning of the flag (rule f), which follows the bit error or six equal bits.
+        let until_rise = if is_idle { FLAG_BITS } else { 1 } + FLAG_BITS + DELIMITER_BITS;
+        for node in nodes.iter_mut() {
+            node.event(BusEvent::Started { own: false }, now);
+            if is_idle && node.line().is_some_and(|line| line.hears()) {
+                node.event(BusEvent::ReceiveFailed { kind: ErrorKind::Stuff, first: true }, now);
+            }
+            let bit = node.line().map_or(Span(0), |line| line.bit);
+            dominant.next.push(now + bits(bit, until_rise));
+        }
+        self.dominant = Some(dominant);
+    }
+
+    /// When the counters of this node rise next because the line stays dominant. A counter that has reached its
+    /// end, or a node that is off the bus, rests.
+    fn next_rise(&self, n: usize, node: &dyn BusNode) -> Option<Time> {
+        let dominant = self.dominant.as_ref()?;
+        node.line().filter(Line::hears)?;
+        let sent = dominant.broken.contains(&(n, node.epoch()));
+        let rests = !sent && node.confinement().rec() == u8::MAX;
+        (!rests).then(|| dominant.next.get(n).copied().unwrap_or(self.now))
+    }
+
+    /// The counters rise: by 8 for each 8 bits that the line stays dominant after an error flag.
+    fn rise(&mut self, nodes: &mut [&mut dyn BusNode]) {
+        let now = self.now;
+        for (n, node) in nodes.iter_mut().enumerate() {
+            if self.next_rise(n, *node).is_none_or(|at| at > now) {
+                continue;
+            }
+            let bit = node.line().map_or(Span(0), |line| line.bit);
+            let Some(dominant) = &mut self.dominant else { return };
+            let own = dominant.broken.contains(&(n, node.epoch()));
+            dominant.next.resize(dominant.next.len().max(n + 1), now);
+            dominant.next[n] = now + bits(bit, DELIMITER_BITS);
+            node.event(BusEvent::StaysDominant { own }, now);
+        }
+    }
+
     /// The number of good frames and of bad ones.
     #[must_use]
     pub fn totals(&self) -> (u64, u64) {
@@ -292,26 +375,36 @@ impl Bus {
     pub fn next_event(&self, nodes: &[&mut dyn BusNode]) -> Option<Time> {
         let flight = self.flight.as_ref().map(Flight::next);
         let inner = self.inner.iter().map(|inner| inner.end);
-        let held = self.held.iter().map(|held| held.due.max(self.free_at)).filter(|_| self.flight.is_none());
+        let held = self.held.iter().map(|held| held.due.max(self.free_at)).filter(|_| !self.is_occupied());
         let nodes = nodes.iter().enumerate().filter_map(|(n, node)| self.next_of_node(n, *node));
         flight.into_iter().chain(inner).chain(held).chain(nodes).min().map(|at| at.max(self.now))
     }
 
     fn next_of_node(&self, n: usize, node: &dyn BusNode) -> Option<Time> {
-        let busy = self.flight.as_ref().is_some_and(|flight| flight.involves(n))
-            || self.inner.iter().any(|inner| inner.node == n);
-        let leaves = node.leaving().filter(|_| !busy);
+        let leaves = node.leaving().filter(|_| !self.is_busy(n, node));
         let joins = self.counted_wait(node).map(|(wait, from)| {
             let sequence = wait.bit.0.saturating_mul(SEQUENCE_BITS);
             from + Span(sequence.saturating_mul(u64::from(wait.sequences)))
         });
         let starts = self.next_start(n, node);
-        [leaves, joins, starts].into_iter().flatten().min()
+        [leaves, joins, starts, self.next_rise(n, node)].into_iter().flatten().min()
+    }
+
+    /// Whether a frame of or for the node is under way. A line that stays dominant keeps it in an error frame.
+    fn is_busy(&self, n: usize, node: &dyn BusNode) -> bool {
+        self.flight.as_ref().is_some_and(|flight| flight.involves(n))
+            || self.inner.iter().any(|inner| inner.node == n)
+            || self.dominant.is_some() && node.line().is_some_and(|line| line.hears())
+    }
+
+    /// Whether a frame is on the line, or it stays dominant.
+    fn is_occupied(&self) -> bool {
+        self.flight.is_some() || self.dominant.is_some()
     }
 
     /// The recessive bits that the node waits for, if any pass now, and since when they have.
     fn counted_wait(&self, node: &dyn BusNode) -> Option<(Wait, Time)> {
-        let wait = node.wait().filter(|wait| self.flight.is_none() || !wait.hears)?;
+        let wait = node.wait().filter(|wait| !self.is_occupied() || !wait.hears)?;
         let from = if wait.hears { wait.since.max(self.recessive_since) } else { wait.since };
         Some((wait, from))
     }
@@ -324,7 +417,7 @@ impl Bus {
             None => node.next_request(self.now)?,
         };
         let allowed = request.max(self.suspended.get(n).copied().unwrap_or_default());
-        let at_rest = || self.flight.is_none().then_some(allowed.max(self.free_at));
+        let at_rest = || (!self.is_occupied()).then_some(allowed.max(self.free_at));
         match line.route() {
             Route::Nowhere => None,
             Route::Inside if self.inner.iter().any(|inner| inner.node == n) => None,
@@ -360,15 +453,14 @@ impl Bus {
         }
         self.end_inner(nodes);
         for (n, node) in nodes.iter_mut().enumerate() {
-            let busy = self.flight.as_ref().is_some_and(|flight| flight.involves(n))
-                || self.inner.iter().any(|inner| inner.node == n);
-            if !busy && node.leaving().is_some_and(|since| since <= now) {
+            if !self.is_busy(n, *node) && node.leaving().is_some_and(|since| since <= now) {
                 node.event(BusEvent::Released, now);
             }
         }
+        self.rise(nodes);
         self.count_recessive(nodes);
         self.start_inner(nodes);
-        if self.flight.is_none() && now >= self.free_at {
+        if !self.is_occupied() && now >= self.free_at {
             self.start(nodes);
         }
     }
@@ -393,7 +485,7 @@ impl Bus {
         let now = self.now;
         for (n, node) in nodes.iter_mut().enumerate() {
             let Some(line) = node.line().filter(|line| line.route() == Route::Inside) else { continue };
-            let waits = line.hears() && (self.flight.is_some() || self.free_at > now);
+            let waits = line.hears() && (self.is_occupied() || self.free_at > now);
             let free = self.inner.iter().all(|inner| inner.node != n) && self.suspended[n] <= now && !waits;
             if let Some(frame) = node.request(now).filter(|_| free) {
                 let is_good = line.loopback;

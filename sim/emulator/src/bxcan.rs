@@ -1158,6 +1158,12 @@ impl BusNode for BxCan {
             BusEvent::ReceiveFailed { kind, first } => {
                 self.count(Some(kind), now, |counters| counters.receive_failed(first));
             }
+            BusEvent::StaysDominant { own } => {
+                // The manual has no last error code for it: the one of the error frame stays.
+                let kind = self.last_error;
+                self.count(Some(ErrorKind::Form), now, |counters| counters.stays_dominant(own));
+                self.last_error = kind;
+            }
             BusEvent::Recessive { sequences } => self.heard_recessive(sequences, now),
             BusEvent::Released => {
                 if let Some((_, rest)) = self.leaving {

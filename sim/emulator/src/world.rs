@@ -219,6 +219,13 @@ impl<M: Computer> World<M> {
         self.bus.clear_faults();
     }
 
+    /// From now on something holds the line of the bus dominant, or lets it go.
+    pub fn hold_dominant(&mut self, is_held: bool) {
+        let mut nodes = nodes(&mut self.slots);
+        self.bus.advance(self.now, &mut nodes);
+        self.bus.hold_dominant(is_held, &mut nodes);
+    }
+
     fn plug(&mut self, plug: Plug<M>) -> usize {
         self.slots.push(Slot { plug, unplugged: Unplugged, stuck: 0 });
         self.slots.len() - 1

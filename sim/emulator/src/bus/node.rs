@@ -169,6 +169,11 @@ pub enum BusEvent {
         /// It saw the error first.
         first: bool,
     },
+    /// The line has stayed dominant for 8 more bits after an error flag.
+    StaysDominant {
+        /// It broke a frame of this node.
+        own: bool,
+    },
     /// The bus has been recessive for so many sequences of 11 bits that the node waited for.
     Recessive {
         /// How many.

@@ -191,6 +191,10 @@ impl BusNode for HostPort {
             }
             BusEvent::Missed => self.confinement.received(),
             BusEvent::ReceiveFailed { first, .. } => self.confinement.receive_failed(first),
+            BusEvent::StaysDominant { own } => {
+                self.confinement.stays_dominant(own);
+                self.check_bus_off(now);
+            }
             BusEvent::Recessive { sequences } => {
                 if let Some((_, left)) = self.recovery {
                     let left = left.saturating_sub(sequences);

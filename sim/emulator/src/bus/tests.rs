@@ -42,16 +42,11 @@ impl Bench {
 
     /// Runs until so many microseconds.
     fn run(&mut self, until: u64) {
-        let mut nodes: Vec<&mut dyn BusNode> = self
-            .nodes
-            .iter_mut()
-            .map(|node| match node {
-                Node::Port(port) => port as &mut dyn BusNode,
-                Node::Can(can) => can.as_mut(),
-                Node::Nothing(nothing) => nothing,
-            })
-            .collect();
-        self.bus.advance(Time(until * US), &mut nodes);
+        self.bus.advance(Time(until * US), &mut refs(&mut self.nodes));
+    }
+
+    fn hold_dominant(&mut self, is_held: bool) {
+        self.bus.hold_dominant(is_held, &mut refs(&mut self.nodes));
     }
 
     fn port(&mut self, n: usize) -> &mut HostPort {
@@ -92,6 +87,15 @@ impl Bench {
         let log = self.log.borrow();
         log.iter().map(|r| (r.start.0 / US, r.end.0 / US, r.frame.raw_id(), r.outcome)).collect()
     }
+}
+
+fn refs(nodes: &mut [Node]) -> Vec<&mut dyn BusNode> {
+    let each = nodes.iter_mut().map(|node| match node {
+        Node::Port(port) => port as &mut dyn BusNode,
+        Node::Can(can) => can.as_mut(),
+        Node::Nothing(nothing) => nothing,
+    });
+    each.collect()
 }
 
 fn sync() -> Frame {
@@ -643,4 +647,95 @@ fn in_loop_back_mode_without_a_pin_it_plays_with_itself() {
     assert_eq!(bench.log(), []);
     assert_eq!(bench.read(0, 0x08) & 3, 3, "RQCP and TXOK");
     assert_eq!(bench.read(0, 0x0C) & 3, 1);
+}
+
+/// ISO 11898-1:2015, 12.1.4.2, for receivers: 1 for the stuff error and 8 for the first dominant bit after the flag
+/// (rules a and b), then 8 with the 14th dominant bit from the beginning of the flag and with each 8 more (rule f). The flag
+/// begins after 6 equal bits. So 129 are reached at bit 6 + 14 + 14 x 8 = 132; a receiver never goes bus-off.
+#[test]
+fn on_a_line_that_stays_dominant_a_receiver_ends_error_passive() {
+    const EPVF_BOFF: u32 = 0b110;
+    let mut bench = Bench::new(vec![controller(0, 0), Node::Port(HostPort::new(1_000_000))]);
+    bench.run(1_000);
+    bench.hold_dominant(true);
+    bench.run(1_131);
+    assert_eq!((bench.read(0, 0x18) >> 24, bench.read(0, 0x18) & EPVF_BOFF), (121, 0));
+    bench.run(1_132);
+    assert_eq!((bench.read(0, 0x18) >> 24, bench.read(0, 0x18) & EPVF_BOFF), (129, 0b010));
+    bench.send(1, 1_200, sync());
+    bench.run(600_000_000);
+    assert_eq!((bench.read(0, 0x18) >> 24, bench.read(0, 0x18) & EPVF_BOFF), (255, 0b010));
+    assert_eq!(bench.log(), []);
+    // Eight bits of the error delimiter and three of intermission; the frame has 48.
+    bench.hold_dominant(false);
+    bench.run(600_000_059);
+    assert_eq!(bench.log(), [(600_000_011, 600_000_059, 0x080, Outcome::Good)]);
+    assert_eq!(bench.read(0, 0x18) >> 24, 120, "RM0090, CAN_ESR");
+}
+
+/// The bit error counts 8, and each 8 bits of rule f: 32 x 8 = 256 at bit 1 + 14 + 30 x 8 = 255. Bus-off lasts
+/// until the line is free, and 128 x 11 bits longer.
+#[test]
+fn a_line_that_falls_in_the_middle_of_a_frame_takes_its_transmitter_to_bus_off() {
+    let mut bench = Bench::ports(&[1_000_000, 1_000_000]);
+    bench.send(0, 0, boot_up());
+    bench.run(40);
+    bench.hold_dominant(true);
+    bench.run(40 + 254);
+    assert_eq!(bench.port(0).error_counters().tec(), 248);
+    bench.run(40 + 255);
+    assert_eq!(bench.port(0).error_counters().state(), ErrorState::BusOff);
+    assert_eq!(bench.port(1).error_counters().state(), ErrorState::Passive);
+    bench.run(60_000_000);
+    assert_eq!(bench.log(), [(0, 40, 0x701, Outcome::Bad(ErrorKind::BitRecessive))]);
+    bench.hold_dominant(false);
+    bench.run(60_000_000 + 128 * 11 - 1);
+    assert_eq!(bench.port(0).error_counters().state(), ErrorState::BusOff);
+    bench.run(60_010_000);
+    assert_eq!(bench.log()[1], (60_001_408, 60_001_464, 0x701, Outcome::Good));
+}
+
+/// RM0090 sections 32.4.1 and 32.4.2: initialisation is entered when the activity on the bus is over, and left
+/// after 11 recessive bits. MCR.RESET does not wait.
+#[test]
+fn a_line_that_stays_dominant_lets_nobody_in_and_nobody_out() {
+    let mut bench = Bench::new(vec![controller(0, 0), controller(0, 0)]);
+    bench.run(5);
+    bench.write(1, 0x00, 0x1_0001);
+    bench.run(20);
+    bench.hold_dominant(true);
+    bench.write(0, 0x00, 0x1_0001);
+    bench.write(1, 0x00, 0x1_0000);
+    bench.run(120_000_000);
+    assert_eq!(bench.read(0, 0x04) & 1, 0, "INAK does not come");
+    assert_eq!(bench.read(1, 0x04) & 1, 1, "INAK does not go");
+    bench.hold_dominant(false);
+    bench.run(120_000_010);
+    assert_eq!(bench.read(1, 0x04) & 1, 1);
+    bench.run(120_000_011);
+    assert_eq!((bench.read(0, 0x04) & 1, bench.read(1, 0x04) & 1), (1, 0));
+    bench.hold_dominant(true);
+    bench.write(1, 0x00, 0x8000);
+    assert_eq!(bench.read(1, 0x04) & 3, 2, "SLAK");
+}
+
+/// ISO 11898-1:2015, 12.1.4.2, rule c, exception 1: without an acknowledge the counter of a transmitter ends at
+/// 128. A controller repeats the frame for ever (RM0090 section 32.7.1), 48 - 8 + 6 + 8 + 3 + 8 = 65 bits each.
+#[test]
+fn a_controller_that_nobody_acknowledges_ends_error_passive_and_repeats() {
+    let mut bench = Bench::new(vec![controller(0, 0)]);
+    bench.run(20);
+    bench.write(0, 0x184, 0);
+    bench.write(0, 0x180, 0x080 << 21 | 1);
+    bench.run(60_000_000);
+    // TEC 128, LEC 3 (no acknowledge), EPVF and EWGF, no BOFF.
+    assert_eq!(bench.read(0, 0x18), 128 << 16 | 3 << 4 | 0b011);
+    assert_eq!(bench.read(0, 0x180), 0x080 << 21 | 1, "TXRQ");
+    let log = bench.log();
+    assert!(log.iter().all(|(.., outcome)| *outcome == Outcome::Bad(ErrorKind::Acknowledge)));
+    assert!(log[16..].windows(2).all(|pair| pair[1].0 - pair[0].0 == 65));
+    bench.nodes.push(Node::Port(HostPort::new(1_000_000)));
+    bench.run(60_001_000);
+    assert_eq!(bench.read(0, 0x18) >> 16, 127);
+    assert_eq!(bench.received(1).len(), 1);
 }
