@@ -23,6 +23,7 @@ use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
 use crate::periph::tim::{self, Tim};
 use crate::periph::usart::{self, Usart};
+use crate::periph::wwdg::Wwdg;
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::report::{Access, Report, Reports};
 use crate::silicon::Silicon;
@@ -65,6 +66,7 @@ enum Block {
     Flash,
     Gpio(usize),
     Iwdg,
+    Wwdg,
     Pwr,
     Syscfg,
     Exti,
@@ -91,7 +93,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 41] = [
+const BLOCKS: [(u32, Block, ClockEnable); 42] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -101,6 +103,7 @@ const BLOCKS: [(u32, Block, ClockEnable); 41] = [
     (0x4000_1800, Block::Tim(9), Some((rcc::APB1ENR, 6))),
     (0x4000_1C00, Block::Tim(10), Some((rcc::APB1ENR, 7))),
     (0x4000_2000, Block::Tim(11), Some((rcc::APB1ENR, 8))),
+    (0x4000_2C00, Block::Wwdg, Some((rcc::APB1ENR, 11))),
     (0x4000_3000, Block::Iwdg, None),
     (0x4000_4400, Block::Usart(1), Some((rcc::APB1ENR, 17))),
     (0x4000_4800, Block::Usart(2), Some((rcc::APB1ENR, 18))),
@@ -139,9 +142,8 @@ const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 21] = [
+const UNMODELLED: [(u32, &str); 20] = [
     (0x4000_2800, "RTC"),
-    (0x4000_2C00, "WWDG"),
     (0x4000_3400, "I2S2ext"),
     (0x4000_3800, "SPI2"),
     (0x4000_3C00, "SPI3"),
@@ -211,6 +213,7 @@ pub struct Chip {
     pub rcc: Rcc,
     /// The watchdog.
     pub iwdg: Iwdg,
+    wwdg: Wwdg,
     /// The ports.
     pub gpio: Vec<Gpio>,
     /// CAN1 and CAN2.
@@ -278,6 +281,7 @@ impl Chip {
             clocks: rcc.clocks(),
             rcc,
             iwdg: Iwdg::new(silicon),
+            wwdg: Wwdg::default(),
             gpio: ('A'..='K').take(geometry.ports.into()).map(Gpio::new).collect(),
             can: [BxCan::new().on(silicon), BxCan::slave().on(silicon)],
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
@@ -347,6 +351,20 @@ impl Chip {
         if self.pwr.enter_standby() {
             self.wake_up();
         }
+    }
+
+    /// Whether the option bits have a reset in place of the deep sleep that a WFI enters (section 7.1.1,
+    /// low-power management reset).
+    #[must_use]
+    pub fn deep_sleep_is_reset(&self, is_standby: bool) -> bool {
+        self.flash.low_power_is_reset(is_standby)
+    }
+
+    /// The crystal of the board has this frequency from now on, 0 when it stops.
+    pub fn set_crystal(&mut self, hz: u32) {
+        self.hse_hz = hz;
+        self.rcc.set_crystal(hz);
+        self.slice.leave = true;
     }
 
     /// Leaves Standby.
@@ -443,7 +461,7 @@ impl Chip {
     fn reset_core_domain(&mut self, cause: ResetCause) {
         self.is_halved = false;
         let (crc, syscfg): (&mut dyn Peripheral, _) = (&mut self.crc, &mut self.syscfg);
-        for block in [crc, syscfg, &mut self.exti, &mut self.rcc, &mut self.flash] {
+        for block in [crc, syscfg, &mut self.exti, &mut self.wwdg, &mut self.rcc, &mut self.flash] {
             block.reset();
         }
         for can in &mut self.can {
@@ -494,13 +512,20 @@ impl Chip {
     fn apply_clocks(&mut self) {
         self.clocks = self.rcc.clocks();
         let now = self.now();
-        self.clock.set_hz(self.clocks.hclk);
-        self.scs.systick.set_clock(self.clocks.hclk.into(), now);
+        let is_stopped = self.rcc.is_stopped();
+        if is_stopped {
+            // Until a reset.
+            self.slice.hold_until = Some(Time(u64::MAX));
+        } else {
+            self.clock.set_hz(self.clocks.hclk);
+            self.scs.systick.set_clock(self.clocks.hclk.into(), now);
+        }
         for (_, block, enable) in BLOCKS {
-            let clock_of = |clock: u32| if self.is_clocked(enable) { clock } else { 0 };
+            let clock_of = |clock: u32| if self.is_clocked(enable) && !is_stopped { clock } else { 0 };
             let (pclk1, pclk2) = (clock_of(self.clocks.pclk1), clock_of(self.clocks.pclk2));
             let (timclk1, timclk2) = (clock_of(self.clocks.timclk1), clock_of(self.clocks.timclk2));
             match block {
+                Block::Wwdg => self.wwdg.set_clock(pclk1, now),
                 Block::Can1 => self.can[0].set_clock(pclk1),
                 Block::Can2 => self.can[1].set_clock(pclk1),
                 Block::Usart(index) => {
@@ -599,6 +624,7 @@ impl Chip {
         self.flash.advance(now);
         self.settle_flash();
         self.iwdg.advance(now);
+        self.wwdg.advance(now);
         for can in &mut self.can {
             can.advance(now);
         }
@@ -610,6 +636,9 @@ impl Chip {
         }
         if self.iwdg.has_expired() {
             self.slice.reset_request = Some(ResetCause::IndependentWatchdog);
+            self.slice.leave = true;
+        } else if self.wwdg.has_expired() {
+            self.slice.reset_request = Some(ResetCause::WindowWatchdog);
             self.slice.leave = true;
         }
         if self.scs.systick.advance(now) {
@@ -631,6 +660,7 @@ impl Chip {
         for tim in &self.tims {
             tim.interrupts(&mut lines);
         }
+        self.wwdg.interrupts(&mut lines);
         self.exti.interrupts(&mut lines);
         self.scs.exceptions.set_levels(&lines);
         self.lines = lines;
@@ -655,6 +685,7 @@ impl Chip {
         [
             self.flash.next_event(),
             self.iwdg.next_event(),
+            self.wwdg.next_event(),
             self.can[0].next_event(),
             self.can[1].next_event(),
             self.rcc.next_event(),
@@ -788,6 +819,7 @@ impl Chip {
             Block::Flash => &mut self.flash,
             Block::Gpio(port) => &mut self.gpio[port],
             Block::Iwdg => &mut self.iwdg,
+            Block::Wwdg => &mut self.wwdg,
             Block::Pwr => &mut self.pwr,
             Block::Syscfg => &mut self.syscfg,
             Block::Exti => &mut self.exti,
@@ -921,6 +953,8 @@ impl Chip {
                 self.follow_watchdog();
             }
             Block::Iwdg => self.follow_watchdog(),
+            // It may have been written outside its window.
+            Block::Wwdg => self.slice.leave = true,
             Block::Crc if self.costs => self.clock.cycles += CRC_WORD,
             Block::Flash => {
                 self.settle_flash();

@@ -416,6 +416,11 @@ impl Machine {
     /// The core executes WFI or WFE, or sleeps on exit: it sleeps as `light` says unless SLEEPDEEP is set.
     fn fall_asleep(&mut self, light: Activity) -> Entry {
         match self.cpu.chip().deep_sleep_is_standby() {
+            Some(is_standby) if !self.cpu.wakes() && self.cpu.chip().deep_sleep_is_reset(is_standby) => {
+                let slice = &mut self.cpu.chip_mut().slice;
+                slice.reset_request = Some(ResetCause::LowPower);
+                return Entry::Taken;
+            }
             // With an interrupt pending, WFI does nothing (PM0214 section 3.11.12).
             Some(true) if !self.cpu.wakes() => {
                 self.cpu.chip_mut().enter_standby();
@@ -577,7 +582,7 @@ impl Machine {
     /// Protects a sector of the flash by its option byte, as a debug probe does, or no longer.
     ///
     /// # Panics
-    /// For a sector of a second bank, whose option bytes are not modelled.
+    /// For a sector without a bit of its own.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
     }
@@ -599,6 +604,12 @@ impl Machine {
     /// Sets the option bit WDG_SW as a debug probe does: whether the watchdog starts with each reset.
     pub fn set_hardware_watchdog(&mut self, on: bool) {
         self.cpu.chip_mut().flash.preset_hardware_watchdog(on);
+    }
+
+    /// The crystal of the board stops (0), or has this frequency again, in Hz. A core that runs from a crystal
+    /// that stops stands still until a watchdog resets it.
+    pub fn set_crystal(&mut self, hz: u32) {
+        self.cpu.chip_mut().set_crystal(hz);
     }
 
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,

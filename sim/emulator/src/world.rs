@@ -107,11 +107,13 @@ pub struct World<M: Computer = Machine> {
     slots: Vec<Slot<M>>,
     now: Time,
     news: VecDeque<News<M::Stop>>,
+    /// When something takes hold of the line of the bus.
+    falls_at: Option<Time>,
 }
 
 impl<M: Computer> Default for World<M> {
     fn default() -> Self {
-        Self { bus: Bus::new(), slots: Vec::new(), now: Time(0), news: VecDeque::new() }
+        Self { bus: Bus::new(), slots: Vec::new(), now: Time(0), news: VecDeque::new(), falls_at: None }
     }
 }
 
@@ -226,6 +228,11 @@ impl<M: Computer> World<M> {
         self.bus.hold_dominant(is_held, &mut nodes);
     }
 
+    /// The same after a time, while the world runs.
+    pub fn hold_dominant_after(&mut self, span: Span) {
+        self.falls_at = Some(self.now + span);
+    }
+
     fn plug(&mut self, plug: Plug<M>) -> usize {
         self.slots.push(Slot { plug, unplugged: Unplugged, stuck: 0 });
         self.slots.len() - 1
@@ -331,6 +338,11 @@ impl<M: Computer> World<M> {
         // A machine that has just got power is not known to the bus yet; without the bus it would
         // not stop for it.
         self.bus.advance(self.now, &mut nodes(&mut self.slots));
+        if self.falls_at.is_some_and(|at| at <= self.now) {
+            self.falls_at = None;
+            self.bus.hold_dominant(true, &mut nodes(&mut self.slots));
+        }
+        let limit = self.falls_at.map_or(limit, |at| at.min(limit));
         let horizon = {
             let nodes = nodes(&mut self.slots);
             self.bus.next_event(&nodes).map_or(limit, |event| event.min(limit))

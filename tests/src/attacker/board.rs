@@ -98,6 +98,8 @@ impl Target for Board {
                 Stop::Reset(
                     ResetCause::IndependentWatchdog
                     | ResetCause::Pin
+                    | ResetCause::WindowWatchdog
+                    | ResetCause::LowPower
                     | ResetCause::Standby
                     | ResetCause::BrownOut,
                 )

@@ -51,9 +51,6 @@ const CR_ERRIE: u32 = 1 << 25;
 const CR_LOCK: u32 = 1 << 31;
 const CR_KEPT: u32 = CR_PG | CR_SER | CR_MER | CR_SNB | CR_PSIZE | CR_EOPIE | CR_ERRIE;
 
-/// OPTCR1 from the factory: no sector of the second bank is protected (section 3.9.11).
-const OPTCR1_FACTORY: u32 = 0x0FFF_0000;
-
 const ACR_MASK: u32 = 0x0000_1F07;
 
 /// Which of the datasheet's times operations take.
@@ -359,18 +356,22 @@ impl Flash {
 
     /// nWRP: a zero protects the sector (section 3.6.5).
     fn is_protected(&self, sector: Sector) -> bool {
-        // The sectors of a second bank have theirs in OPTCR1, which stays as from the factory.
-        let second = self.geometry.second_bank.is_some_and(|first| sector.number >= first);
-        !second && self.options.protects(sector.number)
+        match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
+            Some(within) => self.options.protects_second(within),
+            None => self.options.protects(sector.number),
+        }
     }
 
     /// Sets the option bytes as a debug probe does: at once, and unnoticed by the running program.
     ///
     /// # Panics
-    /// For a sector of a second bank, whose option bytes are not modelled.
+    /// For a sector without a bit of its own.
     pub fn protect_sector(&mut self, number: u8, protected: bool) {
-        assert!(number < 12, "the write protection of a second bank is not modelled");
-        self.options.preset_protection(number, protected);
+        match self.geometry.second_bank.and_then(|first| number.checked_sub(first)) {
+            Some(within) if within < 12 => self.options.preset_second(within, protected),
+            None if number < 12 => self.options.preset_protection(number, protected),
+            _ => panic!("sector {number} has no bit of nWRP"),
+        }
     }
 
     fn refuse(&mut self, flag: u32, why: &'static str) -> Store {
@@ -590,6 +591,12 @@ impl Flash {
         self.options.bytes()
     }
 
+    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.9.9).
+    #[must_use]
+    pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
+        self.options.low_power_is_reset(is_standby)
+    }
+
     /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
@@ -620,7 +627,7 @@ impl Peripheral for Flash {
                     matches!(&self.running, Some(Running { operation: Operation::Options { .. }, .. }));
                 self.options.read(programming)
             }
-            0x18 if self.geometry.second_bank.is_some() => OPTCR1_FACTORY,
+            0x18 if self.geometry.second_bank.is_some() => self.options.read_second(),
             _ => return Err(Unmodelled("the flash interface has no such register".into())),
         })
     }
@@ -646,7 +653,8 @@ impl Peripheral for Flash {
             0x10 => self.write_cr(value, now),
             0x14 => self.write_optcr(value, now),
             0x18 if self.geometry.second_bank.is_some() => {
-                Err(Unmodelled("FLASH_OPTCR1 (protection of the second bank) is not modelled".into()))
+                self.wait_until_idle(now);
+                self.options.write_second(value)
             }
             _ => Err(Unmodelled("the flash interface has no such register".into())),
         }
@@ -833,6 +841,36 @@ mod tests {
                 .enumerate()
                 .position(|(at, &byte)| (byte == 0xFF) != erased.contains(&at));
             assert_eq!(wrong, None, "{code:05b}");
+        }
+    }
+
+    /// Sections 3.9.9 and 3.9.11: bits 16 to 27 of OPTCR and OPTCR1 are sectors 0 to 11 and 12 to 23; a zero protects.
+    #[test]
+    fn each_bank_has_its_own_write_protection() {
+        for (optcr, optcr1, refused) in
+            [(0x0FFF_AAEC_u32, 0x0FFE_0000, 0b10000), (0x0FFE_AAEC, 0x0FFF_0000, 0b00000)]
+        {
+            let mut flash = Flash::new(&STM32F429ZI, FlashTimes::Typical, TYPICAL);
+            for (register, value) in [
+                (KEYR, 0x4567_0123),
+                (KEYR, 0xCDEF_89AB),
+                (0x08, 0x0819_2A3B), // OPTKEYR, OPTCR1, OPTCR with OPTSTRT
+                (0x08, 0x4C5D_6E7F),
+                (0x18, optcr1),
+                (0x14, optcr | 1 << 1),
+            ] {
+                flash.write(register, value, Time(0)).unwrap();
+            }
+            let later = Time(1_000_000_000_000);
+            flash.advance(later);
+            assert_eq!(flash.read(0x18, later), Ok(optcr1));
+            for code in [0b00000, 0b10000] {
+                flash.write(CR, CR_SER | code << 3 | X32 | CR_STRT, later).unwrap();
+                let is_refused = flash.read(0x0C, later).unwrap() & SR_WRPERR != 0;
+                assert_eq!(is_refused, code == refused, "{code:05b}");
+                flash.advance(Time(u64::MAX));
+                flash.write(0x0C, SR_WRPERR, later).unwrap();
+            }
         }
     }
 

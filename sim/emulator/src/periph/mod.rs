@@ -11,3 +11,4 @@ pub mod rcc;
 pub mod syscfg;
 pub mod tim;
 pub mod usart;
+pub mod wwdg;

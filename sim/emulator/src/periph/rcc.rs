@@ -34,6 +34,8 @@ const CSR_PINRSTF: u32 = 1 << 26;
 const CSR_PORRSTF: u32 = 1 << 27;
 const CSR_SFTRSTF: u32 = 1 << 28;
 const CSR_IWDGRSTF: u32 = 1 << 29;
+const CSR_WWDGRSTF: u32 = 1 << 30;
+const CSR_LPWRRSTF: u32 = 1 << 31;
 
 const BDCR_LSEON: u32 = 1 << 0;
 const BDCR_LSERDY: u32 = 1 << 1;
@@ -50,6 +52,10 @@ pub enum ResetCause {
     Software,
     /// The independent watchdog ran out.
     IndependentWatchdog,
+    /// The window watchdog ran out, or was refreshed outside its window.
+    WindowWatchdog,
+    /// The program entered Stop or Standby, for which the option bits nRST_STOP and nRST_STDBY have a reset.
+    LowPower,
     /// A wake-up from Standby, which starts the chip as a reset does.
     Standby,
     /// The supply is back after it was below the brown-out level of the option bytes.
@@ -176,10 +182,28 @@ impl Rcc {
             ResetCause::Pin => CSR_PINRSTF,
             ResetCause::Software => CSR_SFTRSTF | CSR_PINRSTF,
             ResetCause::IndependentWatchdog => CSR_IWDGRSTF | CSR_PINRSTF,
+            ResetCause::WindowWatchdog => CSR_WWDGRSTF | CSR_PINRSTF,
+            ResetCause::LowPower => CSR_LPWRRSTF | CSR_PINRSTF,
             ResetCause::Standby if self.silicon.flags_after_standby => POWER_ON,
             ResetCause::Standby => 0,
             ResetCause::BrownOut => CSR_BORRSTF | CSR_PINRSTF,
         };
+    }
+
+    /// The crystal works, or has stopped. Without the clock security system nothing takes its place: what runs
+    /// from it stands still (section 7.2.7).
+    pub fn set_crystal(&mut self, hz: u32) {
+        self.hse_hz = hz;
+        if hz == 0 {
+            self.hse = Source::Off;
+        }
+    }
+
+    /// Whether the system clock comes from a crystal that has stopped.
+    #[must_use]
+    pub fn is_stopped(&self) -> bool {
+        let pll_from_hse = self.plain(PLLCFGR) & 1 << 22 != 0;
+        self.hse_hz == 0 && (self.sws == 1 || self.sws == 2 && pll_from_hse)
     }
 
     /// Whether the LSI is on.
@@ -513,6 +537,10 @@ mod tests {
         assert_eq!(rcc.read(0x74, Time(0)), Ok(0x1400_0000));
         rcc.note_reset(ResetCause::IndependentWatchdog);
         assert_eq!(rcc.read(0x74, Time(0)), Ok(0x3400_0000));
+        rcc.note_reset(ResetCause::WindowWatchdog);
+        assert_eq!(rcc.read(0x74, Time(0)), Ok(0x7400_0000));
+        rcc.note_reset(ResetCause::LowPower);
+        assert_eq!(rcc.read(0x74, Time(0)), Ok(0xF400_0000));
     }
 
     /// No manual says which flag a wake-up from Standby sets.

@@ -1227,3 +1227,62 @@ fn breakpoints_outlive_a_reset_and_not_the_power() {
     let (log, _) = debugged(&mut machine, [0x0101_0000, 0, 0, 0], 1);
     assert_eq!(log, [[0x0800_0238, 2], [0, 0]]);
 }
+
+/// RM0090 sections 7.1.1 and 7.3.21: with nRST_STDBY or nRST_STOP clear, the entry is a reset with LPWRRSTF, and the
+/// pin's flag as with every internal reset.
+#[test]
+fn with_an_option_bit_the_entry_into_standby_is_a_reset() {
+    for (optcr, is_reset) in [(0x0FFF_AA6C, true), (0x0FFF_AAAC, false)] {
+        let mut machine = machine(&programs::STANDBY);
+        machine.set_option_bytes(optcr);
+        put(&mut machine, ARGUMENT, 0);
+        if is_reset {
+            assert_eq!(machine.run_until(ms(10)), Stop::Reset(ResetCause::LowPower));
+            assert_eq!(machine.run_until(ms(10)), Stop::Reset(ResetCause::LowPower));
+            assert_eq!(words(&machine, 2), [0x8400_0000, 0x4000], "no SBF");
+        } else {
+            assert_eq!(machine.run_until(ms(10)), Stop::Deadline, "nRST_STOP is for Stop");
+            assert!(machine.is_in_standby());
+        }
+    }
+}
+
+/// RM0090 section 22.4: 64 counts of 4096 periods of PCLK1, 16.384 ms at 16 MHz; section 7.3.21: WWDGRSTF, and the flags of
+/// the power-on.
+#[test]
+fn the_window_watchdog_resets_the_chip() {
+    let mut machine = machine(&programs::BUSY);
+    machine.run_until(ms(1));
+    for (register, value) in [(0x4002_3840_u32, 1_u32 << 11), (0x4000_2C00, 0xFF)] {
+        machine.poke(register, &value.to_le_bytes()).unwrap();
+    }
+    assert_eq!(machine.run_until(ms(100)), Stop::Reset(ResetCause::WindowWatchdog));
+    let at = machine.now().0 / 1_000_000;
+    assert!((17_384..17_390).contains(&at), "{at} us");
+    assert_eq!(machine.register(0x4002_3874).unwrap() >> 24, 0x4E);
+    assert_eq!(machine.run_until(ms(100)), Stop::Deadline, "the reset stops it");
+}
+
+/// RM0090 section 7.2: nothing takes the place of a crystal that stops, and the core stands still until the
+/// independent watchdog, which has the LSI, resets it: 4 x 1001 periods of 32 kHz.
+#[test]
+fn a_core_whose_crystal_stops_stands_still_until_the_watchdog_bites() {
+    let mut machine = machine(&programs::BUSY);
+    machine.run_until(ms(1));
+    machine.poke(0x4002_3800, &0x0001_0083_u32.to_le_bytes()).unwrap();
+    machine.run_until(ms(10));
+    machine.poke(0x4002_3808, &1_u32.to_le_bytes()).unwrap();
+    machine.run_until(ms(11));
+    assert_eq!(machine.core_clock(), 8_000_000);
+    machine.preset_watchdog(1_000);
+    machine.set_crystal(0);
+    let before = machine.counters().instructions;
+    assert_eq!(machine.run_until(ms(111)), Stop::Deadline);
+    assert!(machine.counters().instructions - before < 10);
+    assert_eq!(machine.run_until(ms(500)), Stop::Reset(ResetCause::IndependentWatchdog));
+    let at = machine.now().0 / 1_000_000;
+    assert!((136_120..136_130).contains(&at), "{at} us");
+    machine.run_until(ms(200));
+    assert_eq!(machine.core_clock(), 16_000_000);
+    assert!(machine.counters().instructions > before + 1_000);
+}

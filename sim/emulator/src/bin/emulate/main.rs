@@ -750,6 +750,8 @@ fn happened(stop: Stop, cause: impl Fn() -> String) -> Option<String> {
         Stop::Reset(ResetCause::Pin) => "reset by the pin NRST".into(),
         Stop::Reset(ResetCause::Software) => "reset by its software".into(),
         Stop::Reset(ResetCause::IndependentWatchdog) => "reset by the watchdog".into(),
+        Stop::Reset(ResetCause::WindowWatchdog) => "reset by the window watchdog".into(),
+        Stop::Reset(ResetCause::LowPower) => "reset in place of Stop or Standby (option bytes)".into(),
         Stop::Reset(ResetCause::Standby) => "woke up from Standby".into(),
         Stop::PowerCut => "the power is cut".into(),
         Stop::Lockup => {

@@ -1,4 +1,5 @@
-//! The option bytes and FLASH_OPTCR (RM0090 sections 3.6 and 3.9.9), as far as bank 1 goes.
+//! The option bytes, FLASH_OPTCR and, on a chip with two banks, FLASH_OPTCR1 (RM0090 sections 3.6, 3.9.9 and
+//! 3.9.11).
 //!
 //! The chip loads the register from the option bytes at reset. A program changes the register, and
 //! OPTSTRT erases the option bytes and programs them from it. They are not part of the array: a
@@ -22,6 +23,8 @@ const KEPT: u32 = 0x0FFF_FFEC;
 const SPRMOD: u32 = 1 << 31;
 /// From the factory: no protection, BOR off, software watchdog (section 3.9.9).
 const FACTORY: u32 = 0x0FFF_AAEC;
+/// OPTCR1 has nWRP of the second bank. From the factory no sector is protected.
+const SECOND: u32 = 0x0FFF_0000;
 /// What is left when the power fails while they are programmed: an erased cell reads as 1. That is
 /// read-out protection level 1 with no sector protected. Of an STM32F429 it was reported in ST's
 /// forum ("STM32F429ZIT6 reset values for flash option bytes when power down", 2018); there the
@@ -49,12 +52,21 @@ pub struct OptionBytes {
     programmed: u32,
     /// OPTCR as written.
     register: u32,
+    /// The same of OPTCR1.
+    programmed_second: u32,
+    register_second: u32,
     lock: Lock,
 }
 
 impl Default for OptionBytes {
     fn default() -> Self {
-        Self { programmed: FACTORY, register: FACTORY, lock: Lock::default() }
+        Self {
+            programmed: FACTORY,
+            register: FACTORY,
+            programmed_second: SECOND,
+            register_second: SECOND,
+            lock: Lock::default(),
+        }
     }
 }
 
@@ -80,6 +92,24 @@ impl OptionBytes {
     pub fn read(&self, programming: bool) -> u32 {
         let lock = if self.lock.is_open() { 0 } else { OPTLOCK };
         self.register | lock | if programming { OPTSTRT } else { 0 }
+    }
+
+    /// OPTCR1 as it reads.
+    #[must_use]
+    pub fn read_second(&self) -> u32 {
+        self.register_second
+    }
+
+    /// Takes a write to OPTCR1: a wish until OPTSTRT programs it with the others.
+    ///
+    /// # Errors
+    /// The lock is shut.
+    pub fn write_second(&mut self, value: u32) -> Result<(), Unmodelled> {
+        if !self.lock.is_open() {
+            return Err(Unmodelled("FLASH_OPTCR1 is written while it is locked: the chip ignores it".into()));
+        }
+        self.register_second = value & SECOND;
+        Ok(())
     }
 
     /// Takes a write to OPTCR.
@@ -111,17 +141,20 @@ impl OptionBytes {
     pub fn program(&mut self, value: u32) -> bool {
         let before = self.level();
         self.programmed = value & KEPT;
+        self.programmed_second = self.register_second;
         before == 1 && self.level() == 0
     }
 
     /// The power fails, or a reset comes, while they are programmed.
     pub fn tear(&mut self) {
         self.programmed = ERASED;
+        self.programmed_second = SECOND;
     }
 
     /// A reset: the register is loaded, and locked.
     pub fn reset(&mut self) {
         self.register = self.programmed;
+        self.register_second = self.programmed_second;
         self.lock = Lock::default();
     }
 
@@ -139,6 +172,20 @@ impl OptionBytes {
     #[must_use]
     pub fn protects(&self, sector: u8) -> bool {
         (self.programmed >> 16 & 1 << sector == 0) != (self.programmed & SPRMOD != 0)
+    }
+
+    /// The same for a sector of the second bank, counted from 0.
+    #[must_use]
+    pub fn protects_second(&self, sector: u8) -> bool {
+        (self.programmed_second >> 16 & 1 << sector == 0) != (self.programmed & SPRMOD != 0)
+    }
+
+    /// Sets nWRP of a sector of the second bank, counted from 0, as a debug probe does.
+    pub fn preset_second(&mut self, sector: u8, protected: bool) {
+        let bit = 1 << (16 + sector);
+        for options in [&mut self.programmed_second, &mut self.register_second] {
+            *options = *options & !bit | if protected { 0 } else { bit };
+        }
     }
 
     /// Sets all of them as a debug probe does, in the form of OPTCR, with bits that some lines alone have.
@@ -191,6 +238,12 @@ impl OptionBytes {
         bytes[8..10].copy_from_slice(&high.to_le_bytes());
         bytes[10..12].copy_from_slice(&(!high).to_le_bytes());
         bytes
+    }
+
+    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.9.9).
+    #[must_use]
+    pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
+        self.programmed & (if is_standby { 1 << 7 } else { 1 << 6 }) == 0
     }
 
     /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
@@ -255,6 +308,24 @@ mod tests {
         assert_eq!(options.read(false), 0x0FFC_AAED);
         let protected: Vec<u8> = (0..12).filter(|sector| options.protects(*sector)).collect();
         assert_eq!(protected, [0, 1]);
+    }
+
+    /// Section 3.9.11: bits 16 to 27, a zero protects; programmed by OPTSTRT of OPTCR.
+    #[test]
+    fn the_second_bank_has_its_write_protection_in_optcr1() {
+        let mut options = OptionBytes::default();
+        assert_eq!(options.read_second(), 0x0FFF_0000);
+        assert!(options.write_second(0).is_err(), "locked");
+        let mut options = open();
+        options.write_second(0xFFFD_FFFF).unwrap();
+        assert_eq!(options.read_second(), 0x0FFD_0000);
+        assert!(!options.protects_second(1), "not programmed yet");
+        options.program(0x0FFF_AAEC);
+        options.reset();
+        assert!((0..12).filter(|sector| options.protects_second(*sector)).eq([1]));
+        assert!((0..12).all(|sector| !options.protects(sector)));
+        options.preset_second(1, false);
+        assert_eq!(options.read_second(), 0x0FFF_0000);
     }
 
     #[test]
