@@ -23,6 +23,7 @@ mod silicon;
 mod slcan;
 mod stack;
 mod standby;
+mod stuck_bus;
 mod supply;
 mod uart;
 mod virtual_can;
