@@ -3,6 +3,7 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
+use coflash::device::Doing;
 use coflash::file::convert::{blocks_of, Options};
 use coflash::file::read::{read, Format};
 use coflash::update::{flash, FlashOptions};
@@ -23,6 +24,150 @@ const CODE: [u16; 34] = [
     0x6841, 0x4708, 0x0000, // ldr r1, [r0, #4]; bx r1
     0x3800, 0x4002, 0x60FA, 0xC010, 0xE010, 0xE000,
 ];
+
+/// A program that stores the values of a table, ends in a state by the bits of the last one, and jumps.
+const SCRIPT: [u16; 40] = [
+    0xB672, 0xA013, // cpsid i; adr r0, table
+    0xC806, 0xB109, 0x600A, 0xE7FB, // ldmia r0!, {r1, r2}; cbz r1, end; str r2, [r1]; next
+    0xF04F, 0x6400, 0x6825, 0x6866, // end: mov r4, #0x08000000; ldr r5, [r4]; ldr r6, [r4, #4]
+    0x07D3, 0xD400, 0xB662, // without bit 0: cpsie i
+    0x0793, 0xD500, 0xB671, // bit 1: cpsid f
+    0x0753, 0xD501, 0xEE00, 0x4A10, // bit 2: vmov s0, r4
+    0x0713, 0xD500, 0xDF00, // bit 3: svc #0, whose vector is the next instruction
+    0x06D3, 0xD502, 0x2310, 0xF383, 0x8811, // bit 4: msr BASEPRI, #10h
+    0x0693, 0xD506, 0xF385, 0x8809, 0x2302, 0xF383, 0x8814, // bit 5: msr PSP, r5; msr CONTROL, #2
+    0xF3BF, 0x8F6F, // isb
+    0xF385, 0x8808, 0x4730, // msr MSP, r5; bx r6; the table follows
+];
+/// Where the vectors of HardFault and SVC lead (ARMv7-M B1.5.2: exceptions 3 and 11), from the first instruction on.
+const END: u32 = 0x0C;
+const AFTER_SVC: u32 = 0x2E;
+const INTERRUPTS_OFF: u32 = 1 << 0;
+const FAULTS_MASKED: u32 = 1 << 1;
+const FPU_USED: u32 = 1 << 2;
+const FROM_A_HANDLER: u32 = 1 << 3;
+const PRIORITIES_MASKED: u32 = 1 << 4;
+const PROCESS_STACK: u32 = 1 << 5;
+
+/// What a program leaves wrong.
+struct Wrong {
+    what: &'static str,
+    /// Stores, in order.
+    stores: &'static [(u32, u32)],
+    /// The state of the core.
+    core: u32,
+}
+
+const APB1ENR: u32 = 0x4002_3840;
+const CAN1: u32 = 0x4000_6400;
+/// PWR, CAN1, WWDG, TIM2.
+const APB1_CLOCKS: u32 = 1 << 28 | 1 << 25 | 1 << 11 | 1 << 0;
+
+/// Registers by RM0090, and by ARMv7-M those of the core.
+const WRONG: [Wrong; 16] = [
+    Wrong { what: "PRIMASK and FAULTMASK set", stores: &[], core: INTERRUPTS_OFF | FAULTS_MASKED },
+    Wrong { what: "BASEPRI set", stores: &[], core: PRIORITIES_MASKED },
+    Wrong { what: "on the process stack", stores: &[], core: PROCESS_STACK },
+    Wrong { what: "FPU in use", stores: &[(0xE000_ED88, 0x00F0_0000)], core: FPU_USED },
+    Wrong { what: "in a handler", stores: &[], core: FROM_A_HANDLER },
+    Wrong {
+        what: "every interrupt enabled, some pending, TIM2 and SysTick run",
+        stores: &[
+            (APB1ENR, APB1_CLOCKS),
+            (0x4000_002C, 60_000), // TIM2: ARR, DIER, CR1
+            (0x4000_000C, 1),
+            (0x4000_0000, 1),
+            (0xE000_E014, 60_000), // SYST_RVR, SYST_CSR
+            (0xE000_E010, 7),
+            (0xE000_E100, u32::MAX), // ISER0 to 2, ISPR0
+            (0xE000_E104, u32::MAX),
+            (0xE000_E108, u32::MAX),
+            (0xE000_E200, u32::MAX),
+        ],
+        core: INTERRUPTS_OFF,
+    },
+    Wrong {
+        what: "VTOR in RAM, unaligned accesses and divisions by 0 fault",
+        stores: &[(0xE000_ED08, 0x2000_0000), (0xE000_ED14, 0x218)],
+        core: 0,
+    },
+    Wrong {
+        what: "SLEEPDEEP and SLEEPONEXIT, and Standby chosen",
+        stores: &[(APB1ENR, APB1_CLOCKS), (0x4000_7000, 0xC006), (0xE000_ED10, 6)],
+        core: 0,
+    },
+    Wrong {
+        what: "flash open for programming by bytes, its caches off",
+        stores: &[
+            (0x4002_3C04, 0x4567_0123), // KEYR, CR, ACR
+            (0x4002_3C04, 0xCDEF_89AB),
+            (0x4002_3C10, 1),
+            (0x4002_3C00, 7),
+        ],
+        core: 0,
+    },
+    // A bus error: the program jumps from the handler of the fault.
+    Wrong { what: "option bytes shut by a wrong key", stores: &[(0x4002_3C08, 0)], core: 0 },
+    Wrong {
+        what: "voltage detector at 2.9 V with its interrupt",
+        stores: &[
+            (APB1ENR, APB1_CLOCKS),
+            (0x4000_7000, 0xC0F0),  // PWR_CR: PVDE, PLS 7
+            (0x4001_3C00, 1 << 16), // EXTI: IMR, RTSR, FTSR, SWIER
+            (0x4001_3C08, 1 << 16),
+            (0x4001_3C0C, 1 << 16),
+            (0x4001_3C10, 1 << 16),
+        ],
+        core: 0,
+    },
+    Wrong { what: "independent watchdog", stores: &[(0x4000_3000, 0xCCCC)], core: 0 },
+    Wrong { what: "window watchdog", stores: &[(APB1ENR, APB1_CLOCKS), (0x4000_2C00, 0xFF)], core: 0 },
+    Wrong {
+        what: "CAN in loop-back and silent mode with a frame to send and its interrupts",
+        stores: &[
+            (APB1ENR, APB1_CLOCKS),
+            (CAN1, 1), // MCR, BTR, MCR, IER, TI0R
+            (CAN1 + 0x1C, 0xC123_0001),
+            (CAN1, 0),
+            (CAN1 + 0x14, 0x0003_8F7F),
+            (CAN1 + 0x180, 1),
+        ],
+        core: 0,
+    },
+    Wrong {
+        what: "slow buses, the oscillator in place of the PLL, and no crystal",
+        stores: &[(0x4002_3808, 0xFCA0), (0x4002_3800, 0x83)],
+        core: 0,
+    },
+    Wrong {
+        what: "peripherals held in reset, and without clocks",
+        stores: &[
+            (0x4002_3810, 0x0000_11FF), // RSTRs
+            (0x4002_3820, 0x36FE_C9FF),
+            (0x4002_3824, 0x0007_5933),
+            (0x4002_3830, 0), // ENRs
+            (APB1ENR, 0),
+            (0x4002_3844, 0),
+        ],
+        core: 0,
+    },
+];
+
+fn scripted_program(wrong: &Wrong) -> Vec<u8> {
+    let program = firmware::board().programs[0].base;
+    let mut image = vec![0; 0x400];
+    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
+    image[4..8].copy_from_slice(&(program + 0x201).to_le_bytes());
+    image[12..16].copy_from_slice(&(program + 0x201 + END).to_le_bytes());
+    image[44..48].copy_from_slice(&(program + 0x201 + AFTER_SVC).to_le_bytes());
+    let code = SCRIPT.iter().flat_map(|half| half.to_le_bytes());
+    let table = wrong.stores.iter().copied().chain([(0, wrong.core)]);
+    let table = table.flat_map(|(address, value)| [address, value]).flat_map(u32::to_le_bytes);
+    for (place, byte) in image[0x200..].iter_mut().zip(code.chain(table)) {
+        *place = byte;
+    }
+    image
+}
 
 fn foreign_program() -> Vec<u8> {
     let program = firmware::board().programs[0].base;
@@ -50,6 +195,39 @@ fn assert_alive(bench: &mut Bench) {
     let errors =
         bench.records().iter().filter(|record| record.outcome != emulator::bus::Outcome::Good).count();
     assert_eq!(errors, 0, "error frames");
+}
+
+/// Each alone: the device is reachable within the time of its watchdogs, and its flash works.
+#[test]
+fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
+    let mut lost = Vec::new();
+    for wrong in &WRONG {
+        let mut bench = Bench::new();
+        bench.power_on();
+        bench.await_boot_up(100);
+        let base = firmware::board().programs[0].base;
+        let image = read(&scripted_program(wrong), Some(Format::Raw), Some(base)).unwrap();
+        let blocks = blocks_of(image, &Options::default()).unwrap().file;
+        flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+        bench.run_ms(100);
+        bench.events();
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        // A second of the watchdog at 32 kHz, and a rescue window.
+        bench.run_ms(2_000);
+        let stops: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+        println!("{}: {stops:?}", wrong.what);
+        let answer = bench.ask(REQUEST, &[0x40, 0, 0x10, 0, 0, 0, 0, 0], RESPONSE);
+        if answer.is_none_or(|answer| answer[0] != 0x43) {
+            let machine = bench.machine();
+            lost.push(format!("{}: {stops:?}, pc {:08X}h", wrong.what, machine.pc()));
+            continue;
+        }
+        assert!(bench.is_bootloader(NODE), "{}", wrong.what);
+        // It can erase.
+        bench.session().command(1, ProgramControl::Clear).unwrap();
+        bench.session().await_idle(1, Doing::Block(0)).unwrap();
+    }
+    assert!(lost.is_empty(), "not reachable after: {lost:#?}");
 }
 
 #[test]
