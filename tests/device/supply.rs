@@ -172,6 +172,35 @@ fn a_program_gets_the_voltage_detector_switched_off() {
     bench.assert_nothing_unmodelled();
 }
 
+/// BOR level 3 and off, WDG_SW, nRST_STOP, nRST_STDBY, and nWRP of the bootloader's first sector: the program starts, can be
+/// called back and erased, and the device says in 2007h/6 what its option bytes are.
+#[test]
+fn with_every_combination_of_option_bytes_a_program_is_called_back_and_erased() {
+    let pristine = board_with_a_program().machine().flash().to_vec();
+    for bits in (0_u32..64).filter(|bits| matches!(bits & 0b11, 0 | 3)) {
+        let pick = |bit: u32, mask: u32| if bits >> bit & 1 != 0 { mask } else { 0 };
+        let optcr = (bits & 0b11) << 2
+            | pick(2, 1 << 5)
+            | pick(3, 1 << 6)
+            | pick(4, 1 << 7)
+            | 0xAA << 8
+            | 0xFFE << 16
+            | pick(5, 1 << 16);
+        let mut bench = Bench::new();
+        bench.machine().load_bin(firmware::board().chip.flash.base, &pristine).unwrap();
+        bench.machine().set_option_bytes(optcr);
+        bench.power_on();
+        bench.await_program(1_000);
+        bench.run_ms(50);
+        bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1_000);
+        bench.run_ms(20);
+        bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
+        bench.session().await_idle(1, coflash::device::Doing::Block(0)).unwrap();
+        assert_eq!(bench.session().read_number(OPTION_BYTES).unwrap(), optcr | 1, "{optcr:08X}h");
+    }
+}
+
 /// Each combination of brown-out level, WDG_SW, BFB2, SPRMOD, RDP and a protected sector is shown as it is, and
 /// `coflash info` names what is wrong with it.
 #[test]
