@@ -123,6 +123,30 @@ fn start_times(silicon: Silicon) {
     }
 }
 
+/// The budget of the design is 4.5 ms with a crystal of 2 ms: 2.5 ms are for all the rest. A crystal that never starts is
+/// given up after 50 ms (bsp/src/pll.rs), and not while a late one may still come (20 ms).
+#[test]
+fn the_boot_up_waits_for_a_late_crystal_and_for_none_at_all_a_bounded_time() {
+    const REST_US: u64 = 2_500;
+    for crystal_start_us in [300, 2_000, 10_000, 20_000] {
+        let silicon = Silicon { crystal_start_us, ..TYPICAL };
+        let mut bench = Bench::with(ChipOptions { silicon, ..ChipOptions::default() });
+        bench.power_on();
+        let took = micros(bench.await_boot_up(100) - Time(0));
+        println!("crystal after {crystal_start_us} us: boot-up {took} us after power-on");
+        assert!(took <= u64::from(crystal_start_us) + REST_US, "{took} us");
+    }
+    // This product speaks without its crystal. A host understands it only if the internal oscillator is exact.
+    for silicon in [TYPICAL, Silicon { hsi_hz: TYPICAL.hsi_hz, ..emulator::silicon::WORST }] {
+        let chip = ChipOptions { hse_hz: 0, silicon, ..ChipOptions::default() };
+        let mut bench = Bench::of_image_with(firmware::BOOTLOADER_LEAST, chip);
+        bench.power_on();
+        let took = micros(bench.await_boot_up(100) - Time(0));
+        println!("no crystal: boot-up {took} us after power-on, {silicon}");
+        assert!((20_000..=50_000 + REST_US).contains(&took), "{took} us");
+    }
+}
+
 fn micros(span: Span) -> u64 {
     span.0 / 1_000_000
 }

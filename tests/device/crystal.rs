@@ -6,7 +6,7 @@ use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{dead_crystal, firmware};
 use coflash::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
-use emulator::machine::Options;
+use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::Time;
 
 const CLOCK: Address = Address::new(0x2007, 5);
@@ -109,6 +109,36 @@ fn a_silent_device_hears_a_host_that_is_alone() {
     bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
     bench.run_ms(200);
     assert!(bench.is_bootloader(NODE));
+}
+
+/// The core stands still then. The watchdog of the bootloader, a second at 32 kHz (0.7 to 1.9 s, docs/product.md), resets
+/// it; from there on it is a board whose crystal has failed. With its crystal again it is as before.
+#[test]
+fn a_crystal_that_stops_is_a_watchdog_reset_and_then_silence_until_lss_speaks() {
+    let mut bench = Bench::new();
+    bench.world.add_host_port(BIT_RATE);
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.run_ms(20);
+    bench.events();
+    let stopped = bench.time();
+    bench.machine().set_crystal(0);
+    bench.run_ms(2_500);
+    let events = bench.events();
+    let [(at, Stop::Reset(ResetCause::IndependentWatchdog))] = events[..] else { panic!("{events:?}") };
+    println!("crystal stops: reset after {} us", (at - stopped).0 / 1_000_000);
+    assert!((700..=1_900).contains(&((at - stopped).0 / 1_000_000_000)), "{events:?}");
+    assert_eq!(bench.frames_since(at), []);
+    bench.post(0x7E5, &[0x04, 1, 0, 0, 0, 0, 0, 0]);
+    let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4);
+    assert_eq!(answer.as_deref(), Some(&[0x5E, NODE, 0, 0, 0, 0, 0, 0][..]));
+    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 2);
+
+    bench.power_off();
+    bench.machine().set_crystal(bsp::CLOCK_TREE.hse);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!(bench.session().read_number(CLOCK).unwrap(), 1);
 }
 
 #[test]
