@@ -123,8 +123,9 @@ fn start_times(silicon: Silicon) {
     }
 }
 
-/// The budget of the design is 4.5 ms with a crystal of 2 ms: 2.5 ms are for all the rest. A crystal that never starts is
-/// given up after 50 ms (bsp/src/pll.rs), and not while a late one may still come (20 ms).
+/// The budget of the design is 4.5 ms with a crystal of 2 ms: 2.5 ms are for all the rest. A crystal that
+/// never starts is given up after 50 ms (bsp/src/pll.rs), and not while a late one may still come (20
+/// ms).
 #[test]
 fn the_boot_up_waits_for_a_late_crystal_and_for_none_at_all_a_bounded_time() {
     const REST_US: u64 = 2_500;

@@ -111,8 +111,9 @@ fn a_silent_device_hears_a_host_that_is_alone() {
     assert!(bench.is_bootloader(NODE));
 }
 
-/// The core stands still then. The watchdog of the bootloader, a second at 32 kHz (0.7 to 1.9 s, docs/product.md), resets
-/// it; from there on it is a board whose crystal has failed. With its crystal again it is as before.
+/// The core stands still then. The watchdog of the bootloader, a second at 32 kHz (0.7 to 1.9 s,
+/// docs/product.md), resets it; from there on it is a board whose crystal has failed. With its crystal
+/// again it is as before.
 #[test]
 fn a_crystal_that_stops_is_a_watchdog_reset_and_then_silence_until_lss_speaks() {
     let mut bench = Bench::new();

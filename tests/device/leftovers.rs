@@ -39,7 +39,8 @@ const SCRIPT: [u16; 40] = [
     0xF3BF, 0x8F6F, // isb
     0xF385, 0x8808, 0x4730, // msr MSP, r5; bx r6; the table follows
 ];
-/// Where the vectors of HardFault and SVC lead (ARMv7-M B1.5.2: exceptions 3 and 11), from the first instruction on.
+/// Where the vectors of HardFault and SVC lead (ARMv7-M B1.5.2: exceptions 3 and 11), from the first
+/// instruction on.
 const END: u32 = 0x0C;
 const AFTER_SVC: u32 = 0x2E;
 const INTERRUPTS_OFF: u32 = 1 << 0;

@@ -172,8 +172,9 @@ fn a_program_gets_the_voltage_detector_switched_off() {
     bench.assert_nothing_unmodelled();
 }
 
-/// BOR level 3 and off, WDG_SW, nRST_STOP, nRST_STDBY, and nWRP of the bootloader's first sector: the program starts, can be
-/// called back and erased, and the device says in 2007h/6 what its option bytes are.
+/// BOR level 3 and off, WDG_SW, nRST_STOP, nRST_STDBY, and nWRP of the bootloader's first sector: the
+/// program starts, can be called back and erased, and the device says in 2007h/6 what its option bytes
+/// are.
 #[test]
 fn with_every_combination_of_option_bytes_a_program_is_called_back_and_erased() {
     let pristine = board_with_a_program().machine().flash().to_vec();

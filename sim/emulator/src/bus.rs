@@ -23,7 +23,7 @@
 //!   flag destroys the frames of the others; it starts only while the bus is idle, though it hears
 //!   nothing. Without a pin for TX it sees the same, and nobody is disturbed.
 //! - A line that something holds dominant ([`Bus::hold_dominant`]) breaks the frame on it, carries none, and
-//!   lets the counters of the nodes on it rise (12.1.4.2, rules b, d and f), each at its own bit time.
+//!   lets the counters of the nodes on it rise (12.1.4, rules b, d and f), each at its own bit time.
 //!   A frame that is broken in its arbitration field counts as a bit error, too.
 //! - There are no overload frames.
 
@@ -294,8 +294,8 @@ impl Bus {
         self.faults.clear();
     }
 
-    /// From now on something holds the line dominant (a short circuit, a transceiver without its supply), or
-    /// lets it go.
+    /// From now on something holds the line dominant (a short circuit, a transceiver without its supply),
+    /// or lets it go.
     pub fn hold_dominant(&mut self, is_held: bool, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
         match (is_held, self.dominant.take()) {
@@ -313,8 +313,8 @@ impl Bus {
         }
     }
 
-    /// The line falls for a long time: the frame on it is broken, and idle nodes take the edge for the start of
-    /// one.
+    /// The line falls for a long time: the frame on it is broken, and idle nodes take the edge for the
+    /// start of one.
     fn fall(&mut self, nodes: &mut [&mut dyn BusNode]) {
         let now = self.now;
         let mut dominant = Dominant::default();
@@ -338,8 +338,8 @@ impl Bus {
         self.dominant = Some(dominant);
     }
 
-    /// When the counters of this node rise next because the line stays dominant. A counter that has reached its
-    /// end, or a node that is off the bus, rests.
+    /// When the counters of this node rise next because the line stays dominant. A counter that has
+    /// reached its end, or a node that is off the bus, rests.
     fn next_rise(&self, n: usize, node: &dyn BusNode) -> Option<Time> {
         let dominant = self.dominant.as_ref()?;
         node.line().filter(Line::hears)?;
@@ -390,7 +390,8 @@ impl Bus {
         [leaves, joins, starts, self.next_rise(n, node)].into_iter().flatten().min()
     }
 
-    /// Whether a frame of or for the node is under way. A line that stays dominant keeps it in an error frame.
+    /// Whether a frame of or for the node is under way. A line that stays dominant keeps it in an error
+    /// frame.
     fn is_busy(&self, n: usize, node: &dyn BusNode) -> bool {
         self.flight.as_ref().is_some_and(|flight| flight.involves(n))
             || self.inner.iter().any(|inner| inner.node == n)

@@ -83,8 +83,8 @@ impl Confinement {
         self.rec = self.rec.saturating_add(if first { 9 } else { 1 });
     }
 
-    /// The line has stayed dominant for 8 more bits after an error flag (rule f): the counter of the role that the
-    /// node had in the frame rises by 8.
+    /// The line has stayed dominant for 8 more bits after an error flag (rule f): the counter of the role
+    /// that the node had in the frame rises by 8.
     pub fn stays_dominant(&mut self, own: bool) {
         if own {
             self.transmit_failed(false);

@@ -649,9 +649,10 @@ fn in_loop_back_mode_without_a_pin_it_plays_with_itself() {
     assert_eq!(bench.read(0, 0x0C) & 3, 1);
 }
 
-/// ISO 11898-1:2015, 12.1.4.2, for receivers: 1 for the stuff error and 8 for the first dominant bit after the flag
-/// (rules a and b), then 8 with the 14th dominant bit from the beginning of the flag and with each 8 more (rule f). The flag
-/// begins after 6 equal bits. So 129 are reached at bit 6 + 14 + 14 x 8 = 132; a receiver never goes bus-off.
+/// ISO 11898-1:2015, 12.1.4, for receivers: 1 for the stuff error and 8 for the first dominant bit
+/// after the flag (rules a and b), then 8 with the 14th dominant bit from the beginning of the flag and
+/// with each 8 more (rule f). The flag begins after 6 equal bits. So 129 are reached at bit 6 + 14 + 14 x
+/// 8 = 132; a receiver never goes bus-off.
 #[test]
 fn on_a_line_that_stays_dominant_a_receiver_ends_error_passive() {
     const EPVF_BOFF: u32 = 0b110;
@@ -673,8 +674,8 @@ fn on_a_line_that_stays_dominant_a_receiver_ends_error_passive() {
     assert_eq!(bench.read(0, 0x18) >> 24, 120, "RM0090, CAN_ESR");
 }
 
-/// The bit error counts 8, and each 8 bits of rule f: 32 x 8 = 256 at bit 1 + 14 + 30 x 8 = 255. Bus-off lasts
-/// until the line is free, and 128 x 11 bits longer.
+/// The bit error counts 8, and each 8 bits of rule f: 32 x 8 = 256 at bit 1 + 14 + 30 x 8 = 255. Bus-off
+/// lasts until the line is free, and 128 x 11 bits longer.
 #[test]
 fn a_line_that_falls_in_the_middle_of_a_frame_takes_its_transmitter_to_bus_off() {
     let mut bench = Bench::ports(&[1_000_000, 1_000_000]);
@@ -695,8 +696,8 @@ fn a_line_that_falls_in_the_middle_of_a_frame_takes_its_transmitter_to_bus_off()
     assert_eq!(bench.log()[1], (60_001_408, 60_001_464, 0x701, Outcome::Good));
 }
 
-/// RM0090 sections 32.4.1 and 32.4.2: initialisation is entered when the activity on the bus is over, and left
-/// after 11 recessive bits. MCR.RESET does not wait.
+/// RM0090 sections 32.4.1 and 32.4.2: initialisation is entered when the activity on the bus is over, and
+/// left after 11 recessive bits. MCR.RESET does not wait.
 #[test]
 fn a_line_that_stays_dominant_lets_nobody_in_and_nobody_out() {
     let mut bench = Bench::new(vec![controller(0, 0), controller(0, 0)]);
@@ -719,8 +720,9 @@ fn a_line_that_stays_dominant_lets_nobody_in_and_nobody_out() {
     assert_eq!(bench.read(1, 0x04) & 3, 2, "SLAK");
 }
 
-/// ISO 11898-1:2015, 12.1.4.2, rule c, exception 1: without an acknowledge the counter of a transmitter ends at
-/// 128. A controller repeats the frame for ever (RM0090 section 32.7.1), 48 - 8 + 6 + 8 + 3 + 8 = 65 bits each.
+/// ISO 11898-1:2015, 12.1.4, rule c, exception 1: without an acknowledge the counter of a transmitter
+/// ends at 128. A controller repeats the frame for ever (RM0090 section 32.7.1), 48 - 8 + 6 + 8 + 3 + 8 =
+/// 65 bits each.
 #[test]
 fn a_controller_that_nobody_acknowledges_ends_error_passive_and_repeats() {
     let mut bench = Bench::new(vec![controller(0, 0)]);

@@ -844,7 +844,8 @@ mod tests {
         }
     }
 
-    /// Sections 3.9.9 and 3.9.11: bits 16 to 27 of OPTCR and OPTCR1 are sectors 0 to 11 and 12 to 23; a zero protects.
+    /// Sections 3.9.9 and 3.9.11: bits 16 to 27 of OPTCR and OPTCR1 are sectors 0 to 11 and 12 to 23; a
+    /// zero protects.
     #[test]
     fn each_bank_has_its_own_write_protection() {
         for (optcr, optcr1, refused) in

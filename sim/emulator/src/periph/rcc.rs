@@ -54,7 +54,8 @@ pub enum ResetCause {
     IndependentWatchdog,
     /// The window watchdog ran out, or was refreshed outside its window.
     WindowWatchdog,
-    /// The program entered Stop or Standby, for which the option bits nRST_STOP and nRST_STDBY have a reset.
+    /// The program entered Stop or Standby, for which the option bits nRST_STOP and nRST_STDBY have a
+    /// reset.
     LowPower,
     /// A wake-up from Standby, which starts the chip as a reset does.
     Standby,
@@ -190,8 +191,8 @@ impl Rcc {
         };
     }
 
-    /// The crystal works, or has stopped. Without the clock security system nothing takes its place: what runs
-    /// from it stands still (section 7.2.7).
+    /// The crystal works, or has stopped. Without the clock security system nothing takes its place: what
+    /// runs from it stands still (section 7.2.7).
     pub fn set_crystal(&mut self, hz: u32) {
         self.hse_hz = hz;
         if hz == 0 {

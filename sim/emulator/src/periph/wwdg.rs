@@ -169,14 +169,15 @@ mod tests {
     const CFR: u32 = 0x04;
     const SR: u32 = 0x08;
 
-    /// At 30 MHz, as in table 109.
+    /// At 30 MHz, as in the table of section 22.4.
     fn dog() -> Wwdg {
         let mut dog = Wwdg::default();
         dog.set_clock(30_000_000, Time(0));
         dog
     }
 
-    /// RM0090 table 109: the shortest and the longest time at 30 MHz by WDGTB, in hundredths of a microsecond.
+    /// RM0090 section 22.4: the shortest and the longest time at 30 MHz by WDGTB, in hundredths of a
+    /// microsecond.
     #[test]
     fn it_runs_out_after_the_times_of_the_manual() {
         for (prescaler, shortest, longest) in

@@ -1228,8 +1228,8 @@ fn breakpoints_outlive_a_reset_and_not_the_power() {
     assert_eq!(log, [[0x0800_0238, 2], [0, 0]]);
 }
 
-/// RM0090 sections 7.1.1 and 7.3.21: with nRST_STDBY or nRST_STOP clear, the entry is a reset with LPWRRSTF, and the
-/// pin's flag as with every internal reset.
+/// RM0090 sections 7.1.1 and 7.3.21: with nRST_STDBY or nRST_STOP clear, the entry is a reset with
+/// LPWRRSTF, and the pin's flag as with every internal reset.
 #[test]
 fn with_an_option_bit_the_entry_into_standby_is_a_reset() {
     for (optcr, is_reset) in [(0x0FFF_AA6C, true), (0x0FFF_AAAC, false)] {
@@ -1247,8 +1247,8 @@ fn with_an_option_bit_the_entry_into_standby_is_a_reset() {
     }
 }
 
-/// RM0090 section 22.4: 64 counts of 4096 periods of PCLK1, 16.384 ms at 16 MHz; section 7.3.21: WWDGRSTF, and the flags of
-/// the power-on.
+/// RM0090 section 22.4: 64 counts of 4096 periods of PCLK1, 16.384 ms at 16 MHz; section 7.3.21:
+/// WWDGRSTF, and the flags of the power-on.
 #[test]
 fn the_window_watchdog_resets_the_chip() {
     let mut machine = machine(&programs::BUSY);

@@ -1,5 +1,5 @@
-//! The option bytes, FLASH_OPTCR and, on a chip with two banks, FLASH_OPTCR1 (RM0090 sections 3.6, 3.9.9 and
-//! 3.9.11).
+//! The option bytes, FLASH_OPTCR and, on a chip with two banks, FLASH_OPTCR1 (RM0090 sections 3.6, 3.9.9
+//! and 3.9.11).
 //!
 //! The chip loads the register from the option bytes at reset. A program changes the register, and
 //! OPTSTRT erases the option bytes and programs them from it. They are not part of the array: a
