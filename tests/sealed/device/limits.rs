@@ -4,9 +4,9 @@
 use canopen::program::ProgramControl;
 use canopen::BitRate;
 use coboot_tests::bench::{Bench, REQUEST, RESPONSE};
-use coboot_tests::{firmware, stack};
 use coboot_tests::sealed_board::{board, open_board, provision, release, sealer, write, COUNTER, KEK};
 use coboot_tests::throughput::{change_over, code};
+use coboot_tests::{firmware, stack};
 use coflash::device::Transfers;
 use coflash::file::sealed::Sealer;
 use emulator::bus::Outcome;

@@ -5,7 +5,7 @@ use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
 use super::{find, Downloader, Failure, Transfer};
-use crate::intake::{Destination, Intake, Findings};
+use crate::intake::{Destination, Findings, Intake};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
 use crate::resume::Partial;

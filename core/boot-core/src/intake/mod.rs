@@ -24,7 +24,7 @@ use canopen::AbortCode;
 use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
-pub(crate) use format::{Destination, Format, Findings, Recognition};
+pub(crate) use format::{Destination, Findings, Format, Recognition};
 
 formats! {
     Sealed(sealed::SealedImage),

@@ -8,7 +8,7 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use super::buffers::{start, Buffers};
-use super::content::{Content, Acceptance};
+use super::content::{Acceptance, Content};
 use crate::flash::Flash;
 use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
@@ -161,7 +161,8 @@ impl Image {
             }
             Stage::Content(content) => {
                 if content.advance(self.place.region, buffers, flash, queue)? {
-                    self.stage = Stage::Installed(Installed { acceptance: content.acceptance(), raises: true });
+                    self.stage =
+                        Stage::Installed(Installed { acceptance: content.acceptance(), raises: true });
                 }
             }
             Stage::Installed(_) => {}
