@@ -319,13 +319,7 @@ fn ci(summary: &mut Summary) -> Outcome {
     let without = NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
     doc.current_dir(workspace::root()).args(["--doc", "--workspace", "--quiet"]).args(without);
     runner::count("documentation", process::run(&mut doc), summary);
-    for other in other_chips() {
-        on_board(other, Tier::Ci, summary, |program, test| {
-            let is_of = |row: &(&str, &str)| row.0 == program && test.starts_with(row.1);
-            OF_EACH_CHIP.iter().any(is_of) && Tier::of(program, test) != Tier::All
-        })?;
-    }
-    Ok(())
+    other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
 }
 
 /// The tests that take minutes.
@@ -338,7 +332,7 @@ fn slow(summary: &mut Summary) -> Outcome {
 
 /// Every test that runs firmware, for each other chip.
 fn boards(summary: &mut Summary) -> Outcome {
-    other_chips().try_for_each(|board| on_board(board, Tier::All, summary, |_, _| true))
+    other_chips().try_for_each(|board| on_board(board, Tier::All, summary))
 }
 
 /// A board of each other chip.
@@ -346,23 +340,22 @@ fn other_chips() -> impl Iterator<Item = &'static Layout> {
     BOARDS.iter().copied().filter(|other| other.chip.chip != DEFAULT.chip.chip)
 }
 
-/// Tests that run firmware, with that of a board. The programs are compiled for it.
-fn on_board(
-    board: &'static Layout,
-    tier: Tier,
-    summary: &mut Summary,
-    chosen: impl Fn(&str, &str) -> bool,
-) -> Outcome {
+/// Tests that run firmware, with that of a board: all, or those that show the mistakes of a port. The
+/// programs are compiled for it.
+fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcome {
     if tier == Tier::All {
         build::boards(&[(board, &[])])?;
     }
     let programs = board_programs(board, tier)?;
     let mut jobs = Vec::new();
-    let is_of = |program: &str, test: &str, row: &(&str, &str)| program == row.0 && test.starts_with(row.1);
-    let has = |program: &str, test: &str| {
-        board.home.is_some() || !SPLIT_ALONE.iter().any(|row| is_of(program, test, row))
+    let is_among = |rows: &[(&str, &str)], program: &str, test: &str| {
+        rows.iter().any(|(of, tests)| *of == program && test.starts_with(tests))
     };
-    let chosen = |program: &str, test: &str| has(program, test) && chosen(program, test);
+    let chosen = |program: &str, test: &str| {
+        let has = board.home.is_some() || !is_among(SPLIT_ALONE, program, test);
+        let of_tier = is_among(OF_EACH_CHIP, program, test) && Tier::of(program, test) != Tier::All;
+        has && (tier == Tier::All || of_tier)
+    };
     add(&mut jobs, summary, &programs, Some(board.board), variables(board), chosen)?;
     runner::run(jobs, summary);
     Ok(())
