@@ -143,7 +143,7 @@ pub fn run(mut args: Args) -> Outcome {
     evidence::begin(&name)?;
     let mut summary = Summary::default();
     if chosen_board {
-        on_board(board, Tier::All, &mut summary, |_, _| true)?;
+        on_board(board, Tier::All, &mut summary)?;
     } else {
         for stage in &stages {
             println!("== {}: {}", stage.name, stage.about);
