@@ -226,11 +226,16 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
                 scope.spawn(move || {
                     let own = boards.iter().filter(|(board, _)| board.chip.line.name() == chip);
                     own.copied().try_for_each(|(board, names)| {
-                        if !names.is_empty() {
-                            return images(board, names).map(drop);
+                        let mut rust = names.to_vec();
+                        rust.retain(|name| *name != C_APPLICATION);
+                        if names.is_empty() {
+                            rust.extend(Variant::of(board).map(|variant| variant.name));
                         }
-                        images(board, &Variant::of(board).map(|variant| variant.name).collect::<Vec<_>>())?;
-                        c_applications(board)
+                        images(board, &rust)?;
+                        if names.is_empty() || names.contains(&C_APPLICATION) {
+                            c_applications(board)?;
+                        }
+                        Ok(())
                     })
                 })
             })

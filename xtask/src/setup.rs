@@ -312,14 +312,21 @@ fn requirements() -> PathBuf {
     workspace::root().join("tests/python/requirements.txt")
 }
 
-/// The file that records the environment's contents: a copy of the requirements, written last.
+/// The file that records the environment, written last.
 fn stamp() -> PathBuf {
     workspace::target_dir().join("python/requirements.installed")
 }
 
+/// What it records: the environment's folder, which its programs name, and the requirements.
+fn record() -> Outcome<String> {
+    Ok(format!("{}\n{}", python().display(), files::text(&requirements())?))
+}
+
 fn python_environment_is_there() -> bool {
-    let wanted = fs::read(requirements()).ok();
-    wanted.is_some() && fs::read(stamp()).ok() == wanted && process::succeeds(python(), &["--version"])
+    let wanted = record().ok();
+    wanted.is_some()
+        && fs::read_to_string(stamp()).ok() == wanted
+        && process::succeeds(python(), &["--version"])
 }
 
 fn python_environment() -> Outcome {
@@ -335,7 +342,7 @@ fn python_environment() -> Outcome {
             .arg(requirements()),
     )
     .map_err(|problem| format!("{problem} It needs a connection to the Python package index, once."))?;
-    files::copy(&requirements(), &stamp())
+    files::write(&stamp(), record()?)
 }
 
 #[cfg(test)]

@@ -105,8 +105,16 @@ pub struct Images {
 const OF_A_CHIP: &[&str] = &["bootloader", "bootloader-paulus", "bootloader-watchdog", "app-v1", "app-v2"];
 
 /// The images for the board with two programs.
-const OF_TWO_PROGRAMS: &[&str] =
-    &["bootloader", "bootloader-lift", "app-v1", "app-v2", "app-program-2", "app-lift", "app-lift-v2"];
+const OF_TWO_PROGRAMS: &[&str] = &[
+    "bootloader",
+    "bootloader-lift",
+    "app-v1",
+    "app-v2",
+    "app-program-2",
+    "app-lift",
+    "app-lift-v2",
+    "app-c",
+];
 
 /// The images by tier.
 pub const IMAGES: &[Images] = &[
