@@ -212,9 +212,9 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     Ok(workspace::firmware_dir(board))
 }
 
-/// Builds the images with these names for several boards, or everything, the applications in C
-/// too, where there are no names; several chips at once, since the last step of each image uses only
-/// one core.
+/// Builds the images with these names for several boards, the applications in C if their name is the last, or
+/// everything where there are no names; several chips at once, since the last step of each image uses only one
+/// core.
 pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
     let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     chips.sort_unstable();
@@ -226,16 +226,12 @@ pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
                 scope.spawn(move || {
                     let own = boards.iter().filter(|(board, _)| board.chip.line.name() == chip);
                     own.copied().try_for_each(|(board, names)| {
-                        let mut rust = names.to_vec();
-                        rust.retain(|name| *name != C_APPLICATION);
-                        if names.is_empty() {
-                            rust.extend(Variant::of(board).map(|variant| variant.name));
-                        }
-                        images(board, &rust)?;
-                        if names.is_empty() || names.contains(&C_APPLICATION) {
-                            c_applications(board)?;
-                        }
-                        Ok(())
+                        match *names {
+                            [] => images(board, &Variant::of(board).map(|of| of.name).collect::<Vec<_>>())?,
+                            [ref rust @ .., C_APPLICATION] => images(board, rust)?,
+                            _ => return images(board, names).map(drop),
+                        };
+                        c_applications(board)
                     })
                 })
             })
