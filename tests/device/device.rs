@@ -18,7 +18,7 @@ const STATUS: Address = Address::new(0x1F57, 1);
 const VERSION: Address = Address::new(0x100A, 0);
 
 /// A board in its bootloader, without a program.
-fn empty_board() -> Bench {
+pub(super) fn empty_board() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
@@ -26,18 +26,18 @@ fn empty_board() -> Bench {
 }
 
 /// A board that runs version 1.
-fn running_board() -> Bench {
+pub(super) fn running_board() -> Bench {
     let mut bench = empty_board();
     install(&mut bench, firmware::APP_V1);
     bench
 }
 
-fn install(bench: &mut Bench, image: &str) {
+pub(super) fn install(bench: &mut Bench, image: &str) {
     let file = firmware::blocks(image);
     flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
 }
 
-fn call_back(bench: &mut Bench) {
+pub(super) fn call_back(bench: &mut Bench) {
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
 }

@@ -154,30 +154,24 @@ const WRONG: [Wrong; 16] = [
     },
 ];
 
-fn scripted_program(wrong: &Wrong) -> Vec<u8> {
-    let program = firmware::board().programs[0].base;
-    let mut image = vec![0; 0x400];
+/// A program whose reset handler is these half-words; its other bytes are 0.
+fn image_of(code: impl IntoIterator<Item = u16>) -> Vec<u8> {
+    let mut image = vec![0; 0x200];
     image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
-    image[4..8].copy_from_slice(&(program + 0x201).to_le_bytes());
-    image[12..16].copy_from_slice(&(program + 0x201 + END).to_le_bytes());
-    image[44..48].copy_from_slice(&(program + 0x201 + AFTER_SVC).to_le_bytes());
-    let code = SCRIPT.iter().flat_map(|half| half.to_le_bytes());
-    let table = wrong.stores.iter().copied().chain([(0, wrong.core)]);
-    let table = table.flat_map(|(address, value)| [address, value]).flat_map(u32::to_le_bytes);
-    for (place, byte) in image[0x200..].iter_mut().zip(code.chain(table)) {
-        *place = byte;
-    }
+    image[4..8].copy_from_slice(&(firmware::board().programs[0].base + 0x201).to_le_bytes());
+    image.extend(code.into_iter().flat_map(u16::to_le_bytes));
+    image.resize(0x400.max(image.len()), 0);
     image
 }
 
-fn foreign_program() -> Vec<u8> {
-    let program = firmware::board().programs[0].base;
-    let mut image = vec![0; 0x400];
-    image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
-    image[4..8].copy_from_slice(&(program + 0x201).to_le_bytes());
-    for (place, half) in image[0x200..].chunks_exact_mut(2).zip(CODE) {
-        place.copy_from_slice(&half.to_le_bytes());
-    }
+fn scripted_program(wrong: &Wrong) -> Vec<u8> {
+    let table = wrong.stores.iter().copied().chain([(0, wrong.core)]);
+    let table = table.flat_map(|(address, value)| [address, value]);
+    let table = table.flat_map(|word| [word as u16, (word >> 16) as u16]);
+    let mut image = image_of(SCRIPT.into_iter().chain(table));
+    let code = firmware::board().programs[0].base + 0x201;
+    image[12..16].copy_from_slice(&(code + END).to_le_bytes());
+    image[44..48].copy_from_slice(&(code + AFTER_SVC).to_le_bytes());
     image
 }
 
@@ -237,8 +231,7 @@ fn a_foreign_program_that_jumps_with_everything_wrong_does_no_harm() {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    let image =
-        read(&foreign_program(), Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap();
+    let image = read(&image_of(CODE), Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap();
     let blocks = blocks_of(image, &Options::default()).unwrap().file;
     flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     bench.run_ms(100);

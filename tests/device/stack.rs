@@ -1,24 +1,11 @@
 //! How much of the stack the bootloader uses: its boot stage, and its RAM image.
 
-use canopen::program::ProgramControl;
-use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, stack};
-use coflash::update::{flash, FlashOptions};
 use emulator::time::Span;
 use shared_abi::geometry::Region;
 use shared_abi::layout::LEAST_STACK;
 
-fn install(bench: &mut Bench, image: &str) {
-    flash(&mut bench.session(), &firmware::blocks(image), &FlashOptions::default(), &mut |_| {}).unwrap();
-}
-
-/// A board in its bootloader.
-fn empty_board() -> Bench {
-    let mut bench = Bench::new();
-    bench.power_on();
-    bench.await_boot_up(100);
-    bench
-}
+use crate::device::{call_back, empty_board, install, running_board};
 
 /// The boot stage, from power-on to the first instruction of a program and to that of the RAM image,
 /// uses no more than is kept free for it: the end of the RAM, where the image is not copied to.
@@ -27,9 +14,8 @@ fn the_boot_stage_stays_within_its_stack() {
     let board = firmware::board();
     let mut depths = Vec::new();
     for is_installed in [true, false] {
-        let mut bench = empty_board();
+        let mut bench = if is_installed { running_board() } else { empty_board() };
         if is_installed {
-            install(&mut bench, firmware::APP_V1);
             bench.confirm_program();
         }
         bench.power_off();
@@ -50,10 +36,8 @@ fn the_boot_stage_stays_within_its_stack() {
 /// An update from the call back to the start of the program.
 #[test]
 fn an_update_stays_within_the_stack() {
-    let mut bench = empty_board();
-    install(&mut bench, firmware::APP_V1);
-    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
-    bench.await_boot_up(1000);
+    let mut bench = running_board();
+    call_back(&mut bench);
     let stack = stack::of_image(firmware::BOOTLOADER);
     stack::fill(bench.machine(), stack);
     install(&mut bench, firmware::APP_V2);

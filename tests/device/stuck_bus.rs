@@ -3,12 +3,13 @@
 
 use std::time::Duration;
 
+use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::update::{flash, FlashOptions};
 use emulator::machine::Options;
 use emulator::silicon::{Silicon, TYPICAL, WORST};
-use emulator::time::Time;
+use emulator::time::{Span, Time};
 
 const MINUTE_MS: u64 = 60_000;
 /// The device's own wait after bus-off, the longest (docs/testing.md, "The slowest answer").
@@ -56,11 +57,11 @@ fn an_update_on_a_line_that_falls_breaks_off_and_works_later() {
         bench.power_on();
         bench.await_boot_up(100);
         assert!(update(&mut bench, firmware::APP_V1), "{what}");
-        bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1_000);
         bench.run_ms(20);
         bench.events();
-        bench.world.hold_dominant_after(emulator::time::Span::from_millis(after_ms));
+        bench.world.hold_dominant_after(Span::from_millis(after_ms));
         assert!(!update(&mut bench, firmware::APP_V2), "{what}");
         bench.run_ms(MINUTE_MS);
         comes_back(&mut bench, &what);
@@ -89,7 +90,7 @@ fn a_program_on_a_dominant_line_can_be_called_back_later() {
         bench.run_ms(2 * MINUTE_MS);
         comes_back(&mut bench, &what);
         assert!(!bench.is_bootloader(NODE), "{what}");
-        bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1_000);
         assert!(bench.is_bootloader(NODE), "{what}");
     }

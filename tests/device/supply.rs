@@ -1,12 +1,12 @@
 //! The supply of the chip, and its option bytes (2007h/6 and 7). Thresholds: datasheet DS8626, typical.
 
-use canopen::program::FlashError;
+use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash::device::option_bytes::OptionBytes;
 use coflash::device::read_state::read_state;
-use coflash::device::Error;
+use coflash::device::{Doing, Error};
 use coflash::update::{flash, FlashOptions};
 use emulator::machine::{Operation, ResetCause, Stop};
 use emulator::time::Span;
@@ -23,7 +23,7 @@ fn board_with_a_program() -> Bench {
     bench.power_on();
     bench.await_boot_up(100);
     update(&mut bench, firmware::APP_V1).unwrap();
-    bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     bench.run_ms(20);
     bench.events();
@@ -166,7 +166,7 @@ fn a_program_gets_the_voltage_detector_switched_off() {
     let level = bsp::voltage::detector_level(bsp::SUPPLY_MV);
     let watches = bench.machine().register(PWR_CR).unwrap() >> 4 & 0xF;
     assert_eq!(watches, level.map_or(0, |level| u32::from(level) << 1 | 1));
-    bench.session().command(1, canopen::program::ProgramControl::Start).unwrap();
+    bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1000);
     assert_eq!(bench.machine().register(PWR_CR).unwrap() >> 4 & 0xF, 0);
     bench.assert_nothing_unmodelled();
@@ -193,11 +193,11 @@ fn with_every_combination_of_option_bytes_a_program_is_called_back_and_erased() 
         bench.power_on();
         bench.await_program(1_000);
         bench.run_ms(50);
-        bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
+        bench.session().command(1, ProgramControl::StartBootloader).unwrap();
         bench.await_boot_up(1_000);
         bench.run_ms(20);
-        bench.session().command(1, canopen::program::ProgramControl::Clear).unwrap();
-        bench.session().await_idle(1, coflash::device::Doing::Block(0)).unwrap();
+        bench.session().command(1, ProgramControl::Clear).unwrap();
+        bench.session().await_idle(1, Doing::Block(0)).unwrap();
         assert_eq!(bench.session().read_number(OPTION_BYTES).unwrap(), optcr | 1, "{optcr:08X}h");
     }
 }

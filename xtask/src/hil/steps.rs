@@ -290,6 +290,7 @@ fn crystal(bench: &mut Bench) -> Outcome<Done> {
     if !bench.hand(Hand::Crystal, true)? {
         return not_run("nobody stops the crystal: --crystal-command, or a terminal to ask at");
     }
+    // The crystal runs again whatever comes.
     let seen = silent_or_info(bench);
     bench.hand(Hand::Crystal, false)?;
     let info = seen?;
