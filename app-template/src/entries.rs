@@ -4,7 +4,7 @@
 use canopen::device;
 use canopen::emcy;
 use canopen::od::{Access, DataType, Entry, Table};
-use canopen::program::control_count;
+use canopen::program::{control_count, Numbers};
 
 /// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
 pub const REENTRY_PATH: u16 = 0x2000;
@@ -20,7 +20,10 @@ const SHOW_ENTRIES: [Entry; 2] = [
 
 /// How many entries the object dictionary of a device with `programs` programs has.
 pub const fn entry_count(programs: u8) -> usize {
-    device::ENTRIES.len() + emcy::ENTRIES.len() + SHOW_ENTRIES.len() + control_count(programs)
+    device::ENTRIES.len()
+        + emcy::ENTRIES.len()
+        + SHOW_ENTRIES.len()
+        + control_count(Numbers::of_programs(programs))
 }
 
 /// The object dictionary of a device with `programs` programs, [`entry_count`] entries long. coboot
@@ -30,5 +33,5 @@ pub const fn entries<const LEN: usize>(programs: u8) -> Table<LEN> {
         .with(&device::ENTRIES)
         .with(&emcy::ENTRIES)
         .with(&SHOW_ENTRIES)
-        .with_program_control(programs)
+        .with_program_control(Numbers::of_programs(programs))
 }

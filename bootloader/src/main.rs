@@ -78,6 +78,8 @@ mod app {
     const TICK_MS: u32 = 2;
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     const PROGRAMS: usize = LAYOUT.programs.len();
+    /// The same with the bootloader itself, if it can be renewed.
+    const IMAGES: usize = PROGRAMS + PRODUCT.renewal as usize;
     const EXTRAS: Extras = PRODUCT.extras();
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
     static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
@@ -126,7 +128,7 @@ mod app {
     #[shared]
     struct Shared {
         can: CanPort,
-        bootloader: Bootloader<'static, BootFlash, Store, PROGRAMS, Chosen>,
+        bootloader: Bootloader<'static, BootFlash, Store, IMAGES, Chosen>,
     }
 
     #[local]

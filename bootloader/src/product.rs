@@ -9,7 +9,7 @@ use core::ops::RangeInclusive;
 
 use boot_core::bootloader::Extras;
 use boot_core::canopen::{BitRate, NodeId};
-use boot_core::control::{Erase, Policy, Verdict};
+use boot_core::control::{Erase, Policy, Renewal, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::decision;
 use boot_core::flash::Flash;
@@ -19,6 +19,8 @@ use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
+use shared_abi::ram_image::{feature, SERVICES_VERSION};
+use shared_abi::renewal;
 use shared_abi::services::Facts;
 use shared_abi::warm_start::Cell;
 
@@ -28,6 +30,9 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 
 /// Whether the bootloader takes sealed images.
 pub const SEALED: bool = cfg!(feature = "sealed");
+
+/// The abilities of the resident part, which the RAM image needs.
+pub const FEATURES: u32 = if SEALED { feature::SEALED } else { 0 };
 
 /// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
 /// (DS8626 table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
@@ -143,6 +148,11 @@ pub struct Product {
     /// `include_bytes!`; the RAM image is then built for it. `None` for a fresh one. The choices in
     /// [`FACTS`] must be the same.
     pub resident: Option<&'static [u8]>,
+    /// Whether the bootloader itself can be renewed over CAN (docs/renewal.md); on boards whose layout
+    /// has `staging` alone.
+    pub renewal: bool,
+    /// The time within which a master must confirm a new bootloader on trial, in seconds, 1 to 3600.
+    pub renewal_s: u16,
 }
 
 impl Product {
@@ -185,6 +195,8 @@ impl Product {
         security_counter: 0,
         counter_with_confirmation: false,
         resident: None,
+        renewal: LAYOUT.staging.is_some(),
+        renewal_s: 60,
     };
 
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
@@ -260,6 +272,15 @@ impl Product {
             self.answer_to_reset_ms >= 10,
             "product: answer_to_reset_ms must be 10 or more (SYS TEC manual L-1112d_10, 4.5)"
         );
+        assert!(
+            !self.renewal || LAYOUT.staging.is_some(),
+            "product: renewal needs a layout with staging, where a new bootloader waits"
+        );
+        assert!(
+            !self.renewal || self.watchdog_ms.is_some(),
+            "product: renewal needs watchdog_ms: it ends the trial of a bootloader that hangs"
+        );
+        assert!(self.renewal_s >= 1 && self.renewal_s <= 3600, "product: renewal_s must be 1 to 3600");
         if let Some(data) = self.profile.download.data {
             assert!(
                 match self.autostart {
@@ -298,6 +319,7 @@ impl Product {
             crc_step: self.crc_step,
             seal: if SEALED { self.seal() } else { SealPolicy::NONE },
             read_back: self.reads_back(),
+            renewal: self.renewal(),
             ..self.profile.download
         }
     }
@@ -309,7 +331,29 @@ impl Product {
             second_server: self.second_server,
             resume: self.resume,
             read_back: self.reads_back(),
+            bootloader: self.bootloader_number(),
             ..self.profile.extras
+        }
+    }
+
+    /// The program number of the bootloader itself.
+    pub const fn bootloader_number(&self) -> Option<u8> {
+        if self.renewal {
+            Some(renewal::number(LAYOUT.programs.len() as u8, self.profile.download.data))
+        } else {
+            None
+        }
+    }
+
+    /// The values for a renewal.
+    const fn renewal(&self) -> Renewal {
+        Renewal {
+            board: BOARD_IDENTITY,
+            features: FEATURES,
+            identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
+            services: SERVICES_VERSION,
+            version: VERSION,
+            confirm_within_s: self.renewal_s,
         }
     }
 
@@ -378,7 +422,7 @@ pub const FACTS: Facts = Facts {
     node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
     bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
         | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
-    reserved: 0,
+    abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 },
 };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.

@@ -8,7 +8,7 @@ use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Header};
 use shared_abi::services::{self, Facts};
 
-use crate::product::{BOARD_IDENTITY, FACTS, PRODUCT, SEALED};
+use crate::product::{BOARD_IDENTITY, FACTS, FEATURES, PRODUCT, SEALED};
 
 /// The bytes of the resident part: of the released one that the product names, or a fresh one.
 const BYTES: &[u8] = match PRODUCT.resident {
@@ -34,6 +34,7 @@ const _: () = {
     assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
     assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
     assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other bit_rates");
+    assert!(facts.abilities == FACTS.abilities, "product: `resident` has another renewal");
 };
 
 #[repr(C, align(4))]
@@ -70,7 +71,7 @@ global_asm!(
     ram_base = const LAYOUT.ram.base,
     ram_end = const LAYOUT.ram.end(),
     services = const ram_image::SERVICES_VERSION,
-    features = const ram_image::FEATURES,
+    features = const FEATURES,
     board = const BOARD_IDENTITY,
     vendor = const IDENTITY.vendor_id,
     product = const IDENTITY.product_code,

@@ -111,6 +111,7 @@ impl Store {
 
 impl Parameters for Store {
     const RESUMES: bool = PRODUCT.resume;
+    const RENEWS: bool = PRODUCT.renewal;
 
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];

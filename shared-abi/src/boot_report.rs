@@ -5,6 +5,7 @@
 //! image, never both.
 
 use crate::check_word;
+use crate::renewal::{Origin, TrialEnd};
 use crate::warm_start::Owed;
 
 /// Identifies a boot report ("CBBR" read as little-endian bytes).
@@ -43,11 +44,13 @@ pub enum Reason {
     Vectors = 10,
     /// The product forbids the start at present.
     Forbidden = 11,
+    /// The RAM image is on trial, or its trial has just ended ([`crate::renewal`]).
+    Renewal = 12,
 }
 
 impl Reason {
     /// All reasons, in the order of their numbers.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Requested,
         Self::Strap,
         Self::CrashLoop,
@@ -60,6 +63,7 @@ impl Reason {
         Self::Damaged,
         Self::Vectors,
         Self::Forbidden,
+        Self::Renewal,
     ];
 
     /// The reason with this number; `None` for a number from a later version.
@@ -94,6 +98,10 @@ pub struct BootReport {
     pub node_id: u8,
     /// Bit rate in force from this reset on, as the index of CiA 305 table 1.
     pub bit_rate: u8,
+    /// Where the RAM image was loaded from.
+    pub origin: Origin,
+    /// How the last trial of a RAM image ended.
+    pub trial_end: TrialEnd,
 }
 
 /// The record in RAM: twelve words, little-endian.
@@ -106,7 +114,8 @@ pub struct BootReport {
 /// | 3 | owed: program, value, node-ID; then the program that returned |
 /// | 4 | node-ID, bit rate, the reset that ended the program, crash resets |
 /// | 5 | refused program |
-/// | 6–10 | 0 |
+/// | 6 | origin, the end of the last trial (2 bytes), 0 |
+/// | 7–10 | 0 |
 /// | 11 | [`check_word`] of the words before |
 pub type Words = [u32; 12];
 
@@ -124,6 +133,8 @@ impl BootReport {
         returned: 0,
         node_id: 255,
         bit_rate: 9,
+        origin: Origin::Home,
+        trial_end: TrialEnd::None,
     };
 
     /// The record with this report.
@@ -138,6 +149,8 @@ impl BootReport {
         words[3] = u32::from_le_bytes([program, value, node_id, self.returned]);
         words[4] = u32::from_le_bytes([self.node_id, self.bit_rate, self.program_reset, self.crash_resets]);
         words[5] = self.refused as u32;
+        let [end, detail] = self.trial_end.bytes();
+        words[6] = u32::from_le_bytes([self.origin as u8, end, detail, 0]);
         words[11] = check_of(&words);
         words
     }
@@ -154,6 +167,7 @@ impl BootReport {
         let [program, value, node, returned] = words[3].to_le_bytes();
         let [node_id, bit_rate, program_reset, crash_resets] = words[4].to_le_bytes();
         let [refused, ..] = words[5].to_le_bytes();
+        let [origin, end, detail, _] = words[6].to_le_bytes();
         Some(Self {
             reason,
             refused,
@@ -165,6 +179,8 @@ impl BootReport {
             returned,
             node_id,
             bit_rate,
+            origin: Origin::from_byte(origin),
+            trial_end: TrialEnd::from_bytes([end, detail]),
         })
     }
 }
@@ -177,6 +193,7 @@ const fn check_of(words: &Words) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::handoff::ResetCause;
 
     const REPORT: BootReport = BootReport {
         reason: 1,
@@ -189,6 +206,8 @@ mod tests {
         program_reset: 4,
         crash_resets: 12,
         refused: 13,
+        origin: Origin::Confirmed,
+        trial_end: TrialEnd::Reset(ResetCause::Software),
     };
 
     /// Written down by hand from the table above.
@@ -196,7 +215,7 @@ mod tests {
     fn the_words_are_frozen() {
         let words = REPORT.words();
         assert_eq!(words[..5], [0x5242_4243, 0x0030_0001, 0x0403_0201, 0x0807_0605, 0x0C04_0A09]);
-        assert_eq!(words[5..11], [13, 0, 0, 0, 0, 0]);
+        assert_eq!(words[5..11], [13, 0x0003_0302, 0, 0, 0, 0]);
         assert_eq!(BootReport::parse(&words), Some(REPORT));
     }
 
@@ -206,7 +225,7 @@ mod tests {
         for (number, reason) in (0..).zip(Reason::ALL) {
             assert_eq!((reason as u8, Reason::from_byte(number)), (number, Some(reason)));
         }
-        assert_eq!(Reason::from_byte(12), None);
+        assert_eq!(Reason::from_byte(13), None);
     }
 
     #[test]

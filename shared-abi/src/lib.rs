@@ -16,6 +16,7 @@
 //! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
 //! | [`boot_report`] | information from the resident part of the bootloader to its RAM image |
 //! | [`services`] | the services of the resident part for the RAM image |
+//! | [`renewal`] | a new RAM image: staged, on trial, confirmed, installed |
 //! | `reentry` | the return from an application to its bootloader (on the target) |
 //! | `reset` | register values after a reset, for code that restores them (on the target) |
 //! | [`block_file`] | the format of the data for object 1F50h |
@@ -40,6 +41,7 @@ pub mod ram_image;
 pub mod reentry;
 #[cfg(any(target_arch = "arm", test))]
 mod registers;
+pub mod renewal;
 #[cfg(any(target_arch = "arm", test))]
 pub mod reset;
 pub mod services;

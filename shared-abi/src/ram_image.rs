@@ -17,8 +17,12 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
 /// that is added to their table.
 pub const SERVICES_VERSION: u32 = 1;
 
-/// Optional abilities of the resident part, a bit each. None is defined yet.
-pub const FEATURES: u32 = 0;
+/// Abilities that a resident part may have and an image may need, a bit each.
+pub mod feature {
+    /// The device takes sealed images. A resident part that knows them loads only an image that needs
+    /// this: another one would take programs from anybody.
+    pub const SEALED: u32 = 1;
+}
 
 /// The header before the image: 64 bytes, little-endian. `cargo build` writes everything but the
 /// CRC, which `cargo xtask build` writes.
@@ -40,7 +44,7 @@ pub struct Header {
     pub ram_end: u32,
     /// The image needs at least this [`SERVICES_VERSION`].
     pub services: u32,
-    /// The image needs these [`FEATURES`].
+    /// The image needs these abilities ([`feature`]).
     pub features: u32,
     /// The board: the CRC-32/ISO-HDLC of its layout as TOML ([`crate::layout::toml`]).
     pub board: u32,
@@ -59,6 +63,49 @@ pub struct Header {
 }
 
 impl Header {
+    /// The header in these bytes of an image.
+    #[must_use]
+    pub const fn of_bytes(bytes: &[u8; Self::SIZE as usize]) -> Self {
+        let mut words = [0; Self::SIZE as usize / 4];
+        let mut n = 0;
+        while n < words.len() {
+            let at = 4 * n;
+            words[n] = u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]]);
+            n += 1;
+        }
+        Self::of_words(words)
+    }
+
+    /// The header in these words.
+    #[must_use]
+    pub const fn of_words(words: [u32; Self::SIZE as usize / 4]) -> Self {
+        let [magic, crc, length, size, ram_base, ram_end, services, features, board, rest @ ..] = words;
+        let [vendor, product, revisions, version, counter, reserved @ ..] = rest;
+        Self {
+            magic,
+            crc,
+            length,
+            size,
+            ram_base,
+            ram_end,
+            services,
+            features,
+            board,
+            vendor,
+            product,
+            revisions,
+            version,
+            counter,
+            reserved,
+        }
+    }
+
+    /// The bytes of header and image.
+    #[must_use]
+    pub const fn total(&self) -> u32 {
+        Self::SIZE.saturating_add(self.size)
+    }
+
     /// Its size in bytes.
     pub const SIZE: u32 = size_of::<Self>() as u32;
     /// The offset of the CRC.
@@ -67,11 +114,11 @@ impl Header {
     pub const CRC_FROM: u32 = Self::CRC + 4;
 
     /// Checks a header: `flash` bytes follow it in the region of the RAM image, `ram` is the RAM of
-    /// the images, and `board` the identity of this board.
+    /// the images, `board` the identity of this board, and `features` the abilities of the resident part.
     ///
     /// # Errors
     /// [`Damage::Header`], [`Damage::Board`] or [`Damage::Services`].
-    pub const fn check(&self, flash: u32, ram: Region, board: u32) -> Result<(), Damage> {
+    pub const fn check(&self, flash: u32, ram: Region, board: u32, features: u32) -> Result<(), Damage> {
         if self.magic != MAGIC || self.length != Self::SIZE {
             return Err(Damage::Header);
         }
@@ -89,7 +136,10 @@ impl Header {
         if !fits || self.reserved[0] != 0 || self.reserved[1] != 0 {
             return Err(Damage::Header);
         }
-        if self.services > SERVICES_VERSION || self.features & !FEATURES != 0 {
+        if self.services > SERVICES_VERSION
+            || self.features & !features != 0
+            || features & !self.features & feature::SEALED != 0
+        {
             return Err(Damage::Services);
         }
         Ok(())
@@ -135,7 +185,7 @@ mod tests {
 
     #[test]
     fn a_header_is_judged() {
-        let check = |header: Header| header.check(0x4000, RAM, BOARD);
+        let check = |header: Header| header.check(0x4000, RAM, BOARD, 0);
         assert_eq!(check(SOUND), Ok(()));
         assert_eq!(check(Header { services: 0, size: 64, ram_end: 0x2000_0040, ..SOUND }), Ok(()));
         for (header, damage) in [
@@ -163,7 +213,10 @@ mod tests {
             assert_eq!(check(header), Err(damage), "{header:?}");
         }
         let large = Header { size: RAM.size - LEAST_STACK + 4, ..SOUND };
-        assert_eq!(large.check(u32::MAX, RAM, BOARD), Err(Damage::Header), "no room for the stack");
+        let sealed = Header { features: feature::SEALED, ..SOUND };
+        let check = |header: Header| header.check(0x4000, RAM, BOARD, feature::SEALED);
+        assert_eq!((check(SOUND), check(sealed)), (Err(Damage::Services), Ok(())));
+        assert_eq!(large.check(u32::MAX, RAM, BOARD, 0), Err(Damage::Header), "no room for the stack");
     }
 
     #[test]

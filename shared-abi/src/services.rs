@@ -63,11 +63,13 @@ pub struct Facts {
     /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1; bit 9:
     /// the device may find it out.
     pub bit_rates: u16,
-    /// 0.
-    pub reserved: u16,
+    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS).
+    pub abilities: u16,
 }
 
 impl Facts {
+    /// In [`abilities`](Self::abilities): it loads a RAM image from staging, too ([`crate::renewal`]).
+    pub const RENEWS: u16 = 1;
     /// Its size in bytes.
     pub const SIZE: u16 = size_of::<Self>() as u16;
 
@@ -96,7 +98,7 @@ impl Facts {
             crc_bits: second as u16,
             node_ids: (second >> 16) as u16,
             bit_rates: third as u16,
-            reserved: (third >> 16) as u16,
+            abilities: (third >> 16) as u16,
         };
         if facts.size < Self::SIZE {
             return None;

@@ -82,6 +82,13 @@ pub enum BootRequest {
     Invalidate(u8) = 11,
     /// Store node parameters, then start as after a power-on.
     StoreNode(StoredNode) = 12,
+    /// Load the RAM image from staging once, on trial. The bootloader writes this request itself, and
+    /// the next two ([`crate::renewal`]).
+    Try = 13,
+    /// The image on trial was not confirmed in time: load the one at home, and stay.
+    TrialLate = 14,
+    /// A master has given up the image on trial: load the one at home, and stay.
+    TrialGivenUp = 15,
 }
 
 /// Node parameters in the cell.
@@ -134,7 +141,8 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 try, 14 trial late, 15 trial
+    /// given up.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
@@ -169,6 +177,9 @@ impl WarmStart {
             BootRequest::StoreNode(StoredNode { node_id, bit_rate }) => {
                 (12, u32::from_le_bytes([node_id, bit_rate, 0, 0]))
             }
+            BootRequest::Try => (13, 0),
+            BootRequest::TrialLate => (14, 0),
+            BootRequest::TrialGivenUp => (15, 0),
         };
         Self::encode(request, argument)
     }
@@ -203,6 +214,9 @@ impl WarmStart {
             (10, 1..=254) => BootRequest::Confirm(program),
             (11, 1..=254) => BootRequest::Invalidate(program),
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
+            (13, 0) => BootRequest::Try,
+            (14, 0) => BootRequest::TrialLate,
+            (15, 0) => BootRequest::TrialGivenUp,
             _ => return None,
         })
     }
@@ -281,6 +295,9 @@ mod tests {
             BootRequest::Invalidate(254),
             BootRequest::StoreNode(StoredNode::new(127, 1_000_000)),
             BootRequest::StoreNode(StoredNode::new(255, 0)),
+            BootRequest::Try,
+            BootRequest::TrialLate,
+            BootRequest::TrialGivenUp,
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -349,6 +366,9 @@ mod tests {
             (11, 0x0101),
             (12, 0x0001_0001),
             (13, 1),
+            (14, 1),
+            (15, 4),
+            (16, 0),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

@@ -8,7 +8,7 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
-use crate::product::BOARD_IDENTITY;
+use crate::product::{BOARD_IDENTITY, FEATURES};
 
 extern "C" {
     /// The image's header: the linker script of the resident part has its address.
@@ -16,22 +16,29 @@ extern "C" {
     static HEADER: Header;
 }
 
-/// Checks the image, copies it to its RAM, and returns its vectors.
+/// The place of the image in flash.
+pub fn home() -> Region {
+    // SAFETY: only the address is taken.
+    let at = unsafe { &raw const HEADER } as u32;
+    let home = LAYOUT.home.unwrap_or(LAYOUT.bootloader);
+    Region::new(at, home.end() - at)
+}
+
+/// Checks the image in a place, copies it to its RAM, and returns its vectors.
 ///
 /// # Errors
 /// The damaged part; the RAM may then hold the image.
 ///
 /// # Safety
-/// Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::layout::LEAST_STACK)
+/// `place` must be [`home`], or staging of the layout. Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::layout::LEAST_STACK)
 /// bytes.
-pub unsafe fn load(flash: &ResidentFlash) -> Result<VectorTable, Damage> {
-    // SAFETY: the linker script places it in flash, aligned; any bits are a valid `Header`, and the
-    // flash after it is part of its region, which `check` compares with the image's size.
-    let header = unsafe { &HEADER };
-    let at = core::ptr::from_ref(header) as u32;
+pub unsafe fn load(flash: &ResidentFlash, place: Region) -> Result<VectorTable, Damage> {
+    let at = place.base;
+    // SAFETY: it is in flash, aligned; any bits are a valid `Header`, and the flash after it is part of
+    // the place, whose size `check` compares with that of the image.
+    let header = unsafe { &*(at as *const Header) };
     let data = at + Header::SIZE;
-    let home = LAYOUT.home.unwrap_or(LAYOUT.bootloader);
-    header.check(home.end() - data, LAYOUT.ram, BOARD_IDENTITY)?;
+    header.check(place.end() - data, LAYOUT.ram, BOARD_IDENTITY, FEATURES)?;
     if header.crc != 0 {
         let covered = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.size);
         if flash.crc32(0, covered) != header.crc {

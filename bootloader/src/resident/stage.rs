@@ -15,12 +15,13 @@ use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
+use shared_abi::renewal::{Origin, TrialEnd};
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
 use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
-use crate::{ram_image, storing};
+use crate::{renewal, storing};
 
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
 /// the warm-start cell in this time.
@@ -71,7 +72,12 @@ pub unsafe extern "C" fn stage() -> ! {
         crate::callgate::store_after_reset(&mut flash, request);
     }
     let mut parameters = product::parameters(&flash);
-    let crash_resets = count_crash_resets(&mut parameters, &mut flash, reset_cause, request);
+    // A reset that ends the RAM image is no crash of a program.
+    let crash_resets = if PRODUCT.renewal && request.is_none() && renewal::last_report().is_some() {
+        storing::crash_count(&parameters, &flash)
+    } else {
+        count_crash_resets(&mut parameters, &mut flash, reset_cause, request)
+    };
     // SAFETY: as above; nothing is programmed from here on.
     let caches = unsafe { Caches::on() };
 
@@ -81,18 +87,32 @@ pub unsafe extern "C" fn stage() -> ! {
         decide(circumstances, &DECISION, |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number))
     };
     let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
+    let mut trial_end = TrialEnd::None;
+    if PRODUCT.renewal {
+        trial_end = renewal::trial_end(request, reset_cause);
+        if matches!(trial_end, TrialEnd::Reset(_)) && matches!(request, None | Some(BootRequest::Fault)) {
+            // The image at home says why it ended.
+            circumstances.request = Some(BootRequest::TrialGivenUp);
+        }
+    }
     let mut decision = decide(&circumstances);
     if !matches!(decision, BootDecision::Start { .. }) {
         // SAFETY: only the stack uses the RAM.
-        match unsafe { ram_image::load(&flash) } {
-            Ok(vectors) => {
+        match unsafe { renewal::load(&flash, &parameters, request, &mut trial_end) } {
+            Ok((vectors, origin)) => {
                 let report = BootReport {
+                    origin,
+                    trial_end,
                     crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
                     node_id,
                     bit_rate: node.bit_rate as u8,
                     ..boot_report(&decision, request, reset_cause)
                 };
                 drop(caches);
+                if let (Origin::Trial, Some(ms)) = (origin, PRODUCT.watchdog_ms) {
+                    // An image that hangs before it starts the watchdog ends, too.
+                    bsp::watchdog::start(&iwdg, ms);
+                }
                 // The image changes the clock. The CRC unit keeps its clock, for the services.
                 // SAFETY: the layout's handoff region, checked to be RAM of that size outside every
                 // image. Since the reset no interrupt was enabled and no bus master started.

@@ -11,10 +11,11 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, ClockSource, FlashError, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS,
-    IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION,
-    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES,
-    STATE_PROGRAM_WATCHDOG, STATE_SUPPLY, UNLOCK, UNLOCK_ENTRIES,
+    control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH,
+    FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION,
+    PROGRAM_VERSION, RENEWAL_ENTRIES, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES,
+    STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK,
+    UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -22,10 +23,11 @@ use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 use {canopen::program::ACCESS, seal::access::right};
 
-use crate::control::{Downloader, Policy, Sealed, Step};
+use crate::control::{Downloader, Policy, Renewal, Sealed, Step};
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
@@ -43,6 +45,8 @@ pub struct Extras {
     pub second_server: bool,
     /// Whether 2006h exists, which says where a download goes on.
     pub resume: bool,
+    /// The program number of the bootloader itself, if it can be renewed.
+    pub bootloader: Option<u8>,
 }
 
 impl Extras {
@@ -53,6 +57,7 @@ impl Extras {
         sealed: false,
         second_server: true,
         resume: true,
+        bootloader: None,
     };
 
     /// Whether an object takes a password.
@@ -81,8 +86,10 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     let data = Entry::sub(PROGRAM_DATA, 1, "Program data of a program", DataType::Domain, data_access);
     let table = Table::<LEN>::EMPTY.with(&device::ENTRIES).with(&emcy::ENTRIES);
     let table = if extras.second_server { table.with(&second::ENTRIES) } else { table };
-    let table = table.with_array("Program data", data, programs).with_program_control(programs);
+    let numbers = Numbers { programs, bootloader: extras.bootloader };
+    let table = table.with_numbers("Program data", data, numbers).with_program_control(numbers);
     let table = table.with(&STATE_ENTRIES);
+    let table = if extras.bootloader.is_some() { table.with(&RENEWAL_ENTRIES) } else { table };
     let table = if extras.resume {
         let element =
             Entry::sub(PROGRAM_PARTIAL, 1, "Begun download of a program", DataType::Unsigned64, Access::Ro);
@@ -114,8 +121,14 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
     let second_server = if extras.second_server { second::ENTRIES.len() } else { 0 };
     let resume = if extras.resume { array } else { 0 };
-    let always =
-        device::ENTRIES.len() + emcy::ENTRIES.len() + array + control_count(programs) + STATE_ENTRIES.len();
+    let numbers = Numbers { programs, bootloader: extras.bootloader };
+    let renewal = if extras.bootloader.is_some() { RENEWAL_ENTRIES.len() } else { 0 };
+    let always = device::ENTRIES.len()
+        + emcy::ENTRIES.len()
+        + numbers.entries()
+        + control_count(numbers)
+        + STATE_ENTRIES.len()
+        + renewal;
     always + password + sealed + second_server + resume
 }
 
@@ -131,6 +144,7 @@ pub trait Choices {
         sealed: true,
         second_server: true,
         resume: true,
+        bootloader: None,
     };
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
@@ -211,11 +225,17 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     ) -> Self {
         let mut download =
             Downloader::new(config.layout, &config.download, parameters, &flash, buffer, sealed);
-        download.refused_to_start(report);
+        download.take_report(&flash, report);
         let mut bootloader = Self {
             config,
             serial_number,
-            state: [0, report.reason, report.program_reset, report.crash_resets, 0],
+            state: [
+                C::EXTRAS.bootloader.unwrap_or(0),
+                report.reason,
+                report.program_reset,
+                report.crash_resets,
+                0,
+            ],
             node,
             id: config.node_id.or(node.id),
             flash,
@@ -265,6 +285,18 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// Sets the current time; call this at least every few milliseconds.
     pub fn set_time(&mut self, now: Instant) {
         self.now = now;
+        if P::RENEWS {
+            self.download.watch_trial(now);
+        }
+    }
+
+    /// The program of a sub-index: the bootloader has a number of its own.
+    fn program(sub: u8) -> u8 {
+        if P::RENEWS && C::EXTRAS.bootloader == Some(sub) {
+            BOOTLOADER
+        } else {
+            sub
+        }
     }
 
     /// Reports the result of work on the flash by an emergency.
@@ -285,6 +317,10 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
                     FlashError::Write | FlashError::Secured | FlashError::NvData => emcy::code::HARDWARE,
                     FlashError::NoAccess if self.flash.supply() == Supply::Low => emcy::code::HARDWARE,
                     _ => emcy::code::DATA_SET,
+                };
+                let program = match C::EXTRAS.bootloader {
+                    Some(number) if P::RENEWS && program == BOOTLOADER => number,
+                    _ => program,
                 };
                 self.emcy.raise(code, emcy::register::MANUFACTURER, [error.code(), program, 0, 0, 0]);
             }
@@ -309,8 +345,8 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     ///
     /// # Errors
     /// The abort for the client.
-    pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
-        self.download.command(program, command)
+    pub fn command(&mut self, sub: u8, command: ProgramControl) -> Result<(), AbortCode> {
+        self.download.command(Self::program(sub), command)
     }
 
     /// The program (0 for none) has returned the device to the bootloader: from now on it starts
@@ -377,19 +413,27 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if let Some(read) = self.download.rights_mut().read(at, buf) {
             return read;
         }
+        let program = Self::program(at.sub);
         let word = match at.index {
-            PROGRAM_CONTROL => return put(buf, &[self.download.control(at.sub) as u8]),
-            PROGRAM_REGION => return put(buf, &self.download.region(at.sub)),
+            PROGRAM_CONTROL => return put(buf, &[self.download.control(program) as u8]),
+            PROGRAM_REGION => return put(buf, &self.download.region(program)),
             PROGRAM_PARTIAL if P::RESUMES => return put(buf, &self.download.partial(at.sub)),
             DEVICE_STATE if at.sub == STATE_PROGRAM_WATCHDOG => {
                 return put(buf, &self.config.program_watchdog_ms.to_le_bytes());
             }
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
+            DEVICE_STATE if P::RENEWS && at.sub == STATE_VERSIONS => {
+                let Renewal { version, services, .. } = self.config.download.renewal;
+                return put(buf, &(u64::from(services) << 32 | u64::from(version)).to_le_bytes());
+            }
+            DEVICE_STATE if P::RENEWS && at.sub == STATE_RENEWAL => {
+                u32::from_le_bytes(self.download.renewal().bytes())
+            }
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
-            PROGRAM_ID => self.download.identification(at.sub),
+            PROGRAM_ID => self.download.identification(program),
             SECOND_SERVER if C::EXTRAS.second_server => self.second_server.read(at.sub),
-            FLASH_STATUS => self.download.status(at.sub).to_word(),
-            PROGRAM_VERSION => self.download.version(at.sub),
+            FLASH_STATUS => self.download.status(program).to_word(),
+            PROGRAM_VERSION => self.download.version(program),
             IDENTITY if at.sub == SERIAL_NUMBER => self.serial_number,
             _ => return self.config.device.read(at, buf).unwrap_or(Err(AbortCode::NO_DATA)),
         };
@@ -427,7 +471,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         {
             return Err(AbortCode::DEVICE_STATE);
         }
-        self.download.download_start(at.sub, size)
+        self.download.download_start(&self.flash, Self::program(at.sub), size)
     }
 
     fn download_space(&mut self, _at: Address, held: bool) -> usize {
@@ -452,14 +496,14 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
         if !C::EXTRAS.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
-        self.download.stored(at.sub).map(|stored| Some(stored.size))
+        self.download.stored(Self::program(at.sub)).map(|stored| Some(stored.size))
     }
 
     fn upload_data(&mut self, at: Address, offset: u32, buf: &mut [u8]) -> Result<usize, AbortCode> {
         if !C::EXTRAS.read_back {
             return Err(AbortCode::WRITE_ONLY);
         }
-        let stored = self.download.stored(at.sub)?;
+        let stored = self.download.stored(Self::program(at.sub))?;
         let rest = stored.size.saturating_sub(offset) as usize;
         let len = rest.min(buf.len());
         self.flash.read(stored.base + offset, &mut buf[..len]);

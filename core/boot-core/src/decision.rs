@@ -54,7 +54,14 @@ impl Policy {
     pub fn crash_resets(&self, before: u32, cause: ResetCause, request: Option<BootRequest>) -> u32 {
         use ResetCause::{IndependentWatchdog, LowPower, Software, WindowWatchdog};
         match request {
-            Some(BootRequest::Fault | BootRequest::Resume(_) | BootRequest::Damaged(_)) => before,
+            Some(
+                BootRequest::Fault
+                | BootRequest::Resume(_)
+                | BootRequest::Damaged(_)
+                | BootRequest::Try
+                | BootRequest::TrialLate
+                | BootRequest::TrialGivenUp,
+            ) => before,
             Some(_) => 0,
             None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
                 // A device that resets for ever does not wear its flash out.
@@ -117,6 +124,9 @@ pub fn decide(
     match circumstances.request {
         Some(BootRequest::Stay | BootRequest::Owed(_)) => return stay(Reason::Requested),
         Some(BootRequest::Fault) => return stay(Reason::Fault),
+        Some(BootRequest::Try | BootRequest::TrialLate | BootRequest::TrialGivenUp) => {
+            return stay(Reason::Renewal);
+        }
         _ => {}
     }
     if circumstances.strap {

@@ -17,6 +17,7 @@
 //! | [`bootloader`] | the object dictionary over it | objects |
 //! | `stored_version` | 100Ah: the version text, searched in a stored program | |
 //! | [`program`] | the proof that a program may be started | |
+//! | [`renewal`] | which RAM image of the bootloader is loaded, and whether one is good | |
 //! | `keys` | whether the device takes sealed images, and whether it has keys and takes no others | |
 //! | [`crc`] | the CRCs of block file, program and journal | |
 //! | [`policy`], [`profile`] | what a product may choose, and the rules for data that follow from it | |
@@ -37,6 +38,7 @@ pub mod program;
 mod programmer;
 mod queue;
 mod refusal;
+pub mod renewal;
 mod resume;
 mod sequence;
 mod session;

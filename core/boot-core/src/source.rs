@@ -18,6 +18,9 @@ pub(crate) struct Source<'b> {
     pub queue: Queue<'b>,
     /// The sealed image, if the program came as one.
     pub unsealer: Unsealer<'b>,
+    /// What is added to the address of a piece: a new RAM image is linked for home, and written to
+    /// staging.
+    offset: u32,
     /// `Some` from the end of the program's data until the program is to be verified.
     ended: Option<Expected>,
 }
@@ -38,11 +41,13 @@ pub(crate) enum Demand {
 
 impl<'b> Source<'b> {
     pub(crate) fn new(buffer: &'b mut [u8], unsealer: Unsealer<'b>) -> Self {
-        Self { queue: Queue::new(buffer), unsealer, ended: None }
+        Self { queue: Queue::new(buffer), unsealer, offset: 0, ended: None }
     }
 
-    /// Another program begins, or none: the queue stays.
-    pub(crate) fn rest(&mut self) {
+    /// Another program begins, whose pieces are written `offset` after their addresses; or none. The
+    /// queue stays.
+    pub(crate) fn rest(&mut self, offset: u32) {
+        self.offset = offset;
         self.unsealer.rest();
         self.ended = None;
     }
@@ -50,7 +55,7 @@ impl<'b> Source<'b> {
     /// Discards the received data.
     pub(crate) fn clear(&mut self) {
         self.queue.clear();
-        self.rest();
+        self.rest(0);
     }
 
     /// The program was sent completely.
@@ -101,7 +106,8 @@ impl<'b> Source<'b> {
         if self.unsealer.is_active() {
             self.unsealer.piece()
         } else {
-            self.queue.first()
+            let Piece { address, size } = self.queue.first()?;
+            Some(Piece { address: address.wrapping_add(self.offset), size })
         }
     }
 

@@ -5,7 +5,7 @@ use core::fmt;
 use core::num::NonZeroU8;
 
 use crate::abort::AbortCode;
-use crate::od::{Access, DataType, Entry, Table};
+use crate::od::{Access, Address, DataType, Entry, Table};
 
 /// Device type.
 pub const DEVICE_TYPE: u16 = 0x1000;
@@ -64,10 +64,33 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     ),
 ];
 
-/// The number of entries of [`CONTROL_ARRAYS`] on a device with this many programs.
+/// The sub-indices of the objects that have one for each program of a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Numbers {
+    /// The programs: 1 to this number.
+    pub programs: u8,
+    /// The number of the bootloader itself, if it can be renewed: it is higher.
+    pub bootloader: Option<u8>,
+}
+
+impl Numbers {
+    /// Of a device whose bootloader is not renewed.
+    #[must_use]
+    pub const fn of_programs(programs: u8) -> Self {
+        Self { programs, bootloader: None }
+    }
+
+    /// The entries of an object with these sub-indices.
+    #[must_use]
+    pub const fn entries(self) -> usize {
+        1 + self.programs as usize + self.bootloader.is_some() as usize
+    }
+}
+
+/// The number of entries of [`CONTROL_ARRAYS`] on a device.
 #[must_use]
-pub const fn control_count(programs: u8) -> usize {
-    CONTROL_ARRAYS.len() * (1 + programs as usize)
+pub const fn control_count(numbers: Numbers) -> usize {
+    CONTROL_ARRAYS.len() * numbers.entries()
 }
 
 impl<const LEN: usize> Table<LEN> {
@@ -76,14 +99,33 @@ impl<const LEN: usize> Table<LEN> {
     /// # Panics
     /// If the table has too few entries left.
     #[must_use]
-    pub const fn with_program_control(mut self, programs: u8) -> Self {
+    pub const fn with_program_control(mut self, numbers: Numbers) -> Self {
         let mut array = 0;
         while array < CONTROL_ARRAYS.len() {
             let (name, element) = CONTROL_ARRAYS[array];
-            self = self.with_array(name, element, programs);
+            self = self.with_numbers(name, element, numbers);
             array += 1;
         }
         self
+    }
+
+    /// Appends an object with an element for each program; it has [`Numbers::entries`].
+    ///
+    /// # Panics
+    /// If the table has too few entries left.
+    #[must_use]
+    pub const fn with_numbers(self, name: &'static str, element: Entry, numbers: Numbers) -> Self {
+        let Some(bootloader) = numbers.bootloader else {
+            return self.with_array(name, element, numbers.programs);
+        };
+        let index = element.at.index;
+        let mut table = self.with(&[Entry::array(index, name, bootloader)]);
+        let mut sub = 1;
+        while sub <= numbers.programs {
+            table = table.with(&[Entry { at: Address::new(index, sub), ..element }]);
+            sub += 1;
+        }
+        table.with(&[Entry { at: Address::new(index, bootloader), ..element }])
     }
 }
 
@@ -101,9 +143,10 @@ pub const PROGRAM_VERSION: u16 = 0x2005;
 /// address up to which its data have arrived; 0 if there is none.
 pub const PROGRAM_PARTIAL: u16 = 0x2006;
 
-/// The state of the device, an object of coboot. Sub-index 1 is reserved for the program number of the
-/// bootloader itself, 0 for none.
+/// The state of the device, an object of coboot.
 pub const DEVICE_STATE: u16 = 0x2007;
+/// In [`DEVICE_STATE`]: the program number of the bootloader itself, 0 if it cannot be renewed.
+pub const STATE_BOOTLOADER: u8 = 1;
 /// In [`DEVICE_STATE`]: why the device stays in the bootloader (`shared_abi::boot_report::Reason`).
 pub const STATE_REASON: u8 = 2;
 /// In [`DEVICE_STATE`]: the reset by which the last program ended
@@ -118,6 +161,12 @@ pub const STATE_CLOCK: u8 = 5;
 pub const STATE_OPTION_BYTES: u8 = 6;
 /// In [`DEVICE_STATE`]: the [`Supply`].
 pub const STATE_SUPPLY: u8 = 7;
+/// In [`DEVICE_STATE`]: the version of the running RAM image of the bootloader in the lower 32 bits, as
+/// in 1018h/3; the version of the services of its resident part in the upper ones. Only with renewal.
+pub const STATE_VERSIONS: u8 = 8;
+/// In [`DEVICE_STATE`]: the state of a renewal of the bootloader (`shared_abi::renewal::Progress`). Only
+/// with renewal.
+pub const STATE_RENEWAL: u8 = 9;
 /// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
 /// watchdog, which the bootloader starts; 0 if it does not.
 pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
@@ -149,7 +198,13 @@ pub const SUPPLY_DETAIL: u8 = 1;
 /// The entries of [`DEVICE_STATE`].
 pub const STATE_ENTRIES: [Entry; 9] = [
     Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_WATCHDOG),
-    Entry::sub(DEVICE_STATE, 1, "Program number of the bootloader", DataType::Unsigned8, Access::Const),
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_BOOTLOADER,
+        "Program number of the bootloader",
+        DataType::Unsigned8,
+        Access::Const,
+    ),
     Entry::sub(
         DEVICE_STATE,
         STATE_REASON,
@@ -175,6 +230,18 @@ pub const STATE_ENTRIES: [Entry; 9] = [
         DataType::Unsigned16,
         Access::Const,
     ),
+];
+
+/// The further entries of [`DEVICE_STATE`] of a device whose bootloader can be renewed.
+pub const RENEWAL_ENTRIES: [Entry; 2] = [
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_VERSIONS,
+        "Versions of the bootloader",
+        DataType::Unsigned64,
+        Access::Const,
+    ),
+    Entry::sub(DEVICE_STATE, STATE_RENEWAL, "State of a renewal", DataType::Unsigned32, Access::Ro),
 ];
 
 /// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`

@@ -4,6 +4,7 @@
 use canopen::program::{FlashError, ProgramControl};
 use canopen::AbortCode;
 use seal::access::right;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use super::{find, Downloader, Failure};
@@ -22,7 +23,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn command(&mut self, program: u8, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        let state = find(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
+        if P::RENEWS && program == BOOTLOADER {
+            return self.command_bootloader(command);
+        }
+        let keeps = P::RENEWS && command == Clear && self.keeps_staging(program);
+        let state = find::<P>(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
             // No program runs, but the bootloader: the requested state already exists.
             return Ok(());
@@ -50,7 +55,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             _ => self.programmer.has_work(),
         };
-        if self.boot_request.is_some() || (busy && !restarts) {
+        if self.boot_request.is_some() || (busy && !restarts) || keeps {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
@@ -126,13 +131,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// # Errors
     /// The device is busy with other work.
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
-        let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         if self.boot_request.is_some() || !self.programmer.is_abortable() {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         self.download_cancel();
         self.programmer.abort();
-        if let Some(state) = find(&mut self.programs, program) {
+        if let Some(state) = find::<P>(&mut self.programs, program) {
             state.locked = false;
             state.failure = None;
             state.streamed = false;

@@ -12,6 +12,7 @@
 //! [`Erase`].
 
 mod commands;
+mod renewal;
 mod rights;
 mod sealed;
 mod transfer;
@@ -25,6 +26,7 @@ use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::geometry::Region;
 use shared_abi::label;
 use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::Flash;
@@ -41,7 +43,7 @@ use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Outcome;
 use rights::Rights;
 
-pub use crate::policy::{Erase, Policy, Verdict};
+pub use crate::policy::{Erase, Policy, Renewal, Verdict};
 pub use crate::programmer::Step;
 pub use sealed::{Room, Sealed};
 
@@ -89,7 +91,9 @@ struct Transfer {
     intake: Intake,
 }
 
-/// The download of programs into flash. `PROGRAMS` is the number of programs in the layout.
+/// The download of programs into flash. `PROGRAMS` is the number of programs in the layout, and one
+/// more if the bootloader can be renewed: its own image is the last one, with the number
+/// [`BOOTLOADER`](shared_abi::renewal::BOOTLOADER).
 pub struct Downloader<'b, P, const PROGRAMS: usize> {
     layout: &'static Layout,
     policy: &'static Policy,
@@ -106,6 +110,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     outcome: Option<(u8, Result<(), FlashError>)>,
     /// The result of the last storing of node-ID and bit rate.
     node_stored: Result<(), FlashError>,
+    renewal: renewal::Renewal,
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
@@ -124,7 +129,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let (record, partial) = load(&parameters, flash, number, &rights);
+            let (record, partial) = if layout.program(number).is_some() {
+                load(&parameters, flash, number, &rights)
+            } else {
+                (None, Partial::NONE)
+            };
             Program {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),
                 record,
@@ -150,13 +159,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             boot_request: None,
             outcome: None,
             node_stored: Ok(()),
+            renewal: renewal::Renewal::NONE,
         }
     }
 
-    /// The boot stage has refused to start a program: its status is that of a START of no valid program.
-    /// A damaged program is none any more.
-    pub(crate) fn refused_to_start(&mut self, report: &BootReport) {
-        let Some(state) = find(&mut self.programs, report.refused) else { return };
+    /// Takes the report of the resident part. If it has refused to start a program, its status is that of a
+    /// START of no valid program. A damaged program is none any more.
+    pub(crate) fn take_report<F: Flash>(&mut self, flash: &F, report: &BootReport) {
+        if P::RENEWS {
+            self.begin_renewal(flash, report);
+        }
+        let Some(state) = find::<P>(&mut self.programs, report.refused) else { return };
         state.failure = Some(Failure::of(FlashError::NoValidProgram));
         if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {
             state.record = None;
@@ -195,6 +208,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 1F51h: no program runs. The value shows whether a program exists.
     #[must_use]
     pub fn control(&self, program: u8) -> ProgramState {
+        if P::RENEWS && program == BOOTLOADER {
+            return ProgramState::Running;
+        }
         match self.program(program).and_then(|state| state.record) {
             Some(_) => ProgramState::Stopped,
             None => ProgramState::Absent,
@@ -321,9 +337,24 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         match event {
             None => {}
             Some(Event::NodeStored(outcome)) => self.node_stored = outcome,
+            Some(Event::Stored { program: BOOTLOADER, ends }) if P::RENEWS => {
+                self.image_stored(flash);
+                if ends {
+                    self.end(BOOTLOADER, Ok(()));
+                }
+            }
+            Some(Event::Written { program: BOOTLOADER, expected, crc }) if P::RENEWS => {
+                if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+                    state.session = Session::Idle;
+                }
+                match self.check_image(flash, &expected, crc) {
+                    Ok(record) => self.programmer.record_image(&mut self.parameters, record),
+                    Err(error) => self.end(BOOTLOADER, Err(error)),
+                }
+            }
             Some(Event::Stored { program, ends }) => {
                 let (record, partial) = load(&self.parameters, flash, program, &self.rights);
-                if let Some(state) = find(&mut self.programs, program) {
+                if let Some(state) = find::<P>(&mut self.programs, program) {
                     state.record = record;
                     if record.is_none() {
                         state.identification = 0;
@@ -341,7 +372,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 }
             }
             Some(Event::Written { program, expected, crc }) => {
-                if let Some(state) = find(&mut self.programs, program) {
+                if let Some(state) = find::<P>(&mut self.programs, program) {
                     state.identification = crc;
                     state.session = Session::Idle;
                 }
@@ -432,7 +463,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             self.programmer.source_mut().queue.clear();
         }
         self.outcome = Some((program, outcome));
-        let Some(state) = find(&mut self.programs, program) else { return };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return };
         let start = core::mem::take(&mut state.start_when_verified);
         state.failure = outcome.err().map(|error| Failure { error, detail: self.programmer.take_detail() });
         if outcome.is_err() {
@@ -452,7 +483,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// The program with this number, if it exists.
     fn program(&self, program: u8) -> Option<&Program> {
-        self.programs.get(usize::from(program).wrapping_sub(1))
+        self.programs.get(place::<P>(PROGRAMS, program))
     }
 }
 
@@ -471,8 +502,18 @@ fn load<F: Flash, P: Parameters>(
 }
 
 /// The program with this number, if it exists.
-fn find(programs: &mut [Program], number: u8) -> Option<&mut Program> {
-    programs.get_mut(usize::from(number).wrapping_sub(1))
+fn find<P: Parameters>(programs: &mut [Program], number: u8) -> Option<&mut Program> {
+    programs.get_mut(place::<P>(programs.len(), number))
+}
+
+/// The place of a program in the list of all. The last one is the bootloader's, if it can be renewed.
+fn place<P: Parameters>(programs: usize, number: u8) -> usize {
+    let place = usize::from(number).wrapping_sub(1);
+    match number {
+        BOOTLOADER if P::RENEWS => programs - 1,
+        _ if P::RENEWS && place + 1 == programs => usize::MAX,
+        _ => place,
+    }
 }
 
 impl Program {

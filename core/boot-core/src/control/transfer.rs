@@ -5,6 +5,7 @@ use canopen::AbortCode;
 use shared_abi::block_file::FRAMING;
 
 use super::{find, Downloader, Failure, Transfer};
+use crate::flash::Flash;
 use crate::intake::{Destination, Findings, Intake};
 use crate::policy::Judge;
 use crate::refusal::Refusal;
@@ -18,10 +19,18 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     ///
     /// # Errors
     /// The abort for the client.
-    pub fn download_start(&mut self, program: u8, size: Option<u32>) -> Result<(), AbortCode> {
+    pub fn download_start<F: Flash>(
+        &mut self,
+        flash: &F,
+        program: u8,
+        size: Option<u32>,
+    ) -> Result<(), AbortCode> {
         self.download_cancel();
+        if P::RENEWS {
+            self.may_renew(flash, program)?;
+        }
         let room = self.has_room();
-        let Some(state) = find(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
         if PROGRAMS > 1
             && matches!(state.session, Session::Open { .. })
             && self.programmer.program() != Some(program)
@@ -76,7 +85,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn download_end(&mut self) -> Result<(), AbortCode> {
         let program = self.take(None)?;
         self.transfer = None;
-        if let Some(state) = find(&mut self.programs, program) {
+        if let Some(state) = find::<P>(&mut self.programs, program) {
             state.failure = None;
         }
         Ok(())
@@ -87,7 +96,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub fn download_cancel(&mut self) {
         let Some(Transfer { program, intake }) = self.transfer.take() else { return };
         self.programmer.source_mut().queue.discard();
-        let Some(state) = find(&mut self.programs, program) else { return };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return };
         if intake.is_stream() && matches!(state.session, Session::Open { .. }) {
             state.session = Session::Failed;
             state.failure.get_or_insert(Failure::of(FlashError::Format));
@@ -100,7 +109,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     fn take(&mut self, data: Option<&[u8]>) -> Result<u8, AbortCode> {
         let Some(Transfer { program, intake }) = &mut self.transfer else { return Err(self.fault) };
         let program = *program;
-        let Some(state) = find(&mut self.programs, program) else { return Err(self.fault) };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return Err(self.fault) };
         let judge = Judge {
             layout: self.layout,
             policy: self.policy,
@@ -145,7 +154,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
-        let Some(state) = find(&mut self.programs, program) else { return };
+        let staging = self.staging_of(program);
+        if let (Some(staging), Some(_)) = (staging, findings.begins) {
+            self.drop_partial(staging);
+        }
+        let Some(state) = find::<P>(&mut self.programs, program) else { return };
         if let Some(begin) = findings.begins {
             state.version = begin.version;
             let mut next = 1;
@@ -166,8 +179,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     next = ANY;
                 }
                 self.programmer.source_mut().queue.last = LastBlock::none(partial.start());
-                let erases = next == ANY || self.policy.erases(state.session);
-                self.programmer.open(program, state.region, erases, begin.size, partial);
+                let mut erases = next == ANY || self.policy.erases(state.session);
+                if let Some(staging) = staging {
+                    // It is erased in any case, and begins anew after a cut.
+                    (erases, partial) = (true, Partial::begin(0, staging.base));
+                }
+                let region = staging.unwrap_or(state.region);
+                let offset = region.base.wrapping_sub(state.region.base);
+                self.programmer.open(program, region, erases, begin.size, partial, offset);
                 if findings.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
                     self.programmer.disown();
@@ -175,7 +194,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                         layout: self.layout,
                         policy: &self.policy.seal,
                         program,
-                        region: state.region,
+                        region,
                         lowered_counter: self.rights.lowered_counter(),
                     });
                 }

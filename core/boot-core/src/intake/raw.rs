@@ -2,6 +2,7 @@
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
+use shared_abi::ram_image::MAGIC;
 use shared_abi::vectors::VectorTable;
 
 use super::format::{Destination, Format, Recognition};
@@ -21,7 +22,12 @@ impl Format for Raw {
             return raw();
         }
         let Some(word) = first.first_chunk() else { return Recognition::More };
-        if VectorTable::is_stack_pointer(u32::from_le_bytes(*word), judge.layout) {
+        let word = u32::from_le_bytes(*word);
+        let starts = match judge.is_bootloader() {
+            true => word == MAGIC,
+            false => VectorTable::is_stack_pointer(word, judge.layout),
+        };
+        if starts {
             raw()
         } else {
             Recognition::No

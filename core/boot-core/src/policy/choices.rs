@@ -70,6 +70,31 @@ pub struct Policy {
     pub crc_step: u32,
     /// The values with which a sealed image is checked.
     pub seal: SealPolicy,
+    /// The values for a renewal of the bootloader.
+    pub renewal: Renewal,
+}
+
+/// The values for a renewal of the bootloader (docs/renewal.md).
+#[derive(Clone, Copy, Debug)]
+pub struct Renewal {
+    /// The identity of the board, as in the header of a RAM image.
+    pub board: u32,
+    /// The abilities of the resident part (`shared_abi::ram_image::feature`).
+    pub features: u32,
+    /// Vendor-ID and product code of the device, which an image must have; `None` for any.
+    pub identity: Option<(u32, u32)>,
+    /// The version of the services of the resident part.
+    pub services: u32,
+    /// The version of the running image.
+    pub version: u32,
+    /// The time within which an image on trial must be confirmed, in seconds.
+    pub confirm_within_s: u16,
+}
+
+impl Renewal {
+    /// Values of no device.
+    pub const NONE: Self =
+        Self { board: 0, features: 0, identity: None, services: 0, version: 0, confirm_within_s: 60 };
 }
 
 /// The values with which a sealed image is checked, besides the keys in the device.
@@ -127,6 +152,7 @@ impl Policy {
         crc: CrcKind::Crc32,
         crc_step: 1024,
         seal: SealPolicy::NONE,
+        renewal: Renewal::NONE,
     };
 
     /// Whether a download that begins in this state first erases the flash. Otherwise each piece

@@ -5,6 +5,7 @@ use shared_abi::block_file::{fits, Control, Difference, Identity};
 use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::vectors::VectorTable;
 
 use super::choices::{Policy, Verdict};
@@ -38,6 +39,11 @@ impl Judge<'_> {
     /// Whether the program number is for data of the application.
     pub(crate) fn is_data(&self) -> bool {
         self.policy.data == Some(self.program)
+    }
+
+    /// Whether the image is a new one for the bootloader.
+    pub(crate) fn is_bootloader(&self) -> bool {
+        self.program == BOOTLOADER
     }
 
     /// Whether the download has begun: from then on the old program is given up.

@@ -11,21 +11,28 @@
 //! is erased or written. The record of an opened program is removed with the first piece and not
 //! before: a refusal or an abort until then has no effect on the old program.
 
+mod install;
 mod write;
 
 use core::task::Poll;
 
 use canopen::program::{FlashError, Supply, SUPPLY_DETAIL};
 use shared_abi::geometry::{Region, Sector};
+use shared_abi::ram_image::Header;
+use shared_abi::renewal::{State, BOOTLOADER};
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Piece;
+use crate::renewal::Places;
 use crate::resume::Partial;
 use crate::source::{Demand, Source};
-use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, Value};
+use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
+use install::{Install, Phase};
 use write::WritePiece;
+
+pub(crate) use install::Renewing;
 
 /// The result of a step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -90,6 +97,8 @@ enum Job {
     Process,
     /// The flash is compared with the sent program.
     Verify { expected: Expected, crc: FlashCrc },
+    /// A confirmed RAM image is being installed.
+    Install,
 }
 
 /// The kind of change in the store.
@@ -107,6 +116,8 @@ enum Change {
     Counter,
     /// A value for which no host waits.
     Note,
+    /// The record that permits an installation.
+    Permit,
 }
 
 /// The flash half. It starts operations and polls them, but never waits for them.
@@ -124,6 +135,10 @@ pub(crate) struct Programmer<'b> {
     /// Whether the counter proved by the next of these programs is already stored.
     kept: bool,
     job: Option<Job>,
+    /// The installation of a RAM image.
+    install: Option<Install>,
+    /// `None` if the RAM image cannot be renewed.
+    pub renewing: Option<Renewing>,
     /// The present operation of the flash. Without a job its result is ignored.
     running: Option<Step>,
 }
@@ -141,6 +156,8 @@ impl<'b> Programmer<'b> {
             detail: 0,
             kept: false,
             job: None,
+            install: None,
+            renewing: None,
             running: None,
         }
     }
@@ -164,7 +181,16 @@ impl<'b> Programmer<'b> {
     /// otherwise each piece must find its place erased.
     /// `partial` is the progress to begin with: a download that goes on begins after its region's
     /// start.
-    pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
+    /// The pieces are written `offset` after their addresses.
+    pub(crate) fn open(
+        &mut self,
+        program: u8,
+        region: Region,
+        erase: bool,
+        size: u32,
+        partial: Partial,
+        offset: u32,
+    ) {
         let (erased, ahead) = if erase {
             (partial.start(), region.base + size.min(region.size))
         } else {
@@ -172,7 +198,7 @@ impl<'b> Programmer<'b> {
         };
         let (untouched, clearing, half_erased) = (Some(ahead), false, true);
         let ahead = erased;
-        self.source.rest();
+        self.source.rest(offset);
         self.target =
             Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, partial });
     }
@@ -190,7 +216,7 @@ impl<'b> Programmer<'b> {
 
     /// Removes the record of a program, then erases all its sectors that are not erased.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
-        self.open(program, region, true, region.size, Partial::begin(0, region.base));
+        self.open(program, region, true, region.size, Partial::begin(0, region.base), 0);
         if let Some(target) = &mut self.target {
             target.clearing = true;
         }
@@ -230,6 +256,16 @@ impl<'b> Programmer<'b> {
     ) {
         let change = if confirms { Change::Confirm } else { Change::Record };
         self.job = Some(store(parameters, change, program, record.value()));
+    }
+
+    /// Replaces the record of the RAM image in staging.
+    pub(crate) fn record_image(&mut self, parameters: &mut impl Parameters, record: RenewalRecord) {
+        self.job = Some(store(parameters, Change::Record, BOOTLOADER, record.value()));
+    }
+
+    /// Installs the confirmed RAM image.
+    pub(crate) fn install(&mut self, places: Places, record: RenewalRecord) {
+        self.install = Some(Install::new(places, record));
     }
 
     /// Stores node-ID and bit rate.
@@ -278,6 +314,7 @@ impl<'b> Programmer<'b> {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
+            || self.install.is_some()
             || self.source.has_work()
             || self.target.as_ref().is_some_and(|target| target.clearing || target.erased < target.ahead)
     }
@@ -293,7 +330,10 @@ impl<'b> Programmer<'b> {
         };
         let waiting =
             |target: &Target| target.clearing || self.source.is_complete() || !self.source.has_room();
-        ending || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
+        let installing = self.install.is_some() && program == BOOTLOADER;
+        ending
+            || installing
+            || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
     }
 
     /// The program that was sent completely, or whose record is being stored: its host believes
@@ -309,7 +349,7 @@ impl<'b> Programmer<'b> {
     /// Whether [`abort`](Self::abort) undoes nothing that a host believes to be done.
     pub(crate) fn is_abortable(&self) -> bool {
         let clearing = self.target.as_ref().is_some_and(|target| target.clearing);
-        !clearing && self.finishing().is_none() && !self.is_storing_node()
+        !clearing && self.install.is_none() && self.finishing().is_none() && !self.is_storing_node()
     }
 
     /// Whether node-ID and bit rate are being stored.
@@ -386,6 +426,14 @@ impl<'b> Programmer<'b> {
                     false => Next::Again,
                 };
             }
+            (Some(Job::Install), _) => {
+                match self.install.as_mut().map(|install| install.next(flash, self.crc_step)) {
+                    Some(Next::Start(operation)) => Ok(Some(operation)),
+                    Some(Next::Again) => return Next::Again,
+                    Some(Next::Done(Err(fault))) => Err(fault),
+                    Some(Next::Done(Ok(()))) | None => Ok(None),
+                }
+            }
             (None, _) => Ok(None),
         };
         match next {
@@ -415,7 +463,17 @@ impl<'b> Programmer<'b> {
     fn done<P: Parameters>(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
-            (Job::Store(Change::Counter | Change::Note, _) | Job::Process, Ok(())) => None,
+            (Job::Store(Change::Permit, _), Ok(())) => {
+                if let Some(install) = &mut self.install {
+                    install.permitted();
+                }
+                None
+            }
+            (Job::Store(Change::Counter | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
+            (Job::Install, Err(error)) => {
+                self.install = None;
+                Some(Event::Failed { program: BOOTLOADER, error, erasing: false })
+            }
             (Job::Store(change, program), result) => {
                 // A record whose counter could not be stored stays, too.
                 if matches!(change, Change::Void | Change::Counter) {
@@ -430,6 +488,7 @@ impl<'b> Programmer<'b> {
                     // The consequence is only another rescue window.
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
+                        self.install = None;
                         // If the record cannot be removed, its data must not be changed.
                         if self.program() == Some(program) {
                             self.abort();
@@ -483,9 +542,17 @@ impl<'b> Programmer<'b> {
         if let Some(job) = note().map(|note| store_note(parameters, note)).or_else(|| self.process_first()) {
             return Ok(Some(job));
         }
+        if P::RENEWS {
+            if let Some(job) = self.go_on_installing(parameters, flash)? {
+                return Ok(Some(job));
+            }
+        }
         let piece = self.source.piece();
         if self.unwritten.is_none() {
             self.give_up_old::<F, P>(flash, piece)?;
+        }
+        if P::RENEWS {
+            self.give_up_staging(piece);
         }
         if let Some(region) = self.unwritten.take() {
             self.check_writable(flash, region).inspect_err(|_| self.voids = 0)?;
@@ -523,6 +590,11 @@ impl<'b> Programmer<'b> {
             return Ok(());
         }
         let Some(ahead) = target.untouched else { return Ok(()) };
+        if P::RENEWS && target.program == BOOTLOADER {
+            // Nothing was lost: the download ends.
+            judge_image(self.renewing.as_ref(), &self.source, piece)?;
+        }
+        let Some(target) = &mut self.target else { return Ok(()) };
         // Nothing is lost for a program that the flash does not take.
         let region = target.region;
         let size = match (self.source.size(), ahead - region.base) {
@@ -545,8 +617,44 @@ impl<'b> Programmer<'b> {
         Ok(())
     }
 
+    /// The next job of an installation.
+    fn go_on_installing<F: Flash>(
+        &mut self,
+        parameters: &mut impl Parameters,
+        flash: &F,
+    ) -> Result<Option<Job>, FlashError> {
+        let Some(install) = &self.install else { return Ok(None) };
+        let region = install.region();
+        let (change, state) = match install.phase {
+            Phase::Permit => (Change::Permit, State::Confirmed),
+            Phase::Done => (Change::Record, State::Installed),
+            Phase::Erase(_) | Phase::Copy(_) | Phase::Check(_) => return Ok(Some(Job::Install)),
+        };
+        let value = install.value(state);
+        if change == Change::Record {
+            self.install = None;
+        } else if let Err(error) = self.check_writable(flash, region) {
+            self.install = None;
+            return Err(error);
+        }
+        Ok(Some(store(parameters, change, BOOTLOADER, value)))
+    }
+
+    /// A program that reaches into staging takes its flash: the record of the image there is removed first.
+    fn give_up_staging(&mut self, piece: Option<Piece>) {
+        let (Some(target), Some(renewing)) = (&self.target, &mut self.renewing) else { return };
+        if target.untouched.is_some() {
+            return;
+        }
+        let end = piece.map_or(target.ahead, |piece| target.ahead.max(piece.address + piece.size));
+        if renewing.is_reached(target.program, end) {
+            renewing.has_record = false;
+            self.void(BOOTLOADER);
+        }
+    }
+
     /// Whether all sectors of a region may be written now.
-    fn check_writable<F: Flash>(&mut self, flash: &F, region: Region) -> Result<(), FlashError> {
+    pub(crate) fn check_writable<F: Flash>(&mut self, flash: &F, region: Region) -> Result<(), FlashError> {
         if flash.supply() == Supply::Low {
             return Err(self.low_supply());
         }
@@ -628,6 +736,23 @@ impl Target {
         let again = P::RESUMES && self.partial.is_resumed();
         WritePiece::new(flash, piece, again).map(Job::Write).ok_or(FlashError::NotCleared)
     }
+}
+
+/// Judges a new RAM image by its first piece.
+fn judge_image(
+    renewing: Option<&Renewing>,
+    source: &Source<'_>,
+    piece: Option<Piece>,
+) -> Result<(), FlashError> {
+    let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err(FlashError::Format) };
+    if piece.address != renewing.places.staging.base || piece.size < Header::SIZE {
+        return Err(FlashError::Format);
+    }
+    let mut header = [0; Header::SIZE as usize];
+    for (at, byte) in header.iter_mut().enumerate() {
+        *byte = source.byte(at);
+    }
+    renewing.judge(&header)
 }
 
 /// The bit of a program in `voids`.

@@ -16,13 +16,14 @@ impl Key {
     /// The number of grants of rights, and whether one of them has opened the device permanently.
     pub const GRANTS: Self = Self(0x0006_0000);
 
-    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord).
+    /// The record of a program (1 to 254), see [`ProgramRecord`](super::ProgramRecord); 255 is that of
+    /// the bootloader's RAM image, see [`RenewalRecord`](super::RenewalRecord).
     #[must_use]
     pub const fn program(number: u8) -> Self {
         Self(0x0001_0000 | number as u32)
     }
 
-    /// Of a program (1 to 254): the lowest security counter and the lowest epoch that the device
+    /// Of a program (1 to 254, 255 for the bootloader): the lowest security counter and the lowest epoch that the device
     /// accepts, and the counter of the installed program. This value survives the program's record.
     #[must_use]
     pub const fn counter(number: u8) -> Self {
@@ -65,6 +66,9 @@ pub trait Parameters {
     /// Whether the progress of a download is stored, so that one that was cut off goes on where it
     /// stopped (2006h). Without it, the compiler leaves out the code.
     const RESUMES: bool = true;
+    /// Whether the bootloader can be renewed (docs/renewal.md). Without it, the compiler leaves out the
+    /// code.
+    const RENEWS: bool = true;
 
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;

@@ -4,7 +4,7 @@
 use canopen::debugger::Stop;
 use canopen::device::Device;
 use canopen::od::{Access, DataType, Entry, Table};
-use canopen::program::{control_count, region_of, region_value};
+use canopen::program::{control_count, region_of, region_value, Numbers};
 use canopen::{AbortCode, Address, BitRate, CobId, Instant, NodeId, Objects};
 
 #[test]
@@ -62,8 +62,9 @@ fn a_region_is_its_base_and_then_its_size() {
 /// Each array has sub-index 0 and one for each program.
 #[test]
 fn a_table_has_the_arrays_of_program_control() {
-    const LEN: usize = control_count(2);
-    let entries = Table::<LEN>::EMPTY.with_program_control(2).entries();
+    const NUMBERS: Numbers = Numbers::of_programs(2);
+    const LEN: usize = control_count(NUMBERS);
+    let entries = Table::<LEN>::EMPTY.with_program_control(NUMBERS).entries();
     let subs: Vec<u8> = entries.iter().map(|entry| entry.at.sub).collect();
     assert_eq!(subs, [0, 1, 2].repeat(LEN / 3));
     assert!(entries.chunks(3).all(|of| of.iter().all(|entry| entry.at.index == of[0].at.index)));

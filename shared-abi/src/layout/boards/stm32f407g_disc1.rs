@@ -13,7 +13,7 @@ pub const LAYOUT: Layout = Layout {
     parameters: [Region::new(0x0800_4000, 16 * 1024), Region::new(0x0800_8000, 16 * 1024)],
     data: Some(Region::new(0x0800_C000, 16 * 1024)),
     programs: &[Region::new(0x0802_0000, 896 * 1024)],
-    staging: None,
+    staging: Some(Region::new(0x080E_0000, 128 * 1024)),
     ram: Region::new(0x2000_0000, 128 * 1024 - 64),
     handoff: Region::new(0x2001_FFC0, 48),
     warm_start: Region::new(0x2001_FFF0, 16),

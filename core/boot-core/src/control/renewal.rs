@@ -1,0 +1,257 @@
+//! The renewal of the bootloader in the objects 1F50h to 1F57h: the bootloader's own RAM image is one
+//! more program, with rules of its own (docs/renewal.md).
+
+use canopen::program::{FlashError, ProgramControl};
+use canopen::{AbortCode, Instant};
+use shared_abi::boot_report::BootReport;
+use shared_abi::geometry::Region;
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd, BOOTLOADER};
+use shared_abi::warm_start::BootRequest;
+
+use super::{find, Downloader, Failure};
+use crate::flash::Flash;
+use crate::program::Expected;
+use crate::programmer::Renewing;
+use crate::refusal::Refusal;
+use crate::renewal::{check, header, Places};
+use crate::resume::Partial;
+use crate::session::Session;
+use crate::store::{Parameters, RenewalRecord};
+
+/// What is known about a renewal.
+pub(super) struct Renewal {
+    /// The stored record; a copy, because the flash cannot be read while it is busy.
+    record: Option<RenewalRecord>,
+    /// The place of the running image.
+    origin: Origin,
+    trial_end: TrialEnd,
+}
+
+impl Renewal {
+    /// The running image is that of home.
+    pub(super) const NONE: Self = Self { record: None, origin: Origin::Home, trial_end: TrialEnd::None };
+
+    const fn state(&self) -> State {
+        match self.record {
+            Some(record) => record.state,
+            None => State::None,
+        }
+    }
+}
+
+impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+    /// 2007h/9.
+    #[must_use]
+    pub fn renewal(&self) -> Progress {
+        let Renewal { origin, trial_end, .. } = self.renewal;
+        Progress { state: self.renewal.state(), origin, trial_end }
+    }
+
+    /// Starts with the report of the resident part. What a cut has interrupted goes on.
+    pub(super) fn begin_renewal<F: Flash>(&mut self, flash: &F, report: &BootReport) {
+        let Some(places) = Places::of(self.layout) else { return };
+        let record = RenewalRecord::load(&self.parameters, flash);
+        self.renewal = Renewal { record, origin: report.origin, trial_end: report.trial_end };
+        let running = if report.origin == Origin::Home { places.home } else { places.staging };
+        let header = header(flash, running);
+        if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+            state.region = places.home;
+            state.identification = header.crc;
+            if header.crc == 0 {
+                // An image for the bench.
+                let size = header.total().min(running.size);
+                state.identification = flash.crc32(0, Region::new(running.base, size));
+            }
+        }
+        self.programmer.renewing = Some(Renewing {
+            layout: self.layout,
+            policy: &self.policy.renewal,
+            places,
+            has_record: record.is_some(),
+        });
+        let Some(record) = record else { return };
+        match (record.state, report.origin) {
+            (State::Confirmed, Origin::Confirmed) | (State::Installed, Origin::Spare) => {
+                self.programmer.install(places, record);
+            }
+            // Home is an image that the record does not know, so it is void; or nothing is left in staging.
+            (State::Confirmed, Origin::Home) | (State::Staged | State::Installed, Origin::Home)
+                if places.is_home_foreign(flash, &record) || !places.is_in_staging(flash, &record) =>
+            {
+                self.programmer.void(BOOTLOADER);
+            }
+            // Such a record may read differently each time: it is not relied upon before a master confirms
+            // the image again.
+            (State::Confirmed, Origin::Home) => {
+                self.renewal.record = Some(RenewalRecord { state: State::Staged, ..record });
+            }
+            _ => {}
+        }
+    }
+
+    /// Takes the time since the start of the image: a trial ends by itself.
+    pub(crate) fn watch_trial(&mut self, now: Instant) {
+        let ends = u32::from(self.policy.renewal.confirm_within_s) * 1000;
+        let is_open = self.renewal.origin == Origin::Trial && self.renewal.state() == State::Staged;
+        if is_open && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
+            self.boot_request = Some(BootRequest::TrialLate);
+        }
+    }
+
+    /// 1F51h/n: a command for the bootloader itself. By itself it changes no flash but the record.
+    pub(super) fn command_bootloader(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
+        use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
+
+        let on_trial = self.renewal.origin == Origin::Trial && self.renewal.state() == State::Staged;
+        let busy = self.boot_request.is_some() || self.programmer.has_work();
+        let loads = self.transfer.is_some() || self.programmer.program().is_some();
+        let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else {
+            return Err(AbortCode::NO_SUB_INDEX);
+        };
+        if matches!(command, Stop | StartBootloader) {
+            // It runs, and it is the bootloader.
+            return Ok(());
+        }
+        let own = self.programmer.program() == Some(BOOTLOADER);
+        let restarts = command == Clear && own && self.programmer.is_abortable();
+        // A start would break off a download, and nobody starts a second trial from a first one.
+        if busy && !restarts || command == Start && (loads && !own || self.renewal.origin == Origin::Trial) {
+            return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
+        }
+        if matches!(command, Clear | SetSignature | ClrSignature | Start)
+            && (state.locked || !(self.policy.allowed)())
+        {
+            return Err(state.refuse(Refusal::untimely(FlashError::NoAccess)));
+        }
+        state.failure = None;
+        match command {
+            Clear | ClrSignature if on_trial => self.boot_request = Some(BootRequest::TrialGivenUp),
+            Clear => {
+                state.session = Session::Cleared { just: true };
+                self.download_cancel();
+                self.programmer.abort();
+            }
+            Start if self.renewal.state() == State::Staged => self.boot_request = Some(BootRequest::Try),
+            Start => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
+            SetSignature if on_trial => self.confirm_image(),
+            SetSignature => self.install_again(),
+            Stop | StartBootloader | ResetStat | ClrSignature => {}
+        }
+        Ok(())
+    }
+
+    /// A master has reached the image on trial, and confirms it.
+    fn confirm_image(&mut self) {
+        let Some(record) = self.renewal.record else { return };
+        let record = RenewalRecord { state: State::Confirmed, ..record };
+        self.programmer.record_image(&mut self.parameters, record);
+    }
+
+    /// An installation that has failed is tried again.
+    fn install_again(&mut self) {
+        let (Some(places), Some(record)) = (Places::of(self.layout), self.renewal.record) else { return };
+        if record.state == State::Confirmed {
+            self.programmer.install(places, record);
+        }
+    }
+
+    /// The record of the image was stored or removed.
+    pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
+        let record = RenewalRecord::load(&self.parameters, flash);
+        let was = self.renewal.state();
+        self.renewal.record = record;
+        if let Some(renewing) = &mut self.programmer.renewing {
+            renewing.has_record = record.is_some();
+        }
+        if was != State::Confirmed && self.renewal.state() == State::Confirmed {
+            self.install_again();
+        }
+    }
+
+    /// Checks a complete image in staging; its record.
+    pub(super) fn check_image<F: Flash>(
+        &mut self,
+        flash: &F,
+        expected: &Expected,
+        crc: u32,
+    ) -> Result<RenewalRecord, FlashError> {
+        let places = Places::of(self.layout).ok_or(FlashError::Unspecified)?;
+        let renewal = &self.policy.renewal;
+        if expected.crc.is_some_and(|told| told != crc) {
+            return Err(FlashError::NoValidProgram);
+        }
+        let image = check(flash, places.staging, self.layout, renewal.board, renewal.features)
+            .map_err(|_| FlashError::NoValidProgram)?;
+        if expected.size < image.total() {
+            return Err(FlashError::NoValidProgram);
+        }
+        if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+            state.identification = image.crc;
+        }
+        let home = header(flash, places.home).crc;
+        Ok(RenewalRecord { state: State::Staged, size: image.total(), crc: image.crc, home })
+    }
+
+    /// Whether a download of a new image, or of the last program, may begin now.
+    pub(super) fn may_renew<F: Flash>(&mut self, flash: &F, program: u8) -> Result<(), AbortCode> {
+        let is_last = usize::from(program) == self.layout.programs.len();
+        let Some(places) = Places::of(self.layout) else { return Ok(()) };
+        let is_open =
+            self.program(program).is_some_and(|state| matches!(state.session, Session::Open { .. }));
+        if is_open || program != BOOTLOADER && !is_last {
+            return Ok(());
+        }
+        let mut detail = 0;
+        let error = if self.renewal.state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
+        {
+            Some(FlashError::Busy)
+        } else if program != BOOTLOADER || self.programmer.is_busy() {
+            None
+        } else {
+            let last = self.layout.programs.len() as u8;
+            let (installed, _) = self.installed(last);
+            if installed.end() > places.staging.base {
+                detail = last;
+                Some(FlashError::NotCleared)
+            } else {
+                let writable = self.programmer.check_writable(flash, places.staging);
+                let writable = writable.and_then(|()| self.programmer.check_writable(flash, places.home));
+                detail = self.programmer.take_detail();
+                writable.err()
+            }
+        };
+        let Some(error) = error else { return Ok(()) };
+        let Some(state) = find::<P>(&mut self.programs, program) else { return Ok(()) };
+        let abort = state.refuse(Refusal::untimely(error));
+        state.failure = Some(Failure { error, detail });
+        Err(abort)
+    }
+
+    /// The flash for a new image of the bootloader; `None` for any other program.
+    pub(super) fn staging_of(&self, program: u8) -> Option<Region> {
+        let places = if P::RENEWS && program == BOOTLOADER { Places::of(self.layout) } else { None };
+        places.map(|places| places.staging)
+    }
+
+    /// Whether a program has to leave staging alone, because its image is confirmed and not installed yet.
+    pub(super) fn keeps_staging(&self, program: u8) -> bool {
+        let is_last = usize::from(program) == self.layout.programs.len();
+        is_last && self.renewal.state() == State::Confirmed
+    }
+
+    /// Whether the running image is on trial.
+    pub(super) fn is_on_trial(&self) -> bool {
+        self.renewal.origin == Origin::Trial && self.renewal.state() != State::Confirmed
+    }
+
+    /// A download of a new image begins: a download of the last program that has reached staging does not
+    /// go on after it.
+    pub(super) fn drop_partial(&mut self, staging: Region) {
+        let last = self.layout.programs.len() as u8;
+        let Some(state) = find::<P>(&mut self.programs, last) else { return };
+        if state.partial.start() > staging.base {
+            state.partial = Partial::NONE;
+            self.programmer.void(last);
+        }
+    }
+}

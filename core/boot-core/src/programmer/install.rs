@@ -1,0 +1,136 @@
+//! The renewal of the bootloader in the flash half: a new RAM image is judged before staging is
+//! erased for it; a confirmed one is copied from staging over home, while the bootloader runs from
+//! RAM (docs/renewal.md).
+
+use canopen::program::FlashError;
+use shared_abi::block_file::{fits, Difference};
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+use shared_abi::ram_image::Header;
+use shared_abi::renewal::State;
+
+use crate::crc::CrcKind;
+use crate::flash::{Flash, FlashFault, Next};
+use crate::policy::Renewal;
+use crate::program::FlashCrc;
+use crate::renewal::Places;
+use crate::sequence::{EraseSectors, ProgramWords};
+use crate::store::{RenewalRecord, Value};
+
+/// What the flash half knows about renewals.
+#[derive(Clone, Copy)]
+pub(crate) struct Renewing {
+    pub layout: &'static Layout,
+    pub policy: &'static Renewal,
+    pub places: Places,
+    /// A record of staging is stored: it must be removed before a program changes that flash.
+    pub has_record: bool,
+}
+
+impl Renewing {
+    /// Whether an image with this header may become the bootloader.
+    pub(super) fn judge(&self, bytes: &[u8; Header::SIZE as usize]) -> Result<(), FlashError> {
+        let header = Header::of_bytes(bytes);
+        let Renewal { board, features, identity, .. } = *self.policy;
+        let room = self.places.staging.size - Header::SIZE;
+        if header.check(room, self.layout.ram, board, features).is_err() || header.crc == 0 {
+            return Err(FlashError::Format);
+        }
+        match identity.map(|device| fits((header.vendor, header.product), device)) {
+            Some(Err(Difference::VendorId)) => Err(FlashError::WrongVendorId),
+            Some(Err(Difference::ProductCode)) => Err(FlashError::WrongProductId),
+            Some(Ok(())) | None => Ok(()),
+        }
+    }
+
+    /// Whether the last program's flash up to `end` is a part of staging, and has a record.
+    pub(super) fn is_reached(&self, program: u8, end: u32) -> bool {
+        self.has_record
+            && usize::from(program) == self.layout.programs.len()
+            && end > self.places.staging.base
+    }
+}
+
+/// The installation of a confirmed image.
+pub(super) struct Install {
+    places: Places,
+    record: RenewalRecord,
+    pub phase: Phase,
+}
+
+/// The progress of an installation.
+pub(super) enum Phase {
+    /// The record that permits the erase must be stored once more: a power cut may have left it
+    /// between 0 and 1.
+    Permit,
+    /// Home is being erased.
+    Erase(EraseSectors),
+    /// The image is being copied.
+    Copy(ProgramWords),
+    /// The copy is being checked.
+    Check(FlashCrc),
+    /// The record of the installed image must be stored.
+    Done,
+}
+
+impl Install {
+    pub(super) const fn new(places: Places, record: RenewalRecord) -> Self {
+        Self { places, record, phase: Phase::Permit }
+    }
+
+    /// The flash that it writes.
+    pub(super) const fn region(&self) -> Region {
+        self.places.home
+    }
+
+    /// The stored form of its record in this state.
+    pub(super) const fn value(&self, state: State) -> Value {
+        let home = match state {
+            State::Installed => self.record.crc,
+            _ => self.record.home,
+        };
+        RenewalRecord { state, home, ..self.record }.value()
+    }
+
+    /// The record is certain: home may be erased.
+    pub(super) const fn permitted(&mut self) {
+        self.phase = Phase::Erase(EraseSectors::new(self.places.home));
+    }
+
+    /// The next operation, until [`Phase::Done`].
+    pub(super) fn next<F: Flash>(&mut self, flash: &F, crc_step: u32) -> Next<FlashFault> {
+        let Places { home, staging } = self.places;
+        let words = self.record.size as usize / 4;
+        let next = match &mut self.phase {
+            Phase::Erase(sectors) => sectors.next(flash),
+            Phase::Copy(copy) => {
+                copy.next(flash, words, |word| flash.read_word(staging.base + 4 * word as u32))
+            }
+            Phase::Check(crc) => {
+                return match crc.step(flash, CrcKind::Crc32, crc_step) {
+                    false => Next::Again,
+                    true if crc.value() != self.record.crc => Next::Done(Err(FlashFault::Verify)),
+                    true => {
+                        self.phase = Phase::Done;
+                        Next::Done(Ok(()))
+                    }
+                };
+            }
+            Phase::Permit | Phase::Done => Ok(None),
+        };
+        match next {
+            Ok(Some(operation)) => Next::Start(operation),
+            Err(fault) => Next::Done(Err(fault)),
+            Ok(None) => {
+                self.phase = match self.phase {
+                    Phase::Erase(_) => Phase::Copy(ProgramWords::new(home.base)),
+                    _ => {
+                        let from = home.base + Header::CRC_FROM;
+                        Phase::Check(FlashCrc::new(Region::new(from, self.record.size - Header::CRC_FROM)))
+                    }
+                };
+                Next::Again
+            }
+        }
+    }
+}
