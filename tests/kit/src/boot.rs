@@ -1,6 +1,6 @@
 //! The one way to make a bootloader in a test: what it starts from, and then the flash.
 
-use boot_core::bootloader::{Bootloader, Config};
+use boot_core::bootloader::{Bootloader, Choices, Config};
 use boot_core::control::{Room, Sealed};
 use boot_core::flash::Flash;
 use boot_core::store::{Journal, NodeParameters, Parameters};
@@ -42,13 +42,13 @@ impl Boot {
     }
 
     /// Starts on this flash, with the parameters in this store.
-    pub fn with<'b, F: Flash, P: Parameters, const PROGRAMS: usize>(
+    pub fn with<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices>(
         self,
         parameters: P,
         flash: F,
         buffer: &'b mut [u8],
         sealed: Sealed<'b>,
-    ) -> Bootloader<'b, F, P, PROGRAMS> {
+    ) -> Bootloader<'b, F, P, PROGRAMS, C> {
         let Self { config, node, serial_number, report } = self;
         Bootloader::new(config, serial_number, node, &report, parameters, flash, buffer, sealed)
     }

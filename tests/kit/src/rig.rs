@@ -3,7 +3,7 @@
 //! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
 //! [`boot`](crate::boot) and [`Rig::stored`].
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Everything, PasswordObject};
 use boot_core::control::{Erase, Policy, Step};
 use boot_core::flash::Flash;
 use boot_core::profile::Profile;
@@ -190,8 +190,8 @@ impl Rig {
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let boot = Boot::new(&setup.config, node);
         match setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, buffer, sealed)),
-            2 => Box::new(boot.with::<_, _, 2>(parameters, flash, buffer, sealed)),
+            1 => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, buffer, sealed)),
+            2 => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, buffer, sealed)),
             _ => unreachable!(),
         }
     }

@@ -507,12 +507,12 @@ fn find<P: Parameters>(programs: &mut [Program], number: u8) -> Option<&mut Prog
 }
 
 /// The place of a program in the list of all. The last one is the bootloader's, if it can be renewed.
-fn place<P: Parameters>(programs: usize, number: u8) -> usize {
-    let place = usize::from(number).wrapping_sub(1);
-    match number {
-        BOOTLOADER if P::RENEWS => programs - 1,
-        _ if P::RENEWS && place + 1 == programs => usize::MAX,
-        _ => place,
+fn place<P: Parameters>(count: usize, number: u8) -> usize {
+    let of_bootloader = count.wrapping_sub(1);
+    match usize::from(number).wrapping_sub(1) {
+        _ if P::RENEWS && number == BOOTLOADER => of_bootloader,
+        place if P::RENEWS && place == of_bootloader => usize::MAX,
+        place => place,
     }
 }
 

@@ -470,10 +470,6 @@ impl<'b> Programmer<'b> {
                 None
             }
             (Job::Store(Change::Counter | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
-            (Job::Install, Err(error)) => {
-                self.install = None;
-                Some(Event::Failed { program: BOOTLOADER, error, erasing: false })
-            }
             (Job::Store(change, program), result) => {
                 // A record whose counter could not be stored stays, too.
                 if matches!(change, Change::Void | Change::Counter) {
@@ -527,7 +523,10 @@ impl<'b> Programmer<'b> {
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
         self.source.fail(error);
         // The signature of a request for rights belongs to no program.
-        let program = self.program().unwrap_or(0);
+        let program = match self.install.take() {
+            Some(_) => BOOTLOADER,
+            None => self.program().unwrap_or(0),
+        };
         self.abort();
         Some(Event::Failed { program, error, erasing })
     }
@@ -633,9 +632,8 @@ impl<'b> Programmer<'b> {
         let value = install.value(state);
         if change == Change::Record {
             self.install = None;
-        } else if let Err(error) = self.check_writable(flash, region) {
-            self.install = None;
-            return Err(error);
+        } else {
+            self.check_writable(flash, region)?;
         }
         Ok(Some(store(parameters, change, BOOTLOADER, value)))
     }
@@ -671,11 +669,11 @@ impl<'b> Programmer<'b> {
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.
-    fn remove_record<F: Flash>(&mut self, parameters: &mut impl Parameters, flash: &F) -> Option<Job> {
+    fn remove_record<F: Flash, P: Parameters>(&mut self, parameters: &mut P, flash: &F) -> Option<Job> {
         if self.voids == 0 {
             return None;
         }
-        let program = self.voids.trailing_zeros() as u8;
+        let program = of_bit::<P>(self.voids.trailing_zeros() as u8);
         // The counter that a program has proved must survive its record.
         if let Some(counter) = self.source.proved(flash, parameters, program) {
             if !core::mem::replace(&mut self.kept, true) {
@@ -753,6 +751,14 @@ fn judge_image(
         *byte = source.byte(at);
     }
     renewing.judge(&header)
+}
+
+/// The program of a bit in `voids`: [`bit`] has 31 for the bootloader.
+fn of_bit<P: Parameters>(bit: u8) -> u8 {
+    match bit {
+        31 if P::RENEWS => BOOTLOADER,
+        bit => bit,
+    }
 }
 
 /// The bit of a program in `voids`.

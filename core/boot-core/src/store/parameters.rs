@@ -66,9 +66,9 @@ pub trait Parameters {
     /// Whether the progress of a download is stored, so that one that was cut off goes on where it
     /// stopped (2006h). Without it, the compiler leaves out the code.
     const RESUMES: bool = true;
-    /// Whether the bootloader can be renewed (docs/renewal.md). Without it, the compiler leaves out the
-    /// code.
-    const RENEWS: bool = true;
+    /// Whether the bootloader can be renewed (docs/renewal.md): then it is one more program of the
+    /// [`Downloader`](crate::control::Downloader). Without it, the compiler leaves out the code.
+    const RENEWS: bool = false;
 
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;

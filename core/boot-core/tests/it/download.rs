@@ -740,7 +740,7 @@ fn parameters_may_be_kept_in_an_eeprom() {
     };
     device.command(1, ProgramControl::Clear).unwrap();
     for block in block_file(&image, 96) {
-        device.download_start(1, None).unwrap();
+        device.download_start(&flash, 1, None).unwrap();
         device.download_data(&block).unwrap();
         device.download_end().unwrap();
         assert_eq!(settle(&mut device, &mut flash), 0);

@@ -12,6 +12,7 @@ mod masters;
 mod objects;
 mod parameters;
 mod protection;
+mod renewal;
 mod resume;
 mod streams;
 mod supply;

@@ -1,0 +1,692 @@
+//! The renewal of the bootloader, on the model of the flash, with the power cut at every operation.
+
+use boot_core::bootloader::{entries, entry_count, Bootloader, Choices, Config, Extras};
+use boot_core::control::{Policy, Renewal, Step};
+use boot_core::crc::CrcKind;
+use boot_core::crc32;
+use boot_core::flash::{Flash, FlashFault, Next};
+use boot_core::program::verify;
+use boot_core::renewal::{header, Places};
+use boot_core::store::{Journal, Key, Parameters, RenewalRecord, StoreError, Value};
+use canopen::od::{Address, Entry, Objects};
+use canopen::{AbortCode, Instant};
+use kit::bench::{self, block_file, node, program, DEVICE};
+use kit::boot::{leaked, Boot};
+use kit::ihex;
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::random::Random;
+use shared_abi::boot_report::BootReport;
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+use shared_abi::ram_image::{Header, MAGIC, SERVICES_VERSION};
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
+use shared_abi::warm_start::{BootRequest, Damage};
+
+const HOME: Region = Region::new(0x0800_0800, 0x400);
+const STAGING: Region = Region::new(0x0800_3C00, 0x800);
+const PROGRAM: Region = Region::new(0x0800_0C00, 0x3800);
+static LAYOUT: Layout = Layout {
+    bootloader: Region::new(0x0800_0000, 0x200),
+    parameters: [Region::new(0x0800_0200, 0x200), Region::new(0x0800_0400, 0x200)],
+    home: Some(HOME),
+    programs: &[PROGRAM],
+    staging: Some(STAGING),
+    ..ONE_PROGRAM
+}
+.checked();
+const PLACES: Places = match Places::of(&LAYOUT) {
+    Some(places) => places,
+    None => panic!("the layout has staging"),
+};
+
+const BOARD: u32 = 0x1234_5678;
+const N: u8 = 2;
+const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
+static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
+const RENEWAL: Renewal = Renewal {
+    board: BOARD,
+    identity: Some((7, 8)),
+    version: 0x0001_0002,
+    services: SERVICES_VERSION,
+    ..Renewal::NONE
+};
+static CONFIG: Config = Config {
+    entries: &ENTRIES,
+    device: DEVICE,
+    layout: &LAYOUT,
+    download: Policy { renewal: RENEWAL, ..Policy::DEFAULT },
+    ..bench::CONFIG
+};
+
+/// A device with renewal.
+struct Renews;
+
+impl Choices for Renews {
+    const EXTRAS: Extras = EXTRAS;
+}
+
+/// The journal of a device with renewal.
+struct Store(Journal);
+
+impl Parameters for Store {
+    const RENEWS: bool = true;
+
+    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
+        self.0.get(flash, key)
+    }
+
+    fn store(&mut self, key: Key, value: Value) {
+        self.0.store(key, value);
+    }
+
+    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
+        self.0.next(flash, outcome)
+    }
+}
+
+const CLEAR: u8 = 3;
+const START: u8 = 1;
+const CONFIRM: u8 = 0x83;
+const WITHDRAW: u8 = 0x84;
+const BUSY: u32 = 0x86;
+const NOT_CLEARED: u32 = 0x08;
+const FORMAT: u32 = 0x04;
+const NO_VALID_PROGRAM: u32 = 0x02;
+const SECURED: u32 = 0x0E;
+
+const SOUND: Header = Header {
+    magic: MAGIC,
+    crc: 0,
+    length: Header::SIZE,
+    size: 0,
+    ram_base: LAYOUT.ram.base,
+    ram_end: LAYOUT.ram.base + LAYOUT.ram.size,
+    services: SERVICES_VERSION,
+    features: 0,
+    board: BOARD,
+    vendor: 7,
+    product: 8,
+    revisions: 0,
+    version: 0x0001_0002,
+    counter: 0,
+    reserved: [0; 2],
+};
+
+fn words(header: &Header) -> Vec<u8> {
+    let Header { magic, crc, length, size, ram_base, ram_end, services, features, .. } = *header;
+    let Header { board, vendor, product, revisions, version, counter, reserved: [a, b], .. } = *header;
+    [
+        magic, crc, length, size, ram_base, ram_end, services, features, board, vendor, product, revisions,
+        version, counter, a, b,
+    ]
+    .into_iter()
+    .flat_map(u32::to_le_bytes)
+    .collect()
+}
+
+/// An image with this header; the CRC is written unless the header has the CRC `bench`.
+fn image_of(header: Header, size: usize, fill: u8, has_crc: bool) -> Vec<u8> {
+    let mut image = words(&Header { size: size as u32, ..header });
+    image.extend([header.ram_end, header.ram_base + 0x41].into_iter().flat_map(u32::to_le_bytes));
+    image.extend((8..size).map(|at| fill ^ at as u8));
+    if has_crc {
+        let crc = crc32(&image[8..]).to_le_bytes();
+        image[4..8].copy_from_slice(&crc);
+    }
+    image
+}
+
+fn image(size: usize, fill: u8) -> Vec<u8> {
+    image_of(SOUND, size, fill, true)
+}
+
+/// What remains of a device when its power is off: the flash. And what a warm reset keeps.
+struct Board {
+    flash: ModelFlash,
+    request: Option<BootRequest>,
+    /// The origin of the image that ran before the reset.
+    ran: Option<Origin>,
+}
+
+/// The checks of the resident part before it loads an image (bootloader/src/resident/ram_image.rs).
+fn load(flash: &ModelFlash, place: Region) -> Result<Header, Damage> {
+    let header = header(flash, place);
+    header.check(place.size - Header::SIZE, LAYOUT.ram, BOARD, 0)?;
+    let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
+    if header.crc != 0 && flash.crc32(0, covered) != header.crc {
+        return Err(Damage::Crc);
+    }
+    Ok(header)
+}
+
+impl Board {
+    /// A device with the first image at home, and a program that does not reach into staging.
+    fn new(first: &[u8]) -> Self {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(HOME.base, first);
+        let mut board = Self { flash, request: None, ran: None };
+        board.install_program(0x1000);
+        board.off();
+        board
+    }
+
+    fn install_program(&mut self, size: usize) {
+        let mut node = self.start();
+        node.command(1, CLEAR);
+        for block in block_file_at(&program_of(size), PROGRAM.base, 200) {
+            node.send(1, &block).unwrap();
+        }
+        assert_eq!(node.command(1, CONFIRM), 0);
+        self.leave(None);
+    }
+
+    fn off(&mut self) {
+        self.flash.power_on();
+        (self.request, self.ran) = (None, None);
+    }
+
+    /// A warm reset with this request.
+    fn leave(&mut self, request: Option<BootRequest>) {
+        self.request = request;
+    }
+
+    /// The image that the resident part loads.
+    fn loads(&self) -> (Header, Origin, TrialEnd) {
+        let journal = Journal::open(&self.flash, LAYOUT.parameters);
+        let record = RenewalRecord::load(&journal, &self.flash);
+        let mut trial_end = match (self.request, self.ran) {
+            (Some(BootRequest::TrialLate), _) => TrialEnd::Late,
+            (Some(BootRequest::TrialGivenUp), _) => TrialEnd::GivenUp,
+            _ => TrialEnd::None,
+        };
+        let tries = self.request == Some(BootRequest::Try);
+        for (place, origin) in PLACES.order(&self.flash, record, tries).into_iter().flatten() {
+            match load(&self.flash, place) {
+                Ok(header) => return (header, origin, trial_end),
+                Err(damage) if origin == Origin::Trial => trial_end = TrialEnd::Damaged(damage),
+                Err(_) => {}
+            }
+        }
+        panic!("no bootloader can be loaded, with the record {record:?}");
+    }
+
+    fn start(&mut self) -> Node<'_> {
+        let (_, origin, trial_end) = self.loads();
+        self.request = None;
+        self.ran = Some(origin);
+        let report = BootReport { origin, trial_end, ..BootReport::NONE };
+        let journal = Store(Journal::open(&self.flash, LAYOUT.parameters));
+        let (buffer, sealed) = leaked(512);
+        let boot = Boot { report, ..Boot::new(&CONFIG, node()) };
+        let mut node = Node(boot.with(journal, &mut self.flash, buffer, sealed));
+        node.settle();
+        node
+    }
+
+    /// What a tool does until the new image is installed, from whatever state.
+    fn renew(&mut self, new: &[u8]) {
+        for _ in 0..8 {
+            let mut node = self.start();
+            let Progress { state, origin, .. } = node.progress();
+            match (state, origin) {
+                (State::Staged, Origin::Trial) => {
+                    assert_eq!(node.command(N, CONFIRM), 0);
+                    assert_eq!(node.progress().state, State::Installed);
+                    return;
+                }
+                (State::Staged, _) if node.word(0x1F56) != crc_of(new) || !node.has_staged(new) => {
+                    node.stage(new);
+                }
+                (State::Staged, _) => {
+                    assert_eq!(node.command(N, START), 0);
+                    let request = node.0.take_boot_request();
+                    assert_eq!(request, Some(BootRequest::Try));
+                    self.leave(request);
+                    continue;
+                }
+                (State::Installed, Origin::Home) if node.word(0x1F56) == crc_of(new) => return,
+                _ => node.stage(new),
+            }
+            let request = {
+                assert_eq!(node.command(N, START), 0);
+                node.0.take_boot_request()
+            };
+            self.leave(request);
+        }
+        panic!("the renewal does not end");
+    }
+
+    /// What holds at any time: a bootloader can be loaded, and the program is there.
+    fn check(&self, images: [&[u8]; 2]) {
+        let (loaded, ..) = self.loads();
+        assert!(images.iter().any(|image| crc_of(image) == loaded.crc), "an image of nobody");
+        let journal = Journal::open(&self.flash, LAYOUT.parameters);
+        assert!(verify(&self.flash, &journal, &LAYOUT, CrcKind::Crc32, 1).unwrap().signed());
+    }
+}
+
+fn program_of(size: usize) -> Vec<u8> {
+    let mut image = program(size, 0x5A);
+    image[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
+    image
+}
+
+fn crc_of(image: &[u8]) -> u32 {
+    u32::from_le_bytes(image[4..8].try_into().unwrap())
+}
+
+/// A block file for another address than that of the model's program.
+fn block_file_at(image: &[u8], base: u32, chunk: usize) -> Vec<Vec<u8>> {
+    let mut file = block_file(image, chunk);
+    for block in &mut file {
+        let word = |at: usize| u32::from_le_bytes(block[at..at + 4].try_into().unwrap());
+        let (number, address) = (word(0), word(4));
+        if number != 0 && number != u32::MAX {
+            let data = block[12..block.len() - 4].to_vec();
+            *block = bench::block(number, address - bench::PROGRAM.base + base, &data);
+        }
+    }
+    file
+}
+
+/// A running bootloader.
+struct Node<'f>(Bootloader<'static, &'f mut ModelFlash, Store, 2, Renews>);
+
+impl Node<'_> {
+    fn settle(&mut self) {
+        for _ in 0..1_000_000 {
+            if self.0.step() == Step::Idle {
+                return;
+            }
+        }
+        panic!("the work does not end");
+    }
+
+    fn read<const LEN: usize>(&mut self, index: u16, sub: u8) -> [u8; LEN] {
+        let mut bytes = [0; LEN];
+        assert_eq!(self.0.read(Address::new(index, sub), &mut bytes), Ok(LEN));
+        bytes
+    }
+
+    /// A word of the bootloader's own program number.
+    fn word(&mut self, index: u16) -> u32 {
+        u32::from_le_bytes(self.read(index, N))
+    }
+
+    fn progress(&mut self) -> Progress {
+        Progress::from_bytes(self.read(0x2007, 9)).unwrap()
+    }
+
+    fn try_command(&mut self, program: u8, command: u8) -> Result<(), AbortCode> {
+        self.0.write(Address::new(0x1F51, program), &[command])
+    }
+
+    /// Carries out a command; its status.
+    fn command(&mut self, program: u8, command: u8) -> u32 {
+        self.try_command(program, command).unwrap();
+        self.settle();
+        u32::from_le_bytes(self.read(0x1F57, program))
+    }
+
+    fn send(&mut self, program: u8, block: &[u8]) -> Result<(), AbortCode> {
+        let at = Address::new(0x1F50, program);
+        self.0.download_start(at, Some(block.len() as u32))?;
+        for segment in block.chunks(7) {
+            while self.0.download_space(at, false) < segment.len() {
+                assert_ne!(self.0.step(), Step::Idle, "there is never room");
+            }
+            if let Err(abort) = self.0.download_data(at, segment) {
+                self.0.download_cancel(at);
+                return Err(abort);
+            }
+        }
+        self.0.download_end(at)?;
+        self.settle();
+        Ok(())
+    }
+
+    /// Downloads an image in block files.
+    fn stage(&mut self, new: &[u8]) {
+        assert_eq!(self.command(N, CLEAR), 0);
+        for block in block_file_at(new, HOME.base, 200) {
+            assert_eq!((self.send(N, &block), self.word(0x1F57)), (Ok(()), 0));
+        }
+        assert_eq!(self.progress().state, State::Staged);
+    }
+
+    fn has_staged(&mut self, new: &[u8]) -> bool {
+        self.0.flash().cells(STAGING)[..new.len()] == *new
+    }
+}
+
+#[test]
+fn an_image_is_staged_tried_confirmed_and_installed() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    let program = board.flash.cells(PROGRAM)[..0x1000].to_vec();
+    let mut node = board.start();
+    assert_eq!(node.read(0x2007, 1), [N]);
+    assert_eq!(node.read(0x1F51, N), [1], "it runs");
+    let places = [HOME.base, HOME.size].map(u32::to_le_bytes).concat();
+    assert_eq!(node.read::<8>(0x2004, N).to_vec(), places);
+    assert_eq!(node.read::<8>(0x2007, 8).to_vec(), [0x0001_0002, 1_u32].map(u32::to_le_bytes).concat());
+    assert_eq!((node.progress(), node.word(0x1F56)), (Progress::default(), crc_of(&old)));
+    assert_eq!(node.command(N, START), NO_VALID_PROGRAM, "nothing is staged");
+    assert_eq!(node.command(N, CONFIRM), 0, "and nothing to confirm");
+    node.stage(&new);
+    assert_eq!(node.word(0x1F56), crc_of(&new));
+    assert_eq!(node.command(N, CONFIRM), 0, "before its trial this changes nothing");
+    assert_eq!(node.progress(), Progress { state: State::Staged, ..Progress::default() });
+    assert_eq!(node.command(N, START), 0);
+    assert_eq!(node.0.take_boot_request(), Some(BootRequest::Try));
+    board.leave(Some(BootRequest::Try));
+    assert_eq!(board.loads().0.crc, crc_of(&new));
+    let mut node = board.start();
+    let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
+    assert_eq!((node.progress(), node.word(0x1F56)), (trial, crc_of(&new)));
+    assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE), "one trial at a time");
+    assert_eq!(node.command(N, CONFIRM), 0);
+    assert_eq!(node.progress().state, State::Installed);
+    assert_eq!(node.command(N, CONFIRM), 0, "twice");
+    assert_eq!(board.flash.cells(HOME)[..new.len()], new);
+    assert_eq!(board.flash.cells(PROGRAM)[..0x1000], program);
+    board.off();
+    let mut node = board.start();
+    assert_eq!(node.progress(), Progress { state: State::Installed, ..Progress::default() });
+    assert_eq!(board.loads().1, Origin::Home);
+    board.check([&new, &new]);
+}
+
+/// Each form in which 1F50h takes a program.
+#[test]
+fn every_format_is_taken() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    for form in ["raw", "hex"] {
+        let mut board = Board::new(&old);
+        let mut node = board.start();
+        let bytes = if form == "raw" { new.clone() } else { ihex::intel_hex(HOME.base, &new).into_bytes() };
+        node.send(N, &bytes).unwrap();
+        assert_eq!((node.word(0x1F57), node.progress().state), (0, State::Staged), "{form}");
+        assert!(node.has_staged(&new), "{form}");
+    }
+}
+
+#[test]
+fn a_trial_ends_without_anybody_there() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    for (ends, end) in
+        [(None, TrialEnd::Late), (Some(WITHDRAW), TrialEnd::GivenUp), (Some(CLEAR), TrialEnd::GivenUp)]
+    {
+        board.leave(Some(BootRequest::Try));
+        let mut node = board.start();
+        let request = match ends {
+            Some(command) => {
+                assert_eq!(node.command(N, command), 0);
+                node.0.take_boot_request()
+            }
+            None => {
+                node.0.set_time(Instant::from_millis(59_999));
+                assert_eq!(node.0.take_boot_request(), None);
+                node.0.set_time(Instant::from_millis(60_000));
+                node.0.take_boot_request()
+            }
+        };
+        board.leave(request);
+        assert_eq!(board.loads().0.crc, crc_of(&old));
+        let mut node = board.start();
+        let over = Progress { state: State::Staged, origin: Origin::Home, trial_end: end };
+        assert_eq!(node.progress(), over);
+        node.0.set_time(Instant::from_millis(100_000));
+        assert_eq!(node.0.take_boot_request(), None, "it stays");
+    }
+    // A power cut in a trial.
+    board.leave(Some(BootRequest::Try));
+    board.start();
+    board.off();
+    assert_eq!(board.loads().1, Origin::Home);
+    // A confirmed one stays.
+    board.leave(Some(BootRequest::Try));
+    let mut node = board.start();
+    assert_eq!(node.command(N, CONFIRM), 0);
+    node.0.set_time(Instant::from_millis(100_000));
+    assert_eq!(node.0.take_boot_request(), None);
+}
+
+/// "Refused before an erase": staging keeps the image that is there.
+#[test]
+fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
+    let (old, spare) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&spare);
+    for (case, header, has_crc) in [
+        ("for the bench", SOUND, false),
+        ("for another board", Header { board: !BOARD, ..SOUND }, true),
+        ("for newer services", Header { services: SERVICES_VERSION + 1, ..SOUND }, true),
+        ("with an unknown ability", Header { features: 1 << 7, ..SOUND }, true),
+        ("with a reserved word", Header { reserved: [0, 1], ..SOUND }, true),
+        ("for another place in RAM", Header { ram_base: 0x2000_0200, ..SOUND }, true),
+        ("of another format", Header { length: 64 | 1 << 16, ..SOUND }, true),
+    ] {
+        let wrong = image_of(header, 0x280, 3, has_crc);
+        for bytes in [block_file_at(&wrong, HOME.base, 200)[1].clone(), wrong.clone()] {
+            let mut node = board.start();
+            assert_eq!(node.command(N, CLEAR), 0);
+            if bytes.len() < wrong.len() {
+                node.send(N, &block_file_at(&wrong, HOME.base, 200)[0]).unwrap();
+            }
+            let refused = node.send(N, &bytes);
+            node.settle();
+            assert!(refused.is_err() || node.word(0x1F57) == FORMAT, "{case}");
+            assert_eq!(node.word(0x1F57), FORMAT, "{case}");
+            assert!(node.has_staged(&spare), "{case}");
+            assert_eq!(node.progress().state, State::Staged, "{case}");
+            board.leave(None);
+        }
+    }
+    // Of another vendor, another product.
+    for (header, status) in [(Header { vendor: 9, ..SOUND }, 0x80), (Header { product: 9, ..SOUND }, 0x82)] {
+        let mut node = board.start();
+        let _ = node.send(N, &image_of(header, 0x280, 3, true));
+        node.settle();
+        assert_eq!((node.word(0x1F57), node.has_staged(&spare)), (status, true));
+        board.leave(None);
+    }
+    // Write protection of home, and of staging.
+    for sector in [4, 11] {
+        board.flash.protected = vec![sector];
+        let mut node = board.start();
+        assert_eq!(node.command(N, CLEAR), 0);
+        assert_eq!(node.send(N, &spare), Err(AbortCode::DEVICE_STATE));
+        assert_eq!(node.word(0x1F57), SECURED | u32::from(sector) << 16);
+        board.leave(None);
+    }
+}
+
+#[test]
+fn a_damaged_image_is_not_staged() {
+    let (old, mut new) = (image(0x200, 1), image(0x300, 2));
+    new[0x200] ^= 4;
+    let mut board = Board::new(&old);
+    let mut node = board.start();
+    let _ = node.send(N, &new);
+    assert_eq!((node.word(0x1F57), node.progress().state), (NO_VALID_PROGRAM, State::None));
+    assert_eq!(node.command(N, START), NO_VALID_PROGRAM);
+    assert_eq!(node.0.take_boot_request(), None);
+}
+
+/// The last program and staging share a sector.
+#[test]
+fn a_program_that_reaches_into_staging_takes_it() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let large = program_of(0x3400);
+    for state in [State::Staged, State::Installed] {
+        let mut board = Board::new(&old);
+        match state {
+            State::Staged => board.start().stage(&new),
+            _ => board.renew(&new),
+        }
+        board.off();
+        let mut node = board.start();
+        assert_eq!(node.command(1, CLEAR), 0);
+        assert_eq!(node.progress().state, state, "CLEAR alone changes nothing");
+        let file = block_file_at(&large, PROGRAM.base, 200);
+        let mut removed_at = None;
+        for (number, block) in file.iter().enumerate() {
+            node.send(1, block).unwrap();
+            let is_there = node.has_staged(&new);
+            let record = node.progress().state;
+            assert!(is_there || record == State::None, "{state:?}: block {number}");
+            if record == State::None {
+                removed_at.get_or_insert(number);
+            }
+        }
+        assert!(removed_at.is_some());
+        assert_eq!(u32::from_le_bytes(node.read(0x1F57, 1)), 0);
+        assert_eq!(node.command(1, CONFIRM), 0);
+        // Now there is no room for an image.
+        assert_eq!(node.command(N, CLEAR), 0);
+        let first = &block_file_at(&new, HOME.base, 200)[0];
+        assert_eq!(node.send(N, first), Err(AbortCode::DEVICE_STATE));
+        assert_eq!(node.word(0x1F57), NOT_CLEARED | 1 << 16);
+        assert_eq!(node.command(1, CLEAR), 0);
+        assert_eq!(node.command(1, CLEAR), 0, "all of it");
+        node.stage(&new);
+    }
+}
+
+/// A small program leaves a spare alone.
+#[test]
+fn a_program_that_ends_before_staging_leaves_it_alone() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.renew(&new);
+    board.off();
+    board.install_program(0x1800);
+    let mut node = board.start();
+    assert_eq!((node.progress().state, node.has_staged(&new)), (State::Installed, true));
+}
+
+#[test]
+fn a_damaged_home_is_repaired_from_the_spare() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.renew(&new);
+    board.off();
+    for at in [0, 4, 0x20, 0x2FF] {
+        let mut cells = board.flash.cells(HOME).to_vec();
+        cells[at] &= !(cells[at] & cells[at].wrapping_neg());
+        board.flash.poke(HOME.base, &cells);
+        assert_eq!(board.loads().1, Origin::Spare);
+        let mut node = board.start();
+        let Progress { state, origin, .. } = node.progress();
+        assert_eq!((state, origin), (State::Installed, Origin::Spare));
+        assert_eq!(board.flash.cells(HOME)[..new.len()], new, "byte {at}");
+        board.off();
+        assert_eq!(board.loads().1, Origin::Home);
+    }
+}
+
+/// A debug probe writes another bootloader while a record of the old one is stored.
+#[test]
+fn an_image_from_a_probe_makes_the_record_void() {
+    let (old, new, probed) = (image(0x200, 1), image(0x300, 2), image(0x240, 3));
+    for confirmed in [false, true] {
+        let mut board = Board::new(&old);
+        board.start().stage(&new);
+        if confirmed {
+            // The power is cut when home is half erased.
+            board.leave(Some(BootRequest::Try));
+            board.flash.cut = Some((board.flash.operations + 12, Cut::Torn(1)));
+            assert!(until_power_cut(|| {
+                board.start().command(N, CONFIRM);
+            }));
+        }
+        board.off();
+        board.flash.poke(HOME.base, &[0xFF; HOME.size as usize]);
+        board.flash.poke(HOME.base, &probed);
+        assert_eq!(board.loads().0.crc, crc_of(&probed));
+        let mut node = board.start();
+        assert_eq!(node.progress().state, State::None, "confirmed: {confirmed}");
+        assert_eq!(board.flash.cells(HOME)[..probed.len()], probed);
+    }
+}
+
+/// The heart: a power cut at any operation, and another one in what follows.
+#[test]
+fn no_cut_leaves_a_device_without_a_bootloader() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let fresh = Board::new(&old);
+    let operations = {
+        let mut board = Board { flash: fresh.flash.clone(), request: None, ran: None };
+        board.renew(&new);
+        board.flash.operations
+    };
+    let mut random = Random(39);
+    let mut starts = 0;
+    for operation in 1..=operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(3), Cut::Torn(4), Cut::Unstable(5), Cut::Unstable(6)] {
+            let mut board = Board { flash: fresh.flash.clone(), request: None, ran: None };
+            board.flash.cut = Some((operation, cut));
+            assert!(until_power_cut(|| board.renew(&new)));
+            board.off();
+            board.check([&old, &new]);
+            starts += 1;
+            // A second cut in the recovery.
+            let kinds = [Cut::Before, Cut::After, Cut::Torn(7), Cut::Unstable(8)];
+            let second = (1 + random.below(40) as u32, random.pick(&kinds));
+            board.flash.cut = Some(second);
+            until_power_cut(|| board.renew(&new));
+            board.off();
+            board.check([&old, &new]);
+            board.renew(&new);
+            board.off();
+            board.check([&new, &new]);
+            assert_eq!(board.flash.cells(HOME)[..new.len()], new, "{operation} {cut:?} {second:?}");
+            starts += 2;
+        }
+    }
+    assert!(starts > 1_000, "{starts}");
+}
+
+/// While an image is confirmed and not installed, nothing else touches its flash.
+#[test]
+fn a_confirmed_image_is_kept_until_it_is_installed() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    board.leave(Some(BootRequest::Try));
+    let mut node = board.start();
+    // The installation fails: home cannot be erased.
+    node.0.flash().protected = vec![4];
+    assert_eq!(node.command(N, CONFIRM), SECURED | 4 << 16);
+    assert_eq!(node.progress().state, State::Confirmed);
+    assert_eq!(node.try_command(1, CLEAR), Err(AbortCode::DEVICE_STATE));
+    assert_eq!(u32::from_le_bytes(node.read(0x1F57, 1)), BUSY);
+    let first = &block_file_at(&new, HOME.base, 200)[0];
+    for program in [1, N] {
+        assert_eq!(node.send(program, first), Err(AbortCode::DEVICE_STATE), "{program}");
+        assert_eq!(u32::from_le_bytes(node.read(0x1F57, program)), BUSY);
+    }
+    // A second 83h tries again.
+    node.0.flash().protected = vec![];
+    assert_eq!(node.command(N, CONFIRM), 0);
+    assert_eq!(node.progress().state, State::Installed);
+}
+
+/// A master that does not know this number, and writes to every sub-index.
+#[test]
+fn commands_by_themselves_change_nothing() {
+    let old = image(0x200, 1);
+    let mut board = Board::new(&old);
+    let before = board.flash.clone();
+    let mut node = board.start();
+    for command in [0, 0x80, CLEAR, CLEAR, CLEAR, 2, CONFIRM, WITHDRAW] {
+        assert_eq!(node.command(N, command), 0, "{command}");
+    }
+    assert_eq!(node.command(N, START), NO_VALID_PROGRAM);
+    assert_eq!(node.0.take_boot_request(), None);
+    assert_eq!(node.try_command(N, 0x55), Err(AbortCode::INVALID_VALUE));
+    assert_eq!(board.flash.cells(CHIP.flash), before.cells(CHIP.flash));
+}
