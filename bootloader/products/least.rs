@@ -9,6 +9,7 @@ pub const PRODUCT: Product = Product {
     auto_bit_rate: false,
     boot_up_emergency: false,
     watchdog_ms: None,
+    renewal: false,
     lss: false,
     crystal_failure: CrystalFailure::RunFromHsi,
     block_upload: false,

@@ -19,6 +19,7 @@ mod mute;
 mod options;
 mod program_control;
 mod reentry;
+mod renewal;
 mod silicon;
 mod slcan;
 mod stack;

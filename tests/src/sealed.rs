@@ -3,7 +3,7 @@
 
 use std::sync::OnceLock;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, PasswordObject};
+use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Everything, PasswordObject};
 use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
@@ -473,8 +473,8 @@ impl Device {
         let mut room = Box::<Room>::default();
         let boot = Boot::new(&self.setup.config, node);
         let node: Box<dyn Node + '_> = match self.setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1>(parameters, flash, &mut buffer, room.sealed())),
-            _ => Box::new(boot.with::<_, _, 2>(parameters, flash, &mut buffer, room.sealed())),
+            1 => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, &mut buffer, room.sealed())),
+            _ => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, &mut buffer, room.sealed())),
         };
         let result = talk(&mut Host { device: self, node, now: 0 });
         self.chip.model().power_on();

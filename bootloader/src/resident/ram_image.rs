@@ -18,8 +18,7 @@ extern "C" {
 
 /// The place of the image in flash.
 pub fn home() -> Region {
-    // SAFETY: only the address is taken.
-    let at = unsafe { &raw const HEADER } as u32;
+    let at = &raw const HEADER as u32;
     let home = LAYOUT.home.unwrap_or(LAYOUT.bootloader);
     Region::new(at, home.end() - at)
 }

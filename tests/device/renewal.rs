@@ -1,0 +1,354 @@
+//! The bootloader is renewed over CAN, with the built firmware: a new RAM image waits in staging, runs once
+//! on trial, and is installed at home after its confirmation (docs/renewal.md).
+
+use canopen::program::{
+    FlashError, FlashStatus, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, STATE_BOOTLOADER,
+    STATE_RENEWAL, STATE_VERSIONS,
+};
+use canopen::Address;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coflash::device::Doing;
+use coflash::update::{flash, FlashOptions};
+use crc::{Crc, CRC_32_ISO_HDLC};
+use emulator::machine::{Cut, FlashCut, Options, Stop};
+use emulator::silicon::Silicon;
+use emulator::time::Span;
+use kit::random::Random;
+use shared_abi::geometry::Region;
+use shared_abi::handoff::ResetCause;
+use shared_abi::ram_image::Header;
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
+
+use crate::image::Parts;
+
+/// The program number of the bootloader: it follows those of the layout.
+fn number() -> u8 {
+    firmware::board().programs.len() as u8 + 1
+}
+
+fn with_crc(mut image: Vec<u8>) -> Vec<u8> {
+    let crc = Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(&image[8..]);
+    image[4..8].copy_from_slice(&crc.to_le_bytes());
+    image
+}
+
+/// The built image with another version in its header.
+fn version(version: u32) -> Vec<u8> {
+    let mut image = Parts::of(firmware::BOOTLOADER).image;
+    image[48..52].copy_from_slice(&version.to_le_bytes());
+    with_crc(image)
+}
+
+/// An image for this board with code of its own: all its vectors lead there.
+fn made_of(code: &[u16]) -> Vec<u8> {
+    let real = Parts::of(firmware::BOOTLOADER).image;
+    let word = |at: usize| u32::from_le_bytes(real[at..at + 4].try_into().unwrap());
+    let (ram_base, ram_end) = (word(16), word(20));
+    let mut body: Vec<u8> = ram_end.to_le_bytes().to_vec();
+    body.extend((1..16).flat_map(|_| (ram_base + 0x41).to_le_bytes()));
+    body.extend(code.iter().flat_map(|half| half.to_le_bytes()));
+    body.resize(body.len().next_multiple_of(4), 0);
+    let mut image = real[..Header::SIZE as usize].to_vec();
+    image[12..16].copy_from_slice(&(body.len() as u32).to_le_bytes());
+    image.extend(body);
+    with_crc(image)
+}
+
+/// A branch to itself (ARMv7-M A7.7.12).
+const HANGS: [u16; 1] = [0xE7FE];
+/// An undefined instruction; its fault handler is the same, so the core locks up.
+const FAULTS: [u16; 1] = [0xDE00];
+/// Writes SYSRESETREQ to AIRCR (B3.2.6): two loads of the literals at the end, a store.
+const RESETS: [u16; 8] = [0x4801, 0x4902, 0x6001, 0xE7FE, 0xED0C, 0xE000, 0x0004, 0x05FA];
+
+fn board() -> Bench {
+    board_on(Options::default())
+}
+
+/// A board with a program that has shown that it comes back, in the bootloader.
+fn board_on(options: Options) -> Bench {
+    let mut bench = Bench::with(options);
+    bench.power_on();
+    bench.await_boot_up(100);
+    let blocks = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
+    bench.confirm_program();
+    call_back(&mut bench);
+    bench
+}
+
+fn call_back(bench: &mut Bench) {
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1000);
+    assert!(bench.is_bootloader(NODE));
+    bench.events();
+}
+
+fn progress(bench: &mut Bench) -> Progress {
+    let word = bench.session().read_number(Address::new(DEVICE_STATE, STATE_RENEWAL)).unwrap();
+    Progress::from_bytes(word.to_le_bytes()).unwrap()
+}
+
+fn status(bench: &mut Bench) -> FlashStatus {
+    bench.session().await_idle(number(), Doing::Write(Address::new(PROGRAM_DATA, number()))).unwrap()
+}
+
+fn stage(bench: &mut Bench, image: &[u8]) {
+    let at = Address::new(PROGRAM_DATA, number());
+    bench.session().command(number(), ProgramControl::Clear).unwrap();
+    bench.session().write(at, image, Doing::Write(at), &mut |_| {}).unwrap();
+    assert_eq!(status(bench), FlashStatus::OK);
+    assert_eq!(progress(bench).state, State::Staged);
+}
+
+/// START of the staged image; the time from the answer to the next boot-up, if there is one.
+fn start(bench: &mut Bench) -> Span {
+    bench.session().command(number(), ProgramControl::Start).unwrap();
+    let answered = bench.time();
+    bench.await_boot_up(5_000) - answered
+}
+
+fn confirm(bench: &mut Bench) {
+    bench.session().command(number(), ProgramControl::SetSignature).unwrap();
+    assert_eq!(status(bench), FlashStatus::OK);
+    assert_eq!(progress(bench).state, State::Installed);
+}
+
+/// The version of the running image.
+fn running(bench: &mut Bench) -> u32 {
+    let at = Address::new(DEVICE_STATE, STATE_VERSIONS);
+    let value = bench.session().read(at).unwrap();
+    u32::from_le_bytes(value[..4].try_into().unwrap())
+}
+
+fn crc_of(image: &[u8]) -> u32 {
+    u32::from_le_bytes(image[4..8].try_into().unwrap())
+}
+
+fn identification(bench: &mut Bench) -> u32 {
+    bench.session().read_number(Address::new(PROGRAM_ID, number())).unwrap()
+}
+
+fn cells(bench: &mut Bench, place: Region) -> Vec<u8> {
+    let mut bytes = vec![0; place.size as usize];
+    bench.machine().read_memory(place.base, &mut bytes).unwrap();
+    bytes
+}
+
+fn home(size: usize) -> Region {
+    Region::new(firmware::board().home.unwrap().base, size as u32)
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.run_ms(500);
+}
+
+/// The main job. The program is untouched, and starts as fast as before.
+#[test]
+fn a_new_bootloader_is_installed_while_the_program_stays() {
+    let mut bench = board();
+    let at = Address::new(DEVICE_STATE, STATE_BOOTLOADER);
+    assert_eq!(bench.session().read_number(at).unwrap(), u32::from(number()));
+    let old = Parts::of(firmware::BOOTLOADER).image;
+    assert_eq!((progress(&mut bench), identification(&mut bench)), (Progress::default(), crc_of(&old)));
+    let program = Region::new(firmware::board().programs[0].base, 32 * 1024);
+    let before = cells(&mut bench, program);
+    bench.power_off();
+    let starts = bench.power_on_to_first_instruction();
+    bench.await_program(1000);
+    call_back(&mut bench);
+
+    let new = version(0x0009_0001);
+    stage(&mut bench, &new);
+    assert_eq!(cells(&mut bench, home(old.len())), old, "home is untouched");
+    assert!(start(&mut bench) <= Span::from_millis(45), "with the 20 ms of the answer");
+    let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
+    assert_eq!((progress(&mut bench), identification(&mut bench)), (trial, crc_of(&new)));
+    let from = bench.time();
+    confirm(&mut bench);
+    // Each answer while home is erased and written.
+    let frames = bench.frames_since(from);
+    let asked = frames.iter().filter(|(_, id, _)| *id == 0x600 + u32::from(NODE));
+    let answers = frames.iter().filter(|(_, id, _)| *id == 0x580 + u32::from(NODE));
+    let slowest = asked.zip(answers).map(|((asked, ..), (answered, ..))| *answered - *asked).max().unwrap();
+    assert!(slowest <= Span::from_millis(5), "{slowest:?}");
+    assert_eq!(cells(&mut bench, home(new.len())), new);
+
+    // Programs start as before, and the new image is the bootloader.
+    bench.events();
+    bench.power_off();
+    // The journal has four more values, which the boot stage searches.
+    let later = bench.power_on_to_first_instruction() - starts;
+    assert!(later <= Span(200_000_000), "{later:?}");
+    bench.await_program(1000);
+    assert_eq!(cells(&mut bench, program), before);
+    call_back(&mut bench);
+    let installed = Progress { state: State::Installed, ..Progress::default() };
+    assert_eq!((progress(&mut bench), identification(&mut bench)), (installed, crc_of(&new)));
+    bench.assert_nothing_unmodelled();
+}
+
+/// A bootloader with a visible change: another product for this board, whose code is at other addresses.
+#[test]
+fn the_image_may_differ_in_every_address() {
+    let mut bench = board();
+    let other = Parts::of(firmware::BOOTLOADER_WATCHDOG).image;
+    let watchdog = Address::new(DEVICE_STATE, 10);
+    assert_eq!(bench.session().read_number(watchdog).unwrap(), 0);
+    stage(&mut bench, &other);
+    start(&mut bench);
+    assert_eq!(bench.session().read_number(watchdog).unwrap(), 1000);
+    confirm(&mut bench);
+    power_cycle(&mut bench);
+    assert!(!bench.is_bootloader(NODE));
+    call_back(&mut bench);
+    assert_eq!(bench.session().read_number(watchdog).unwrap(), 1000);
+}
+
+/// Images that are deaf, hang, fault or reset: the old bootloader answers, says why, and keeps its home.
+#[test]
+fn an_image_that_does_not_work_ends_by_itself() {
+    for (case, image, end) in [
+        ("hangs", made_of(&HANGS), TrialEnd::Reset(ResetCause::IndependentWatchdog)),
+        ("locks up", made_of(&FAULTS), TrialEnd::Reset(ResetCause::IndependentWatchdog)),
+        ("resets", made_of(&RESETS), TrialEnd::Reset(ResetCause::Software)),
+    ] {
+        let mut bench = board();
+        let old = crc_of(&Parts::of(firmware::BOOTLOADER).image);
+        stage(&mut bench, &image);
+        start(&mut bench);
+        let over = Progress { state: State::Staged, origin: Origin::Home, trial_end: end };
+        assert_eq!((progress(&mut bench), identification(&mut bench)), (over, old), "{case}");
+        assert!(bench.is_bootloader(NODE), "{case}");
+        let crashes = bench.session().read_number(Address::new(DEVICE_STATE, 4)).unwrap();
+        assert_eq!(crashes, 0, "{case}: no program has crashed");
+        power_cycle(&mut bench);
+        assert!(!bench.is_bootloader(NODE), "{case}: the program starts");
+    }
+}
+
+/// The real image, with the power of its reach taken away in different ways.
+#[test]
+fn a_trial_that_nobody_confirms_ends() {
+    let new = version(0x0009_0001);
+    let mut bench = board();
+    stage(&mut bench, &new);
+    // Nobody speaks to it for a minute.
+    start(&mut bench);
+    bench.run_ms(58_000);
+    assert_eq!(progress(&mut bench).origin, Origin::Trial);
+    bench.await_boot_up(3_000);
+    let over = |trial_end| Progress { state: State::Staged, origin: Origin::Home, trial_end };
+    assert_eq!(progress(&mut bench), over(TrialEnd::Late));
+    // A fault in it.
+    start(&mut bench);
+    bench.run_ms(20);
+    let idle = bench.machine().pc();
+    bench.machine().write_ram(idle, &FAULTS[0].to_le_bytes()).expect("idle sleeps in RAM");
+    bench.await_boot_up(3_000);
+    assert_eq!(progress(&mut bench), over(TrialEnd::Reset(ResetCause::Software)));
+    // It stops to feed the watchdog.
+    start(&mut bench);
+    bench.run_ms(20);
+    let idle = bench.machine().pc();
+    bench.machine().write_ram(idle, &HANGS[0].to_le_bytes()).expect("idle sleeps in RAM");
+    bench.await_boot_up(5_000);
+    assert_eq!(progress(&mut bench), over(TrialEnd::Reset(ResetCause::IndependentWatchdog)));
+    // A master gives it up.
+    start(&mut bench);
+    bench.session().command(number(), ProgramControl::ClrSignature).unwrap();
+    bench.await_boot_up(1_000);
+    assert_eq!(progress(&mut bench), over(TrialEnd::GivenUp));
+    // The power fails.
+    start(&mut bench);
+    power_cycle(&mut bench);
+    assert!(!bench.is_bootloader(NODE), "the program starts");
+    call_back(&mut bench);
+    assert_eq!(progress(&mut bench).origin, Origin::Home);
+    assert_eq!(running(&mut bench), 1);
+    start(&mut bench);
+    confirm(&mut bench);
+}
+
+/// Cuts of the power anywhere in a renewal, drawn by seeds, and a second one in what follows.
+#[test]
+fn a_cut_anywhere_leaves_a_bootloader_and_the_program() {
+    let new = version(0x0009_0001);
+    // Operations of the flash: staging is erased, written, recorded; home the same.
+    let operations = 2 * new.len() / 4 + 40;
+    for seed in 0..6 {
+        let mut random = Random(seed);
+        let mut bench = board_on(Options { silicon: Silicon::drawn(seed), seed, ..Options::default() });
+        for _ in 0..2 {
+            let operation = random.below(operations) as u64;
+            let torn = random.next();
+            let when = random.pick(&[
+                Cut::Before,
+                Cut::After,
+                Cut::Torn { seed: torn },
+                Cut::Unstable { seed: torn },
+            ]);
+            println!("seed {seed}: operation {operation}, {when:?}");
+            bench.machine().cut_power_at(Some(FlashCut { operation, when }));
+            let _ = renew(&mut bench, &new);
+            bench.machine().cut_power_at(None);
+            power_cycle(&mut bench);
+            bench.events();
+            assert!(!bench.is_bootloader(NODE), "the program starts");
+            call_back(&mut bench);
+        }
+        renew(&mut bench, &new).unwrap();
+        assert_eq!(cells(&mut bench, home(new.len())), new);
+        assert_eq!(progress(&mut bench).state, State::Installed);
+    }
+}
+
+/// What a tool does, from whatever state.
+fn renew(bench: &mut Bench, new: &[u8]) -> Result<(), coflash::Error> {
+    let doing = Doing::Write(Address::new(PROGRAM_DATA, number()));
+    let n = number();
+    let mut session = bench.session();
+    session.await_idle(n, doing)?;
+    let word = session.read_number(Address::new(DEVICE_STATE, STATE_RENEWAL))?;
+    let at = Address::new(PROGRAM_ID, n);
+    if word as u8 == State::Installed as u8 && session.read_number(at)? == crc_of(new) {
+        return Ok(());
+    }
+    session.command(n, ProgramControl::Clear)?;
+    let at = Address::new(PROGRAM_DATA, n);
+    session.write(at, new, doing, &mut |_| {})?;
+    session.await_idle(n, doing)?;
+    session.command(n, ProgramControl::Start)?;
+    drop(session);
+    bench.run_ms(100);
+    let mut session = bench.session();
+    session.command(n, ProgramControl::SetSignature)?;
+    session.await_idle(n, doing)?;
+    Ok(())
+}
+
+/// What cannot run here is refused, and the old image stays.
+#[test]
+fn a_wrong_image_is_refused_before_an_erase() {
+    let mut bench = board();
+    let spare = version(0x0009_0001);
+    stage(&mut bench, &spare);
+    let staging = Region::new(firmware::board().staging.unwrap().base, spare.len() as u32);
+    let mut bench_image = Parts::of(firmware::BOOTLOADER).image;
+    bench_image[4..8].fill(0);
+    let mut other_board = bench_image.clone();
+    other_board[32] ^= 1;
+    for wrong in [bench_image, with_crc(other_board)] {
+        let at = Address::new(PROGRAM_DATA, number());
+        bench.session().command(number(), ProgramControl::Clear).unwrap();
+        let _ = bench.session().write(at, &wrong, Doing::Write(at), &mut |_| {});
+        assert_eq!(status(&mut bench).error, Some(FlashError::Format));
+        assert_eq!(progress(&mut bench).state, State::Staged);
+        assert_eq!(cells(&mut bench, staging), spare);
+    }
+    assert_eq!(bench.events().into_iter().filter(|(_, stop)| matches!(stop, Stop::Reset(_))).count(), 0);
+}
