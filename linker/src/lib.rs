@@ -96,23 +96,24 @@ pub struct Application {
     /// The file that the layout comes from.
     file: Option<PathBuf>,
     program: u8,
+    over_staging: bool,
 }
 
 impl Application {
     /// For a board with this memory map.
     pub const fn new(layout: &'static Layout) -> Self {
-        Self { layout: Ok(layout), file: None, program: 1 }
+        Self { layout: Ok(layout), file: None, program: 1, over_staging: false }
     }
 
     /// For a board of the coboot repository, by its name.
     pub fn of_board(name: &str) -> Self {
         let layout = layout::by_name(name).ok_or_else(|| Error::NoBoard { name: name.to_owned() });
-        Self { layout, file: None, program: 1 }
+        Self { layout, ..Self::new(layout::DEFAULT) }
     }
 
     /// For the board of the coboot repository that the variable `COBOOT_BOARD` names.
     pub fn chosen() -> Self {
-        Self { layout: chosen_board(), file: None, program: 1 }
+        Self { layout: chosen_board(), ..Self::new(layout::DEFAULT) }
     }
 
     /// For a board whose memory map is in this file, which `cargo xtask layout --toml` has written.
@@ -123,12 +124,19 @@ impl Application {
         let layout = fs::read_to_string(path)
             .map_err(|error| Error::file(path, &error))
             .and_then(|text| board::parse(&text).map_err(|error| Error::file(path, &error)));
-        Self { layout, file: Some(path.to_owned()), program: 1 }
+        Self { layout, file: Some(path.to_owned()), ..Self::new(layout::DEFAULT) }
     }
 
     /// Links for the place of program `number`; 1 (the default) is the first.
     pub const fn program(mut self, number: u8) -> Self {
         self.program = number;
+        self
+    }
+
+    /// Links into staging, too: the flash that a new bootloader needs (docs/renewal.md). Such a program has to
+    /// be cleared before the bootloader of its device is renewed.
+    pub const fn over_staging(mut self) -> Self {
+        self.over_staging = true;
         self
     }
 
@@ -169,7 +177,11 @@ impl Application {
                 programs: layout.programs.len(),
             });
         }
-        write_memory(layout, Image::Program(self.program), folder)?;
+        let image = match self.over_staging {
+            true => Image::WholeProgram(self.program),
+            false => Image::Program(self.program),
+        };
+        write_memory(layout, image, folder)?;
         for (name, text) in
             [("application.x", TEMPLATE.to_owned()), (LAYOUT_FILE, rust::Expression(layout).to_string())]
         {

@@ -308,6 +308,18 @@ impl Layout {
         self.programs.get(index).copied()
     }
 
+    /// The flash of program `number` without staging.
+    #[must_use]
+    pub fn program_before_staging(&self, number: u8) -> Option<Region> {
+        let region = self.program(number)?;
+        let is_last = usize::from(number) == self.programs.len();
+        let end = match self.staging {
+            Some(staging) if is_last => staging.base,
+            _ => region.end(),
+        };
+        Some(Region::new(region.base, end - region.base))
+    }
+
     /// The linker script of this layout, which `build.rs` writes to `layout.x`.
     #[must_use]
     pub const fn linker_script(&self, image: Image) -> LinkerScript<'_> {
@@ -334,8 +346,11 @@ const fn is_one_sector(chip: &Geometry, region: &Region) -> bool {
 pub enum Image {
     /// The bootloader.
     Bootloader,
-    /// Program `n`, 1 is the first.
+    /// Program `n`, 1 is the first. It ends before staging: a larger program would take the flash that a
+    /// new bootloader needs.
     Program(u8),
+    /// Program `n` with all of its flash, staging included.
+    WholeProgram(u8),
 }
 
 /// Prints the `MEMORY` command and the border symbols for the templates in `linker/`.
@@ -350,7 +365,8 @@ impl fmt::Display for LinkerScript<'_> {
         let layout = self.layout;
         let (flash, name) = match self.image {
             Image::Bootloader => (layout.resident(), "bootloader"),
-            Image::Program(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
+            Image::Program(number) => (layout.program_before_staging(number).ok_or(fmt::Error)?, "program"),
+            Image::WholeProgram(number) => (layout.program(number).ok_or(fmt::Error)?, "program"),
         };
         writeln!(
             f,

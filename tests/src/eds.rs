@@ -13,6 +13,7 @@ use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, IDENTITY, PROGRAM_REGION};
+use shared_abi::renewal;
 
 /// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
 const DATE: &str = "11-21-2026";
@@ -22,13 +23,20 @@ const TIME: &str = "12:00AM";
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
 
 /// The tables of the bootloader: standard and Paulus, ESAcademy, lift.
-static STANDARD: [Entry; len(Extras::STANDARD)] = entries(PROGRAMS, Extras::STANDARD).entries();
-static ESACADEMY: [Entry; len(Profile::ESACADEMY.extras)] =
-    entries(PROGRAMS, Profile::ESACADEMY.extras).entries();
-static LIFT: [Entry; len(Profile::LIFT.extras)] = entries(PROGRAMS, Profile::LIFT.extras).entries();
+static STANDARD: [Entry; len(extras(Profile::STANDARD))] =
+    entries(PROGRAMS, extras(Profile::STANDARD)).entries();
+static ESACADEMY: [Entry; len(extras(Profile::ESACADEMY))] =
+    entries(PROGRAMS, extras(Profile::ESACADEMY)).entries();
+static LIFT: [Entry; len(extras(Profile::LIFT))] = entries(PROGRAMS, extras(Profile::LIFT)).entries();
+
+/// The objects of a profile: the bootloader can be renewed where the layout has staging.
+const fn extras(profile: Profile) -> Extras {
+    let number = renewal::number(PROGRAMS, profile.download.data);
+    Extras { bootloader: if bsp::LAYOUT.staging.is_some() { Some(number) } else { None }, ..profile.extras }
+}
 
 /// The objects of a bootloader for sealed images.
-const SEALED: Extras = Extras { sealed: true, ..Extras::STANDARD };
+const SEALED: Extras = Extras { sealed: true, ..extras(Profile::STANDARD) };
 static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
 
 const fn len(extras: Extras) -> usize {

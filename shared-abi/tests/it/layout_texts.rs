@@ -33,9 +33,11 @@ fn boards_have_names() {
 
 #[test]
 fn the_linker_script_of_a_program() {
+    let whole = LAYOUT.linker_script(Image::WholeProgram(1)).to_string();
+    assert!(whole.contains("FLASH : ORIGIN = 0x08020000, LENGTH = 0xe0000\n"), "{whole}");
     let text = LAYOUT.linker_script(Image::Program(1)).to_string();
     for line in [
-        "  FLASH : ORIGIN = 0x08020000, LENGTH = 0xe0000",
+        "  FLASH : ORIGIN = 0x08020000, LENGTH = 0xc0000",
         "  RAM   : ORIGIN = 0x20000000, LENGTH = 0x1ffc0",
         "__vector_table_alignment = 0x00000200;",
         "__vector_table_size = 0x00000188;",
