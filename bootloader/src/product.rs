@@ -153,6 +153,12 @@ pub struct Product {
     pub renewal: bool,
     /// The time within which a master must confirm a new bootloader on trial, in seconds, 1 to 3600.
     pub renewal_s: u16,
+    /// The security counter of this bootloader (feature `sealed`): a device takes a new one only with a
+    /// higher counter.
+    pub bootloader_counter: u32,
+    /// The hardware revisions on which this bootloader runs: bit n for revision numbers (1018h/3) with n in
+    /// the five lowest bits; 0 for all.
+    pub bootloader_revisions: u32,
 }
 
 impl Product {
@@ -197,6 +203,8 @@ impl Product {
         resident: None,
         renewal: LAYOUT.staging.is_some(),
         renewal_s: 60,
+        bootloader_counter: 0,
+        bootloader_revisions: 0,
     };
 
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
@@ -351,6 +359,7 @@ impl Product {
             board: BOARD_IDENTITY,
             features: FEATURES,
             identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
+            revision: IDENTITY.revision,
             services: SERVICES_VERSION,
             version: VERSION,
             confirm_within_s: self.renewal_s,

@@ -64,8 +64,8 @@ global_asm!(
     ".section .ram_image, \"a\"",
     ".word {magic}, 0, {length}, __ram_image_size",
     ".word {ram_base}, {ram_end}, {services}, {features}",
-    ".word {board}, {vendor}, {product}, 0",
-    ".word {version}, 0, 0, 0",
+    ".word {board}, {vendor}, {product}, {revisions}",
+    ".word {version}, {counter}, 0, 0",
     magic = const ram_image::MAGIC,
     length = const Header::SIZE,
     ram_base = const LAYOUT.ram.base,
@@ -75,7 +75,9 @@ global_asm!(
     board = const BOARD_IDENTITY,
     vendor = const IDENTITY.vendor_id,
     product = const IDENTITY.product_code,
+    revisions = const PRODUCT.bootloader_revisions,
     version = const crate::product::VERSION,
+    counter = const PRODUCT.bootloader_counter,
 );
 
 /// The report of the resident part. Without one a debugger has started the image; it then stays, as

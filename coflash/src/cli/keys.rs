@@ -49,6 +49,16 @@ enum KeyRole {
     Kek,
 }
 
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum SigningRole {
+    /// Programs for the field.
+    Release,
+    /// Programs for devices that are marked for tests.
+    Test,
+    /// Bootloaders, and no programs. Its holder is as powerful as that of a root.
+    Bootloader,
+}
+
 #[derive(Debug, Args)]
 struct New {
     /// The purpose of the key. Root and release keys are Ed25519 keys in PKCS#8 PEM, as OpenSSL
@@ -102,9 +112,9 @@ struct Certify {
     #[arg(long, value_name = "NUMBER", value_parser = number, default_value = "0xFFFFFFFF")]
     highest: u32,
 
-    /// Certify the key only for programs of devices that are marked for tests.
-    #[arg(long)]
-    test: bool,
+    /// What the key may sign.
+    #[arg(long, value_name = "ROLE", default_value = "release")]
+    role: SigningRole,
 
     /// The file for the certificate; by default the key's name with .cert.
     #[arg(long, short, value_name = "FILE")]
@@ -225,7 +235,11 @@ impl Certify {
         }
         let root = signing_key(&self.root)?;
         let certificate = Certificate {
-            role: if self.test { Role::Test } else { Role::Release },
+            role: match self.role {
+                SigningRole::Release => Role::Release,
+                SigningRole::Test => Role::Test,
+                SigningRole::Bootloader => Role::Bootloader,
+            },
             epoch: self.epoch,
             vendor_id: self.vendor,
             product_code: self.product,

@@ -3,6 +3,7 @@
 
 use seal::key_block::{COUNTER, EPOCH};
 use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 
 use crate::flash::Flash;
 use crate::store::{Key, Parameters, ProgramRecord};
@@ -102,13 +103,17 @@ pub(crate) fn floor<F: Flash>(
     let counters = |program| parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
     // The epoch is the device's: a key that is revoked for one program signs for none.
     let programs = layout.programs.len() as u8;
-    let epoch = (1..=programs).fold(word(EPOCH), |epoch, program| {
+    let epoch = (1..=programs).chain([BOOTLOADER]).fold(word(EPOCH), |epoch, program| {
         let [_, proved, ..] = counters(program);
         epoch.max(proved)
     });
     // A program that has proved itself has raised the counter, if the policy raises it at
     // confirmation.
     let [mut counter, _, installed, _] = counters(program);
+    if program == BOOTLOADER {
+        // It counts by itself.
+        return (counter, epoch);
+    }
     if ProgramRecord::load(parameters, flash, program).is_some_and(|record| record.confirmed) {
         counter = counter.max(installed);
     }

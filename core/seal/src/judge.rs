@@ -6,8 +6,8 @@
 
 use crate::key_block::{self, FOR_TESTS, KEKS, KEK_COUNT, ROOTS, ROOT_COUNT};
 use crate::wire::{
-    flag, role, tag, word, Fault, Head, CERTIFICATE, ED25519, FIXED, FORMAT, MAX_CHUNK, MIN_CHUNK, RECIPIENT,
-    RESERVED,
+    flag, role, tag, word, Fault, Head, Requirements, BOOTLOADER, CERTIFICATE, ED25519, FIXED, FORMAT,
+    MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
 };
 
 /// The device that has received the image.
@@ -21,8 +21,10 @@ pub struct Device<'a> {
     pub revision: u32,
     /// The 96-bit unique ID of the chip.
     pub unique_id: [u8; 12],
-    /// The program to be written: the sub-index of 1F50h.
+    /// The program to be written: the sub-index of 1F50h, or [`BOOTLOADER`].
     pub program: u8,
+    /// What the device has for a RAM image of its bootloader; `None` if that cannot be renewed.
+    pub has: Option<Requirements>,
     /// Whether this program number is for data of the application.
     pub is_data: bool,
     /// Bytes of the program's flash.
@@ -67,6 +69,8 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
     if !possible {
         return Err(Fault::Format);
     }
+    let is_bootloader = device.program == BOOTLOADER;
+    let mut needs = None;
     let mut recipient = None;
     let mut at = FIXED;
     for (tag, record) in head.records() {
@@ -74,6 +78,8 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
         if tag == tag::RECIPIENT && record.len() == RECIPIENT {
             let key = key_block::find(device.keys, KEKS, KEK_COUNT, word(record, 0));
             recipient = recipient.or(key.map(|key| (key, at)));
+        } else if tag == tag::BOOTLOADER && is_bootloader && needs.is_none() {
+            needs = Requirements::parse(record);
         } else if tag & tag::CRITICAL != 0 {
             return Err(Fault::Format);
         }
@@ -92,6 +98,22 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
     if !fits {
         return Err(Fault::WrongProduct);
     }
+    // A program that writes flash could write a bootloader that nobody has verified.
+    let writes = has(flag::WRITES_FLASH) && device.has.is_some();
+    let holds = match (needs, device.has) {
+        _ if !is_bootloader => !writes,
+        (Some(needs), Some(has_it)) => {
+            needs.board == has_it.board
+                && needs.services <= has_it.services
+                && needs.features == has_it.features
+                && !writes
+                && !has(flag::DICTIONARY)
+        }
+        _ => false,
+    };
+    if !holds {
+        return Err(Fault::WrongProduct);
+    }
     if size > device.room {
         return Err(Fault::Address);
     }
@@ -108,7 +130,7 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
         let own = certificate.product_code();
         let holds = usize::from(certificate.len()) == CERTIFICATE
             && u16::from(certificate.algorithm()) == ED25519
-            && (certificate.role() == role::RELEASE || certificate.role() == role::TEST)
+            && may_sign(certificate.role(), is_bootloader)
             && certificate.vendor_id() == device.vendor_id
             && (own == 0 || own == device.product_code)
             && (certificate.lowest()..=certificate.highest()).contains(&counter)
@@ -136,4 +158,13 @@ pub fn judge(head: Head<'_>, device: &Device<'_>) -> Result<Needs, Fault> {
     }
     let recipient = recipient.filter(|_| has(flag::ENCRYPTED));
     Ok(Needs { root, epoch, recipient })
+}
+
+/// Whether a key with this role signs bootloaders, or programs.
+const fn may_sign(of: u8, bootloaders: bool) -> bool {
+    if bootloaders {
+        of == role::BOOTLOADER
+    } else {
+        of == role::RELEASE || of == role::TEST
+    }
 }

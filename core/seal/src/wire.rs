@@ -17,6 +17,10 @@ pub const CERTIFICATE_MAGIC: [u8; 4] = *b"CBK1";
 /// The prefix of the manifest in the signed message, so that no other signed message can be taken
 /// for a manifest.
 pub const DOMAIN: &[u8; 22] = b"coboot sealed image 1\0";
+/// The same for the manifest of a bootloader's RAM image: a signature over one is none over the other.
+pub const BOOTLOADER_DOMAIN: &[u8; 27] = b"coboot sealed bootloader 1\0";
+/// The program number of the bootloader's RAM image, on every device.
+pub const BOOTLOADER: u8 = 255;
 /// The prefix of the nonce when the key stream for a recipient is made from a key-encryption key.
 pub const WRAP_DOMAIN: &[u8; 13] = b"coboot key 1\0";
 /// The version of this format: a manifest that needs a higher one is refused.
@@ -78,6 +82,8 @@ pub mod tag {
     pub const SBOM: u16 = 0x0003;
     /// Revision of the source.
     pub const SOURCE: u16 = 0x0004;
+    /// What the device of a bootloader's RAM image must have ([`super::Requirements`]).
+    pub const BOOTLOADER: u16 = 0x8004;
 }
 
 /// Roles of a certified key.
@@ -86,6 +92,8 @@ pub mod role {
     pub const RELEASE: u8 = 1;
     /// Signs programs for devices that are marked for tests.
     pub const TEST: u8 = 2;
+    /// Signs bootloaders, and no programs. Its holder is as powerful as that of a root.
+    pub const BOOTLOADER: u8 = 3;
 }
 
 /// Why a sealed image is refused. The numbers are those of the flash status (1F57h) of the device.
@@ -176,6 +184,16 @@ impl<'a> Head<'a> {
         self.0.get(..usize::from(half(self.0, 4))).unwrap_or(&[])
     }
 
+    /// The prefix of the manifest in the signed message.
+    #[must_use]
+    pub fn domain(self) -> &'static [u8] {
+        if self.program() == BOOTLOADER {
+            BOOTLOADER_DOMAIN
+        } else {
+            DOMAIN
+        }
+    }
+
     /// Number of signatures.
     #[must_use]
     pub fn signatures(self) -> u8 {
@@ -212,7 +230,7 @@ impl<'a> Head<'a> {
         word(self.0, 20)
     }
 
-    /// The number of the program, 1 to 254: the sub-index of 1F50h.
+    /// The number of the program, 1 to 254: the sub-index of 1F50h; or [`BOOTLOADER`].
     #[must_use]
     pub fn program(self) -> u8 {
         self.0[24]
@@ -338,6 +356,43 @@ impl<'a> Iterator for Records<'a> {
         let record = self.0.get(4..end);
         self.0 = self.0.get(end..).unwrap_or(&[]);
         Some(record.map_or((u16::MAX, &[]), |bytes| (tag, bytes)))
+    }
+}
+
+/// What the device of a bootloader's RAM image must have, as in the header of the image: a record of
+/// twelve bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Requirements {
+    /// The identity of the board.
+    pub board: u32,
+    /// The lowest version of the services of the resident part.
+    pub services: u32,
+    /// The abilities of the resident part.
+    pub features: u32,
+}
+
+impl Requirements {
+    /// Bytes of the record.
+    pub const SIZE: usize = 12;
+
+    /// The requirements in a record; `None` if it has another size.
+    #[must_use]
+    pub fn parse(record: &[u8]) -> Option<Self> {
+        (record.len() == Self::SIZE).then(|| Self {
+            board: word(record, 0),
+            services: word(record, 4),
+            features: word(record, 8),
+        })
+    }
+
+    /// The record.
+    #[must_use]
+    pub fn bytes(self) -> [u8; Self::SIZE] {
+        let mut bytes = [0; Self::SIZE];
+        for (word, at) in [self.board, self.services, self.features].into_iter().zip((0..).step_by(4)) {
+            bytes[at..at + 4].copy_from_slice(&word.to_le_bytes());
+        }
+        bytes
     }
 }
 

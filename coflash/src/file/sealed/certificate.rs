@@ -13,6 +13,8 @@ pub enum Role {
     Release = role::RELEASE,
     /// Programs for devices that are marked for tests.
     Test = role::TEST,
+    /// Bootloaders, and no programs. The holder of such a key is as powerful as that of a root.
+    Bootloader = role::BOOTLOADER,
 }
 
 /// A root's statement about a key.

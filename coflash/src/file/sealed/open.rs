@@ -5,8 +5,8 @@
 
 use seal::judge::judge;
 use seal::wire::{
-    array, flag, head_size, role, tag, word, Certificate, Fault, Head, Recipient, CERTIFICATE, DOMAIN,
-    ED25519, FORMAT, HASH, MAGIC, MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
+    array, flag, head_size, role, tag, word, Certificate, Fault, Head, Recipient, Requirements, BOOTLOADER,
+    CERTIFICATE, ED25519, FORMAT, HASH, MAGIC, MAX_CHUNK, MIN_CHUNK, RECIPIENT, RESERVED,
 };
 
 use super::cipher::{chacha20, hash, wrap};
@@ -417,7 +417,7 @@ impl<'a> Sealed<'a> {
         };
         let id = signed_by.id();
         let signature = head.signature(id).ok_or(Refusal::NoSignature(id))?;
-        if !signed_by.verifies(&[&DOMAIN[..], head.manifest()].concat(), signature) {
+        if !signed_by.verifies(&[head.domain(), head.manifest()].concat(), signature) {
             return Err(Refusal::Signature(id));
         }
         let mut payload = self.payload()?;
@@ -508,6 +508,7 @@ impl<'a> Sealed<'a> {
             revision: device.revision.unwrap_or(as_wanted),
             unique_id: device.unique_id.unwrap_or(head.unique_id()),
             program: device.program.unwrap_or(head.program()),
+            has: self.requirements(),
             is_data: head.flags() & flag::DATA != 0,
             room: device.room.unwrap_or(u32::MAX),
             counter: device.counter,
@@ -525,6 +526,15 @@ impl<'a> Sealed<'a> {
         Ok((root, recipient, needs.epoch))
     }
 
+    /// What the device of a bootloader's RAM image must have; a program needs no device whose bootloader can
+    /// be renewed.
+    fn requirements(&self) -> Option<Requirements> {
+        let record = self.head.records().find(|(tag, _)| *tag == tag::BOOTLOADER);
+        record
+            .filter(|_| self.head.program() == BOOTLOADER)
+            .and_then(|(_, record)| Requirements::parse(record))
+    }
+
     /// The rule that a fault breaks.
     fn why(&self, fault: Fault, device: &seal::judge::Device<'_>) -> Refusal {
         let head = self.head;
@@ -536,6 +546,12 @@ impl<'a> Sealed<'a> {
             }
             Fault::WrongProduct if head.program() != device.program => {
                 Refusal::Program { image: head.program(), device: device.program }
+            }
+            Fault::WrongProduct if head.program() == BOOTLOADER && device.has.is_none() => {
+                Refusal::Field("it does not say what the device of a bootloader must have")
+            }
+            Fault::WrongProduct if head.program() == BOOTLOADER && head.flags() & OF_PROGRAMS != 0 => {
+                Refusal::Field("it has a flag that only programs have")
             }
             Fault::WrongProduct if ![[0; 12], device.unique_id].contains(&head.unique_id()) => {
                 Refusal::UniqueId
@@ -576,7 +592,12 @@ impl<'a> Sealed<'a> {
         match () {
             () if usize::from(certificate.len()) != CERTIFICATE => "its size is impossible",
             () if u16::from(certificate.algorithm()) != ED25519 => "its key is for another algorithm",
-            () if ![role::RELEASE, role::TEST].contains(&certificate.role()) => {
+            () if self.head.program() == BOOTLOADER && certificate.role() != role::BOOTLOADER => {
+                "its key does not sign bootloaders"
+            }
+            () if self.head.program() != BOOTLOADER
+                && ![role::RELEASE, role::TEST].contains(&certificate.role()) =>
+            {
                 "its key does not sign programs"
             }
             () if certificate.reserved() != [0; RESERVED] => {
@@ -606,6 +627,9 @@ impl<'a> Sealed<'a> {
         Refusal::Test
     }
 }
+
+/// Flags that a bootloader's RAM image has not.
+const OF_PROGRAMS: u8 = flag::DICTIONARY | flag::DATA | flag::WRITES_FLASH;
 
 /// Checks a file as this device would.
 ///

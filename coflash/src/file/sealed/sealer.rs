@@ -4,10 +4,12 @@
 //! same image, options and key give the same file, byte for byte.
 
 use seal::wire::{
-    flag, tag, CERTIFICATE, CERTIFICATE_MAGIC, DOMAIN, ED25519, FIXED, FORMAT, HASH, MAGIC, MAX_CHUNK,
-    MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, RESERVED, SIGNATURE, SIGNATURE_HEADER,
+    flag, tag, Requirements, BOOTLOADER, CERTIFICATE, CERTIFICATE_MAGIC, ED25519, FIXED, FORMAT, HASH, MAGIC,
+    MAX_CHUNK, MAX_HEAD, MAX_MANIFEST, MIN_CHUNK, RECIPIENT, RESERVED, SIGNATURE, SIGNATURE_HEADER,
 };
 use seal::wire::{role, Certificate as Wire};
+
+use shared_abi::ram_image::{self, Header};
 
 use super::cipher::{chacha20, hash, hmac, wrap};
 use super::key::{Kek, PublicKey, SigningKey};
@@ -34,6 +36,9 @@ pub enum SealFault {
     /// The program number is not a sub-index of 1F50h.
     #[error("there is no program {0}: programs are 1 to 254")]
     Program(u8),
+    /// The image is no RAM image of a bootloader, or has an option that none can have.
+    #[error("it cannot be sealed as a bootloader: {0}")]
+    Bootloader(&'static str),
     /// The records do not fit into the manifest.
     #[error("the manifest would have {0} bytes, and at most {MAX_MANIFEST} are allowed: shorten the text, or encrypt for fewer keys")]
     Manifest(usize),
@@ -81,7 +86,7 @@ pub struct Sealer<'a> {
     pub version: u32,
     /// The security counter: a device accepts none lower than its own.
     pub counter: u32,
-    /// The program's number, 1 to 254: the sub-index of 1F50h.
+    /// The program's number, 1 to 254: the sub-index of 1F50h; 255 for the RAM image of a bootloader.
     pub program: u8,
     /// Binary logarithm of a chunk's payload, 9 to 13.
     pub chunk: u8,
@@ -181,7 +186,9 @@ impl Sealer<'_> {
             image.to_vec()
         };
         let mut manifest = self.manifest(image, payload.len());
-        let size = manifest.len() + self.records_size();
+        let requirements = self.requirements(image);
+        let more = requirements.map_or(0, |_| 4 + Requirements::SIZE);
+        let size = manifest.len() + self.records_size() + more;
         if size > MAX_MANIFEST {
             return Err(SealFault::Manifest(size));
         }
@@ -199,6 +206,11 @@ impl Sealer<'_> {
         let (chain, chunks) = chain(&payload, 1 << self.chunk);
         manifest[72..104].copy_from_slice(&chain);
         self.add_records(&mut manifest, &image_key, &nonce);
+        if let Some(requirements) = requirements {
+            manifest.extend_from_slice(&tag::BOOTLOADER.to_le_bytes());
+            manifest.extend_from_slice(&(Requirements::SIZE as u16).to_le_bytes());
+            manifest.extend_from_slice(&requirements.bytes());
+        }
 
         let mut file = manifest;
         if let Some(certificate) = &self.certificate {
@@ -227,8 +239,11 @@ impl Sealer<'_> {
         if !(MIN_CHUNK..=MAX_CHUNK).contains(&self.chunk) {
             return Err(SealFault::Chunk(self.chunk));
         }
-        if !(1..=254).contains(&self.program) {
+        if self.program == 0 {
             return Err(SealFault::Program(self.program));
+        }
+        if self.program == BOOTLOADER {
+            self.check_bootloader(image)?;
         }
         let ids: Vec<u32> = self.encrypt_for.iter().map(Kek::id).collect();
         if let Some((_, id)) = ids.iter().enumerate().find(|(at, id)| ids[..*at].contains(id)) {
@@ -240,13 +255,32 @@ impl Sealer<'_> {
         }
     }
 
+    /// Refuses a RAM image that no device would accept: what its header says, the manifest has to say, too.
+    fn check_bootloader(&self, image: &[u8]) -> Result<(), SealFault> {
+        let Some(header) = bootloader_header(image) else {
+            return Err(SealFault::Bootloader("the image does not begin with a header (CBI2)"));
+        };
+        match () {
+            () if header.crc == 0 => {
+                Err(SealFault::Bootloader("it has no CRC: build it by `cargo xtask build`"))
+            }
+            () if header.counter != self.counter => Err(SealFault::Bootloader(
+                "its header has another security counter: the product chooses it (bootloader_counter)",
+            )),
+            () if self.data || self.writes_flash || self.base.is_some() => {
+                Err(SealFault::Bootloader("it is no data, writes no flash, and has no dictionary"))
+            }
+            () => Ok(()),
+        }
+    }
+
     /// Refuses a certificate with which no device would accept the image.
     fn check_certificate(&self, bytes: &[u8; CERTIFICATE], key: PublicKey) -> Result<(), SealFault> {
         let certificate = Wire(bytes);
         let known = bytes.starts_with(&CERTIFICATE_MAGIC)
             && usize::from(certificate.len()) == CERTIFICATE
             && u16::from(certificate.algorithm()) == ED25519
-            && [role::RELEASE, role::TEST].contains(&certificate.role())
+            && self.roles().contains(&certificate.role())
             && certificate.reserved() == [0; RESERVED];
         if !known {
             return Err(SealFault::NoCertificate);
@@ -270,6 +304,15 @@ impl Sealer<'_> {
             return not_allowed("security counters", allowed, self.counter.to_string());
         }
         Ok(())
+    }
+
+    /// The roles of a key that signs such an image.
+    fn roles(&self) -> &'static [u8] {
+        if self.program == BOOTLOADER {
+            &[role::BOOTLOADER]
+        } else {
+            &[role::RELEASE, role::TEST]
+        }
     }
 
     /// The fixed fields, still without nonce, chain and size.
@@ -322,6 +365,12 @@ impl Sealer<'_> {
         [text, sbom, source].into_iter().flatten()
     }
 
+    /// What the device of a bootloader's RAM image must have: what its header says.
+    fn requirements(&self, image: &[u8]) -> Option<Requirements> {
+        let header = bootloader_header(image).filter(|_| self.program == BOOTLOADER)?;
+        Some(Requirements { board: header.board, services: header.services, features: header.features })
+    }
+
     fn records_size(&self) -> usize {
         let notes: usize = self.notes().map(|(_, bytes)| 4 + bytes.len()).sum();
         notes + self.encrypt_for.len() * (4 + RECIPIENT)
@@ -349,8 +398,8 @@ impl Unsigned {
     /// The bytes to be signed with pure Ed25519: the domain and the manifest.
     #[must_use]
     pub fn tbs(&self) -> Vec<u8> {
-        let manifest = seal::wire::Head(&self.file).manifest();
-        [&DOMAIN[..], manifest].concat()
+        let head = seal::wire::Head(&self.file);
+        [head.domain(), head.manifest()].concat()
     }
 
     /// The file with zeros for the signature.
@@ -395,6 +444,12 @@ impl Unsigned {
         file[self.at..self.at + SIGNATURE].copy_from_slice(signature);
         Ok(file)
     }
+}
+
+/// The header of a bootloader's RAM image, if the image is one.
+fn bootloader_header(image: &[u8]) -> Option<Header> {
+    let header = Header::of_bytes(image.first_chunk()?);
+    (header.magic == ram_image::MAGIC).then_some(header)
 }
 
 /// Cuts payload into chunks: the hash of the first, and all of them.

@@ -43,6 +43,7 @@ pub fn role_name(role: u8) -> &'static str {
     match role {
         role::RELEASE => "release",
         role::TEST => "test",
+        role::BOOTLOADER => "bootloader",
         _ => "unknown",
     }
 }

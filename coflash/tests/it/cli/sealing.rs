@@ -144,7 +144,7 @@ fn keys_and_certificates_are_shown_without_secrets() {
     let kek = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
     let shown = room.good(&["key", "show", &room.path("kek.pem")]);
     assert_eq!(shown.out, format!("{}: key-encryption key {:08X}h\n", room.path("kek.pem"), kek.id()));
-    room.certify("test.cert", &["--test", "--product", "1234", "--lowest", "2", "--highest", "5"]);
+    room.certify("test.cert", &["--role", "test", "--product", "1234", "--lowest", "2", "--highest", "5"]);
     let shown = json(&["key", "show", &room.path("test.cert")]);
     assert_eq!((&shown["kind"], &shown["role"]), (&"certificate".into(), &"test".into()));
     assert_eq!((&shown["key_id"], &shown["epoch"]), (&id.into(), &3.into()));
@@ -449,7 +449,7 @@ fn encrypted_and_compressed_programs_come_out_again() {
     assert_eq!(room.verify("app.cbs", &["--hardware", "2"]).exit, 3);
 
     // For tests.
-    room.certify("release.cert", &["--test"]);
+    room.certify("release.cert", &["--role", "test"]);
     room.seal("test.cbs", &["--counter", "1"]);
     assert!(room.verify("test.cbs", &[]).err.contains("not marked for tests"));
     assert_eq!(room.verify("test.cbs", &["--for-tests"]).exit, 0);

@@ -133,24 +133,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             Start if self.renewal.state() == State::Staged => self.boot_request = Some(BootRequest::Try),
             Start => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
-            SetSignature if on_trial => self.confirm_image(),
-            SetSignature => self.install_again(),
-            Stop | StartBootloader | ResetStat | ClrSignature => {}
+            SetSignature if on_trial || self.renewal.state() == State::Confirmed => self.install(),
+            SetSignature | Stop | StartBootloader | ResetStat | ClrSignature => {}
         }
         Ok(())
     }
 
-    /// A master has reached the image on trial, and confirms it.
-    fn confirm_image(&mut self) {
-        let Some(record) = self.renewal.record else { return };
-        let record = RenewalRecord { state: State::Confirmed, ..record };
-        self.programmer.record_image(&mut self.parameters, record);
-    }
-
-    /// An installation that has failed is tried again.
-    fn install_again(&mut self) {
-        let (Some(places), Some(record)) = (Places::of(self.layout), self.renewal.record) else { return };
-        if record.state == State::Confirmed {
+    /// A master has reached the image on trial, and confirms it; or an installation that has failed is
+    /// tried again.
+    fn install(&mut self) {
+        if let (Some(places), Some(record)) = (Places::of(self.layout), self.renewal.record) {
             self.programmer.install(places, record);
         }
     }
@@ -158,13 +150,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// The record of the image was stored or removed.
     pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
         let record = RenewalRecord::load(&self.parameters, flash);
-        let was = self.renewal.state();
         self.renewal.record = record;
         if let Some(renewing) = &mut self.programmer.renewing {
             renewing.has_record = record.is_some();
-        }
-        if was != State::Confirmed && self.renewal.state() == State::Confirmed {
-            self.install_again();
         }
     }
 

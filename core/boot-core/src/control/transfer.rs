@@ -155,6 +155,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let staging = self.staging_of(program);
+        let has = if P::RENEWS { Some(self.policy.renewal.requirements()) } else { None };
         if let (Some(staging), Some(_)) = (staging, findings.begins) {
             self.drop_partial(staging);
         }
@@ -196,6 +197,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                         program,
                         region,
                         lowered_counter: self.rights.lowered_counter(),
+                        has,
+                        home: staging.map(|_| state.region),
                     });
                 }
                 state.partial = partial;

@@ -1,6 +1,7 @@
 //! The product's choices about downloads.
 
 use canopen::program::FlashError;
+use seal::wire::Requirements;
 use shared_abi::block_file::Control;
 
 use crate::crc::CrcKind;
@@ -83,6 +84,8 @@ pub struct Renewal {
     pub features: u32,
     /// Vendor-ID and product code of the device, which an image must have; `None` for any.
     pub identity: Option<(u32, u32)>,
+    /// The revision number of the device (1018h/3); the five lowest bits are the hardware revision.
+    pub revision: u32,
     /// The version of the services of the resident part.
     pub services: u32,
     /// The version of the running image.
@@ -92,9 +95,21 @@ pub struct Renewal {
 }
 
 impl Renewal {
+    /// What the device has for a sealed image of the bootloader.
+    pub(crate) const fn requirements(&self) -> Requirements {
+        Requirements { board: self.board, services: self.services, features: self.features }
+    }
+
     /// Values of no device.
-    pub const NONE: Self =
-        Self { board: 0, features: 0, identity: None, services: 0, version: 0, confirm_within_s: 60 };
+    pub const NONE: Self = Self {
+        board: 0,
+        features: 0,
+        identity: None,
+        revision: 0,
+        services: 0,
+        version: 0,
+        confirm_within_s: 60,
+    };
 }
 
 /// The values with which a sealed image is checked, besides the keys in the device.

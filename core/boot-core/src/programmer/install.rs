@@ -13,7 +13,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next};
 use crate::policy::Renewal;
 use crate::program::FlashCrc;
-use crate::renewal::Places;
+use crate::renewal::{header, Places};
 use crate::sequence::{EraseSectors, ProgramWords};
 use crate::store::{RenewalRecord, Value};
 
@@ -28,13 +28,24 @@ pub(crate) struct Renewing {
 }
 
 impl Renewing {
-    /// Whether an image with this header may become the bootloader.
-    pub(super) fn judge(&self, bytes: &[u8; Header::SIZE as usize]) -> Result<(), FlashError> {
+    /// Whether an image with this header may become the bootloader. `counter`: that of its manifest, if it
+    /// is sealed.
+    pub(super) fn judge(
+        &self,
+        bytes: &[u8; Header::SIZE as usize],
+        counter: Option<u32>,
+    ) -> Result<(), FlashError> {
         let header = Header::of_bytes(bytes);
-        let Renewal { board, features, identity, .. } = *self.policy;
+        let Renewal { board, features, identity, revision, .. } = *self.policy;
         let room = self.places.staging.size - Header::SIZE;
-        if header.check(room, self.layout.ram, board, features).is_err() || header.crc == 0 {
+        if header.check(room, self.layout.ram, board, features).is_err()
+            || header.crc == 0
+            || counter.is_some_and(|counter| counter != header.counter)
+        {
             return Err(FlashError::Format);
+        }
+        if header.revisions != 0 && header.revisions >> (revision & 31) & 1 == 0 {
+            return Err(FlashError::WrongProductId);
         }
         match identity.map(|device| fits((header.vendor, header.product), device)) {
             Some(Err(Difference::VendorId)) => Err(FlashError::WrongVendorId),
@@ -60,6 +71,8 @@ pub(super) struct Install {
 
 /// The progress of an installation.
 pub(super) enum Phase {
+    /// The security counter of a sealed image must be raised: from now on no older one is accepted.
+    Counter,
     /// The record that permits the erase must be stored once more: a power cut may have left it
     /// between 0 and 1.
     Permit,
@@ -75,7 +88,12 @@ pub(super) enum Phase {
 
 impl Install {
     pub(super) const fn new(places: Places, record: RenewalRecord) -> Self {
-        Self { places, record, phase: Phase::Permit }
+        Self { places, record, phase: Phase::Counter }
+    }
+
+    /// The security counter of the image, from its header in staging.
+    pub(super) fn counter<F: Flash>(&self, flash: &F) -> u32 {
+        header(flash, self.places.staging).counter
     }
 
     /// The flash that it writes.
@@ -116,7 +134,7 @@ impl Install {
                     }
                 };
             }
-            Phase::Permit | Phase::Done => Ok(None),
+            Phase::Counter | Phase::Permit | Phase::Done => Ok(None),
         };
         match next {
             Ok(Some(operation)) => Next::Start(operation),

@@ -467,7 +467,7 @@ impl<'b> Programmer<'b> {
                 if let Some(install) = &mut self.install {
                     install.permitted();
                 }
-                None
+                Some(Event::Stored { program: BOOTLOADER, ends: false })
             }
             (Job::Store(Change::Counter | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
             (Job::Store(change, program), result) => {
@@ -542,8 +542,10 @@ impl<'b> Programmer<'b> {
             return Ok(Some(job));
         }
         if P::RENEWS {
-            if let Some(job) = self.go_on_installing(parameters, flash)? {
-                return Ok(Some(job));
+            while self.install.is_some() {
+                if let Some(job) = self.go_on_installing(parameters, flash)? {
+                    return Ok(Some(job));
+                }
             }
         }
         let piece = self.source.piece();
@@ -625,6 +627,13 @@ impl<'b> Programmer<'b> {
         let Some(install) = &self.install else { return Ok(None) };
         let region = install.region();
         let (change, state) = match install.phase {
+            Phase::Counter => {
+                let raised = self.raised_counter(parameters, flash, install.counter(flash));
+                if let Some(install) = &mut self.install {
+                    install.phase = Phase::Permit;
+                }
+                return Ok(raised.map(|counter| store_counter(parameters, BOOTLOADER, counter)));
+            }
             Phase::Permit => (Change::Permit, State::Confirmed),
             Phase::Done => (Change::Record, State::Installed),
             Phase::Erase(_) | Phase::Copy(_) | Phase::Check(_) => return Ok(Some(Job::Install)),
@@ -636,6 +645,22 @@ impl<'b> Programmer<'b> {
             self.check_writable(flash, region)?;
         }
         Ok(Some(store(parameters, change, BOOTLOADER, value)))
+    }
+
+    /// The stored counter of the bootloader with this lowest value; `None` on a device that takes no sealed
+    /// images.
+    fn raised_counter<F: Flash>(
+        &self,
+        parameters: &impl Parameters,
+        flash: &F,
+        lowest: u32,
+    ) -> Option<Value> {
+        if !self.source.unsealer.is_present() {
+            return None;
+        }
+        let key = Key::counter(BOOTLOADER);
+        let [counter, epoch, installed, _] = parameters.get(flash, key).unwrap_or([0; 4]);
+        Some([counter.max(lowest), epoch, installed, 0])
     }
 
     /// A program that reaches into staging takes its flash: the record of the image there is removed first.
@@ -750,7 +775,8 @@ fn judge_image(
     for (at, byte) in header.iter_mut().enumerate() {
         *byte = source.byte(at);
     }
-    renewing.judge(&header)
+    let unsealer = &source.unsealer;
+    renewing.judge(&header, unsealer.is_active().then(|| unsealer.edition().counter))
 }
 
 /// The program of a bit in `voids`: [`bit`] has 31 for the bootloader.

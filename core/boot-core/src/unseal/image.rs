@@ -3,9 +3,10 @@
 
 use seal::key_block::{KEKS, KEK_COUNT, KEY};
 use seal::sha512::{hmac, Sha512};
-use seal::wire::{array, flag, head_size, Fault, Head, Recipient, DOMAIN, WRAP_DOMAIN};
+use seal::wire::{array, flag, head_size, Fault, Head, Recipient, Requirements, WRAP_DOMAIN};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 
 use super::buffers::{start, Buffers};
 use super::content::{Acceptance, Content};
@@ -13,7 +14,8 @@ use crate::flash::Flash;
 use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
 use crate::queue::{Piece, Queue};
-use crate::store::{Key, Parameters, ProgramRecord, Value};
+use crate::renewal::header;
+use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord, Value};
 
 /// The place of an image in the device, and the rules for it.
 #[derive(Clone, Copy)]
@@ -25,6 +27,10 @@ pub(crate) struct Place {
     pub region: Region,
     /// The lowest security counter, if a client has the right to lower it.
     pub lowered_counter: Option<u32>,
+    /// What the device has for a new RAM image; `None` if that cannot be renewed.
+    pub has: Option<Requirements>,
+    /// The image at home, if this is a new RAM image.
+    pub home: Option<Region>,
 }
 
 /// An image that is being processed.
@@ -189,13 +195,19 @@ impl Place {
                 flash.read(block + at as u32, &mut keys[at..at + 4]);
             }
         }
-        let record = ProgramRecord::load(parameters, flash, program);
-        let [_, _, installed, _] = parameters.get(flash, Key::counter(program)).unwrap_or([0; 4]);
         let (mut counter, epoch) = floor(flash, parameters, self.layout, policy.counter, program);
         if let Some(lowered) = self.lowered_counter {
             counter = counter.min(lowered);
         }
         let head = Head(&buffers.head);
+        let same = match self.home {
+            Some(home) => self.same_image(head, flash, parameters, home),
+            None => self.same_program(head, flash, parameters),
+        };
+        if let (Some(home), None, None) = (self.home, same, self.lowered_counter) {
+            // Two genuine images cannot be exchanged for ever.
+            counter = counter.max(header(flash, home).counter.saturating_add(1));
+        }
         let needs = seal::judge::judge(
             head,
             &seal::judge::Device {
@@ -204,6 +216,7 @@ impl Place {
                 revision: policy.revision,
                 unique_id: (policy.unique_id)(),
                 program,
+                has: self.has,
                 is_data: policy.data == Some(program),
                 room: self.region.size,
                 counter,
@@ -211,13 +224,8 @@ impl Place {
                 keys: &keys,
             },
         )?;
-        let is_same = |record: &ProgramRecord| {
-            record.seal.is_some()
-                && (record.size, record.crc, record.version) == (head.size(), head.crc(), head.version())
-                && installed == head.counter()
-        };
-        let same = record.filter(is_same).map(|record| record.value());
-        let floor = if policy.counter_with_confirmation { counter } else { head.counter() };
+        let with_confirmation = policy.counter_with_confirmation || self.home.is_some();
+        let floor = if with_confirmation { counter.min(head.counter()) } else { head.counter() };
         let acceptance = Acceptance { same, counter: [floor, needs.epoch, head.counter(), 0] };
         let judged = Judged { acceptance, recipient: needs.recipient };
         let root = &keys[needs.root + 4..][..32];
@@ -233,6 +241,38 @@ impl Place {
                 Ok(Stage::Manifest(judged))
             }
         }
+    }
+
+    /// The record of the program, if it is this one already.
+    fn same_program<F: Flash>(
+        &self,
+        head: Head<'_>,
+        flash: &F,
+        parameters: &impl Parameters,
+    ) -> Option<Value> {
+        let record = ProgramRecord::load(parameters, flash, self.program)?;
+        let [_, _, installed, _] = parameters.get(flash, Key::counter(self.program)).unwrap_or([0; 4]);
+        let is_same = record.seal.is_some()
+            && (record.size, record.crc, record.version) == (head.size(), head.crc(), head.version())
+            && installed == head.counter();
+        is_same.then(|| record.value())
+    }
+
+    /// The stored record of staging, if the new RAM image is there already, or at home.
+    fn same_image<F: Flash>(
+        &self,
+        head: Head<'_>,
+        flash: &F,
+        parameters: &impl Parameters,
+        home: Region,
+    ) -> Option<Value> {
+        let value = parameters.get(flash, Key::program(self.program)).unwrap_or([0; 4]);
+        let staged = RenewalRecord::from_value(value).is_some().then_some(self.region);
+        let is_same = |place: Region| {
+            let size = head.size();
+            size <= place.size && flash.crc32(0, Region::new(place.base, size)) == head.crc()
+        };
+        [Some(home), staged].into_iter().flatten().any(is_same).then_some(value)
     }
 
     /// The other one of two programs, if it is the dictionary.
@@ -284,7 +324,7 @@ fn check_manifest(buffers: &mut Buffers, root: Option<&[u8; 32]>) -> Result<(), 
     let certified = head.certificate().map(|certificate| certificate.key());
     let key = certified.as_ref().or(root).ok_or(Fault::Key)?;
     let signature = head.signature(key_id(key)).ok_or(Fault::Signature)?;
-    start(&mut buffers.verification, key, signature, &[DOMAIN, head.manifest()]);
+    start(&mut buffers.verification, key, signature, &[head.domain(), head.manifest()]);
     Ok(())
 }
 
@@ -292,6 +332,10 @@ fn check_manifest(buffers: &mut Buffers, root: Option<&[u8; 32]>) -> Result<(), 
 /// proved itself. It is stored even if it already has this value: after a power cut it may read
 /// this way now and differently later. (The store writes nothing if it is certain.)
 pub(crate) fn proved<F: Flash>(flash: &F, parameters: &impl Parameters, program: u8) -> Option<Value> {
+    if program == BOOTLOADER {
+        // Its counter is raised with the confirmation, and by nothing else.
+        return None;
+    }
     let record = ProgramRecord::load(parameters, flash, program)?;
     let [counter, epoch, installed, _] = parameters.get(flash, Key::counter(program))?;
     (record.confirmed && installed >= counter).then_some([installed, epoch, installed, 0])

@@ -486,7 +486,11 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
         }
     }
     // Of another vendor, another product.
-    for (header, status) in [(Header { vendor: 9, ..SOUND }, 0x80), (Header { product: 9, ..SOUND }, 0x82)] {
+    for (header, status) in [
+        (Header { vendor: 9, ..SOUND }, 0x80),
+        (Header { product: 9, ..SOUND }, 0x82),
+        (Header { revisions: 2, ..SOUND }, 0x82),
+    ] {
         let mut node = board.start();
         let _ = node.send(N, &image_of(header, 0x280, 3, true));
         node.settle();
@@ -661,6 +665,12 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
     // The installation fails: home cannot be erased.
     node.0.flash().protected = vec![4];
     assert_eq!(node.command(N, CONFIRM), SECURED | 4 << 16);
+    assert_eq!(node.progress().state, State::Staged, "nothing is lost, and nothing was promised");
+    // It fails in the middle: the first word of home.
+    node.0.flash().protected = vec![];
+    let erased = node.0.flash().operations + 9;
+    node.0.flash().fail = Some((erased, FlashFault::Failed));
+    assert_eq!(node.command(N, CONFIRM), 0x0A);
     assert_eq!(node.progress().state, State::Confirmed);
     assert_eq!(node.try_command(1, CLEAR), Err(AbortCode::DEVICE_STATE));
     assert_eq!(u32::from_le_bytes(node.read(0x1F57, 1)), BUSY);
@@ -670,7 +680,6 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
         assert_eq!(u32::from_le_bytes(node.read(0x1F57, program)), BUSY);
     }
     // A second 83h tries again.
-    node.0.flash().protected = vec![];
     assert_eq!(node.command(N, CONFIRM), 0);
     assert_eq!(node.progress().state, State::Installed);
 }

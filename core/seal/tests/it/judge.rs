@@ -3,7 +3,7 @@
 use crate::file::{manifest, put, record, signature};
 use seal::judge::{judge, Device, Needs};
 use seal::key_block::find;
-use seal::wire::{Fault, Head};
+use seal::wire::{Fault, Head, Requirements};
 
 const VENDOR: u32 = 0x319;
 const PRODUCT: u32 = 0x4_0001;
@@ -42,6 +42,9 @@ struct Case {
     revision: u32,
     is_data: bool,
     for_tests: u32,
+    /// The program of the device, and what it has for a bootloader.
+    device_program: u8,
+    has: Option<Requirements>,
 }
 
 struct Certificate {
@@ -82,6 +85,8 @@ fn direct() -> Case {
         revision: 0x1_0025,
         is_data: false,
         for_tests: 0,
+        device_program: 1,
+        has: None,
     }
 }
 
@@ -132,7 +137,8 @@ impl Case {
             product_code: PRODUCT,
             revision: self.revision,
             unique_id: UNIQUE_ID,
-            program: 1,
+            program: self.device_program,
+            has: self.has,
             is_data: self.is_data,
             room: ROOM,
             counter: COUNTER,
@@ -380,4 +386,82 @@ fn the_first_fault_is_told() {
         faults[n..].iter().for_each(|(_, change)| change(&mut case));
         assert_eq!(case.judged(), Err(*fault), "from {n} on");
     }
+}
+
+/// What the device of a bootloader has: board, services, features.
+const HAS: Requirements = Requirements { board: 0x1234_5678, services: 2, features: 1 };
+
+/// A record 8004h with these words.
+fn requirements(words: [u32; 3]) -> Vec<u8> {
+    record(0x8004, &words.map(u32::to_le_bytes).concat())
+}
+
+/// A RAM image for such a device.
+fn of_bootloader(case: &mut Case) {
+    (case.program, case.device_program, case.has) = (255, 255, Some(HAS));
+    case.records = requirements([0x1234_5678, 2, 1]);
+    case.certificate.iter_mut().for_each(|certificate| certificate.role = 3);
+}
+
+#[test]
+fn a_bootloader_is_for_its_board_and_resident_part() {
+    let with = |change: fn(&mut Case), fault| {
+        both(
+            |case| {
+                of_bootloader(case);
+                change(case);
+            },
+            fault,
+        );
+    };
+    with(|_| {}, None);
+    with(|case| case.records = requirements([0x1234_5678, 1, 1]), None);
+    let refused = Some(Fault::WrongProduct);
+    with(|case| case.records = requirements([0x1234_5679, 2, 1]), refused);
+    with(|case| case.records = requirements([0x1234_5678, 3, 1]), refused);
+    with(|case| case.records = requirements([0x1234_5678, 2, 3]), refused);
+    with(|case| case.records = requirements([0x1234_5678, 2, 0]), refused);
+    with(|case| case.records.clear(), refused);
+    with(|case| case.records = record(0x8004, &[0; 8]), refused);
+    // Two of them: the second one is a critical record that is not known.
+    with(|case| case.records = requirements([0x1234_5678, 2, 1]).repeat(2), Some(Fault::Format));
+    with(|case| case.has = None, refused);
+    with(|case| case.program = 1, refused);
+    with(|case| case.flags = 0x20, refused);
+    with(|case| case.flags = DATA, refused);
+    with(|case| (case.flags, case.payload) = (COMPRESSED | DICTIONARY, 100), refused);
+    with(|case| (case.flags, case.payload) = (COMPRESSED, 100), None);
+    with(|case| case.counter = COUNTER - 1, Some(Fault::Rollback));
+}
+
+#[test]
+fn a_key_signs_bootloaders_or_programs() {
+    for (role, holds) in [(1, false), (2, false), (3, true), (4, false)] {
+        let mut case = certified();
+        of_bootloader(&mut case);
+        case.certificate.iter_mut().for_each(|certificate| certificate.role = role);
+        assert_eq!(case.judged(), if holds { accepted(52) } else { Err(Fault::Signature) }, "role {role}");
+    }
+    with_certificate(|certificate| certificate.role = 3, Err(Fault::Signature));
+}
+
+/// Such a program could write a bootloader that nobody has verified.
+#[test]
+fn a_program_that_writes_flash_is_refused_where_the_bootloader_can_be_renewed() {
+    both(
+        |case| {
+            case.has = Some(HAS);
+            case.flags = 0x20;
+        },
+        Some(Fault::WrongProduct),
+    );
+    both(|case| case.has = Some(HAS), None);
+    // A record of a bootloader in a program.
+    both(
+        |case| {
+            case.has = Some(HAS);
+            case.records = requirements([0x1234_5678, 2, 1]);
+        },
+        Some(Fault::Format),
+    );
 }
