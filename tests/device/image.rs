@@ -31,16 +31,16 @@ fn crc32(bytes: &[u8]) -> u32 {
 
 /// A bootloader in flash: the resident part, and the RAM image with its header.
 #[derive(Clone)]
-pub struct Parts {
+struct Parts {
     resident: Vec<u8>,
     /// The address of the header.
     home: u32,
     /// The header, and the image.
-    pub image: Vec<u8>,
+    image: Vec<u8>,
 }
 
 impl Parts {
-    pub fn of(name: &str) -> Self {
+    fn of(name: &str) -> Self {
         let elf = firmware::elf(name);
         let (base, resident) = firmware::section(&elf, ".resident");
         assert_eq!(base, firmware::board().bootloader.base);

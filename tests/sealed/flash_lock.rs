@@ -5,7 +5,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::sealed_board::{board, open_board, release, sealer, COUNTER};
+use coboot_tests::sealed_board::{board, board_of, open_board, release, sealer, status, write, COUNTER};
 use coflash::device::{Doing, Transfers};
 use coflash::file::sealed::Sealer;
 use emulator::machine::{ResetCause, Stop};
@@ -199,10 +199,15 @@ fn a_sealed_program_that_jumps_back_can_be_updated() {
 #[test]
 fn a_sealed_program_that_writes_flash_is_not_locked_out() {
     let file = Sealer { writes_flash: true, ..sealer(COUNTER) }.seal(&program(), &release()).unwrap();
-    let mut bench = installed(board(), &file);
+    let mut bench = installed(board_of(firmware::BOOTLOADER_SEALED_WRITES_FLASH), &file);
     let log = log(&mut bench);
     assert_eq!((log.faults, log.locks), (0, [0, 0x0FFF_AAEC]));
     assert_eq!(log.callgate, 0);
+    // Where the bootloader can be renewed, it could write a bootloader that nobody has verified.
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!(write(&mut bench, &file, Transfers::Blocks).1, status::WRONG_PRODUCT);
 }
 
 /// A device without keys is not sealed.

@@ -13,4 +13,5 @@ mod pieces;
 mod powercut;
 mod provisioning;
 mod refusals;
+mod renewal;
 mod strangers;

@@ -38,6 +38,8 @@ pub const BOOTLOADER_LOG_DEFMT: &str = "bootloader-log-defmt.elf";
 pub const BOOTLOADER_LOG_UART: &str = "bootloader-log-uart.elf";
 /// The bootloader that accepts sealed images, and only these after it has keys.
 pub const BOOTLOADER_SEALED: &str = "bootloader-sealed.elf";
+/// The same for applications that write flash: it cannot be renewed.
+pub const BOOTLOADER_SEALED_WRITES_FLASH: &str = "bootloader-sealed-writes-flash.elf";
 /// The same with a text log for a debug probe, and with the debugger interface.
 pub const BOOTLOADER_SEALED_LOG_RTT: &str = "bootloader-sealed-log-rtt.elf";
 /// See [`BOOTLOADER_SEALED_LOG_RTT`].

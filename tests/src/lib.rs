@@ -12,6 +12,7 @@ pub mod listener;
 pub mod masters;
 pub mod node;
 pub mod powercut;
+pub mod renewal;
 pub mod script;
 pub mod sealed;
 pub mod sealed_board;

@@ -25,6 +25,8 @@ pub mod status {
     pub const FORMAT: u32 = 0x04;
     /// CRC.
     pub const CRC: u32 = 0x06;
+    /// WRONG_PRODUCT_ID.
+    pub const WRONG_PRODUCT: u32 = 0x82;
     /// NO_ACCESS.
     pub const NO_ACCESS: u32 = 0x84;
     /// SEQUENCE.
@@ -149,15 +151,24 @@ pub fn open_board() -> Bench {
 /// # Panics
 /// If the device does not answer.
 pub fn write(bench: &mut Bench, file: &[u8], transfers: Transfers) -> (Option<u32>, u32) {
+    write_to(bench, 1, file, transfers)
+}
+
+/// The same for another program.
+///
+/// # Panics
+/// As [`write`].
+pub fn write_to(bench: &mut Bench, program: u8, file: &[u8], transfers: Transfers) -> (Option<u32>, u32) {
     let mut session = bench.session();
     session.transfer_by(transfers);
-    session.command(1, ProgramControl::Clear).expect("CLEAR is answered");
-    session.await_idle(1, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
-    let abort = match session.write(DATA, file, Doing::Program, &mut |_| {}) {
+    session.command(program, ProgramControl::Clear).expect("CLEAR is answered");
+    session.await_idle(program, Doing::Command(ProgramControl::Clear)).expect("1F57h is answered");
+    let data = Address { sub: program, ..DATA };
+    let abort = match session.write(data, file, Doing::Program, &mut |_| {}) {
         Ok(()) => None,
         Err(Error::Refused { code, .. }) => Some(code.0),
         Err(error) => panic!("{error}"),
     };
-    let status = session.await_idle(1, Doing::Read(STATUS)).expect("1F57h is answered");
+    let status = session.await_idle(program, Doing::Read(STATUS)).expect("1F57h is answered");
     (abort, status.to_word())
 }

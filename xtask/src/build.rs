@@ -75,6 +75,8 @@ pub const VARIANTS: &[Variant] = table![
     bootloader("bootloader-virtual-can", "virtual-can"),
     // It accepts programs only from the holder of a key.
     bootloader("bootloader-sealed", "sealed"),
+    // Its sealed programs may write flash, so it is not renewed.
+    Variant { product: Some("writes-flash"), ..bootloader("bootloader-sealed-writes-flash", "sealed") },
     bootloader("bootloader-sealed-log-rtt", "sealed,log-rtt"),
     // With the debugger interface, only for the tests: never ship it.
     bootloader("bootloader-debugger", "debugger"),

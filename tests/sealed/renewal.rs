@@ -1,0 +1,160 @@
+//! The bootloader of a sealed device is renewed: by a genuine image that is newer, and by no other.
+
+use canopen::program::ProgramControl;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::firmware;
+use coboot_tests::renewal::{
+    cells, confirm, identification, image_of, number, progress, running, start, with_crc,
+};
+use coboot_tests::sealed_board::{board, key, release, root, sealer, status, write_to, COUNTER};
+use coflash::device::Transfers;
+use coflash::file::sealed::{Certificate, Role, Sealer, SigningKey};
+use shared_abi::geometry::Region;
+use shared_abi::renewal::{Origin, State};
+
+/// The program number of a bootloader in a manifest.
+const BOOTLOADER: u8 = 255;
+
+/// The built image with this security counter and version.
+fn image(counter: u32, version: u32) -> Vec<u8> {
+    let mut image = image_of(firmware::BOOTLOADER_SEALED);
+    image[48..52].copy_from_slice(&version.to_le_bytes());
+    image[52..56].copy_from_slice(&counter.to_le_bytes());
+    with_crc(image)
+}
+
+/// The key that signs bootloaders.
+fn signer() -> SigningKey {
+    key(3)
+}
+
+fn bootloader_sealer(counter: u32) -> Sealer<'static> {
+    let of_programs = sealer(counter);
+    let certificate = Certificate {
+        role: Role::Bootloader,
+        epoch: 1,
+        vendor_id: of_programs.vendor_id,
+        product_code: 0,
+        lowest: 0,
+        highest: u32::MAX,
+        key: signer().public(),
+    };
+    Sealer { certificate: Some(certificate.signed_by(&root())), program: BOOTLOADER, ..of_programs }
+}
+
+fn sealed(counter: u32, version: u32) -> Vec<u8> {
+    bootloader_sealer(counter).seal(&image(counter, version), &signer()).unwrap()
+}
+
+/// A sealed device without a program, in its bootloader.
+fn device() -> Bench {
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench
+}
+
+/// Downloads a file; the word of 1F57h.
+fn send(bench: &mut Bench, file: &[u8]) -> u32 {
+    write_to(bench, number(), file, Transfers::Blocks).1
+}
+
+fn power_cycle(bench: &mut Bench) {
+    bench.power_off();
+    bench.run_ms(100);
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert!(bench.is_bootloader(NODE));
+}
+
+#[test]
+fn a_newer_genuine_bootloader_is_installed_and_an_older_one_never() {
+    let mut bench = device();
+    let staging = Region::new(firmware::board().staging.unwrap().base, 1024);
+    let second = sealed(2, 0x0002_0000);
+    assert_eq!(send(&mut bench, &second), status::OK);
+    assert_eq!(progress(&mut bench).state, State::Staged);
+    // Before its confirmation an older one may take its place: the counter is not raised yet.
+    let first = sealed(1, 0x0001_0000);
+    assert_eq!(send(&mut bench, &first), status::OK);
+    start(&mut bench);
+    assert_eq!((progress(&mut bench).origin, running(&mut bench)), (Origin::Trial, 0x0001_0000));
+    bench.session().command(number(), ProgramControl::ClrSignature).unwrap();
+    bench.await_boot_up(1_000);
+    assert_eq!(send(&mut bench, &second), status::OK);
+    start(&mut bench);
+    confirm(&mut bench);
+    power_cycle(&mut bench);
+    assert_eq!((running(&mut bench), progress(&mut bench).state), (0x0002_0000, State::Installed));
+    // Not older, not another one with the same counter; and the same again changes nothing.
+    let spare = cells(&mut bench, staging);
+    for (file, expected) in [
+        (sealed(1, 0x0003_0000), status::ROLLBACK),
+        (sealed(2, 0x0003_0000), status::ROLLBACK),
+        (second.clone(), status::OK),
+    ] {
+        assert_eq!(send(&mut bench, &file), expected);
+        assert_eq!(progress(&mut bench).state, State::Installed);
+        assert_eq!(cells(&mut bench, staging), spare);
+    }
+    bench.machine().keep_flash_log();
+    assert_eq!(send(&mut bench, &second), status::OK);
+    assert_eq!(bench.machine().take_flash_log(), [], "the same image writes nothing");
+    assert_eq!(send(&mut bench, &sealed(3, 0x0003_0000)), status::OK);
+}
+
+/// Each is refused before staging is touched.
+#[test]
+fn an_image_that_is_not_genuine_is_refused() {
+    let mut bench = device();
+    let staging = Region::new(firmware::board().staging.unwrap().base, 1024);
+    bench.machine().load_bin(staging.base, &[0x5A; 1024]).unwrap();
+    let old = identification(&mut bench);
+    let plain = image(1, 0x0001_0000);
+    let of_release = Sealer { program: BOOTLOADER, ..sealer(1) };
+    let signed_as_program = {
+        // The manifest of a bootloader under the signature of a program's message.
+        let mut file = sealed(1, 0x0001_0000);
+        let program = Sealer { ..sealer(COUNTER) }.seal(&plain, &release()).unwrap();
+        let size = usize::from(u16::from_le_bytes([file[4], file[5]]));
+        let other = usize::from(u16::from_le_bytes([program[4], program[5]]));
+        let signature = size + 152 + 8;
+        file[signature..signature + 64].copy_from_slice(&program[other + 152 + 8..][..64]);
+        file
+    };
+    let mut altered = sealed(1, 0x0001_0000);
+    altered[40] ^= 1;
+    let stranger = bootloader_sealer(1).for_module(&plain, key(9).public());
+    assert!(stranger.is_err(), "the certificate is for another key");
+    assert!(of_release.seal(&plain, &release()).is_err(), "the tool refuses the role");
+    for (case, file, expected) in [
+        ("not sealed", plain.clone(), status::NO_ACCESS),
+        ("signed as a program", signed_as_program, status::SIGNATURE),
+        ("altered", altered, status::SIGNATURE),
+    ] {
+        let before = cells(&mut bench, staging);
+        assert_eq!(send(&mut bench, &file), expected, "{case}");
+        assert_eq!(cells(&mut bench, staging), before, "{case}");
+        assert_eq!(progress(&mut bench).state, State::None, "{case}");
+        assert_eq!(identification(&mut bench), old, "{case}");
+        // After a bad signature the device waits.
+        bench.run_ms(20_000);
+    }
+    // Signed by a root itself.
+    let direct = Sealer { certificate: None, ..bootloader_sealer(1) };
+    assert_eq!(send(&mut bench, &direct.seal(&plain, &root()).unwrap()), status::OK);
+}
+
+/// The resident part of a sealed device loads no image that takes programs from anybody.
+#[test]
+fn an_image_that_knows_no_sealed_programs_is_refused() {
+    let mut bench = device();
+    let open = with_crc({
+        let mut image = image_of(firmware::BOOTLOADER);
+        image[52..56].copy_from_slice(&1_u32.to_le_bytes());
+        image
+    });
+    let file = bootloader_sealer(1).seal(&open, &signer()).unwrap();
+    assert_eq!(send(&mut bench, &file), status::WRONG_PRODUCT);
+    assert_eq!(progress(&mut bench).state, State::None);
+}
