@@ -19,7 +19,7 @@ use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
 use shared_abi::block_file;
-use shared_abi::ram_image::{feature, SERVICES_VERSION};
+use shared_abi::ram_image::feature;
 use shared_abi::renewal;
 use shared_abi::services::Facts;
 use shared_abi::warm_start::Cell;
@@ -360,8 +360,6 @@ impl Product {
             features: FEATURES,
             identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
             revision: IDENTITY.revision,
-            services: SERVICES_VERSION,
-            version: VERSION,
             confirm_within_s: self.renewal_s,
         }
     }

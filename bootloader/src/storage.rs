@@ -113,6 +113,10 @@ impl Parameters for Store {
     const RESUMES: bool = PRODUCT.resume;
     const RENEWS: bool = PRODUCT.renewal;
 
+    fn services(&self) -> u32 {
+        services().version
+    }
+
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.

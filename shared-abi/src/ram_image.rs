@@ -24,6 +24,17 @@ pub mod feature {
     pub const SEALED: u32 = 1;
 }
 
+/// What a device has for a RAM image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Host {
+    /// The identity of its board, as in [`Header::board`].
+    pub board: u32,
+    /// The [`SERVICES_VERSION`] of its resident part.
+    pub services: u32,
+    /// The abilities of its resident part ([`feature`]).
+    pub features: u32,
+}
+
 /// The header before the image: 64 bytes, little-endian. `cargo build` writes everything but the
 /// CRC, which `cargo xtask build` writes.
 #[repr(C)]
@@ -114,15 +125,15 @@ impl Header {
     pub const CRC_FROM: u32 = Self::CRC + 4;
 
     /// Checks a header: `flash` bytes follow it in the region of the RAM image, `ram` is the RAM of
-    /// the images, `board` the identity of this board, and `features` the abilities of the resident part.
+    /// the images.
     ///
     /// # Errors
     /// [`Damage::Header`], [`Damage::Board`] or [`Damage::Services`].
-    pub const fn check(&self, flash: u32, ram: Region, board: u32, features: u32) -> Result<(), Damage> {
+    pub const fn check(&self, flash: u32, ram: Region, host: Host) -> Result<(), Damage> {
         if self.magic != MAGIC || self.length != Self::SIZE {
             return Err(Damage::Header);
         }
-        if self.board != board {
+        if self.board != host.board {
             return Err(Damage::Board);
         }
         let fits = self.size >= CORE_VECTORS_SIZE
@@ -136,9 +147,9 @@ impl Header {
         if !fits || self.reserved[0] != 0 || self.reserved[1] != 0 {
             return Err(Damage::Header);
         }
-        if self.services > SERVICES_VERSION
-            || self.features & !features != 0
-            || features & !self.features & feature::SEALED != 0
+        if self.services > host.services
+            || self.features & !host.features != 0
+            || host.features & !self.features & feature::SEALED != 0
         {
             return Err(Damage::Services);
         }
@@ -165,6 +176,7 @@ mod tests {
 
     const RAM: Region = Region::new(0x2000_0000, 0x1_FFC0);
     const BOARD: u32 = 0x1234_5678;
+    const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: 0 };
     const SOUND: Header = Header {
         magic: MAGIC,
         crc: 0,
@@ -185,7 +197,7 @@ mod tests {
 
     #[test]
     fn a_header_is_judged() {
-        let check = |header: Header| header.check(0x4000, RAM, BOARD, 0);
+        let check = |header: Header| header.check(0x4000, RAM, HOST);
         assert_eq!(check(SOUND), Ok(()));
         assert_eq!(check(Header { services: 0, size: 64, ram_end: 0x2000_0040, ..SOUND }), Ok(()));
         for (header, damage) in [
@@ -214,9 +226,9 @@ mod tests {
         }
         let large = Header { size: RAM.size - LEAST_STACK + 4, ..SOUND };
         let sealed = Header { features: feature::SEALED, ..SOUND };
-        let check = |header: Header| header.check(0x4000, RAM, BOARD, feature::SEALED);
+        let check = |header: Header| header.check(0x4000, RAM, Host { features: feature::SEALED, ..HOST });
         assert_eq!((check(SOUND), check(sealed)), (Err(Damage::Services), Ok(())));
-        assert_eq!(large.check(u32::MAX, RAM, BOARD, 0), Err(Damage::Header), "no room for the stack");
+        assert_eq!(large.check(u32::MAX, RAM, HOST), Err(Damage::Header), "no room for the stack");
     }
 
     #[test]

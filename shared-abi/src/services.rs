@@ -228,7 +228,7 @@ mod tests {
             crc_bits: 16,
             node_ids: 0x7F01,
             bit_rates: 0x1FF,
-            reserved: 0x8001,
+            abilities: 0x8001,
         };
         // Its services are at 20h, version 3, and the facts at 60h.
         let mut bytes = [0; 0x80];

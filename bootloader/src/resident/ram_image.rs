@@ -3,12 +3,15 @@
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
-use shared_abi::ram_image::Header;
+use shared_abi::ram_image::{Header, Host, SERVICES_VERSION};
 use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
 use crate::product::{BOARD_IDENTITY, FEATURES};
+
+/// What this resident part has for an image.
+const HOST: Host = Host { board: BOARD_IDENTITY, services: SERVICES_VERSION, features: FEATURES };
 
 extern "C" {
     /// The image's header: the linker script of the resident part has its address.
@@ -37,7 +40,7 @@ pub unsafe fn load(flash: &ResidentFlash, place: Region) -> Result<VectorTable, 
     // the place, whose size `check` compares with that of the image.
     let header = unsafe { &*(at as *const Header) };
     let data = at + Header::SIZE;
-    header.check(place.end() - data, LAYOUT.ram, BOARD_IDENTITY, FEATURES)?;
+    header.check(place.end() - data, LAYOUT.ram, HOST)?;
     if header.crc != 0 {
         let covered = Region::new(at + Header::CRC_FROM, Header::SIZE - Header::CRC_FROM + header.size);
         if flash.crc32(0, covered) != header.crc {

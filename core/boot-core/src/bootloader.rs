@@ -27,7 +27,7 @@ use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 use {canopen::program::ACCESS, seal::access::right};
 
-use crate::control::{Downloader, Policy, Renewal, Sealed, Step};
+use crate::control::{Downloader, Policy, Sealed, Step};
 use crate::flash::Flash;
 use crate::store::{NodeParameters, Parameters};
 use crate::stored_version::StoredVersion;
@@ -423,8 +423,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             }
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
             DEVICE_STATE if P::RENEWS && at.sub == STATE_VERSIONS => {
-                let Renewal { version, services, .. } = self.config.download.renewal;
-                return put(buf, &(u64::from(services) << 32 | u64::from(version)).to_le_bytes());
+                return put(buf, &self.download.versions());
             }
             DEVICE_STATE if P::RENEWS && at.sub == STATE_RENEWAL => {
                 u32::from_le_bytes(self.download.renewal().bytes())

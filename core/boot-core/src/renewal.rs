@@ -3,7 +3,7 @@
 
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::Header;
+use shared_abi::ram_image::{Header, Host};
 use shared_abi::renewal::{Origin, State};
 use shared_abi::warm_start::Damage;
 
@@ -81,15 +81,9 @@ pub fn header<F: Flash>(flash: &F, place: Region) -> Header {
 ///
 /// # Errors
 /// The damage.
-pub fn check<F: Flash>(
-    flash: &F,
-    place: Region,
-    layout: &Layout,
-    board: u32,
-    features: u32,
-) -> Result<Header, Damage> {
+pub fn check<F: Flash>(flash: &F, place: Region, layout: &Layout, host: Host) -> Result<Header, Damage> {
     let header = header(flash, place);
-    header.check(place.size - Header::SIZE, layout.ram, board, features)?;
+    header.check(place.size - Header::SIZE, layout.ram, host)?;
     let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
     if header.crc == 0 || flash.crc32(0, covered) != header.crc {
         return Err(Damage::Crc);

@@ -5,6 +5,7 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::{AbortCode, Instant};
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
+use shared_abi::ram_image::Host;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd, BOOTLOADER};
 use shared_abi::warm_start::BootRequest;
 
@@ -25,11 +26,21 @@ pub(super) struct Renewal {
     /// The place of the running image.
     origin: Origin,
     trial_end: TrialEnd,
+    /// The version of the running image.
+    version: u32,
+    /// What the device has for a RAM image; a copy for the same reason.
+    host: Host,
 }
 
 impl Renewal {
     /// The running image is that of home.
-    pub(super) const NONE: Self = Self { record: None, origin: Origin::Home, trial_end: TrialEnd::None };
+    pub(super) const NONE: Self = Self {
+        record: None,
+        origin: Origin::Home,
+        trial_end: TrialEnd::None,
+        version: 0,
+        host: Host { board: 0, services: 0, features: 0 },
+    };
 
     const fn state(&self) -> State {
         match self.record {
@@ -47,13 +58,27 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Progress { state: self.renewal.state(), origin, trial_end }
     }
 
+    /// 2007h/8: the version of the running image, and that of the services of the resident part.
+    #[must_use]
+    pub fn versions(&self) -> [u8; 8] {
+        let Renewal { version, host, .. } = self.renewal;
+        (u64::from(host.services) << 32 | u64::from(version)).to_le_bytes()
+    }
+
+    /// What the device has for a RAM image.
+    pub(super) fn host(&self) -> Host {
+        self.renewal.host
+    }
+
     /// Starts with the report of the resident part. What a cut has interrupted goes on.
     pub(super) fn begin_renewal<F: Flash>(&mut self, flash: &F, report: &BootReport) {
         let Some(places) = Places::of(self.layout) else { return };
         let record = RenewalRecord::load(&self.parameters, flash);
-        self.renewal = Renewal { record, origin: report.origin, trial_end: report.trial_end };
         let running = if report.origin == Origin::Home { places.home } else { places.staging };
         let header = header(flash, running);
+        let BootReport { origin, trial_end, .. } = *report;
+        let host = self.policy.renewal.host(self.parameters.services());
+        self.renewal = Renewal { record, origin, trial_end, version: header.version, host };
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = header.crc;
@@ -66,6 +91,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.programmer.renewing = Some(Renewing {
             layout: self.layout,
             policy: &self.policy.renewal,
+            host,
             places,
             has_record: record.is_some(),
         });
@@ -164,12 +190,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         crc: u32,
     ) -> Result<RenewalRecord, FlashError> {
         let places = Places::of(self.layout).ok_or(FlashError::Unspecified)?;
-        let renewal = &self.policy.renewal;
         if expected.crc.is_some_and(|told| told != crc) {
             return Err(FlashError::NoValidProgram);
         }
-        let image = check(flash, places.staging, self.layout, renewal.board, renewal.features)
-            .map_err(|_| FlashError::NoValidProgram)?;
+        let image =
+            check(flash, places.staging, self.layout, self.host()).map_err(|_| FlashError::NoValidProgram)?;
         if expected.size < image.total() {
             return Err(FlashError::NoValidProgram);
         }

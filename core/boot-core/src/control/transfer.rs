@@ -2,7 +2,9 @@
 
 use canopen::program::FlashError;
 use canopen::AbortCode;
+use seal::wire::Requirements;
 use shared_abi::block_file::FRAMING;
+use shared_abi::ram_image::Host;
 
 use super::{find, Downloader, Failure, Transfer};
 use crate::flash::Flash;
@@ -155,7 +157,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let staging = self.staging_of(program);
-        let has = if P::RENEWS { Some(self.policy.renewal.requirements()) } else { None };
+        let has = if P::RENEWS {
+            {
+                let Host { board, services, features } = self.host();
+                Some(Requirements { board, services, features })
+            }
+        } else {
+            None
+        };
         if let (Some(staging), Some(_)) = (staging, findings.begins) {
             self.drop_partial(staging);
         }

@@ -1,8 +1,8 @@
 //! The product's choices about downloads.
 
 use canopen::program::FlashError;
-use seal::wire::Requirements;
 use shared_abi::block_file::Control;
+use shared_abi::ram_image::Host;
 
 use crate::crc::CrcKind;
 use crate::session::Session;
@@ -86,30 +86,18 @@ pub struct Renewal {
     pub identity: Option<(u32, u32)>,
     /// The revision number of the device (1018h/3); the five lowest bits are the hardware revision.
     pub revision: u32,
-    /// The version of the services of the resident part.
-    pub services: u32,
-    /// The version of the running image.
-    pub version: u32,
     /// The time within which an image on trial must be confirmed, in seconds.
     pub confirm_within_s: u16,
 }
 
 impl Renewal {
-    /// What the device has for a sealed image of the bootloader.
-    pub(crate) const fn requirements(&self) -> Requirements {
-        Requirements { board: self.board, services: self.services, features: self.features }
+    /// What the device has for a RAM image, with this version of the services.
+    pub(crate) const fn host(&self, services: u32) -> Host {
+        Host { board: self.board, services, features: self.features }
     }
 
     /// Values of no device.
-    pub const NONE: Self = Self {
-        board: 0,
-        features: 0,
-        identity: None,
-        revision: 0,
-        services: 0,
-        version: 0,
-        confirm_within_s: 60,
-    };
+    pub const NONE: Self = Self { board: 0, features: 0, identity: None, revision: 0, confirm_within_s: 60 };
 }
 
 /// The values with which a sealed image is checked, besides the keys in the device.

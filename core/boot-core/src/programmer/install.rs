@@ -6,7 +6,7 @@ use canopen::program::FlashError;
 use shared_abi::block_file::{fits, Difference};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::Header;
+use shared_abi::ram_image::{Header, Host};
 use shared_abi::renewal::State;
 
 use crate::crc::CrcKind;
@@ -22,6 +22,7 @@ use crate::store::{RenewalRecord, Value};
 pub(crate) struct Renewing {
     pub layout: &'static Layout,
     pub policy: &'static Renewal,
+    pub host: Host,
     pub places: Places,
     /// A record of staging is stored: it must be removed before a program changes that flash.
     pub has_record: bool,
@@ -36,9 +37,9 @@ impl Renewing {
         counter: Option<u32>,
     ) -> Result<(), FlashError> {
         let header = Header::of_bytes(bytes);
-        let Renewal { board, features, identity, revision, .. } = *self.policy;
+        let Renewal { identity, revision, .. } = *self.policy;
         let room = self.places.staging.size - Header::SIZE;
-        if header.check(room, self.layout.ram, board, features).is_err()
+        if header.check(room, self.layout.ram, self.host).is_err()
             || header.crc == 0
             || counter.is_some_and(|counter| counter != header.counter)
         {

@@ -1,5 +1,7 @@
 //! What is stored: values under keys.
 
+use shared_abi::ram_image::SERVICES_VERSION;
+
 use crate::flash::{Flash, FlashFault, Next};
 
 /// The key of a stored value: a word, in flash and between the parts of the bootloader. A part that
@@ -69,6 +71,11 @@ pub trait Parameters {
     /// Whether the bootloader can be renewed (docs/renewal.md): then it is one more program of the
     /// [`Downloader`](crate::control::Downloader). Without it, the compiler leaves out the code.
     const RENEWS: bool = false;
+
+    /// The version of the services of the resident part, which owns the store. The flash must be idle.
+    fn services(&self) -> u32 {
+        SERVICES_VERSION
+    }
 
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;

@@ -18,7 +18,7 @@ use kit::random::Random;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::{Header, MAGIC, SERVICES_VERSION};
+use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 use shared_abi::warm_start::{BootRequest, Damage};
 
@@ -40,16 +40,12 @@ const PLACES: Places = match Places::of(&LAYOUT) {
 };
 
 const BOARD: u32 = 0x1234_5678;
+/// What the resident part has.
+const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: 0 };
 const N: u8 = 2;
 const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
 static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
-const RENEWAL: Renewal = Renewal {
-    board: BOARD,
-    identity: Some((7, 8)),
-    version: 0x0001_0002,
-    services: SERVICES_VERSION,
-    ..Renewal::NONE
-};
+const RENEWAL: Renewal = Renewal { board: BOARD, identity: Some((7, 8)), ..Renewal::NONE };
 static CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
@@ -151,7 +147,7 @@ struct Board {
 /// The checks of the resident part before it loads an image (bootloader/src/resident/ram_image.rs).
 fn load(flash: &ModelFlash, place: Region) -> Result<Header, Damage> {
     let header = header(flash, place);
-    header.check(place.size - Header::SIZE, LAYOUT.ram, BOARD, 0)?;
+    header.check(place.size - Header::SIZE, LAYOUT.ram, HOST)?;
     let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
     if header.crc != 0 && flash.crc32(0, covered) != header.crc {
         return Err(Damage::Crc);
