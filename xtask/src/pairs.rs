@@ -25,7 +25,7 @@ of each.
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
-const FIELDS: [(&str, &[&str]); 37] = [
+const FIELDS: [(&str, &[&str]); 41] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Some(1)", "None"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -62,6 +62,10 @@ const FIELDS: [(&str, &[&str]); 37] = [
     ("second_server", &["true", "false"]),
     ("resume", &["true", "false"]),
     ("read_back", &["true", "false"]),
+    ("renewal", &["LAYOUT.staging.is_some()", "false"]),
+    ("renewal_s", &["60", "1"]),
+    ("bootloader_counter", &["0", "3"]),
+    ("bootloader_revisions", &["0", "1"]),
     (SEALED, &["false", "true"]),
 ];
 
@@ -143,14 +147,15 @@ fn words(row: &Row) -> String {
 
 /// Whether a product may have these choices (`Product::checked`): a rescue window delays a program
 /// that starts by itself, so it needs such a program; a sealed image carries a CRC-32; a silent device waits
-/// for LSS. `None` is a field without a choice yet.
+/// for LSS; a renewal needs the watchdog. `None` is a field without a choice yet.
 fn allowed(row: &[Option<u8>; FIELDS.len()]) -> bool {
     let is = |name: &str, value: u8| {
         FIELDS.iter().zip(row).any(|((field, _), chosen)| *field == name && *chosen == Some(value))
     };
     let window = is("rescue_window_ms", 0) || is("rescue_window_confirmed_ms", 1);
     let is_mute = is("lss", 1) && is("crystal_failure", 0);
-    !(is("autostart", 1) && window || is(SEALED, 1) && is("crc", 1) || is_mute)
+    let hangs = is("renewal", 0) && is("watchdog_ms", 1);
+    !(is("autostart", 1) && window || is(SEALED, 1) && is("crc", 1) || is_mute || hangs)
 }
 
 /// Rows in which any two compatible values are together at least once. Each row takes a pair that
@@ -208,12 +213,12 @@ fn pairs() -> Vec<(Choice, Choice)> {
 mod tests {
     use super::*;
 
-    /// Counted by hand: 4 for each pair of the 35 fields with two values, 6 and 8 with those of three and
-    /// four, 12 between these; four are not permitted.
+    /// Counted by hand: 4 for each pair of the 39 fields with two values, 6 and 8 with those of three and
+    /// four, 12 between these; five are not permitted.
     #[test]
     fn every_pair_stands_in_a_row_and_no_row_contradicts_itself() {
         let rows = covering();
-        assert_eq!(pairs().len(), 35 * 34 / 2 * 4 + 35 * 6 + 35 * 8 + 12 - 4);
+        assert_eq!(pairs().len(), 39 * 38 / 2 * 4 + 39 * 6 + 39 * 8 + 12 - 5);
         for ((a, value_a), (b, value_b)) in pairs() {
             assert!(rows.iter().any(|row| row[a] == value_a && row[b] == value_b), "{a} {b}");
         }

@@ -180,6 +180,11 @@ impl Source {
         self.place.layout()
     }
 
+    /// The format of the file, if the user has named it.
+    pub(super) fn format(&self) -> Option<Format> {
+        self.place.format.map(Format::from)
+    }
+
     /// The size of a block in bytes, including framing.
     pub(super) fn block_size(&self) -> usize {
         self.block_size.map_or(DEFAULT_BLOCK_SIZE, |size| size as usize)

@@ -19,7 +19,7 @@ use coflash::file::sealed::SealedFile;
 use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::update::{flash_program, Event, FlashOptions, Program};
+use coflash::update::{flash_program, Event, FlashOptions, NewBootloader, Program};
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -32,6 +32,7 @@ use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
+use super::renew::{bootloader_in, renew_all};
 use super::values::{nodes, number, program_number, watch_time};
 use super::verify::{self, is_sealed};
 
@@ -51,6 +52,10 @@ enum Together {
 /// The file may be a block file or a sealed image; any other firmware file is converted first. The
 /// tool reads and checks the whole file before it changes a device. An interrupted update can be
 /// started again at once.
+///
+/// A file with a bootloader (bootloader.elf, or a sealed one) renews the bootloader of a device: the new one
+/// runs on trial, is confirmed, and installs itself; the program stays. Of several devices the first one is
+/// renewed before the others are touched.
 ///
 /// The tool detects bootloaders of other makers by itself; --dialect names one.
 ///
@@ -190,6 +195,9 @@ impl Flash {
             return Ok(());
         }
         self.legacy.check(context)?;
+        if let Some(new) = self.bootloader()? {
+            return self.renew(context, &new);
+        }
         let devices = match &self.job {
             Some(job) => self.devices_of_job(context, job)?,
             None => self.devices(context)?,
@@ -200,6 +208,36 @@ impl Flash {
             [device] if self.job.is_none() => self.one(context, &mut link, device),
             devices => self.many(context, &mut link, devices),
         }
+    }
+
+    /// The bootloader in the file of the command line, if it is one.
+    fn bootloader(&self) -> Result<Option<NewBootloader>, Failure> {
+        match self.file.as_deref().or(self.legacy_file.as_deref()) {
+            Some(path) if self.job.is_none() => bootloader_in(path, self.source.format()),
+            _ => Ok(None),
+        }
+    }
+
+    /// Renews the bootloaders of the devices of the command line.
+    fn renew(&self, context: &Context, new: &NewBootloader) -> Result<(), Failure> {
+        if self.no_trial || self.no_start {
+            let advice =
+                "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
+            return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
+        }
+        let mut nodes: Vec<NodeId> = Vec::new();
+        for node in self.node.iter().flatten() {
+            if !nodes.contains(node) {
+                nodes.push(*node);
+            }
+        }
+        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
+        let locks = nodes.iter().map(|node| self.lock(context, *node)).collect::<Result<Vec<_>, _>>()?;
+        let options = FlashOptions::default().alone(!self.not_alone).force(self.force);
+        let result = renew_all(context, &mut link, &nodes, new, &self.patience, &options);
+        drop(locks);
+        result
     }
 
     /// The options for reading a file for the named dialect.

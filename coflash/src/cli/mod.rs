@@ -44,6 +44,7 @@ mod progress;
 mod provision;
 mod read;
 mod record;
+mod renew;
 mod reset;
 mod scan;
 mod seal;

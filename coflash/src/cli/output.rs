@@ -542,6 +542,7 @@ impl From<Error> for Failure {
             | Error::NoProgram { .. }
             | Error::OtherRegion { .. }
             | Error::NotAlone { .. }
+            | Error::NotRenewable { .. }
             | Error::Lss { .. } => Exit::Device,
             Error::NoBootloader { .. }
             | Error::Occupied { .. }
@@ -549,6 +550,7 @@ impl From<Error> for Failure {
             | Error::ProgramEnded { .. }
             | Error::FellSilent { .. }
             | Error::TrialFailed { .. }
+            | Error::RenewalFailed { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
         let legacy = legacy::exit_code(&error);

@@ -18,6 +18,10 @@ pub enum Doing {
     Block(u32),
     /// Writing the whole program at once.
     Program,
+    /// Writing a new bootloader.
+    Bootloader,
+    /// Waiting until the device has installed a new bootloader.
+    Installation,
     /// Writing the password of a locked device.
     Unlock,
     /// Commanding the bootloader to restart into the program.
@@ -32,6 +36,8 @@ impl fmt::Display for Doing {
             Self::Block(u32::MAX) => f.write_str("writing the last block"),
             Self::Block(number) => write!(f, "writing block {number}"),
             Self::Program => f.write_str("writing the program"),
+            Self::Bootloader => f.write_str("writing the bootloader"),
+            Self::Installation => f.write_str("installing the bootloader"),
             Self::Unlock => f.write_str("unlocking the device"),
             Self::Restart => f.write_str("restarting the program"),
             Self::Command(command) => f.write_str(match command {

@@ -7,10 +7,12 @@ use canopen::program::{FlashError, FlashStatus, SUPPLY_DETAIL};
 use canopen::AbortCode;
 use canopen::{Address, NodeId};
 use shared_abi::handoff::ResetCause;
+use shared_abi::renewal::TrialEnd;
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
+use super::renewal::trial_end;
 use super::state::{reason, source, BootloaderState};
 use crate::bus::gateway::GatewayError;
 use crate::bus::AdapterError;
@@ -204,6 +206,18 @@ pub enum Error {
         /// Its end.
         ended: Ended,
     },
+    /// The bootloader of the device cannot be renewed over the bus.
+    NotRenewable {
+        /// The device.
+        node: NodeId,
+    },
+    /// The new bootloader did not come up, or was not installed: the old one runs.
+    RenewalFailed {
+        /// The device.
+        node: NodeId,
+        /// The end of its trial.
+        end: TrialEnd,
+    },
     /// The program has started and answered, and the device does not answer any more.
     FellSilent {
         /// The device.
@@ -373,7 +387,7 @@ impl Error {
             Self::NoAnswer { .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
             Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
-            Self::NotInDialect { .. } | Self::NoPassword { .. } => 0x6000_0018,
+            Self::NotInDialect { .. } | Self::NoPassword { .. } | Self::NotRenewable { .. } => 0x6000_0018,
             Self::Occupied { .. } => 0x6000_0010,
             Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
             Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost(_), .. } => 0x6000_0010,
@@ -381,6 +395,7 @@ impl Error {
             | Self::ProgramEnded { .. }
             | Self::FellSilent { .. }
             | Self::TrialFailed { .. }
+            | Self::RenewalFailed { .. }
             | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
@@ -546,6 +561,12 @@ impl fmt::Display for Error {
                 }
             }
             Self::ProgramEnded { node, ended } => write!(f, "the program of node {node} has ended: {ended}"),
+            Self::NotRenewable { node } => {
+                write!(f, "the bootloader of node {node} cannot be renewed over the bus")
+            }
+            Self::RenewalFailed { node, end } => {
+                write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
+            }
             Self::FellSilent { node, elsewhere } => {
                 f.write_str("the program does not answer any more: ")?;
                 write_silence(f, *node, *elsewhere)
@@ -585,6 +606,9 @@ fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt
 pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
     match (error, detail) {
         (FlashError::Secured, 1..) => format!("sector {detail} of the flash is write-protected"),
+        (FlashError::NotCleared, 1..) => {
+            format!("program {detail} reaches into the flash where a new bootloader waits")
+        }
         (FlashError::NoAccess, LOW_SUPPLY) => {
             "the supply of the device is too low to write its flash".to_string()
         }
@@ -597,8 +621,10 @@ pub(crate) const LOW_SUPPLY: u16 = SUPPLY_DETAIL as u16;
 
 /// Whether the detail of an error of 1F57h is shown as a number: [`failure_words`] do not have it.
 pub(crate) fn has_number(error: Option<FlashError>, detail: u16) -> bool {
-    let is_in_words =
-        matches!((error, detail), (Some(FlashError::Secured), _) | (Some(FlashError::NoAccess), LOW_SUPPLY));
+    let is_in_words = matches!(
+        (error, detail),
+        (Some(FlashError::Secured | FlashError::NotCleared), _) | (Some(FlashError::NoAccess), LOW_SUPPLY)
+    );
     detail != 0 && !is_in_words
 }
 

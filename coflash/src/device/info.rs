@@ -14,6 +14,7 @@ use super::dialect::Dialect;
 use super::error::{failure_words, has_number, told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
+use super::renewal::{bootloader, Bootloader};
 use super::session::Session;
 use super::state::{supply, BootloaderState};
 use crate::json;
@@ -48,6 +49,8 @@ pub struct DeviceInfo {
     pub security: Option<Security>,
     /// 2007h: why it stays in its bootloader; `None` for an application.
     pub state: Option<BootloaderState>,
+    /// 2007h: its bootloader, if that can be renewed; `None` for an application.
+    pub bootloader: Option<Bootloader>,
 }
 
 /// The data that the user sees before an update (CiA 814-1 clause 6.3): 1008h, 1009h, 100Ah and
@@ -132,8 +135,10 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let error_register = number(program::ERROR_REGISTER, 0)?;
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
+    let bootloader = if device_type.is_bootloader() { cell(session, bootloader)?.flatten() } else { None };
+    let is_program = |number: &u8| bootloader.is_none_or(|bootloader| bootloader.number > *number);
     let mut programs = Vec::new();
-    for number in 1..=count {
+    for number in (1..=count).filter(is_program) {
         programs.push(program_info(session, number)?);
     }
     let dialect = match count {
@@ -154,6 +159,7 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
         programs,
         security,
         state,
+        bootloader,
     })
 }
 
@@ -251,6 +257,9 @@ impl fmt::Display for DeviceInfo {
                     writeln!(f, "  {:<17} {warning}", "  warning")?;
                 }
             }
+        }
+        if let Some(bootloader) = &self.bootloader {
+            writeln!(f, "  {:<17} {bootloader}", "bootloader")?;
         }
         self.programs.iter().try_for_each(|program| write!(f, "{program}"))
     }

@@ -20,6 +20,7 @@ pub mod partial_download;
 pub mod read_state;
 pub(crate) mod recognise;
 pub mod region;
+pub mod renewal;
 pub mod scan;
 pub mod session;
 pub mod state;

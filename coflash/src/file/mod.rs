@@ -14,6 +14,7 @@ pub mod judge;
 pub mod label;
 pub mod limit;
 mod note;
+pub mod ram_image;
 mod range;
 pub mod raw;
 pub mod read;

@@ -10,6 +10,7 @@ use super::options::Target;
 use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
 use crate::file::block_file::Checksum;
+use crate::file::ram_image::Version;
 use crate::json;
 
 /// An erase that ends within this time was postponed by the device, or had nothing to do: to erase
@@ -65,6 +66,24 @@ pub enum Phase {
     StartingAgain,
     /// The program runs.
     Started(DeviceType),
+    /// The bootloader itself is renewed.
+    Renewing {
+        /// Its program number.
+        number: u8,
+        /// The version that runs, as 1018h/3 has it.
+        from: u32,
+        /// The new version.
+        to: u32,
+    },
+    /// The new bootloader is complete in the device, and starts for its trial.
+    Staged,
+    /// The new bootloader answers: it gets the confirmation (83h), and installs itself.
+    OnTrial,
+    /// The new bootloader is installed.
+    Installed {
+        /// Its version.
+        version: u32,
+    },
     /// After the end of the procedure, the CRC still matches the file's.
     VerifiedAgain {
         /// The CRC.
@@ -189,6 +208,17 @@ impl fmt::Display for Phase {
                 f.write_str("nothing was changed: starting the program again that was called back")
             }
             Self::Started(running) => write!(f, "running: {running}"),
+            Self::Renewing { number, from, to } => write!(
+                f,
+                "renewing the bootloader (program {number}): version {} -> {}; the program stays",
+                Version(*from),
+                Version(*to)
+            ),
+            Self::Staged => f.write_str("the new bootloader is staged: starting it for its trial"),
+            Self::OnTrial => {
+                f.write_str("the new bootloader answers: confirming it (83h), it installs itself")
+            }
+            Self::Installed { version } => write!(f, "installed: bootloader {}", Version(*version)),
             Self::VerifiedAgain { crc } => write!(f, "verified again: CRC {crc:08X}h"),
         }
     }

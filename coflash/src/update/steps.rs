@@ -228,7 +228,7 @@ pub fn reset_status(session: &mut Session<'_>, number: u8) -> Result<(), Error> 
 /// Sends a command that may be repeated, and waits until it is carried out. A device that has just
 /// started may still be storing something (86h): the command is repeated for as long as a start may
 /// take. CLEAR is not: the work may be another master's download, which it would end.
-fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
+pub(super) fn execute(session: &mut Session<'_>, number: u8, command: ProgramControl) -> Result<(), Error> {
     let doing = Doing::Command(command);
     let mut attempt = 1;
     let deadline = session.now() + session.timing().boot;

@@ -60,12 +60,27 @@ impl Error {
                 "take the write protection of sector {sector} away with a debug probe (option bytes: nWRP, SPRMOD), and \
                  look whether the installed program sets it; nothing of that program is lost"
             ),
+            Self::Failed { error: FlashError::NotCleared, detail: program @ 1.., .. } => format!(
+                "clear that program first, and install it again afterwards: coflash erase --program {program}"
+            ),
+            Self::Failed { doing: Doing::Bootloader, error: FlashError::Format, .. } => {
+                "the file is a bootloader for another board, for a newer resident part, or not the one of this product: \
+                 coflash info shows what the device has"
+                    .to_string()
+            }
             Self::Failed { error: FlashError::NoAccess, detail: LOW_SUPPLY, .. } => {
                 "check the supply of the device under load, from its source to the chip (coflash info says whether it \
                  is good), and run the command again"
                     .to_string()
             }
             Self::Failed { error, .. } => failure_advice(*error).to_string(),
+            Self::NotRenewable { .. } => "write it with a debug probe; a product with renewal needs a layout with staging \
+                                          (docs/renewal.md)"
+                .to_string(),
+            Self::RenewalFailed { .. } => "nothing is lost: look whether the file is the bootloader of this product and of its \
+                                           bit rate, and run the command again; a reset that nobody asked for has its cause \
+                                           in coflash info"
+                .to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::SealedOnly { .. } => "seal the program with a key that a root of the device has certified (coflash seal), and \
                                         flash the sealed image"

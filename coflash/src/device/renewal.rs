@@ -1,0 +1,133 @@
+//! The renewal of a device's bootloader, as the device reports it (2007h/1, /8, /9 of coboot).
+
+use std::fmt;
+
+use canopen::program::{DEVICE_STATE, STATE_BOOTLOADER, STATE_RENEWAL, STATE_VERSIONS};
+use canopen::Address;
+use serde::ser::SerializeStruct as _;
+use serde::{Serialize, Serializer};
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
+use shared_abi::warm_start::Damage;
+
+use super::error::{told, Error};
+use super::session::Session;
+use super::state::source;
+use crate::file::ram_image::Version;
+
+/// What a device reports about its bootloader.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Bootloader {
+    /// Its program number: sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    pub number: u8,
+    /// The version of its running RAM image.
+    pub version: Version,
+    /// The version of the services of its resident part.
+    pub services: u32,
+    /// The state of a renewal.
+    pub progress: Progress,
+}
+
+/// Reads what a device reports about its bootloader; `None` if that cannot be renewed, or an application
+/// runs.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn bootloader(session: &mut Session<'_>) -> Result<Option<Bootloader>, Error> {
+    let number = told(session.read_number(Address::new(DEVICE_STATE, STATE_BOOTLOADER)))?.unwrap_or(0);
+    let Ok(number @ 1..) = u8::try_from(number) else { return Ok(None) };
+    let versions = told(session.read(Address::new(DEVICE_STATE, STATE_VERSIONS)))?.unwrap_or_default();
+    let word = |at: usize| {
+        let bytes = versions.get(at..at + 4).and_then(|bytes| bytes.try_into().ok());
+        bytes.map_or(0, u32::from_le_bytes)
+    };
+    Ok(Some(Bootloader {
+        number,
+        version: Version(word(0)),
+        services: word(4),
+        progress: progress(session)?.unwrap_or_default(),
+    }))
+}
+
+/// 2007h/9; `None` for a state of a later version.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn progress(session: &mut Session<'_>) -> Result<Option<Progress>, Error> {
+    let word = session.read_number(Address::new(DEVICE_STATE, STATE_RENEWAL))?;
+    Ok(Progress::from_bytes(word.to_le_bytes()))
+}
+
+/// The end of a trial, in words: the rest of a sentence about the new bootloader.
+#[must_use]
+pub fn trial_end(end: TrialEnd) -> String {
+    match end {
+        TrialEnd::None => "did not run".to_string(),
+        TrialEnd::Late => "was not confirmed in time".to_string(),
+        TrialEnd::GivenUp => "was given up by a master".to_string(),
+        TrialEnd::Reset(cause) => format!("ended by a reset: {}", source(cause)),
+        TrialEnd::Damaged(damage) => format!("could not be loaded: {}", damage_words(damage)),
+    }
+}
+
+/// A damage of a RAM image, in words.
+const fn damage_words(damage: Damage) -> &'static str {
+    match damage {
+        Damage::Header => "its header is wrong",
+        Damage::Services => "it needs a newer resident part, or another ability of it",
+        Damage::Crc => "its CRC is wrong",
+        Damage::Board => "it is for another board",
+        Damage::Vectors => "its stack or its entry is outside its RAM",
+    }
+}
+
+impl fmt::Display for Bootloader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { number, version, services, progress: Progress { state, origin, trial_end: end } } = self;
+        write!(f, "version {version}, services {services}, renewed as program {number}")?;
+        match (state, origin) {
+            (_, Origin::Trial) => f.write_str("; it is on trial: coflash flash confirms it")?,
+            (State::None, _) => {}
+            (State::Staged, _) => f.write_str("; another one waits for its trial")?,
+            (State::Confirmed, _) => f.write_str("; it is confirmed, and not installed yet")?,
+            (State::Installed, Origin::Spare) => {
+                f.write_str("; its place was damaged, and is being repaired")?
+            }
+            (State::Installed, _) => f.write_str("; a spare of it is in the flash of the last program")?,
+        }
+        match end {
+            TrialEnd::None => Ok(()),
+            end => write!(f, "; the last one on trial {}", trial_end(*end)),
+        }
+    }
+}
+
+impl Serialize for Bootloader {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Progress { state, origin, trial_end: end } = self.progress;
+        let mut fields = serializer.serialize_struct("Bootloader", 6)?;
+        fields.serialize_field("number", &self.number)?;
+        fields.serialize_field("version", &self.version.0)?;
+        fields.serialize_field("services", &self.services)?;
+        fields.serialize_field(
+            "state",
+            match state {
+                State::None => "none",
+                State::Staged => "staged",
+                State::Confirmed => "confirmed",
+                State::Installed => "installed",
+            },
+        )?;
+        fields.serialize_field(
+            "from",
+            match origin {
+                Origin::Home => "home",
+                Origin::Trial => "trial",
+                Origin::Confirmed => "staging",
+                Origin::Spare => "spare",
+            },
+        )?;
+        let end = (end != TrialEnd::None).then(|| trial_end(end));
+        fields.serialize_field("last_trial", &end)?;
+        fields.end()
+    }
+}

@@ -1,0 +1,146 @@
+//! The RAM image of a bootloader in a firmware file: what `coflash flash` renews a bootloader with.
+
+use std::fmt;
+
+use shared_abi::ram_image::{Header, MAGIC};
+
+use super::block_file::CRC;
+use super::image::Image;
+
+/// A RAM image, with its header.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RamImage {
+    header: Header,
+    bytes: Vec<u8>,
+}
+
+/// Why a RAM image cannot be sent to a device.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Fault {
+    /// It is for the bench: nobody has computed its CRC.
+    #[error("is a bootloader without a CRC: build it by `cargo xtask build`, which writes the CRC")]
+    Bench,
+    /// Its CRC is wrong.
+    #[error("is a damaged bootloader: its header has the CRC {said:08X}h, and its bytes have {found:08X}h")]
+    Crc {
+        /// The CRC in the header.
+        said: u32,
+        /// The CRC of the bytes.
+        found: u32,
+    },
+}
+
+impl RamImage {
+    /// Finds the RAM image in a file. A file with a whole bootloader has the resident part, too, which is
+    /// left out: it never changes in the field.
+    #[must_use]
+    pub fn find(image: &Image) -> Option<Self> {
+        image.segments().find_map(|(_, data)| Self::find_in(&data))
+    }
+
+    fn find_in(data: &[u8]) -> Option<Self> {
+        let magic = MAGIC.to_le_bytes();
+        (0..data.len()).step_by(4).find_map(|at| {
+            let rest = &data[at..];
+            if !rest.starts_with(&magic) {
+                return None;
+            }
+            let header = Header::of_bytes(rest.first_chunk()?);
+            let is_possible =
+                header.length == Header::SIZE && header.size.is_multiple_of(4) && header.size > 0;
+            let bytes = rest.get(..header.total() as usize).filter(|_| is_possible)?.to_vec();
+            Some(Self { header, bytes })
+        })
+    }
+
+    /// Its header.
+    #[must_use]
+    pub const fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Header and image, as they lie in flash.
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    /// Checks the CRC, as each device does.
+    ///
+    /// # Errors
+    /// [`Fault`].
+    pub fn check(&self) -> Result<(), Fault> {
+        let (said, found) = (self.header.crc, CRC.checksum(&self.bytes[Header::CRC_FROM as usize..]));
+        match said {
+            0 => Err(Fault::Bench),
+            said if said != found => Err(Fault::Crc { said, found }),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// A version of a bootloader, as 1018h/3 has it: major in the upper half, minor in the lower.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Version(pub u32);
+
+impl fmt::Display for Version {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}", self.0 >> 16, self.0 & 0xFFFF)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::file::read::{read, Firmware, Format};
+
+    /// A header in front of `size` bytes, typed from the table of docs/renewal.md.
+    fn made(size: usize) -> Vec<u8> {
+        let mut bytes = b"CBI2".to_vec();
+        for word in [0, 64, size as u32, 0x2000_0000, 0x2001_FFC0, 1, 0, 7, 1, 2, 0, 0x0001_0002, 0, 0, 0] {
+            bytes.extend(word.to_le_bytes());
+        }
+        bytes.extend((0..size).map(|at| at as u8));
+        bytes
+    }
+
+    fn with_crc(mut bytes: Vec<u8>) -> Vec<u8> {
+        let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&bytes[8..]);
+        bytes[4..8].copy_from_slice(&crc.to_le_bytes());
+        bytes
+    }
+
+    fn found(bytes: &[u8]) -> Option<RamImage> {
+        let Ok(Firmware::Image(image)) = read(bytes, Some(Format::Raw), Some(0x0800_0000)) else {
+            panic!("a raw file is an image")
+        };
+        RamImage::find(&image)
+    }
+
+    #[test]
+    fn it_is_found_alone_and_after_a_resident_part() {
+        let image = with_crc(made(128));
+        for before in [0, 0x1_0000] {
+            // The resident part has the magic, too: it compares it.
+            let mut file = vec![0xA5; before];
+            if before > 0 {
+                file[64..68].copy_from_slice(b"CBI2");
+            }
+            file.extend(&image);
+            file.extend([0xFF; 40]);
+            let found = found(&file).expect("there is one");
+            assert_eq!((found.bytes(), found.check()), (&image[..], Ok(())));
+            assert_eq!(Version(found.header().version).to_string(), "1.2");
+        }
+        assert_eq!(found(&image[..image.len() - 1]), None, "its end is missing");
+        assert_eq!(found(&[0x5A; 400]), None);
+    }
+
+    #[test]
+    fn its_crc_is_checked() {
+        assert_eq!(found(&made(128)).unwrap().check(), Err(Fault::Bench));
+        let mut damaged = with_crc(made(128));
+        damaged[100] ^= 1;
+        assert!(matches!(found(&damaged).unwrap().check(), Err(Fault::Crc { .. })));
+    }
+}

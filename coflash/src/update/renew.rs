@@ -1,0 +1,274 @@
+//! The renewal of a device's bootloader: a new RAM image is staged, runs once on trial, and is confirmed;
+//! then the device installs it (docs/renewal.md).
+
+use std::fmt;
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::program::{FlashStatus, ProgramControl, PROGRAM_DATA, PROGRAM_ID};
+use canopen::Address;
+use serde::Serialize;
+use shared_abi::renewal::{Origin, State, TrialEnd};
+
+use super::event::{Event, Phase};
+use super::options::FlashOptions;
+use super::steps::{enter_bootloader, execute, running_program, start};
+use crate::device::access::{security_of, told_challenge};
+use crate::device::renewal::{bootloader, progress, Bootloader};
+use crate::device::{DeviceType, Doing, Error, Session};
+use crate::file::ram_image::{RamImage, Version};
+use crate::file::sealed::SealedFile;
+use crate::json;
+
+/// A device leaves its bootloader within this time after the answer to START.
+const LEAVES_WITHIN: Duration = Duration::from_millis(200);
+/// An image that hangs is ended by the watchdog within this time: the longest one is 4 s, and the
+/// oscillator may be half as fast.
+const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(10);
+
+/// A new bootloader.
+#[derive(Clone, Debug)]
+pub enum NewBootloader {
+    /// A RAM image.
+    Plain(Arc<RamImage>),
+    /// A sealed one.
+    Sealed(Arc<SealedFile>),
+}
+
+impl NewBootloader {
+    /// The bytes for 1F50h.
+    fn bytes(&self) -> &[u8] {
+        match self {
+            Self::Plain(image) => image.bytes(),
+            Self::Sealed(file) => file.bytes(),
+        }
+    }
+
+    /// Its version.
+    #[must_use]
+    pub fn version(&self) -> Version {
+        match self {
+            Self::Plain(image) => Version(image.header().version),
+            Self::Sealed(file) => Version(file.head().version()),
+        }
+    }
+}
+
+/// The results of a renewal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[non_exhaustive]
+pub struct Renewal {
+    /// The program number of the bootloader.
+    pub number: u8,
+    /// The version that ran before.
+    #[serde(serialize_with = "number_of")]
+    pub from: Version,
+    /// The version that runs now.
+    #[serde(serialize_with = "number_of")]
+    pub to: Version,
+    /// Whether the device had this bootloader already: nothing was changed.
+    pub unchanged: bool,
+    /// The total time, on the bus's clock.
+    #[serde(rename = "seconds", serialize_with = "json::seconds")]
+    pub took: Duration,
+    /// The device type of the program, if one ran before and was started again.
+    #[serde(serialize_with = "device_type")]
+    pub running: Option<DeviceType>,
+}
+
+fn number_of<S: serde::Serializer>(version: &Version, serializer: S) -> Result<S::Ok, S::Error> {
+    version.0.serialize(serializer)
+}
+
+fn device_type<S: serde::Serializer>(running: &Option<DeviceType>, serializer: S) -> Result<S::Ok, S::Error> {
+    running.map(|running| running.0).serialize(serializer)
+}
+
+impl fmt::Display for Renewal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { from, to, .. } = self;
+        if self.unchanged {
+            return write!(f, "nothing to do: the device has this bootloader (version {to})");
+        }
+        write!(f, "done in {:.1} s: bootloader {from} -> {to}, installed", self.took.as_secs_f64())
+    }
+}
+
+/// Renews the bootloader of a device; the program stays, and is started again if it ran before.
+///
+/// A renewal that was interrupted at any point can be started again at once: until the device has
+/// confirmed the new bootloader, the old one comes back by itself.
+///
+/// # Errors
+/// [`Error::NotRenewable`] for a device whose bootloader cannot be renewed, [`Error::RenewalFailed`] for
+/// one whose new bootloader did not come up, and the errors of [`flash`](super::flash()).
+pub fn renew(
+    session: &mut Session<'_>,
+    new: &NewBootloader,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Renewal, Error> {
+    let began = session.now();
+    if options.alone {
+        session.ensure_alone()?;
+    }
+    let program = running_program(session, 1)?;
+    let ran = session.device_type()?.is_some_and(|running| !running.is_bootloader());
+    enter_bootloader(session, tell)?;
+    let result = in_bootloader(session, new, options, tell);
+    // A program that ran before runs again, whatever became of the renewal.
+    let again = program.filter(|_| ran && options.start).map(|number| {
+        tell(Phase::Starting.into());
+        start(session, number)
+    });
+    let renewal = result?;
+    let running = again.transpose()?;
+    if let Some(running) = running {
+        tell(Phase::Started(running).into());
+    }
+    Ok(Renewal { running, took: session.now().saturating_sub(began), ..renewal })
+}
+
+fn in_bootloader(
+    session: &mut Session<'_>,
+    new: &NewBootloader,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Renewal, Error> {
+    let node = session.node();
+    let old = bootloader(session)?.ok_or(Error::NotRenewable { node })?;
+    if let (NewBootloader::Plain(_), Some(challenge)) = (new, told_challenge(session)?) {
+        if challenge.is_sealed() {
+            let roots = security_of(session, &challenge)?.roots;
+            return Err(Error::SealedOnly { node, roots });
+        }
+    }
+    let number = old.number;
+    // An installation that goes on ends first.
+    session.await_idle(number, Doing::Installation)?;
+    let (from, to) = (old.version, new.version());
+    let unchanged = Renewal { number, from, to, unchanged: true, took: Duration::ZERO, running: None };
+    if !options.force && is_there(session, new, &old)? {
+        return Ok(unchanged);
+    }
+    tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
+    if old.progress.origin == Origin::Trial {
+        // Somebody's trial is open. The image on it may be another one: the old bootloader comes back.
+        session.command(number, ProgramControl::ClrSignature)?;
+        await_other_image(session)?;
+    }
+    stage(session, number, new, tell)?;
+    if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
+        // The device has found the same image.
+        return Ok(unchanged);
+    }
+    tell(Phase::Staged.into());
+    try_it(session, number)?;
+    tell(Phase::OnTrial.into());
+    install(session, number)?;
+    match progress(session)? {
+        Some(progress) if progress.state == State::Installed => {}
+        other => {
+            let end = other.map_or(TrialEnd::None, |progress| progress.trial_end);
+            return Err(Error::RenewalFailed { node, end });
+        }
+    }
+    let to = bootloader(session)?.map_or(to, |now| now.version);
+    tell(Phase::Installed { version: to.0 }.into());
+    Ok(Renewal { to, unchanged: false, ..unchanged })
+}
+
+/// Whether the device runs this image from its home already. A sealed image is judged by the device.
+fn is_there(session: &mut Session<'_>, new: &NewBootloader, old: &Bootloader) -> Result<bool, Error> {
+    let NewBootloader::Plain(image) = new else { return Ok(false) };
+    let progress = old.progress;
+    if progress.origin != Origin::Home || matches!(progress.state, State::Staged | State::Confirmed) {
+        return Ok(false);
+    }
+    let crc = session.read_number(Address::new(PROGRAM_ID, old.number))?;
+    Ok(crc == image.header().crc)
+}
+
+/// Downloads the image into staging.
+fn stage(
+    session: &mut Session<'_>,
+    number: u8,
+    new: &NewBootloader,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    execute(session, number, ProgramControl::Clear)?;
+    let bytes = new.bytes();
+    let total = bytes.len();
+    let doing = Doing::Bootloader;
+    let sent = session.write(Address::new(PROGRAM_DATA, number), bytes, doing, &mut |done| {
+        tell(Event::Progress { done: done as usize, total });
+    });
+    let status = match sent {
+        Ok(()) => session.await_idle(number, doing)?,
+        // 1F57h says more than the abort.
+        Err(Error::Refused { code, .. }) => {
+            let status = session.await_idle(number, doing)?;
+            let Some(error) = status.error else {
+                return Err(Error::Refused { node: session.node(), doing, code });
+            };
+            return Err(Error::Failed { doing, error, detail: status.detail, code: Some(code) });
+        }
+        Err(error) => return Err(error),
+    };
+    match status.error {
+        None => Ok(()),
+        Some(error) => Err(Error::Failed { doing, error, detail: status.detail, code: None }),
+    }
+}
+
+/// Confirms the image on trial, and waits until the device has installed it.
+fn install(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    let doing = Doing::Installation;
+    match session.command(number, ProgramControl::SetSignature) {
+        // It may be carried out: 83h may be written twice, and 1F57h says more.
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+        Err(error) => return Err(error),
+    }
+    match session.await_idle(number, doing)? {
+        FlashStatus { error: None, .. } => Ok(()),
+        FlashStatus { error: Some(error), detail, .. } => {
+            Err(Error::Failed { doing, error, detail, code: None })
+        }
+    }
+}
+
+/// Starts the staged image, and waits until it answers.
+fn try_it(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+    match session.command(number, ProgramControl::Start) {
+        // A device that resets at once may not send its answer.
+        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
+        Err(error) => return Err(error),
+    }
+    let progress = await_other_image(session)?;
+    if progress.origin == Origin::Trial {
+        return Ok(());
+    }
+    Err(Error::RenewalFailed { node: session.node(), end: progress.trial_end })
+}
+
+/// Waits for the bootloader that comes up after a reset; what it reports.
+fn await_other_image(session: &mut Session<'_>) -> Result<shared_abi::renewal::Progress, Error> {
+    // The old one still answers for a moment.
+    session.wait(LEAVES_WITHIN)?;
+    let deadline = session.now() + TRIAL_ENDS_WITHIN.max(session.timing().boot);
+    loop {
+        let pause = session.timing().sdo;
+        match session.device_type()? {
+            Some(running) if running.is_bootloader() => {
+                if let Some(progress) = progress(session)? {
+                    return Ok(progress);
+                }
+            }
+            _ if session.now() >= deadline => {
+                return Err(Error::NoAnswer { node: session.node(), doing: Doing::Restart });
+            }
+            _ => {}
+        }
+        session.await_boot_up(pause)?;
+    }
+}
