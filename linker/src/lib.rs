@@ -250,8 +250,11 @@ mod tests {
             scripts.push(fs::read_to_string(folder.join("memory.x")).unwrap());
         }
         assert_eq!(scripts[0], scripts[1]);
-        // Sectors 8 to 11 of an STM32F407 (RM0090 table 5).
-        assert!(scripts[0].contains("FLASH : ORIGIN = 0x08080000, LENGTH = 0x80000"), "{}", scripts[0]);
+        // Sectors 8 to 10 of an STM32F407 (RM0090 table 5): sector 11 is staging.
+        assert!(scripts[0].contains("FLASH : ORIGIN = 0x08080000, LENGTH = 0x60000"), "{}", scripts[0]);
+        Application::of_file(&map).program(2).over_staging().write(&folder).unwrap();
+        let whole = fs::read_to_string(folder.join("memory.x")).unwrap();
+        assert!(whole.contains("FLASH : ORIGIN = 0x08080000, LENGTH = 0x80000"), "{whole}");
         assert!(fs::read_to_string(folder.join("application.x")).unwrap().contains("INCLUDE link.x"));
         fs::remove_dir_all(folder).unwrap();
     }

@@ -105,7 +105,7 @@ fn the_layout_of_the_stm32f407_is_the_documented_one() {
     assert_eq!(layout.bootloader, Region::new(0x0800_0000, 0x4000));
     assert_eq!(layout.home, Some(Region::new(0x0801_0000, 0x1_0000)));
     assert_eq!(layout.data, Some(Region::new(0x0800_C000, 0x4000)));
-    assert_eq!(layout.staging, None);
+    assert_eq!(layout.staging, Some(Region::new(0x080E_0000, 0x2_0000)));
     assert_eq!(layout.callgate(), 0x0800_0040);
     assert_eq!(layout.parameters, [Region::new(0x0800_4000, 0x4000), Region::new(0x0800_8000, 0x4000)]);
     assert_eq!(layout.programs, [Region::new(0x0802_0000, 896 * 1024)]);

@@ -17,8 +17,8 @@
 //!
 //! In the data of the device's frames, `..` is any byte: a value that differs between boards. A
 //! letter after F and a digit, for example `s0`, is a named byte: any byte the first time, and the
-//! same byte from then on, also in the master's frames. `p0` is the number of programs of the
-//! board.
+//! same byte from then on, also in the master's frames. `p0` is the highest sub-index of
+//! 1F50h: the number of programs of the board, and one more where the bootloader can be renewed.
 //!
 //! The frames are on the CAN bus, or are text on a board's UART: see [`Wire`].
 
@@ -109,7 +109,8 @@ pub fn play(bench: &mut Bench, script: &str) {
 pub fn play_on(wire: &mut dyn Wire, script: &str, board: &Layout, image: &dyn Fn(&str) -> String) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("expected").join(script);
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    let named = HashMap::from([("p0".to_owned(), board.programs.len() as u8)]);
+    let highest = board.programs.len() as u8 + u8::from(board.staging.is_some());
+    let named = HashMap::from([("p0".to_owned(), highest)]);
     let mut player = Player { seen: wire.time(), node: 1, wire, board, image, named };
     for (number, line) in (1..).zip(text.lines()) {
         let place = format!("{script}, line {number}: {line}");

@@ -10,6 +10,7 @@ mod masters;
 mod powercut;
 mod powercut_board;
 mod recording;
+mod renewal;
 mod resume;
 mod streams;
 mod throughput;

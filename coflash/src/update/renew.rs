@@ -196,6 +196,24 @@ fn stage(
     new: &NewBootloader,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
+    let mut attempt = 1;
+    loop {
+        match stage_once(session, number, new, tell) {
+            // It begins anew: the device keeps no part of a bootloader.
+            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < session.timing().attempts => {
+                attempt += 1;
+            }
+            result => return result,
+        }
+    }
+}
+
+fn stage_once(
+    session: &mut Session<'_>,
+    number: u8,
+    new: &NewBootloader,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
     execute(session, number, ProgramControl::Clear)?;
     let bytes = new.bytes();
     let total = bytes.len();

@@ -101,6 +101,7 @@ fn map(chip: &'static Geometry) -> (Layout, Region) {
         ram: Region::new(chip.sram.base, chip.sram.size - 64),
         handoff: Region::new(ram_end - 64, 48),
         warm_start: Region::new(ram_end - 16, 16),
+        staging: chip.sector_at(chip.flash.end() - 1).filter(|_| is_split).map(|sector| sector.region),
         ..*layout::DEFAULT
     };
     (layout, Region::new(program, chip.flash.end() - program))
@@ -138,6 +139,7 @@ fn layout_file(name: &str, chip: &'static Geometry) -> String {
             ("parameters_b", &region(layout.parameters[1])),
             ("data", &optional(layout.data)),
             ("program", &region(program)),
+            ("staging", &optional(layout.staging)),
             ("ram", &region(layout.ram)),
             ("handoff", &region(layout.handoff)),
             ("warm_start", &region(layout.warm_start)),

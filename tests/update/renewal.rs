@@ -1,0 +1,210 @@
+//! `coflash` renews the bootloader of a device while its program stays (docs/renewal.md).
+
+use std::process::Command;
+use std::sync::Arc;
+
+use canopen::program::FlashError;
+use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::endpoint::Endpoint;
+use coboot_tests::firmware;
+use coboot_tests::renewal::{number, running, version};
+use coboot_tests::sealed_board;
+use coflash::device::info;
+use coflash::file::ram_image::{RamImage, Version};
+use coflash::file::read::{read, Firmware, Format};
+use coflash::update::event::Phase;
+use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Renewal};
+use coflash::Error;
+use emulator::machine::{Cut, FlashCut, Operation};
+use shared_abi::handoff::ResetCause;
+use shared_abi::renewal::{Progress, State, TrialEnd};
+
+const NEW: u32 = 0x0009_0001;
+
+fn plain(bytes: &[u8]) -> NewBootloader {
+    let Ok(Firmware::Image(image)) = read(bytes, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
+    NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")))
+}
+
+/// A board that runs version 1 of the application.
+fn board() -> Bench {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    install(&mut bench, firmware::APP_V1);
+    bench
+}
+
+fn install(bench: &mut Bench, program: &str) {
+    flash(&mut bench.session(), &firmware::blocks(program), &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert!(!bench.is_bootloader(NODE));
+}
+
+fn renewed(bench: &mut Bench, new: &NewBootloader) -> (Result<Renewal, Error>, Vec<Phase>) {
+    let mut phases = Vec::new();
+    let result = renew(&mut bench.session(), new, &FlashOptions::default(), &mut |event| {
+        if let Event::Phase(phase) = event {
+            phases.push(phase);
+        }
+    });
+    (result, phases)
+}
+
+fn progress(bench: &mut Bench) -> Progress {
+    info(&mut bench.session()).unwrap().bootloader.expect("it can be renewed").progress
+}
+
+fn call_back(bench: &mut Bench) {
+    coflash::update::steps::call_back(&mut bench.session()).unwrap();
+}
+
+#[test]
+fn a_running_device_gets_a_new_bootloader_and_runs_again() {
+    let mut bench = board();
+    let new = plain(&version(firmware::BOOTLOADER, NEW));
+    let (result, phases) = renewed(&mut bench, &new);
+    let renewal = result.unwrap();
+    let expected = (number(), Version(1), Version(NEW), false, true);
+    let Renewal { number, from, to, unchanged, running: again, .. } = renewal;
+    assert_eq!((number, from, to, unchanged, again.is_some()), expected);
+    assert!(
+        matches!(
+            phases[..],
+            [
+                Phase::CallingBack,
+                Phase::InBootloader,
+                Phase::Renewing { from: 1, to: NEW, .. },
+                Phase::Staged,
+                Phase::OnTrial,
+                Phase::Installed { version: NEW },
+                Phase::Starting,
+                Phase::Started(_),
+            ]
+        ),
+        "{phases:?}"
+    );
+    assert!(!bench.is_bootloader(NODE));
+    call_back(&mut bench);
+    assert_eq!(running(&mut bench), NEW);
+    let info = info(&mut bench.session()).unwrap();
+    assert_eq!(info.programs.len(), firmware::board().programs.len(), "the bootloader is none of them");
+    assert!(
+        info.to_string().contains("bootloader        version 9.1, services 1, renewed as program 2"),
+        "{info}"
+    );
+    // The same again changes nothing.
+    bench.machine().keep_flash_log();
+    let (again, _) = renewed(&mut bench, &new);
+    assert!(again.unwrap().unchanged);
+    assert_eq!(bench.machine().take_flash_log(), []);
+    install(&mut bench, firmware::APP_V2);
+}
+
+/// The old bootloader is back, and the program runs again.
+#[test]
+fn a_bootloader_that_does_not_come_up_is_named_with_the_reason() {
+    let mut bench = board();
+    // Its Reset leads to a branch to itself.
+    let mut image = version(firmware::BOOTLOADER, NEW);
+    let reset = u32::from_le_bytes(image[68..72].try_into().unwrap()) & !1;
+    let at = 64 + (reset - firmware::board().ram.base) as usize;
+    image[at..at + 2].copy_from_slice(&0xE7FE_u16.to_le_bytes());
+    let hangs = coboot_tests::renewal::with_crc(image);
+    let (result, _) = renewed(&mut bench, &plain(&hangs));
+    let end = TrialEnd::Reset(ResetCause::IndependentWatchdog);
+    let Err(error @ Error::RenewalFailed { .. }) = result else { panic!("{result:?}") };
+    assert!(matches!(error, Error::RenewalFailed { end: found, .. } if found == end));
+    let words = "the new bootloader of node 1 ended by a reset: the independent watchdog; the old one runs";
+    assert_eq!(error.to_string(), words);
+    assert!(!bench.is_bootloader(NODE), "the program runs again");
+    call_back(&mut bench);
+    assert_eq!(progress(&mut bench).state, State::Staged);
+    // A good one goes through then.
+    renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW))).0.unwrap();
+}
+
+/// The power fails while the device installs the new bootloader.
+#[test]
+fn an_interrupted_renewal_goes_on_when_it_is_started_again() {
+    let new = plain(&version(firmware::BOOTLOADER, NEW));
+    let NewBootloader::Plain(image) = &new else { unreachable!() };
+    let words = image.bytes().len() as u64 / 4;
+    for operation in [words / 2, words + words / 2] {
+        let mut bench = board();
+        bench.machine().cut_power_at(Some(FlashCut { operation, when: Cut::Torn { seed: 7 } }));
+        assert!(renewed(&mut bench, &new).0.is_err());
+        bench.machine().cut_power_at(None);
+        bench.power_off();
+        bench.run_ms(100);
+        bench.power_on();
+        bench.await_program(1000);
+        renewed(&mut bench, &new).0.unwrap();
+        call_back(&mut bench);
+        assert_eq!((running(&mut bench), progress(&mut bench).state), (NEW, State::Installed));
+    }
+}
+
+/// A program in the way is named, and so is what to do about it.
+#[test]
+fn a_program_that_reaches_into_staging_is_named() {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    let staging = firmware::board().staging.unwrap();
+    let large =
+        firmware::made_up((staging.base - firmware::board().programs[0].base) as usize + 64, |at| at as u8);
+    let blocks = coflash::file::convert::blocks_of(
+        read(&large, Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap(),
+        &coflash::file::convert::Options::default(),
+    );
+    let options = FlashOptions::default().trial_run(false).start(false).force(true);
+    flash(&mut bench.session(), &blocks.unwrap().file, &options, &mut |_| {}).unwrap();
+    let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
+    let Err(error @ Error::Failed { error: FlashError::NotCleared, detail: 1, .. }) = result else {
+        panic!("{result:?}")
+    };
+    assert!(error.to_string().contains("program 1 reaches into the flash where a new bootloader waits"));
+    assert!(error.advice().contains("coflash erase --program 1"));
+}
+
+/// A sealed device takes a sealed one alone.
+#[test]
+fn an_unsigned_bootloader_is_refused_before_the_call() {
+    let mut bench = sealed_board::board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.machine().keep_flash_log();
+    let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
+    assert!(matches!(result, Err(Error::SealedOnly { .. })), "{result:?}");
+    let erased = |operation: &Operation| matches!(operation, Operation::Erase { .. });
+    assert!(!bench.machine().take_flash_log().iter().any(erased));
+}
+
+#[test]
+fn a_bootloader_without_renewal_says_so() {
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST);
+    bench.power_on();
+    bench.await_boot_up(100);
+    let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
+    assert!(matches!(result, Err(Error::NotRenewable { .. })), "{result:?}");
+}
+
+/// The command line, in real time.
+#[test]
+fn coflash_flash_knows_a_bootloader_by_its_header() {
+    let mut endpoint = Endpoint::new(board());
+    let file = firmware::dir().join(firmware::BOOTLOADER_WATCHDOG);
+    let url = endpoint.url();
+    let coflash = std::env::var("COBOOT_COFLASH").expect("cargo xtask test sets it");
+    let output = endpoint.run(Command::new(&coflash).args(["--bus", &url, "flash"]).arg(&file));
+    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    println!("{said}");
+    assert!(output.status.success(), "{said}");
+    for words in
+        ["renewing the bootloader (program 2): version 0.1 -> 0.1", "installed: bootloader 0.1", "done in "]
+    {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    let output = endpoint.run(Command::new(&coflash).args(["--bus", &url, "flash", "--no-trial"]).arg(&file));
+    assert_eq!(output.status.code(), Some(2));
+}
