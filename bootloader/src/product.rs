@@ -327,7 +327,7 @@ impl Product {
             crc_step: self.crc_step,
             seal: if SEALED { self.seal() } else { SealPolicy::NONE },
             read_back: self.reads_back(),
-            renewal: self.renewal(),
+            renewal: &RENEWAL,
             ..self.profile.download
         }
     }
@@ -350,17 +350,6 @@ impl Product {
             Some(renewal::number(LAYOUT.programs.len() as u8, self.profile.download.data))
         } else {
             None
-        }
-    }
-
-    /// The values for a renewal.
-    const fn renewal(&self) -> Renewal {
-        Renewal {
-            board: BOARD_IDENTITY,
-            features: FEATURES,
-            identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
-            revision: IDENTITY.revision,
-            confirm_within_s: self.renewal_s,
         }
     }
 
@@ -413,6 +402,15 @@ pub enum NodeSource {
 
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
+
+/// The values for a renewal of the bootloader.
+const RENEWAL: Renewal = Renewal {
+    board: BOARD_IDENTITY,
+    features: FEATURES,
+    identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
+    revision: IDENTITY.revision,
+    confirm_within_s: PRODUCT.renewal_s,
+};
 
 /// The choices that the resident part decides by and that the RAM image shares.
 pub const FACTS: Facts = Facts {

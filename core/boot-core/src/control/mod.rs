@@ -99,7 +99,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     policy: &'static Policy,
     parameters: P,
     programs: [Program; PROGRAMS],
-    programmer: Programmer<'b>,
+    programmer: Programmer<'b, P>,
     rights: Rights<'b>,
     transfer: Option<Transfer>,
     /// The abort for a client that continues to send after the flash has failed.
@@ -129,10 +129,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let mut number = 0;
         let programs = [(); PROGRAMS].map(|()| {
             number += 1;
-            let (record, partial) = if layout.program(number).is_some() {
-                load(&parameters, flash, number, &rights)
-            } else {
+            let (record, partial) = if P::RENEWS && layout.program(number).is_none() {
                 (None, Partial::NONE)
+            } else {
+                load(&parameters, flash, number, &rights)
             };
             Program {
                 region: layout.program(number).unwrap_or(Region::new(0, 0)),

@@ -90,7 +90,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         self.programmer.renewing = Some(Renewing {
             layout: self.layout,
-            policy: &self.policy.renewal,
+            policy: self.policy.renewal,
             host,
             places,
             has_record: record.is_some(),

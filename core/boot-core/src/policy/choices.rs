@@ -72,7 +72,7 @@ pub struct Policy {
     /// The values with which a sealed image is checked.
     pub seal: SealPolicy,
     /// The values for a renewal of the bootloader.
-    pub renewal: Renewal,
+    pub renewal: &'static Renewal,
 }
 
 /// The values for a renewal of the bootloader (docs/renewal.md).
@@ -155,7 +155,7 @@ impl Policy {
         crc: CrcKind::Crc32,
         crc_step: 1024,
         seal: SealPolicy::NONE,
-        renewal: Renewal::NONE,
+        renewal: &Renewal::NONE,
     };
 
     /// Whether a download that begins in this state first erases the flash. Otherwise each piece

@@ -14,6 +14,7 @@
 mod install;
 mod write;
 
+use core::marker::PhantomData;
 use core::task::Poll;
 
 use canopen::program::{FlashError, Supply, SUPPLY_DETAIL};
@@ -120,8 +121,10 @@ enum Change {
     Permit,
 }
 
-/// The flash half. It starts operations and polls them, but never waits for them.
-pub(crate) struct Programmer<'b> {
+/// The flash half. It starts operations and polls them, but never waits for them. `P` is the store of the
+/// device, which says what it can do.
+pub(crate) struct Programmer<'b, P> {
+    store: PhantomData<fn() -> P>,
     source: Source<'b>,
     crc_kind: CrcKind,
     crc_step: u32,
@@ -143,10 +146,11 @@ pub(crate) struct Programmer<'b> {
     running: Option<Step>,
 }
 
-impl<'b> Programmer<'b> {
+impl<'b, P: Parameters> Programmer<'b, P> {
     /// One step of a CRC covers `crc_step` bytes.
     pub(crate) fn new(source: Source<'b>, crc_kind: CrcKind, crc_step: u32) -> Self {
         Self {
+            store: PhantomData,
             source,
             crc_kind,
             crc_step,
@@ -268,6 +272,11 @@ impl<'b> Programmer<'b> {
         self.install = Some(Install::new(places, record));
     }
 
+    /// Whether a RAM image is being installed.
+    fn is_installing(&self) -> bool {
+        P::RENEWS && self.install.is_some()
+    }
+
     /// Stores node-ID and bit rate.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
         parameters.store(Key::NODE, node.value());
@@ -314,7 +323,7 @@ impl<'b> Programmer<'b> {
         let confirming = matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
-            || self.install.is_some()
+            || self.is_installing()
             || self.source.has_work()
             || self.target.as_ref().is_some_and(|target| target.clearing || target.erased < target.ahead)
     }
@@ -330,7 +339,7 @@ impl<'b> Programmer<'b> {
         };
         let waiting =
             |target: &Target| target.clearing || self.source.is_complete() || !self.source.has_room();
-        let installing = self.install.is_some() && program == BOOTLOADER;
+        let installing = self.is_installing() && program == BOOTLOADER;
         ending
             || installing
             || self.target.as_ref().map_or(self.has_work(), |target| current && waiting(target))
@@ -349,7 +358,7 @@ impl<'b> Programmer<'b> {
     /// Whether [`abort`](Self::abort) undoes nothing that a host believes to be done.
     pub(crate) fn is_abortable(&self) -> bool {
         let clearing = self.target.as_ref().is_some_and(|target| target.clearing);
-        !clearing && self.install.is_none() && self.finishing().is_none() && !self.is_storing_node()
+        !clearing && !self.is_installing() && self.finishing().is_none() && !self.is_storing_node()
     }
 
     /// Whether node-ID and bit rate are being stored.
@@ -359,7 +368,7 @@ impl<'b> Programmer<'b> {
 
     /// Continues the work with one step. `note` returns a value that must be stored although no host
     /// waits for it, once; it is stored before anything else is done.
-    pub(crate) fn step<F: Flash, P: Parameters>(
+    pub(crate) fn step<F: Flash>(
         &mut self,
         parameters: &mut P,
         flash: &mut F,
@@ -393,7 +402,7 @@ impl<'b> Programmer<'b> {
                     }
                 }
                 Next::Again => return (Step::Again, None),
-                Next::Done(result) => return (Step::Again, self.done::<P>(result)),
+                Next::Done(result) => return (Step::Again, self.done(result)),
             }
         }
     }
@@ -426,7 +435,7 @@ impl<'b> Programmer<'b> {
                     false => Next::Again,
                 };
             }
-            (Some(Job::Install), _) => {
+            (Some(Job::Install), _) if P::RENEWS => {
                 match self.install.as_mut().map(|install| install.next(flash, self.crc_step)) {
                     Some(Next::Start(operation)) => Ok(Some(operation)),
                     Some(Next::Again) => return Next::Again,
@@ -434,7 +443,7 @@ impl<'b> Programmer<'b> {
                     Some(Next::Done(Ok(()))) | None => Ok(None),
                 }
             }
-            (None, _) => Ok(None),
+            (Some(Job::Install) | None, _) => Ok(None),
         };
         match next {
             Ok(Some(operation)) => Next::Start(operation),
@@ -460,10 +469,10 @@ impl<'b> Programmer<'b> {
     }
 
     /// Ends the job.
-    fn done<P: Parameters>(&mut self, result: Result<(), FlashError>) -> Option<Event> {
+    fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
-            (Job::Store(Change::Permit, _), Ok(())) => {
+            (Job::Store(Change::Permit, _), Ok(())) if P::RENEWS => {
                 if let Some(install) = &mut self.install {
                     install.permitted();
                 }
@@ -523,16 +532,14 @@ impl<'b> Programmer<'b> {
     fn fail(&mut self, error: FlashError, erasing: bool) -> Option<Event> {
         self.source.fail(error);
         // The signature of a request for rights belongs to no program.
-        let program = match self.install.take() {
-            Some(_) => BOOTLOADER,
-            None => self.program().unwrap_or(0),
-        };
+        let program = if self.is_installing() { BOOTLOADER } else { self.program().unwrap_or(0) };
+        self.install = None;
         self.abort();
         Some(Event::Failed { program, error, erasing })
     }
 
     /// Chooses the next work for an idle flash: the first of these that there is.
-    fn choose<F: Flash, P: Parameters>(
+    fn choose<F: Flash>(
         &mut self,
         parameters: &mut P,
         flash: &F,
@@ -550,7 +557,7 @@ impl<'b> Programmer<'b> {
         }
         let piece = self.source.piece();
         if self.unwritten.is_none() {
-            self.give_up_old::<F, P>(flash, piece)?;
+            self.give_up_old(flash, piece)?;
         }
         if P::RENEWS {
             self.give_up_staging(piece);
@@ -581,11 +588,7 @@ impl<'b> Programmer<'b> {
 
     /// With the first piece, or for CLEAR, the old program is given up: its record must be removed
     /// first.
-    fn give_up_old<F: Flash, P: Parameters>(
-        &mut self,
-        flash: &F,
-        piece: Option<Piece>,
-    ) -> Result<(), FlashError> {
+    fn give_up_old<F: Flash>(&mut self, flash: &F, piece: Option<Piece>) -> Result<(), FlashError> {
         let Some(target) = &mut self.target else { return Ok(()) };
         if piece.is_none() && !target.clearing && !self.source.is_sized() {
             return Ok(());
@@ -694,7 +697,7 @@ impl<'b> Programmer<'b> {
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.
-    fn remove_record<F: Flash, P: Parameters>(&mut self, parameters: &mut P, flash: &F) -> Option<Job> {
+    fn remove_record<F: Flash>(&mut self, parameters: &mut P, flash: &F) -> Option<Job> {
         if self.voids == 0 {
             return None;
         }
