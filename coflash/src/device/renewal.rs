@@ -85,8 +85,10 @@ impl fmt::Display for Bootloader {
         let Self { number, version, services, progress: Progress { state, origin, trial_end: end } } = self;
         write!(f, "version {version}, services {services}, renewed as program {number}")?;
         match (state, origin) {
-            (_, Origin::Trial) => f.write_str("; it is on trial: coflash flash confirms it")?,
             (State::None, _) => {}
+            (State::Staged, Origin::Trial) => {
+                f.write_str("; it is on trial: coflash flash with its file confirms it")?;
+            }
             (State::Staged, _) => f.write_str("; another one waits for its trial")?,
             (State::Confirmed, _) => f.write_str("; it is confirmed, and not installed yet")?,
             (State::Installed, Origin::Spare) => {

@@ -1,20 +1,23 @@
 //! The renewal of a device's bootloader: a new RAM image is staged, runs once on trial, and is confirmed;
 //! then the device installs it (docs/renewal.md).
 
+use std::cell::RefCell;
 use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::program::{FlashStatus, ProgramControl, PROGRAM_DATA, PROGRAM_ID};
+use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::Address;
 use serde::Serialize;
-use shared_abi::renewal::{Origin, State, TrialEnd};
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
-use super::event::{Event, Phase};
+use super::event::{Event, Phase, Retry, Warning};
+use super::judge::{judge, Judgement};
 use super::options::FlashOptions;
-use super::steps::{enter_bootloader, execute, running_program, start};
+use super::steps::{enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::renewal::{bootloader, progress, Bootloader};
+use crate::device::session::Silence;
 use crate::device::{DeviceType, Doing, Error, Session};
 use crate::file::ram_image::{RamImage, Version};
 use crate::file::sealed::SealedFile;
@@ -22,9 +25,9 @@ use crate::json;
 
 /// A device leaves its bootloader within this time after the answer to START.
 const LEAVES_WITHIN: Duration = Duration::from_millis(200);
-/// An image that hangs is ended by the watchdog within this time: the longest one is 4 s, and the
-/// oscillator may be half as fast.
-const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(10);
+/// The old bootloader is back within this time: an image that nobody reaches, for example with another
+/// bit rate, ends after 60 s (`renewal_s` of the product); the watchdog ends one that hangs earlier.
+const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(75);
 
 /// A new bootloader.
 #[derive(Clone, Debug)]
@@ -108,6 +111,22 @@ pub fn renew(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
+    let tell = RefCell::new(tell);
+    let silence = |silence: Silence| {
+        let Silence { doing, silent, limit, .. } = silence;
+        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
+    };
+    let mut tell = |event| (tell.borrow_mut())(event);
+    let (node, timing) = (session.node(), *session.timing());
+    procedure(&mut session.with(node, timing).tell_silence(&silence), new, options, &mut tell)
+}
+
+fn procedure(
+    session: &mut Session<'_>,
+    new: &NewBootloader,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Renewal, Error> {
     let began = session.now();
     if options.alone {
         session.ensure_alone()?;
@@ -144,26 +163,25 @@ fn in_bootloader(
         }
     }
     let number = old.number;
-    // An installation that goes on ends first.
-    session.await_idle(number, Doing::Installation)?;
+    let running = settled(session, old)?;
     let (from, to) = (old.version, new.version());
     let unchanged = Renewal { number, from, to, unchanged: true, took: Duration::ZERO, running: None };
-    if !options.force && is_there(session, new, &old)? {
+    let is_same = is_same(session, new, number)?;
+    let is_open = running.origin == Origin::Trial && running.state == State::Staged;
+    if is_same && running.state != State::Staged && !options.force {
         return Ok(unchanged);
     }
     tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
-    if old.progress.origin == Origin::Trial {
-        // Somebody's trial is open. The image on it may be another one: the old bootloader comes back.
-        session.command(number, ProgramControl::ClrSignature)?;
-        await_other_image(session)?;
+    if !(is_same && is_open) {
+        leave_trial(session, number, running, tell)?;
+        stage(session, number, new, options, tell)?;
+        if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
+            // The device has found the same image.
+            return Ok(unchanged);
+        }
+        tell(Phase::Staged.into());
+        try_it(session, number)?;
     }
-    stage(session, number, new, tell)?;
-    if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
-        // The device has found the same image.
-        return Ok(unchanged);
-    }
-    tell(Phase::Staged.into());
-    try_it(session, number)?;
     tell(Phase::OnTrial.into());
     install(session, number)?;
     match progress(session)? {
@@ -178,15 +196,44 @@ fn in_bootloader(
     Ok(Renewal { to, unchanged: false, ..unchanged })
 }
 
-/// Whether the device runs this image from its home already. A sealed image is judged by the device.
-fn is_there(session: &mut Session<'_>, new: &NewBootloader, old: &Bootloader) -> Result<bool, Error> {
-    let NewBootloader::Plain(image) = new else { return Ok(false) };
-    let progress = old.progress;
-    if progress.origin != Origin::Home || matches!(progress.state, State::Staged | State::Confirmed) {
-        return Ok(false);
+/// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
+fn settled(session: &mut Session<'_>, old: Bootloader) -> Result<Progress, Error> {
+    session.await_idle(old.number, Doing::Installation)?;
+    let known = progress(session)?.unwrap_or(old.progress);
+    if known.state != State::Confirmed {
+        return Ok(known);
     }
-    let crc = session.read_number(Address::new(PROGRAM_ID, old.number))?;
-    Ok(crc == image.header().crc)
+    // No other image is taken before this one is installed.
+    install(session, old.number)?;
+    Ok(progress(session)?.unwrap_or(known))
+}
+
+/// Whether the device runs this image. A sealed image is judged by the device.
+fn is_same(session: &mut Session<'_>, new: &NewBootloader, number: u8) -> Result<bool, Error> {
+    let NewBootloader::Plain(image) = new else { return Ok(false) };
+    Ok(identification(session, number)? == image.header().crc)
+}
+
+/// Ends a trial, whose image takes no other one.
+fn leave_trial(
+    session: &mut Session<'_>,
+    number: u8,
+    running: Progress,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
+    match running {
+        Progress { origin: Origin::Trial, state: State::Staged, .. } => {
+            session.command(number, ProgramControl::ClrSignature)?;
+            await_other_image(session).map(drop)
+        }
+        // It is installed: the next start loads it from home.
+        Progress { origin: Origin::Trial, .. } => {
+            session.reset_node()?;
+            session.wait(LEAVES_WITHIN)?;
+            enter_bootloader(session, tell)
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Downloads the image into staging.
@@ -194,64 +241,42 @@ fn stage(
     session: &mut Session<'_>,
     number: u8,
     new: &NewBootloader,
+    options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
-    let mut attempt = 1;
-    loop {
-        match stage_once(session, number, new, tell) {
-            // It begins anew: the device keeps no part of a bootloader.
-            Err(Error::NoAnswer { .. } | Error::Protocol { .. }) if attempt < session.timing().attempts => {
-                attempt += 1;
-            }
-            result => return result,
-        }
-    }
-}
-
-fn stage_once(
-    session: &mut Session<'_>,
-    number: u8,
-    new: &NewBootloader,
-    tell: &mut dyn FnMut(Event),
-) -> Result<(), Error> {
-    execute(session, number, ProgramControl::Clear)?;
     let bytes = new.bytes();
     let total = bytes.len();
     let doing = Doing::Bootloader;
-    let sent = session.write(Address::new(PROGRAM_DATA, number), bytes, doing, &mut |done| {
-        tell(Event::Progress { done: done as usize, total });
-    });
-    let status = match sent {
-        Ok(()) => session.await_idle(number, doing)?,
-        // 1F57h says more than the abort.
-        Err(Error::Refused { code, .. }) => {
-            let status = session.await_idle(number, doing)?;
-            let Some(error) = status.error else {
-                return Err(Error::Refused { node: session.node(), doing, code });
-            };
-            return Err(Error::Failed { doing, error, detail: status.detail, code: Some(code) });
+    let mut repeat = 0;
+    loop {
+        execute(session, number, ProgramControl::Clear)?;
+        tell(Event::Progress { done: 0, total });
+        let sent = session.write(Address::new(PROGRAM_DATA, number), bytes, doing, &mut |done| {
+            tell(Event::Progress { done: done as usize, total });
+        });
+        if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
+            return Err(error);
         }
-        Err(error) => return Err(error),
-    };
-    match status.error {
-        None => Ok(()),
-        Some(error) => Err(Error::Failed { doing, error, detail: status.detail, code: None }),
+        // 1F57h says more than an abort.
+        let status = session.await_idle(number, doing)?;
+        match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
+            Judgement::Good => return Ok(()),
+            Judgement::Bad { why: Some(why), .. } if repeat < options.repeats => {
+                repeat += 1;
+                tell(Event::Retry(Retry::program(repeat, options.repeats, why)));
+            }
+            Judgement::Bad { error, .. } => return Err(error),
+        }
     }
 }
 
-/// Confirms the image on trial, and waits until the device has installed it.
+/// Confirms the image on trial, and waits until the device has installed it. 83h may be written twice.
 fn install(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
-    let doing = Doing::Installation;
-    match session.command(number, ProgramControl::SetSignature) {
-        // It may be carried out: 83h may be written twice, and 1F57h says more.
-        Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
-        Err(error) => return Err(error),
-    }
-    match session.await_idle(number, doing)? {
-        FlashStatus { error: None, .. } => Ok(()),
-        FlashStatus { error: Some(error), detail, .. } => {
-            Err(Error::Failed { doing, error, detail, code: None })
+    match execute(session, number, ProgramControl::SetSignature) {
+        Err(Error::Failed { error, detail, code, .. }) => {
+            Err(Error::Failed { doing: Doing::Installation, error, detail, code })
         }
+        result => result,
     }
 }
 
@@ -270,10 +295,10 @@ fn try_it(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
 }
 
 /// Waits for the bootloader that comes up after a reset; what it reports.
-fn await_other_image(session: &mut Session<'_>) -> Result<shared_abi::renewal::Progress, Error> {
+fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
     // The old one still answers for a moment.
     session.wait(LEAVES_WITHIN)?;
-    let deadline = session.now() + TRIAL_ENDS_WITHIN.max(session.timing().boot);
+    let (began, limit) = (session.now(), TRIAL_ENDS_WITHIN.max(session.timing().boot));
     loop {
         let pause = session.timing().sdo;
         match session.device_type()? {
@@ -282,10 +307,10 @@ fn await_other_image(session: &mut Session<'_>) -> Result<shared_abi::renewal::P
                     return Ok(progress);
                 }
             }
-            _ if session.now() >= deadline => {
+            _ if session.now() >= began + limit => {
                 return Err(Error::NoAnswer { node: session.node(), doing: Doing::Restart });
             }
-            _ => {}
+            _ => session.note_silence(began, limit, Doing::Restart),
         }
         session.await_boot_up(pause)?;
     }

@@ -8,5 +8,6 @@ mod many;
 mod master;
 mod mastership;
 mod procedure;
+mod renew;
 mod search;
 mod watch;

@@ -1,0 +1,432 @@
+//! The renewal of a bootloader against a fake device, which is played from docs/protocol.md: 2007h/1, /8 and
+//! /9, and the sub-index 2 of 1F50h to 1F57h.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use canopen::NodeId;
+use coflash::device::info::info;
+use coflash::device::{Session, Timing};
+use coflash::file::ram_image::{RamImage, Version};
+use coflash::file::raw;
+use coflash::update::event::{Phase, Warning};
+use coflash::update::{renew, Event, FlashOptions, NewBootloader, Renewal};
+use coflash::Error;
+
+use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+
+/// Abort codes (CiA 301 table 22).
+const NO_OBJECT: u32 = 0x0602_0000;
+const NOT_STORED: u32 = 0x0800_0020;
+const NOT_NOW: u32 = 0x0800_0022;
+
+/// The states in 2007h/9.
+const NONE: u8 = 0;
+const STAGED: u8 = 1;
+const CONFIRMED: u8 = 2;
+const INSTALLED: u8 = 3;
+/// The origins in 2007h/9.
+const HOME: u8 = 0;
+const TRIAL: u8 = 1;
+
+const OLD: u32 = 0x0001_0002;
+const NEW: u32 = 0x0001_0003;
+const OLD_CRC: u32 = 0x1234_5678;
+
+/// A RAM image, typed from the table of its header; its CRC is that of the words after the CRC.
+fn image(version: u32) -> Vec<u8> {
+    let mut bytes = b"CBI2".to_vec();
+    for word in [0, 64, 256, 0x2000_0000, 0x2001_FFC0, 1, 0, 7, 1, 2, 0, version, 0, 0, 0] {
+        bytes.extend(u32::to_le_bytes(word));
+    }
+    bytes.extend(0..=255_u8);
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&bytes[8..]);
+    bytes[4..8].copy_from_slice(&crc.to_le_bytes());
+    bytes
+}
+
+fn word_of(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+fn new() -> NewBootloader {
+    let image = raw::read(&image(NEW), Some(0x0801_0000)).unwrap();
+    NewBootloader::Plain(Arc::new(RamImage::find(&image).unwrap()))
+}
+
+/// What becomes of the image on trial.
+#[derive(Clone, Copy)]
+enum Trial {
+    /// It answers.
+    Works,
+    /// The old one is back, with these bytes in 2007h/9.
+    Ends([u8; 2]),
+}
+
+/// A device whose bootloader can be renewed.
+struct Board {
+    /// 2007h/1; `None` if it has no such object.
+    number: Option<u8>,
+    state: u8,
+    origin: u8,
+    end: [u8; 2],
+    home: (u32, u32),
+    staging: Option<(u32, u32)>,
+    trial: Trial,
+    /// How many reads of 1F57h are busy.
+    busy: u32,
+    status: u32,
+    /// How a download is refused: the abort code, and then 1F57h.
+    refuses: Option<(u32, u32)>,
+    /// How the installation fails: 1F57h.
+    fails: Option<u32>,
+    log: Log,
+}
+
+/// The writes to the bootloader's own sub-index.
+type Log = Arc<Mutex<Vec<String>>>;
+
+impl Board {
+    fn new(log: &Log) -> Self {
+        Self {
+            number: Some(2),
+            state: NONE,
+            origin: HOME,
+            end: [0; 2],
+            home: (OLD, OLD_CRC),
+            staging: None,
+            trial: Trial::Works,
+            busy: 0,
+            status: 0,
+            refuses: None,
+            fails: None,
+            log: log.clone(),
+        }
+    }
+
+    /// Version and CRC of what runs.
+    fn runs(&self) -> (u32, u32) {
+        self.staging.filter(|_| self.origin != HOME).unwrap_or(self.home)
+    }
+
+    fn restart(&mut self, origin: u8, end: [u8; 2]) -> Deed {
+        (self.origin, self.end) = (origin, end);
+        Deed::Restart(NODE, BOOTLOADER)
+    }
+
+    fn command(&mut self, command: u8) -> Result<Deed, u32> {
+        self.log.lock().unwrap().push(format!("{command:02X}"));
+        if self.busy > 0 {
+            self.status = 0x86;
+            return Err(NOT_NOW);
+        }
+        self.status = 0;
+        let on_trial = self.origin == TRIAL && self.state == STAGED;
+        Ok(match command {
+            0x03 | 0x84 if on_trial => self.restart(HOME, [2, 0]),
+            0x01 if self.state == STAGED && self.origin != TRIAL => match self.trial {
+                Trial::Works => self.restart(TRIAL, [0; 2]),
+                Trial::Ends(end) => self.restart(HOME, end),
+            },
+            0x83 if on_trial || self.state == CONFIRMED => {
+                self.busy = 3;
+                match self.fails.take() {
+                    Some(status) => (self.state, self.status) = (CONFIRMED, status),
+                    None => (self.state, self.home) = (INSTALLED, self.staging.unwrap()),
+                }
+                Deed::Nothing
+            }
+            0x01 => {
+                self.status = 0x02;
+                Deed::Nothing
+            }
+            _ => Deed::Nothing,
+        })
+    }
+
+    fn download(&mut self, data: &[u8]) -> Result<Deed, u32> {
+        self.log.lock().unwrap().push(format!("{} bytes", data.len()));
+        if let Some((code, status)) = self.refuses {
+            self.status = status;
+            return Err(code);
+        }
+        assert_eq!(data, image(NEW), "the image alone, as it lies in flash");
+        (self.state, self.staging) = (STAGED, Some((word_of(data, 48), word_of(data, 4))));
+        Ok(Deed::Nothing)
+    }
+}
+
+impl Maker for Board {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        if running != BOOTLOADER {
+            return None;
+        }
+        let number = match at {
+            (0x2007, 1) => return Some(self.number.map(|number| vec![number]).ok_or(NO_OBJECT)),
+            _ => self.number?,
+        };
+        match at {
+            (0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, 0) => Some(Ok(vec![number])),
+            (0x2007, 8) => Some(Ok((u64::from(self.runs().0) | 1 << 32).to_le_bytes().to_vec())),
+            (0x2007, 9) => Some(Ok([&[self.state, self.origin][..], &self.end].concat())),
+            (0x1F51, 2) => Some(Ok(vec![1])),
+            (0x1F56, 2) => Some(Ok(self.runs().1.to_le_bytes().to_vec())),
+            (0x1F57, 2) if self.busy > 0 => {
+                self.busy -= 1;
+                Some(Ok(vec![1, 0, 0, 0]))
+            }
+            (0x1F57, 2) => Some(Ok(self.status.to_le_bytes().to_vec())),
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>> {
+        match at {
+            (0x1F51, 2) if running == BOOTLOADER => Some(self.command(data[0])),
+            (0x1F50, 2) if running == BOOTLOADER => Some(self.download(data)),
+            _ => None,
+        }
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        self.origin = HOME;
+        Some((NODE, BOOTLOADER))
+    }
+}
+
+/// A device with this board; `change` changes it first.
+fn device(running: u32, change: impl FnOnce(&mut Board)) -> (Fake, Log) {
+    let log = Log::default();
+    let mut board = Board::new(&log);
+    change(&mut board);
+    let mut fake = Fake::new(running);
+    fake.maker = Some(Box::new(board));
+    (fake, log)
+}
+
+fn run_with(fake: &mut Fake, options: &FlashOptions) -> (Result<Renewal, Error>, Vec<Event>) {
+    let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
+    let mut events = Vec::new();
+    let result = renew(&mut session, &new(), options, &mut |event| {
+        if !matches!(event, Event::Progress { .. }) {
+            events.push(event);
+        }
+    });
+    (result, events)
+}
+
+fn run(fake: &mut Fake) -> (Result<Renewal, Error>, Vec<Event>) {
+    run_with(fake, &FlashOptions::default())
+}
+
+/// What was written to the bootloader's sub-index.
+fn written(log: &Log) -> Vec<String> {
+    std::mem::take(&mut log.lock().unwrap())
+}
+
+/// The writes of a whole renewal.
+const WHOLE: [&str; 4] = ["03", "320 bytes", "01", "83"];
+
+#[test]
+fn a_bootloader_is_staged_tried_confirmed_and_installed() {
+    let (mut fake, log) = device(BOOTLOADER, |_| {});
+    let (result, events) = run(&mut fake);
+    let renewal = result.unwrap();
+    let Renewal { number, from, to, unchanged, running, .. } = renewal;
+    assert_eq!((number, from, to, unchanged, running), (2, Version(OLD), Version(NEW), false, None));
+    assert!(renewal.to_string().ends_with("bootloader 1.2 -> 1.3, installed"), "{renewal}");
+    assert_eq!(written(&log), WHOLE);
+    // The program was not started: it did not run before.
+    assert_eq!(fake.count("command 01"), 0);
+    assert!(matches!(
+        events[..],
+        [
+            Event::Found(_),
+            Event::Phase(Phase::Renewing { number: 2, from: OLD, to: NEW }),
+            Event::Phase(Phase::Staged),
+            Event::Phase(Phase::OnTrial),
+            Event::Phase(Phase::Installed { version: NEW }),
+        ]
+    ));
+    // The same again writes nothing, also while the image runs that was on trial.
+    assert!(run(&mut fake).0.unwrap().unchanged);
+    assert_eq!(written(&log), [] as [&str; 0]);
+}
+
+#[test]
+fn a_program_that_ran_runs_again() {
+    for trial in [Trial::Works, Trial::Ends([1, 0])] {
+        let (mut fake, _) = device(APPLICATION, |board| board.trial = trial);
+        let (result, events) = run(&mut fake);
+        assert_eq!(result.is_ok(), matches!(trial, Trial::Works));
+        assert_eq!(fake.writes().iter().filter(|entry| *entry == &"command 01").count(), 1);
+        assert_eq!(fake.running, Some(APPLICATION));
+        assert_eq!(
+            events.iter().any(|event| matches!(event, Event::Phase(Phase::Started(_)))),
+            result.is_ok()
+        );
+    }
+}
+
+/// Each end of a trial, and how it is called.
+#[test]
+fn the_end_of_a_trial_is_told_in_words() {
+    for (end, words) in [
+        ([1, 0], "was not confirmed in time"),
+        ([2, 0], "was given up by a master"),
+        ([3, 4], "ended by a reset: the independent watchdog"),
+        ([4, 1], "could not be loaded: its header is wrong"),
+        ([4, 2], "could not be loaded: it needs a newer resident part, or another ability of it"),
+        ([4, 3], "could not be loaded: its CRC is wrong"),
+    ] {
+        let (mut fake, log) = device(BOOTLOADER, |board| board.trial = Trial::Ends(end));
+        let error = run(&mut fake).0.unwrap_err();
+        assert_eq!(error.to_string(), format!("the new bootloader of node 5 {words}; the old one runs"));
+        assert_eq!(error.number(), 0x6000_0014);
+        assert!(error.advice().contains("nothing is lost"), "{}", error.advice());
+        assert_eq!(written(&log), &WHOLE[..3], "83h is not written to the old one");
+    }
+}
+
+/// An image that nobody reaches ends after a minute; the tool waits for the old one, and says so.
+#[test]
+fn a_deaf_image_is_waited_for() {
+    let (mut fake, _) = device(BOOTLOADER, |board| board.trial = Trial::Ends([1, 0]));
+    fake.restart_time = Duration::from_secs(61);
+    let (result, events) = run(&mut fake);
+    assert!(matches!(result, Err(Error::RenewalFailed { .. })), "{result:?}");
+    assert!(events.iter().any(|event| matches!(event, Event::Warning(Warning::Silent { .. }))), "{events:?}");
+
+    let (mut fake, _) = device(BOOTLOADER, |_| {});
+    fake.restart_time = Duration::from_secs(1000);
+    let began = fake.now;
+    assert!(matches!(run(&mut fake).0, Err(Error::NoAnswer { .. })));
+    assert!(fake.now - began < Duration::from_secs(80));
+}
+
+/// A refusal of the device, before it erases anything: its words and what to do.
+#[test]
+fn a_refusal_says_what_to_do() {
+    for (code, status, words, advice) in [
+        (NOT_NOW, 1 << 16 | 0x08, "program 1 reaches into the flash", "coflash erase --program 1"),
+        (NOT_STORED, 0x04, "writing the bootloader", "another board"),
+        (NOT_NOW, 4 << 16 | 0x0E, "sector 4 of the flash is write-protected", "debug probe"),
+        (NOT_NOW, 1 << 16 | 0x84, "the supply of the device is too low", "supply"),
+    ] {
+        let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((code, status)));
+        let error = run(&mut fake).0.unwrap_err();
+        assert!(error.to_string().contains(words), "{status:X}: {error}");
+        assert!(error.advice().contains(advice), "{status:X}: {}", error.advice());
+        assert_eq!(written(&log), &WHOLE[..2], "{status:X}");
+    }
+    // Busy may pass.
+    let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((NOT_NOW, 0x86)));
+    assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
+    assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"]);
+}
+
+#[test]
+fn a_device_without_renewal_is_left_alone() {
+    for number in [None, Some(0)] {
+        let (mut fake, log) = device(BOOTLOADER, |board| board.number = number);
+        let error = run(&mut fake).0.unwrap_err();
+        assert_eq!(error.to_string(), "the bootloader of node 5 cannot be renewed over the bus");
+        assert!(error.advice().contains("debug probe"));
+        assert_eq!((written(&log), fake.writes()), (vec![], vec![]));
+    }
+}
+
+/// What an earlier renewal has left.
+#[test]
+fn a_renewal_goes_on_from_whatever_state() {
+    let crc = word_of(&image(NEW), 4);
+    let this = Some((NEW, crc));
+    let other = Some((7, 8));
+    let all = |state, origin, staging| {
+        move |board: &mut Board| {
+            (board.state, board.origin, board.staging) = (state, origin, staging);
+            if state == INSTALLED {
+                board.home = staging.unwrap();
+            }
+        }
+    };
+    let whole = WHOLE.to_vec();
+    let again = |first: &'static str| [&[first][..], &WHOLE].concat();
+    for (state, origin, staging, expected) in [
+        (STAGED, HOME, this, whole.clone()),
+        (INSTALLED, HOME, other, whole.clone()),
+        // It is on trial: it gets the confirmation. Another one is given up first.
+        (STAGED, TRIAL, this, vec!["83"]),
+        (STAGED, TRIAL, other, again("84")),
+        // It is installed, and runs from staging yet: a restart loads it from home.
+        (INSTALLED, TRIAL, other, whole.clone()),
+        // It is confirmed: first it is installed.
+        (CONFIRMED, 2, this, vec!["83"]),
+        (CONFIRMED, 2, other, again("83")),
+    ] {
+        let case = format!("{state} {origin} {staging:?}");
+        let (mut fake, log) = device(BOOTLOADER, all(state, origin, staging));
+        run(&mut fake).0.unwrap_or_else(|error| panic!("{case}: {error}"));
+        assert_eq!(written(&log), expected, "{case}");
+        let resets = fake.writes().iter().filter(|entry| entry.starts_with("nmt")).count();
+        assert_eq!(resets, usize::from((state, origin) == (INSTALLED, TRIAL)), "{case}");
+    }
+    // An installation that goes on is waited for.
+    let (mut fake, log) = device(BOOTLOADER, |board| {
+        all(INSTALLED, 2, this)(board);
+        board.busy = 20;
+    });
+    assert!(run(&mut fake).0.unwrap().unchanged);
+    assert_eq!(written(&log), [] as [&str; 0]);
+    // The user insists.
+    let (mut fake, log) = device(BOOTLOADER, all(INSTALLED, HOME, this));
+    assert!(!run_with(&mut fake, &FlashOptions::default().force(true)).0.unwrap().unchanged);
+    assert_eq!(written(&log), whole);
+}
+
+/// 83h may be written twice, and is tried again after an installation that failed.
+#[test]
+fn an_installation_that_fails_says_so_and_can_be_tried_again() {
+    let (mut fake, log) = device(BOOTLOADER, |board| board.fails = Some(1 << 16 | 0x84));
+    let error = run(&mut fake).0.unwrap_err();
+    assert!(error.to_string().contains("installing the bootloader"), "{error}");
+    assert!(error.to_string().contains("supply"), "{error}");
+    assert_eq!(written(&log), WHOLE);
+    run(&mut fake).0.unwrap();
+    assert_eq!(written(&log), ["83"]);
+}
+
+/// The bootloader is no program in `info`, and has a line of its own.
+#[test]
+fn info_shows_the_bootloader_and_its_renewal() {
+    for (state, origin, end, words) in [
+        (NONE, HOME, [0, 0], ""),
+        (STAGED, HOME, [0, 0], "; another one waits for its trial"),
+        (STAGED, TRIAL, [0, 0], "; it is on trial: coflash flash with its file confirms it"),
+        (
+            STAGED,
+            HOME,
+            [1, 0],
+            "; another one waits for its trial; the last one on trial was not confirmed in time",
+        ),
+        (CONFIRMED, 2, [0, 0], "; it is confirmed, and not installed yet"),
+        (INSTALLED, TRIAL, [0, 0], "; a spare of it is in the flash of the last program"),
+        (INSTALLED, HOME, [0, 0], "; a spare of it is in the flash of the last program"),
+        (INSTALLED, 3, [0, 0], "; its place was damaged, and is being repaired"),
+    ] {
+        let (mut fake, _) = device(BOOTLOADER, |board| {
+            (board.state, board.origin, board.end) = (state, origin, end);
+        });
+        let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
+        let info = info(&mut session).unwrap();
+        assert_eq!(info.programs.len(), 1);
+        let bootloader = info.bootloader.unwrap();
+        let line = format!("version 1.2, services 1, renewed as program 2{words}");
+        assert_eq!(bootloader.to_string(), line);
+        let json = serde_json::to_value(info).unwrap();
+        let names = ["none", "staged", "confirmed", "installed"];
+        assert_eq!(json["bootloader"]["state"], names[usize::from(state)]);
+        assert_eq!(json["bootloader"]["version"], OLD);
+        assert_eq!(json["programs"].as_array().unwrap().len(), 1);
+    }
+}
