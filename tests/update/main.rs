@@ -11,6 +11,7 @@ mod powercut;
 mod powercut_board;
 mod recording;
 mod renewal;
+mod renewal_states;
 mod resume;
 mod streams;
 mod throughput;

@@ -28,6 +28,8 @@ pub(super) struct Renewal {
     trial_end: TrialEnd,
     /// The version of the running image.
     version: u32,
+    /// 1F56h of the running image.
+    identification: u32,
     /// What the device has for a RAM image; a copy for the same reason.
     host: Host,
 }
@@ -39,6 +41,7 @@ impl Renewal {
         origin: Origin::Home,
         trial_end: TrialEnd::None,
         version: 0,
+        identification: 0,
         host: Host { board: 0, services: 0, features: 0 },
     };
 
@@ -78,15 +81,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let header = header(flash, running);
         let BootReport { origin, trial_end, .. } = *report;
         let host = self.policy.renewal.host(self.parameters.services());
-        self.renewal = Renewal { record, origin, trial_end, version: header.version, host };
+        let identification = match header.crc {
+            // An image for the bench.
+            0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
+            crc => crc,
+        };
+        self.renewal = Renewal { record, origin, trial_end, version: header.version, identification, host };
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
-            state.identification = header.crc;
-            if header.crc == 0 {
-                // An image for the bench.
-                let size = header.total().min(running.size);
-                state.identification = flash.crc32(0, Region::new(running.base, size));
-            }
+            state.identification = identification;
         }
         self.programmer.renewing = Some(Renewing {
             layout: self.layout,
@@ -179,6 +182,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.renewal.record = record;
         if let Some(renewing) = &mut self.programmer.renewing {
             renewing.has_record = record.is_some();
+        }
+        if record.is_none() {
+            // Nothing is staged any more.
+            let identification = self.renewal.identification;
+            if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
+                state.identification = identification;
+            }
         }
     }
 
