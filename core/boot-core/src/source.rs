@@ -18,9 +18,6 @@ pub(crate) struct Source<'b> {
     pub queue: Queue<'b>,
     /// The sealed image, if the program came as one.
     pub unsealer: Unsealer<'b>,
-    /// What is added to the address of a piece: a new RAM image is linked for home, and written to
-    /// staging.
-    offset: u32,
     /// `Some` from the end of the program's data until the program is to be verified.
     ended: Option<Expected>,
 }
@@ -41,13 +38,11 @@ pub(crate) enum Demand {
 
 impl<'b> Source<'b> {
     pub(crate) fn new(buffer: &'b mut [u8], unsealer: Unsealer<'b>) -> Self {
-        Self { queue: Queue::new(buffer), unsealer, offset: 0, ended: None }
+        Self { queue: Queue::new(buffer), unsealer, ended: None }
     }
 
-    /// Another program begins, whose pieces are written `offset` after their addresses; or none. The
-    /// queue stays.
-    pub(crate) fn rest(&mut self, offset: u32) {
-        self.offset = offset;
+    /// Another program begins, or none: the queue stays.
+    pub(crate) fn rest(&mut self) {
         self.unsealer.rest();
         self.ended = None;
     }
@@ -55,7 +50,7 @@ impl<'b> Source<'b> {
     /// Discards the received data.
     pub(crate) fn clear(&mut self) {
         self.queue.clear();
-        self.rest(0);
+        self.rest();
     }
 
     /// The program was sent completely.
@@ -106,8 +101,7 @@ impl<'b> Source<'b> {
         if self.unsealer.is_active() {
             self.unsealer.piece()
         } else {
-            let Piece { address, size } = self.queue.first()?;
-            Some(Piece { address: address.wrapping_add(self.offset), size })
+            self.queue.first()
         }
     }
 

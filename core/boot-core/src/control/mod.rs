@@ -110,7 +110,8 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     outcome: Option<(u8, Result<(), FlashError>)>,
     /// The result of the last storing of node-ID and bit rate.
     node_stored: Result<(), FlashError>,
-    renewal: renewal::Renewal,
+    /// `None` if the bootloader cannot be renewed.
+    renewal: Option<renewal::Renewal>,
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
@@ -159,7 +160,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             boot_request: None,
             outcome: None,
             node_stored: Ok(()),
-            renewal: renewal::Renewal::NONE,
+            renewal: None,
         }
     }
 

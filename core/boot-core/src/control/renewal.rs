@@ -20,6 +20,7 @@ use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
 
 /// What is known about a renewal.
+#[derive(Clone, Copy)]
 pub(super) struct Renewal {
     /// The stored record; a copy, because the flash cannot be read while it is busy.
     record: Option<RenewalRecord>,
@@ -54,23 +55,34 @@ impl Renewal {
 }
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
+    /// What is known; of a device without renewal, nothing.
+    fn known(&self) -> Renewal {
+        self.renewal.unwrap_or(Renewal::NONE)
+    }
+
+    fn set_record(&mut self, record: Option<RenewalRecord>) {
+        if let Some(renewal) = &mut self.renewal {
+            renewal.record = record;
+        }
+    }
+
     /// 2007h/9.
     #[must_use]
     pub fn renewal(&self) -> Progress {
-        let Renewal { origin, trial_end, .. } = self.renewal;
-        Progress { state: self.renewal.state(), origin, trial_end }
+        let Renewal { origin, trial_end, .. } = self.known();
+        Progress { state: self.known().state(), origin, trial_end }
     }
 
     /// 2007h/8: the version of the running image, and that of the services of the resident part.
     #[must_use]
     pub fn versions(&self) -> [u8; 8] {
-        let Renewal { version, host, .. } = self.renewal;
+        let Renewal { version, host, .. } = self.known();
         (u64::from(host.services) << 32 | u64::from(version)).to_le_bytes()
     }
 
     /// What the device has for a RAM image.
     pub(super) fn host(&self) -> Host {
-        self.renewal.host
+        self.known().host
     }
 
     /// Starts with the report of the resident part. What a cut has interrupted goes on.
@@ -86,7 +98,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
             crc => crc,
         };
-        self.renewal = Renewal { record, origin, trial_end, version: header.version, identification, host };
+        self.renewal =
+            Some(Renewal { record, origin, trial_end, version: header.version, identification, host });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = identification;
@@ -112,7 +125,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             // Such a record may read differently each time: it is not relied upon before a master confirms
             // the image again.
             (State::Confirmed, Origin::Home) => {
-                self.renewal.record = Some(RenewalRecord { state: State::Staged, ..record });
+                self.set_record(Some(RenewalRecord { state: State::Staged, ..record }));
             }
             _ => {}
         }
@@ -121,7 +134,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Takes the time since the start of the image: a trial ends by itself.
     pub(crate) fn watch_trial(&mut self, now: Instant) {
         let ends = u32::from(self.policy.renewal.confirm_within_s) * 1000;
-        let is_open = self.renewal.origin == Origin::Trial && self.renewal.state() == State::Staged;
+        let is_open = self.known().origin == Origin::Trial && self.known().state() == State::Staged;
         if is_open && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
             self.boot_request = Some(BootRequest::TrialLate);
         }
@@ -131,7 +144,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn command_bootloader(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        let on_trial = self.renewal.origin == Origin::Trial && self.renewal.state() == State::Staged;
+        let Renewal { origin, .. } = self.known();
+        let is = self.known().state();
+        let on_trial = origin == Origin::Trial && is == State::Staged;
         let busy = self.boot_request.is_some() || self.programmer.has_work();
         let loads = self.transfer.is_some() || self.programmer.program().is_some();
         let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else {
@@ -144,7 +159,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let own = self.programmer.program() == Some(BOOTLOADER);
         let restarts = command == Clear && own && self.programmer.is_abortable();
         // A start would break off a download, and nobody starts a second trial from a first one.
-        if busy && !restarts || command == Start && (loads && !own || self.renewal.origin == Origin::Trial) {
+        if busy && !restarts || command == Start && (loads && !own || origin == Origin::Trial) {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         if matches!(command, Clear | SetSignature | ClrSignature | Start)
@@ -160,9 +175,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 self.download_cancel();
                 self.programmer.abort();
             }
-            Start if self.renewal.state() == State::Staged => self.boot_request = Some(BootRequest::Try),
+            Start if is == State::Staged => self.boot_request = Some(BootRequest::Try),
             Start => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
-            SetSignature if on_trial || self.renewal.state() == State::Confirmed => self.install(),
+            SetSignature if on_trial || is == State::Confirmed => self.install(),
             SetSignature | Stop | StartBootloader | ResetStat | ClrSignature => {}
         }
         Ok(())
@@ -171,7 +186,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// A master has reached the image on trial, and confirms it; or an installation that has failed is
     /// tried again.
     fn install(&mut self) {
-        if let (Some(places), Some(record)) = (Places::of(self.layout), self.renewal.record) {
+        if let (Some(places), Some(record)) = (Places::of(self.layout), self.known().record) {
             self.programmer.install(places, record);
         }
     }
@@ -179,13 +194,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// The record of the image was stored or removed.
     pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
         let record = RenewalRecord::load(&self.parameters, flash);
-        self.renewal.record = record;
+        self.set_record(record);
         if let Some(renewing) = &mut self.programmer.renewing {
             renewing.has_record = record.is_some();
         }
         if record.is_none() {
             // Nothing is staged any more.
-            let identification = self.renewal.identification;
+            let identification = self.known().identification;
             if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
                 state.identification = identification;
             }
@@ -225,7 +240,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Ok(());
         }
         let mut detail = 0;
-        let error = if self.renewal.state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
+        let error = if self.known().state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
         {
             Some(FlashError::Busy)
         } else if program != BOOTLOADER || self.programmer.is_busy() {
@@ -259,12 +274,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Whether a program has to leave staging alone, because its image is confirmed and not installed yet.
     pub(super) fn keeps_staging(&self, program: u8) -> bool {
         let is_last = usize::from(program) == self.layout.programs.len();
-        is_last && self.renewal.state() == State::Confirmed
+        is_last && self.known().state() == State::Confirmed
     }
 
     /// Whether the running image is on trial.
     pub(super) fn is_on_trial(&self) -> bool {
-        self.renewal.origin == Origin::Trial && self.renewal.state() != State::Confirmed
+        self.known().origin == Origin::Trial && self.known().state() != State::Confirmed
     }
 
     /// A download of a new image begins: a download of the last program that has reached staging does not

@@ -195,8 +195,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     (erases, partial) = (true, Partial::begin(0, staging.base));
                 }
                 let region = staging.unwrap_or(state.region);
-                let offset = region.base.wrapping_sub(state.region.base);
-                self.programmer.open(program, region, erases, begin.size, partial, offset);
+                self.programmer.open(program, region, erases, begin.size, partial);
                 if findings.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
                     self.programmer.disown();

@@ -13,6 +13,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next};
 use crate::policy::Renewal;
 use crate::program::FlashCrc;
+use crate::queue::Piece;
 use crate::renewal::{header, Places};
 use crate::sequence::{EraseSectors, ProgramWords};
 use crate::store::{RenewalRecord, Value};
@@ -53,6 +54,13 @@ impl Renewing {
             Some(Err(Difference::ProductCode)) => Err(FlashError::WrongProductId),
             Some(Ok(())) | None => Ok(()),
         }
+    }
+
+    /// A piece of a new RAM image at its place in staging. Those of a sealed one are there already.
+    pub(super) fn placed(&self, piece: Piece, is_sealed: bool) -> Piece {
+        let Places { home, staging } = self.places;
+        let offset = if is_sealed { 0 } else { staging.base.wrapping_sub(home.base) };
+        Piece { address: piece.address.wrapping_add(offset), ..piece }
     }
 
     /// Whether the last program's flash up to `end` is a part of staging, and has a record.

@@ -185,16 +185,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// otherwise each piece must find its place erased.
     /// `partial` is the progress to begin with: a download that goes on begins after its region's
     /// start.
-    /// The pieces are written `offset` after their addresses.
-    pub(crate) fn open(
-        &mut self,
-        program: u8,
-        region: Region,
-        erase: bool,
-        size: u32,
-        partial: Partial,
-        offset: u32,
-    ) {
+    pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
         let (erased, ahead) = if erase {
             (partial.start(), region.base + size.min(region.size))
         } else {
@@ -202,7 +193,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         };
         let (untouched, clearing, half_erased) = (Some(ahead), false, true);
         let ahead = erased;
-        self.source.rest(offset);
+        self.source.rest();
         self.target =
             Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, partial });
     }
@@ -220,7 +211,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Removes the record of a program, then erases all its sectors that are not erased.
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
-        self.open(program, region, true, region.size, Partial::begin(0, region.base), 0);
+        self.open(program, region, true, region.size, Partial::begin(0, region.base));
         if let Some(target) = &mut self.target {
             target.clearing = true;
         }
@@ -555,7 +546,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 }
             }
         }
-        let piece = self.source.piece();
+        let piece = self.piece();
         if self.unwritten.is_none() {
             self.give_up_old(flash, piece)?;
         }
@@ -578,6 +569,18 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         match piece {
             Some(piece) => target.write::<F, P>(flash, piece).map(Some),
             None => self.complete_program(parameters),
+        }
+    }
+
+    /// The next piece of the source. The blocks of a new RAM image have the addresses of home, and are
+    /// written to staging.
+    fn piece(&self) -> Option<Piece> {
+        let piece = self.source.piece()?;
+        match &self.renewing {
+            Some(renewing) if P::RENEWS && self.program() == Some(BOOTLOADER) => {
+                Some(renewing.placed(piece, self.source.unsealer.is_active()))
+            }
+            _ => Some(piece),
         }
     }
 
