@@ -1,6 +1,7 @@
 //! An error of the work, and its Python exception (`coflash/errors.py`).
 
 use coflash::device::Error;
+use coflash::file::ram_image;
 use coflash::file::sealed::Refusal;
 use coflash::file::FileError;
 use coflash::update::refusal_number;
@@ -16,6 +17,8 @@ pub enum Fault {
     File(FileError),
     /// The sealed image with this name is invalid.
     Sealed(String, Refusal),
+    /// The bootloader in the file with this name is invalid.
+    Bootloader(String, ram_image::Fault),
     /// An error of the bus or the device.
     Device(Error),
 }
@@ -35,6 +38,10 @@ impl Fault {
             Self::Sealed(file, refusal) => {
                 let what = format!("{file}: {refusal}");
                 ("FileError", refusal_number(&refusal), what, refusal.advice().to_owned())
+            }
+            Self::Bootloader(file, fault) => {
+                let advice = ram_image::Fault::ADVICE.to_owned();
+                ("FileError", ram_image::Fault::NUMBER, format!("{file}: {fault}"), advice)
             }
             Self::Device(error) => {
                 let class = match &error {

@@ -17,7 +17,7 @@ use coflash::device::{self, Dialect, ScanOptions, Session, Timing};
 use coflash::file::convert::{blocks_of, ConvertError, Options, Region};
 use coflash::file::sealed::SealedFile;
 use coflash::file::{self, limit, Format};
-use coflash::update::{self, FlashOptions, Password, Program};
+use coflash::update::{self, FlashOptions, NewBootloader, Password, Program};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -46,7 +46,7 @@ mod _native {
     }
 }
 
-/// Downloads a program into a device, and starts it.
+/// Downloads a program into a device, and starts it; a bootloader renews that of the device.
 ///
 /// `bus` is a URL as for the command line's `--bus`. The file is read and checked before the bus is
 /// opened. `on_event` is called with a dictionary for each event, the last one being `done`. If it
@@ -202,7 +202,7 @@ fn object<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, P
     Ok(pythonize::pythonize(py, value)?)
 }
 
-/// A sealed image unchanged, or the blocks of any other file, for this board if one is named; a raw
+/// A bootloader, a sealed image unchanged, or the blocks of any other file, for this board if one is named; a raw
 /// binary gets its address.
 fn program_of(
     path: &std::path::Path,
@@ -221,6 +221,11 @@ fn program_of(
     };
     let fault = |error: file::ReadError| Fault::File(error.of(path.display()));
     let bytes = limit::read(path).map_err(|cause| fault(file::Place::File.fault(cause)))?;
+    let format = address.map(|_| Format::Raw).or_else(|| Format::detect(&bytes));
+    let bootloader = NewBootloader::in_file(&bytes, format);
+    if let Some(new) = bootloader.map_err(|fault| Fault::Bootloader(path.display().to_string(), fault))? {
+        return Ok(new.into());
+    }
     if Format::detect(&bytes) == Some(Format::Sealed) {
         let sealed = SealedFile::for_program(bytes, program);
         let sealed = sealed.map_err(|refusal| Fault::Sealed(path.display().to_string(), refusal))?;

@@ -167,7 +167,8 @@ impl Devices for Buses<'_> {
 
 /// A program in words.
 fn of(program: &Program) -> String {
-    format!("program of {} bytes, CRC {:08X}h", program.program_size(), program.program_crc())
+    let kind = if program.is_bootloader() { "bootloader" } else { "program" };
+    format!("{kind} of {} bytes, CRC {:08X}h", program.program_size(), program.program_crc())
 }
 
 /// The news in an event of an update.
@@ -178,7 +179,9 @@ fn news_of(event: &Event) -> Vec<News> {
             let percent = (done * 100).checked_div(*total).unwrap_or(100);
             vec![News::Percent(u8::try_from(percent).unwrap_or(100))]
         }
-        Event::Phase(Phase::Released | Phase::Started(_)) => vec![News::Kept, phase],
+        Event::Phase(Phase::Released | Phase::Started(_) | Phase::Installed { .. }) => {
+            vec![News::Kept, phase]
+        }
         Event::Done(_) => Vec::new(),
         _ => vec![phase],
     }
@@ -227,6 +230,7 @@ fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
         all.extend(state.option_bytes.map(|options| ("option_bytes".to_string(), options.to_string())));
         all.extend(supply(state.supply).map(|words| ("supply".to_string(), words.to_string())));
     }
+    all.extend(info.bootloader.map(|bootloader| ("bootloader".to_string(), bootloader.version.to_string())));
     for program in &info.programs {
         let key = |what: &str| format!("program_{}_{what}", program.number);
         let crc = program.crc.filter(|crc| *crc != 0);

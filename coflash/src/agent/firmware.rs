@@ -6,9 +6,10 @@ use std::sync::Arc;
 use super::config::Device;
 use crate::file::convert::{blocks_of, Options, Region};
 use crate::file::judge::judge;
+use crate::file::ram_image::Fault;
 use crate::file::sealed::SealedFile;
 use crate::file::{self, AddressRange, Format};
-use crate::update::Program;
+use crate::update::{NewBootloader, Program};
 
 /// Reads and judges a firmware file, as `coflash flash` does, without the device.
 ///
@@ -18,6 +19,10 @@ pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Progr
     let lines = |what: String, advice: &str| vec![what, format!("what to do: {advice}")];
     let anew = "deploy the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image";
     let format = Format::of(Path::new(name), bytes);
+    let bootloader = NewBootloader::in_file(bytes, format);
+    if let Some(new) = bootloader.map_err(|fault| lines(format!("{name}: {fault}"), Fault::ADVICE))? {
+        return Ok(new.into());
+    }
     if format == Some(Format::Sealed) {
         let file = SealedFile::for_program(bytes.to_vec(), device.program);
         let file = file.map_err(|refusal| lines(format!("{name}: {refusal}"), refusal.advice()))?;

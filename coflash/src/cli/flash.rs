@@ -19,7 +19,7 @@ use coflash::file::sealed::SealedFile;
 use coflash::update::dialect::is_data;
 use coflash::update::job::{self, Entry, Settings};
 use coflash::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash::update::{flash_program, Event, FlashOptions, NewBootloader, Program};
+use coflash::update::{flash_program, Event, FlashOptions, Program};
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -32,7 +32,7 @@ use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::progress::Progress;
-use super::renew::{bootloader_in, renew_all};
+use super::renew::bootloader_in;
 use super::values::{nodes, number, program_number, watch_time};
 use super::verify::{self, is_sealed};
 
@@ -195,9 +195,6 @@ impl Flash {
             return Ok(());
         }
         self.legacy.check(context)?;
-        if let Some(new) = self.bootloader()? {
-            return self.renew(context, &new);
-        }
         let devices = match &self.job {
             Some(job) => self.devices_of_job(context, job)?,
             None => self.devices(context)?,
@@ -208,36 +205,6 @@ impl Flash {
             [device] if self.job.is_none() => self.one(context, &mut link, device),
             devices => self.many(context, &mut link, devices),
         }
-    }
-
-    /// The bootloader in the file of the command line, if it is one.
-    fn bootloader(&self) -> Result<Option<NewBootloader>, Failure> {
-        match self.file.as_deref().or(self.legacy_file.as_deref()) {
-            Some(path) if self.job.is_none() => bootloader_in(path, self.source.format()),
-            _ => Ok(None),
-        }
-    }
-
-    /// Renews the bootloaders of the devices of the command line.
-    fn renew(&self, context: &Context, new: &NewBootloader) -> Result<(), Failure> {
-        if self.no_trial || self.no_start {
-            let advice =
-                "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
-            return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
-        }
-        let mut nodes: Vec<NodeId> = Vec::new();
-        for node in self.node.iter().flatten() {
-            if !nodes.contains(node) {
-                nodes.push(*node);
-            }
-        }
-        let bus = context.bus.clone().or_else(|| self.legacy.bus());
-        let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
-        let locks = nodes.iter().map(|node| self.lock(context, *node)).collect::<Result<Vec<_>, _>>()?;
-        let options = FlashOptions::default().alone(!self.not_alone).force(self.force);
-        let result = renew_all(context, &mut link, &nodes, new, &self.patience, &options);
-        drop(locks);
-        result
     }
 
     /// The options for reading a file for the named dialect.
@@ -260,6 +227,13 @@ impl Flash {
                 context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
             }
             Program::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
+            Program::Bootloader(new) => {
+                let (version, size, crc) = (new.version(), new.size(), new.crc());
+                let image = image.display();
+                context
+                    .out
+                    .say(format_args!("{image}: bootloader {version} of {size} bytes, CRC {crc:08X}h"));
+            }
         }
         let address = self.legacy.address();
         let mut nodes: Vec<NodeId> = Vec::new();
@@ -323,6 +297,9 @@ impl Flash {
         source: &Source,
         label: Label,
     ) -> Result<Program, Failure> {
+        if let Some(new) = bootloader_in(path, source.format())? {
+            return Ok(new.into());
+        }
         if is_sealed(path) {
             let bytes = verify::read(path)?.image;
             let file = match self.force {
@@ -361,13 +338,20 @@ impl Flash {
         let advice = "convert it with --vid and --pid, or give these options here";
         let unnamed = || Failure::usage("the file does not name its target device", advice);
         let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
+        let trial = settings.trial_run.unwrap_or(!self.no_trial);
+        let start = settings.start.unwrap_or(!self.no_start);
+        if file.is_bootloader() && !(trial && start) {
+            let advice =
+                "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
+            return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
+        }
         Ok(FlashOptions::default()
             .program(self.program)
             .repeats(self.block_repeats)
             .check_target(check_target)
-            .trial_run(settings.trial_run.unwrap_or(!self.no_trial))
+            .trial_run(trial)
             .watch(self.watch)
-            .start(settings.start.unwrap_or(!self.no_start))
+            .start(start)
             .verify(settings.verify.unwrap_or(self.verify))
             .dialect(self.access.dialect())
             .unlock(self.access.unlock())
@@ -444,7 +428,7 @@ impl Flash {
             let mut value = json!(report);
             value["command"] = "flash".into();
             value["node"] = node.get().into();
-            value["program"] = device.options.program.into();
+            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
             value
         });
         Ok(())

@@ -551,6 +551,7 @@ impl From<Error> for Failure {
             | Error::FellSilent { .. }
             | Error::TrialFailed { .. }
             | Error::RenewalFailed { .. }
+            | Error::FirstFailed { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
         let legacy = legacy::exit_code(&error);

@@ -218,6 +218,11 @@ pub enum Error {
         /// The end of its trial.
         end: TrialEnd,
     },
+    /// The bootloader of the first device could not be renewed, so that of this one was left alone.
+    FirstFailed {
+        /// The first device.
+        first: NodeId,
+    },
     /// The program has started and answered, and the device does not answer any more.
     FellSilent {
         /// The device.
@@ -396,6 +401,7 @@ impl Error {
             | Self::FellSilent { .. }
             | Self::TrialFailed { .. }
             | Self::RenewalFailed { .. }
+            | Self::FirstFailed { .. }
             | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
@@ -566,6 +572,12 @@ impl fmt::Display for Error {
             }
             Self::RenewalFailed { node, end } => {
                 write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
+            }
+            Self::FirstFailed { first } => {
+                write!(
+                    f,
+                    "not renewed: the bootloader of node {first} was the first, and could not be renewed"
+                )
             }
             Self::FellSilent { node, elsewhere } => {
                 f.write_str("the program does not answer any more: ")?;

@@ -7,6 +7,11 @@ use shared_abi::ram_image::{Header, MAGIC};
 use super::block_file::CRC;
 use super::image::Image;
 
+/// The start of the flash.
+const FLASH: u32 = super::area::FLASH.first;
+/// The size of the smallest sector of the flash.
+const SECTOR: usize = 0x4000;
+
 /// A RAM image, with its header.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RamImage {
@@ -30,27 +35,35 @@ pub enum Fault {
     },
 }
 
+impl Fault {
+    /// The stable error number: that of a file that is not firmware.
+    pub const NUMBER: u32 = super::judge::Fault::NUMBER;
+    /// What to do next.
+    pub const ADVICE: &'static str = "give the bootloader.elf of a release, or of cargo xtask build";
+}
+
 impl RamImage {
     /// Finds the RAM image in a file. A file with a whole bootloader has the resident part, too, which is
-    /// left out: it never changes in the field.
+    /// left out: it never changes in the field. A program that carries a RAM image in its data stays a
+    /// program.
     #[must_use]
     pub fn find(image: &Image) -> Option<Self> {
-        image.segments().find_map(|(_, data)| Self::find_in(&data))
+        image.segments().find_map(|(address, data)| match address {
+            // The resident part precedes it; it begins with a sector.
+            0 | FLASH => data.chunks(SECTOR).enumerate().find_map(|(at, _)| Self::at(&data[at * SECTOR..])),
+            _ => Self::at(&data),
+        })
     }
 
-    fn find_in(data: &[u8]) -> Option<Self> {
-        let magic = MAGIC.to_le_bytes();
-        (0..data.len()).step_by(4).find_map(|at| {
-            let rest = &data[at..];
-            if !rest.starts_with(&magic) {
-                return None;
-            }
-            let header = Header::of_bytes(rest.first_chunk()?);
-            let is_possible =
-                header.length == Header::SIZE && header.size.is_multiple_of(4) && header.size > 0;
-            let bytes = rest.get(..header.total() as usize).filter(|_| is_possible)?.to_vec();
-            Some(Self { header, bytes })
-        })
+    /// The RAM image at the start of these bytes.
+    fn at(data: &[u8]) -> Option<Self> {
+        let header = Header::of_bytes(data.first_chunk()?);
+        let is_possible = header.magic == MAGIC
+            && header.length == Header::SIZE
+            && header.size.is_multiple_of(4)
+            && header.size > 0;
+        let bytes = data.get(..header.total() as usize).filter(|_| is_possible)?.to_vec();
+        Some(Self { header, bytes })
     }
 
     /// Its header.
@@ -134,6 +147,18 @@ mod tests {
         }
         assert_eq!(found(&image[..image.len() - 1]), None, "its end is missing");
         assert_eq!(found(&[0x5A; 400]), None);
+    }
+
+    #[test]
+    fn a_program_that_carries_one_is_a_program() {
+        let carried = with_crc(made(128));
+        for (address, before) in [(0x0802_0000, 0x4000), (0, 0x400)] {
+            let file = [vec![0xA5; before], carried.clone()].concat();
+            let Ok(Firmware::Image(image)) = read(&file, Some(Format::Raw), Some(address)) else {
+                panic!("a raw file is an image")
+            };
+            assert_eq!(RamImage::find(&image), None);
+        }
     }
 
     #[test]

@@ -11,8 +11,8 @@ use crate::file::inspect::Inspection;
 use crate::file::judge::{judge, Fault};
 use crate::file::sealed::show::flags;
 use crate::file::sealed::SealedFile;
-use crate::file::{self, label, AddressRange, BlockFile, Format};
-use crate::update::{Program, Target};
+use crate::file::{self, label, ram_image, AddressRange, BlockFile, Format};
+use crate::update::{NewBootloader, Program, Target};
 
 /// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
@@ -43,6 +43,11 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     }
     let region = region(settings)?;
     let format = Format::of(Path::new(&name), &bytes);
+    if let Some(new) = NewBootloader::in_file(&bytes, format)
+        .map_err(|fault| Notice::failed(format!("{name}: {fault}"), ram_image::Fault::ADVICE))?
+    {
+        return Ok(bootloader(bytes, name, new));
+    }
     if format == Some(Format::Sealed) {
         return sealed(bytes, name, settings);
     }
@@ -81,6 +86,27 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         name,
     };
     Ok(Loaded { bytes, program: Arc::new(blocks).into(), shown })
+}
+
+/// A bootloader, which takes the place of that of the device.
+fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
+    let target = new.target();
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: format!(
+            "a bootloader: it renews that of the device, and the program stays ({})",
+            new.version()
+        ),
+        program_size: new.size(),
+        crc: new.crc(),
+        vendor_id: Some(target.vendor_id),
+        product_code: Some(target.product_code),
+        version: Some(new.version().to_string()),
+        left_out: 0,
+        seal: None,
+        name,
+    };
+    Loaded { bytes, program: new.into(), shown }
 }
 
 /// Reads a sealed image. Only the device's keys decrypt it.

@@ -162,7 +162,10 @@ fn update_all(
             match result {
                 Ok(report) => {
                     (update.phase, update.done) = (Phase::Done, update.total);
-                    update.words = format!("done in {:.1} s", report.took.as_secs_f64());
+                    update.words = match report.renewal {
+                        Some(renewal) => renewal.to_string(),
+                        None => format!("done in {:.1} s", report.took.as_secs_f64()),
+                    };
                 }
                 Err(Failed { error, left }) => update.failed(error, &left.to_string()),
             }
@@ -207,6 +210,10 @@ fn report(
         for (node, result) in nodes.iter().zip(results) {
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get())).cloned();
             let words = match result {
+                Ok(report) if report.renewal.is_some() => {
+                    let version = file.shown.version.as_deref().unwrap_or_default();
+                    format!("renewed: bootloader {version}")
+                }
                 Ok(report) if report.running.is_some() => "updated, and the program runs".to_string(),
                 Ok(_) => "updated".to_string(),
                 Err(Failed { error, left }) => format!("failed: {error}; the device: {left}"),

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use canopen::program::FlashError;
 
 use super::options::Target;
+use super::renew::NewBootloader;
 use crate::device::error::flash_error_number;
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{judge, BlockFile};
@@ -62,26 +63,36 @@ pub enum Program {
     Blocks(Arc<BlockFile>),
     /// A sealed image.
     Sealed(Arc<SealedFile>),
+    /// A bootloader, which takes the place of that of the device.
+    Bootloader(NewBootloader),
 }
 
 impl Program {
     /// The CRC that 1F56h of a device with this program reports.
     #[must_use]
     pub fn program_crc(&self) -> u32 {
-        self.content().program_crc()
+        self.program_crcs()[0]
     }
 
     /// The values that 1F56h of a device with this program may report: the CRC of its product may be
     /// another one than that of the file.
     #[must_use]
     pub fn program_crcs(&self) -> [u32; 2] {
-        self.content().program_crcs()
+        match self {
+            Self::Blocks(file) => Content::Blocks(file).program_crcs(),
+            Self::Sealed(file) => Content::Sealed(file).program_crcs(),
+            Self::Bootloader(new) => [new.crc(); 2],
+        }
     }
 
     /// Size of the program in flash in bytes.
     #[must_use]
     pub fn program_size(&self) -> u32 {
-        self.content().program_size()
+        match self {
+            Self::Blocks(file) => Content::Blocks(file).program_size(),
+            Self::Sealed(file) => Content::Sealed(file).program_size(),
+            Self::Bootloader(new) => new.size(),
+        }
     }
 
     /// The target device, if the content names one.
@@ -90,14 +101,14 @@ impl Program {
         match self {
             Self::Blocks(file) => Target::of(file),
             Self::Sealed(file) => Some(Target::of_sealed(file)),
+            Self::Bootloader(new) => Some(new.target()),
         }
     }
 
-    pub(super) fn content(&self) -> Content<'_> {
-        match self {
-            Self::Blocks(file) => Content::Blocks(file),
-            Self::Sealed(file) => Content::Sealed(file),
-        }
+    /// Whether it is a bootloader.
+    #[must_use]
+    pub const fn is_bootloader(&self) -> bool {
+        matches!(self, Self::Bootloader(_))
     }
 }
 
@@ -122,5 +133,11 @@ impl From<Arc<BlockFile>> for Program {
 impl From<Arc<SealedFile>> for Program {
     fn from(file: Arc<SealedFile>) -> Self {
         Self::Sealed(file)
+    }
+}
+
+impl From<NewBootloader> for Program {
+    fn from(new: NewBootloader) -> Self {
+        Self::Bootloader(new)
     }
 }

@@ -13,6 +13,7 @@ use super::dialect::{self, Downloaded};
 use super::event::{Done, Event, Note, Phase, Report, Warning};
 use super::options::FlashOptions;
 use super::reach::reach;
+use super::renew;
 use super::running::RunningUpdate;
 use super::steps::compare_crc;
 use super::watch;
@@ -54,7 +55,7 @@ pub fn flash_sealed(
     flash_content(session, Content::Sealed(file), options, tell)
 }
 
-/// [`flash`] or [`flash_sealed`].
+/// [`flash`], [`flash_sealed`], or [`renew`](super::renew()) for a bootloader.
 ///
 /// # Errors
 /// Those of [`flash`].
@@ -64,7 +65,11 @@ pub fn flash_program(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    flash_content(session, program.content(), options, tell)
+    match program {
+        Program::Blocks(file) => flash_content(session, Content::Blocks(file), options, tell),
+        Program::Sealed(file) => flash_content(session, Content::Sealed(file), options, tell),
+        Program::Bootloader(new) => renew::update(session, new, options, tell),
+    }
 }
 
 fn flash_content(
@@ -137,5 +142,16 @@ fn procedure(
     let took = session.now().saturating_sub(began);
     let (program_size, program_crc) = (file.program_size(), file.program_crc());
     let transfers = session.transfers();
-    Ok(Report { program_size, program_crc, repeats, took, transfer, transfers, running, released, dialect })
+    Ok(Report {
+        program_size,
+        program_crc,
+        repeats,
+        took,
+        transfer,
+        transfers,
+        running,
+        released,
+        dialect,
+        renewal: None,
+    })
 }

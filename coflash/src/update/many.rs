@@ -1,6 +1,7 @@
 //! The update of many devices over one bus: while one erases, another receives, and devices with a
 //! second SDO server receive the same program together.
 
+use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 
@@ -93,7 +94,8 @@ const GROUP: u16 = 0x6DF;
 const GROUP_ANSWERS: u16 = 0x680;
 
 /// Updates all devices; if one fails, the others continue. A device that fails in a group is
-/// updated once more, without the others. `tell` gets the events of each job, on separate threads.
+/// updated once more, without the others. Bootloaders are renewed after that, one after the other; if the
+/// first one fails, the others are not touched. `tell` gets the events of each job, on separate threads.
 /// The results are in the order of the jobs.
 pub fn flash_many(
     adapter: &mut dyn Adapter,
@@ -101,20 +103,56 @@ pub fn flash_many(
     options: &ManyOptions,
     tell: &(dyn Fn(usize, Event) + Sync),
 ) -> Vec<Result<Report, Failed>> {
-    let channels = if options.together { channels(jobs) } else { vec![None; jobs.len()] };
-    let all: Vec<Planned<'_>> = jobs
-        .iter()
+    let numbered = || jobs.iter().enumerate();
+    let programs: Vec<(usize, &Job)> = numbered().filter(|(_, job)| !job.file.is_bootloader()).collect();
+    let channels = if options.together { channels(&programs) } else { vec![None; programs.len()] };
+    let all: Vec<Planned<'_>> = programs
+        .into_iter()
         .zip(channels)
-        .enumerate()
-        .map(|(number, (job, channel))| Planned { number, job, channel })
+        .map(|((number, job), channel)| Planned { number, job, channel })
         .collect();
-    let mut ends = flash_each(adapter, &all, options, tell);
-    let again: Vec<Planned<'_>> = all.into_iter().filter(|plan| ends[plan.number].is_for_another).collect();
-    let again: Vec<Planned<'_>> = again.into_iter().map(|plan| Planned { channel: None, ..plan }).collect();
-    for (plan, end) in again.iter().zip(flash_each(adapter, &again, options, tell)) {
-        ends[plan.number] = end;
+    let mut results: BTreeMap<usize, Result<Report, Failed>> = BTreeMap::new();
+    let mut again: Vec<Planned<'_>> = Vec::new();
+    let ends = flash_each(adapter, &all, options, tell);
+    for (plan, end) in all.into_iter().zip(ends) {
+        if end.is_for_another {
+            again.push(Planned { channel: None, ..plan });
+        }
+        results.insert(plan.number, end.result);
     }
-    ends.into_iter().map(|end| end.result).collect()
+    let ends = flash_each(adapter, &again, options, tell);
+    results.extend(again.iter().map(|plan| plan.number).zip(ends.into_iter().map(|end| end.result)));
+    let mut fate = Fate::default();
+    for (number, job) in numbered().filter(|(_, job)| job.file.is_bootloader()) {
+        let plan = [Planned { number, job, channel: None }];
+        let alone = ManyOptions { at_once: 1, ..options.clone() };
+        let renew = || flash_each(adapter, &plan, &alone, tell).into_iter().map(|end| end.result).next();
+        results.extend(fate.of(job, renew).map(|result| (number, result)));
+    }
+    results.into_values().collect()
+}
+
+/// What became of the first bootloader: if it is not renewed, the others are not touched.
+#[derive(Default)]
+struct Fate {
+    first: Option<(NodeId, bool)>,
+}
+
+impl Fate {
+    /// The result of this renewal.
+    fn of(
+        &mut self,
+        job: &Job,
+        renew: impl FnOnce() -> Option<Result<Report, Failed>>,
+    ) -> Option<Result<Report, Failed>> {
+        if let Some((first, false)) = self.first {
+            let left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
+            return Some(Err(Failed { error: Error::FirstFailed { first }, left }));
+        }
+        let result = renew()?;
+        self.first.get_or_insert((job.node, result.is_ok()));
+        Some(result)
+    }
 }
 
 /// A job with its place among all, and its part in the group.
@@ -133,11 +171,11 @@ struct End {
 
 /// The COB-IDs for the jobs that can be done together: those that have a COB-ID for answers, if there
 /// are several.
-fn channels(jobs: &[Job]) -> Vec<Option<Channel>> {
+fn channels(jobs: &[(usize, &Job)]) -> Vec<Option<Channel>> {
     if jobs.len() < 2 {
         return vec![None; jobs.len()];
     }
-    let of = |job: &Job| {
+    let of = |(_, job): &(usize, &Job)| {
         let response = GROUP_ANSWERS + u16::from(job.node.get());
         if response >= GROUP {
             return None;
@@ -198,18 +236,26 @@ fn flash_each(
 }
 
 /// Updates the devices behind a gateway one after the other, because a gateway does one transfer at
-/// a time.
+/// a time. If the first renewal of a bootloader fails, the other bootloaders are not touched.
 pub fn flash_in_turn(
     gateway: &mut dyn Gateway,
     jobs: &[Job],
     options: &ManyOptions,
     tell: &dyn Fn(usize, Event),
 ) -> Vec<Result<Report, Failed>> {
-    let one = |(number, job): (usize, &Job)| {
+    let mut one = |(number, job): (usize, &Job)| {
         let mut session = Session::through(&mut *gateway, job.node, options.timing);
         update(&mut session, job, &job.options, options, &mut |event| tell(number, event))
     };
-    jobs.iter().enumerate().map(one).collect()
+    let mut fate = Fate::default();
+    let each = |(number, job): (usize, &Job)| {
+        if job.file.is_bootloader() {
+            fate.of(job, || Some(one((number, job))))
+        } else {
+            Some(one((number, job)))
+        }
+    };
+    jobs.iter().enumerate().filter_map(each).collect()
 }
 
 /// Updates one of the devices.

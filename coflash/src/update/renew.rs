@@ -8,18 +8,22 @@ use std::time::Duration;
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::Address;
+use seal::wire::BOOTLOADER;
 use serde::Serialize;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
-use super::event::{Event, Phase, Retry, Warning};
+use super::catch::knock;
+use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
+use super::event::{Done, Event, Note, Phase, Report, Retry, Warning};
 use super::judge::{judge, Judgement};
-use super::options::FlashOptions;
-use super::steps::{enter_bootloader, execute, identification, running_program, start};
+use super::options::{FlashOptions, Target};
+use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::session::Silence;
-use crate::device::{DeviceType, Doing, Error, Session};
-use crate::file::ram_image::{RamImage, Version};
+use crate::device::{DeviceType, Dialect, Doing, Error, Session};
+use crate::file::ram_image::{Fault, RamImage, Version};
+use crate::file::read::{read, Firmware, Format};
 use crate::file::sealed::SealedFile;
 use crate::json;
 
@@ -39,6 +43,68 @@ pub enum NewBootloader {
 }
 
 impl NewBootloader {
+    /// The bootloader in a file of this format; `None` for any other file, also for one that cannot be read.
+    ///
+    /// # Errors
+    /// A [`Fault`] of its RAM image.
+    pub fn in_file(bytes: &[u8], format: Option<Format>) -> Result<Option<Self>, Fault> {
+        if format == Some(Format::Sealed) {
+            return Ok(Self::of_sealed(bytes));
+        }
+        read(bytes, format, Some(0)).map_or(Ok(None), |firmware| Self::of(&firmware))
+    }
+
+    /// The bootloader in firmware that was read; `None` for a program.
+    ///
+    /// # Errors
+    /// A [`Fault`] of its RAM image.
+    pub fn of(firmware: &Firmware) -> Result<Option<Self>, Fault> {
+        let found = match firmware {
+            Firmware::Image(image) => RamImage::find(image),
+            Firmware::Blocks(file) => RamImage::find(&file.image()),
+        };
+        let Some(image) = found else { return Ok(None) };
+        image.check()?;
+        Ok(Some(Self::Plain(Arc::new(image))))
+    }
+
+    /// The bootloader in a sealed image; `None` for a program, and for a file that is no sealed image.
+    #[must_use]
+    pub fn of_sealed(bytes: &[u8]) -> Option<Self> {
+        let file = SealedFile::parse(bytes.to_vec()).ok()?;
+        (file.head().program() == BOOTLOADER).then(|| Self::Sealed(Arc::new(file)))
+    }
+
+    /// The value of 1F56h of a device with this bootloader. That of a sealed image is not known before it is
+    /// opened; its manifest has the CRC of what is written.
+    #[must_use]
+    pub fn crc(&self) -> u32 {
+        match self {
+            Self::Plain(image) => image.header().crc,
+            Self::Sealed(file) => file.head().crc(),
+        }
+    }
+
+    /// Size of header and image in bytes.
+    #[must_use]
+    pub fn size(&self) -> u32 {
+        match self {
+            Self::Plain(image) => image.header().total(),
+            Self::Sealed(file) => file.head().size(),
+        }
+    }
+
+    /// The device that it is for.
+    #[must_use]
+    pub fn target(&self) -> Target {
+        match self {
+            Self::Plain(image) => {
+                Target { vendor_id: image.header().vendor, product_code: image.header().product }
+            }
+            Self::Sealed(file) => Target::of_sealed(file),
+        }
+    }
+
     /// The bytes for 1F50h.
     fn bytes(&self) -> &[u8] {
         match self {
@@ -71,6 +137,11 @@ pub struct Renewal {
     pub to: Version,
     /// Whether the device had this bootloader already: nothing was changed.
     pub unchanged: bool,
+    /// How many times it had to be sent again.
+    pub repeats: u32,
+    /// The time for the download.
+    #[serde(rename = "transfer_seconds", serialize_with = "json::seconds")]
+    pub transfer: Duration,
     /// The total time, on the bus's clock.
     #[serde(rename = "seconds", serialize_with = "json::seconds")]
     pub took: Duration,
@@ -121,6 +192,46 @@ pub fn renew(
     procedure(&mut session.with(node, timing).tell_silence(&silence), new, options, &mut tell)
 }
 
+/// [`renew`] as an update of a device: with [`Event::Done`] at the end.
+///
+/// # Errors
+/// Those of [`renew`].
+pub(super) fn update(
+    session: &mut Session<'_>,
+    new: &NewBootloader,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Report, Error> {
+    let result = renew(session, new, options, tell).map(|renewal| Report {
+        program_size: new.size(),
+        program_crc: new.crc(),
+        repeats: renewal.repeats,
+        took: renewal.took,
+        transfer: renewal.transfer,
+        transfers: session.transfers(),
+        running: renewal.running,
+        released: None,
+        dialect: Dialect::Block,
+        renewal: Some(renewal),
+    });
+    let state = match &result {
+        Ok(_) => DeviceState::Untouched,
+        Err(error) => left_by(session, error),
+    };
+    let left = DeviceAfterUpdate { state, answer: DeviceAnswer::NotAsked };
+    tell(Event::Done(Box::new(Done::new(left, &result))));
+    result
+}
+
+/// The state of the program after a renewal that has failed: it is always complete.
+fn left_by(session: &mut Session<'_>, error: &Error) -> DeviceState {
+    let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
+    match session.device_type() {
+        Ok(Some(running)) if !is_lost && running.is_bootloader() => DeviceState::Called,
+        _ => DeviceState::Untouched,
+    }
+}
+
 fn procedure(
     session: &mut Session<'_>,
     new: &NewBootloader,
@@ -128,8 +239,16 @@ fn procedure(
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
     let began = session.now();
-    if options.alone {
+    if options.alone && !options.wait {
         session.ensure_alone()?;
+    }
+    if options.wait {
+        knock(session, None, tell)?;
+    }
+    if let Some(target) = options.check_target {
+        session.find()?;
+        check_target(session, target)?;
+        tell(Note::TargetRight(target).into());
     }
     let program = running_program(session, 1)?;
     let ran = session.device_type()?.is_some_and(|running| !running.is_bootloader());
@@ -165,7 +284,9 @@ fn in_bootloader(
     let number = old.number;
     let running = settled(session, old)?;
     let (from, to) = (old.version, new.version());
-    let unchanged = Renewal { number, from, to, unchanged: true, took: Duration::ZERO, running: None };
+    let (mut repeats, mut transfer) = (0, Duration::ZERO);
+    let unchanged =
+        Renewal { number, from, to, unchanged: true, repeats, transfer, took: Duration::ZERO, running: None };
     let is_same = is_same(session, new, number)?;
     let is_open = running.origin == Origin::Trial && running.state == State::Staged;
     if is_same && running.state != State::Staged && !options.force {
@@ -174,7 +295,9 @@ fn in_bootloader(
     tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
     if !(is_same && is_open) {
         leave_trial(session, number, running, tell)?;
-        stage(session, number, new, options, tell)?;
+        let began = session.now();
+        repeats = stage(session, number, new, options, tell)?;
+        transfer = session.now().saturating_sub(began);
         if progress(session)?.map(|progress| progress.state) != Some(State::Staged) {
             // The device has found the same image.
             return Ok(unchanged);
@@ -193,7 +316,7 @@ fn in_bootloader(
     }
     let to = bootloader(session)?.map_or(to, |now| now.version);
     tell(Phase::Installed { version: to.0 }.into());
-    Ok(Renewal { to, unchanged: false, ..unchanged })
+    Ok(Renewal { to, unchanged: false, repeats, transfer, ..unchanged })
 }
 
 /// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
@@ -236,14 +359,14 @@ fn leave_trial(
     }
 }
 
-/// Downloads the image into staging.
+/// Downloads the image into staging; returns the number of repetitions.
 fn stage(
     session: &mut Session<'_>,
     number: u8,
     new: &NewBootloader,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
-) -> Result<(), Error> {
+) -> Result<u32, Error> {
     let bytes = new.bytes();
     let total = bytes.len();
     let doing = Doing::Bootloader;
@@ -260,7 +383,7 @@ fn stage(
         // 1F57h says more than an abort.
         let status = session.await_idle(number, doing)?;
         match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
-            Judgement::Good => return Ok(()),
+            Judgement::Good => return Ok(repeat),
             Judgement::Bad { why: Some(why), .. } if repeat < options.repeats => {
                 repeat += 1;
                 tell(Event::Retry(Retry::program(repeat, options.repeats, why)));

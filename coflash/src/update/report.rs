@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use serde::{Serialize, Serializer};
 
+use super::renew::Renewal;
 use crate::device::{DeviceType, Dialect, Transfers};
 use crate::json;
 
@@ -37,6 +38,9 @@ pub struct Report {
     pub released: Option<bool>,
     /// The dialect of the device.
     pub dialect: Dialect,
+    /// The results of a renewal, if the file is a bootloader.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub renewal: Option<Renewal>,
 }
 
 /// Only the device type: it is known that an application runs.
@@ -46,6 +50,9 @@ fn running<S: Serializer>(running: &Option<DeviceType>, serializer: S) -> Result
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(renewal) = &self.renewal {
+            return renewal.fmt(f);
+        }
         write!(f, "done in {:.1} s", self.took.as_secs_f64())?;
         match self.repeats {
             0 => Ok(()),
