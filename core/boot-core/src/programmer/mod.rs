@@ -268,6 +268,13 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         P::RENEWS && self.install.is_some()
     }
 
+    /// The installation has failed.
+    fn stop_installing(&mut self) {
+        if P::RENEWS {
+            self.install = None;
+        }
+    }
+
     /// Stores node-ID and bit rate.
     pub(crate) fn store_node(&mut self, parameters: &mut impl Parameters, node: NodeParameters) {
         parameters.store(Key::NODE, node.value());
@@ -484,7 +491,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                     // The consequence is only another rescue window.
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
-                        self.install = None;
+                        self.stop_installing();
                         // If the record cannot be removed, its data must not be changed.
                         if self.program() == Some(program) {
                             self.abort();
@@ -524,7 +531,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         self.source.fail(error);
         // The signature of a request for rights belongs to no program.
         let program = if self.is_installing() { BOOTLOADER } else { self.program().unwrap_or(0) };
-        self.install = None;
+        self.stop_installing();
         self.abort();
         Some(Event::Failed { program, error, erasing })
     }
