@@ -49,7 +49,9 @@ pub struct DeviceInfo {
     pub security: Option<Security>,
     /// 2007h: why it stays in its bootloader; `None` for an application.
     pub state: Option<BootloaderState>,
-    /// 2007h: its bootloader, if that can be renewed; `None` for an application.
+    /// 2007h: its bootloader, if that can be renewed; `None` for an application. (`bootloader` says for
+    /// programs whether the bootloader runs.)
+    #[serde(rename = "renewal")]
     pub bootloader: Option<Bootloader>,
 }
 

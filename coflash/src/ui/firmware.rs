@@ -219,6 +219,23 @@ mod tests {
     }
 
     #[test]
+    fn a_bootloader_is_known_by_its_header() {
+        let mut bytes = b"CBI2".to_vec();
+        for word in [0, 64, 4, 0x2000_0000, 0x2001_FFC0, 1, 0, 7, 1, 2, 0, 0x0001_0003, 0, 0, 0, 5] {
+            bytes.extend(u32::to_le_bytes(word));
+        }
+        let words = words(&bytes, "new.bin");
+        assert!(words.starts_with("new.bin: is a bootloader without a CRC"), "{words}");
+        let crc = crate::file::block_file::CRC.checksum(&bytes[8..]);
+        bytes[4..8].copy_from_slice(&crc.to_le_bytes());
+        let loaded = load(Arc::new(bytes), "new.bin", &Settings::default()).unwrap();
+        assert!(loaded.program.is_bootloader());
+        let Firmware { crc: told, vendor_id, product_code, version, .. } = loaded.shown;
+        assert_eq!((told, vendor_id, product_code), (crc, Some(1), Some(2)));
+        assert_eq!(version.as_deref(), Some("1.3"));
+    }
+
+    #[test]
     fn a_name_is_one_line_of_text() {
         assert_eq!(printable("a/b\\c.hex"), "c.hex");
         assert_eq!(printable("a\n\u{202E}b"), "a__b");

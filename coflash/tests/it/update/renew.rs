@@ -1,6 +1,7 @@
 //! The renewal of a bootloader against a fake device, which is played from docs/protocol.md: 2007h/1, /8 and
 //! /9, and the sub-index 2 of 1F50h to 1F57h.
 
+use std::fs;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -10,10 +11,13 @@ use coflash::device::{Session, Timing};
 use coflash::file::ram_image::{RamImage, Version};
 use coflash::file::raw;
 use coflash::update::event::{Phase, Warning};
-use coflash::update::{renew, Event, FlashOptions, NewBootloader, Renewal};
+use coflash::update::many::{flash_many, Job, ManyOptions};
+use coflash::update::{renew, DeviceState, Event, FlashOptions, NewBootloader, Renewal};
 use coflash::Error;
+use serde_json::Value;
 
-use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use crate::tool::{coflash, folder, serve};
 
 /// Abort codes (CiA 301 table 22).
 const NO_OBJECT: u32 = 0x0602_0000;
@@ -65,6 +69,7 @@ enum Trial {
 
 /// A device whose bootloader can be renewed.
 struct Board {
+    node: u8,
     /// 2007h/1; `None` if it has no such object.
     number: Option<u8>,
     state: u8,
@@ -89,6 +94,7 @@ type Log = Arc<Mutex<Vec<String>>>;
 impl Board {
     fn new(log: &Log) -> Self {
         Self {
+            node: NODE,
             number: Some(2),
             state: NONE,
             origin: HOME,
@@ -111,7 +117,7 @@ impl Board {
 
     fn restart(&mut self, origin: u8, end: [u8; 2]) -> Deed {
         (self.origin, self.end) = (origin, end);
-        Deed::Restart(NODE, BOOTLOADER)
+        Deed::Restart(self.node, BOOTLOADER)
     }
 
     fn command(&mut self, command: u8) -> Result<Deed, u32> {
@@ -190,7 +196,7 @@ impl Maker for Board {
 
     fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
         self.origin = HOME;
-        Some((NODE, BOOTLOADER))
+        Some((self.node, BOOTLOADER))
     }
 }
 
@@ -425,8 +431,117 @@ fn info_shows_the_bootloader_and_its_renewal() {
         assert_eq!(bootloader.to_string(), line);
         let json = serde_json::to_value(info).unwrap();
         let names = ["none", "staged", "confirmed", "installed"];
-        assert_eq!(json["bootloader"]["state"], names[usize::from(state)]);
-        assert_eq!(json["bootloader"]["version"], OLD);
+        assert_eq!(json["renewal"]["state"], names[usize::from(state)]);
+        assert_eq!(json["renewal"]["version"], OLD);
+        assert_eq!(json["bootloader"], true, "it runs");
         assert_eq!(json["programs"].as_array().unwrap().len(), 1);
+    }
+}
+
+/// Devices with these node-IDs and trials.
+fn devices(trials: [Trial; 3]) -> (Bus, Log) {
+    let log = Log::default();
+    let device = |(node, trial): (u8, Trial)| {
+        let board = Board { node, trial, ..Board::new(&log) };
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.node = node;
+        fake.maker = Some(Box::new(board));
+        fake
+    };
+    (Bus([5, 6, 7].into_iter().zip(trials).map(device).collect()), log)
+}
+
+/// The first one is renewed before the others; if it fails, the others are not touched. If a later one
+/// fails, the rest continue.
+#[test]
+fn of_several_devices_the_first_one_goes_first() {
+    use Trial::{Ends, Works};
+    let late = Ends([1, 0]);
+    let (all, some) = ([WHOLE; 3].concat(), [&WHOLE[..], &WHOLE[..3], &WHOLE].concat());
+    for (trials, good, expected) in [
+        ([Works; 3], [true; 3], all),
+        ([late, Works, Works], [false; 3], WHOLE[..3].to_vec()),
+        ([Works, late, Works], [true, false, true], some),
+    ] {
+        let (mut bus, log) = devices(trials);
+        let job = |node| Job::new(NodeId::new(node).unwrap(), new(), FlashOptions::default());
+        let ends = Mutex::new(0);
+        let results = flash_many(&mut bus, &[5, 6, 7].map(job), &ManyOptions::default(), &|_, event| {
+            *ends.lock().unwrap() += u32::from(matches!(event, Event::Done(_)));
+        });
+        assert_eq!(results.iter().map(Result::is_ok).collect::<Vec<_>>(), good);
+        assert_eq!(written(&log), expected);
+        match &results[2] {
+            Ok(report) => assert_eq!(report.renewal.unwrap().to, Version(NEW)),
+            Err(failed) => {
+                assert!(matches!(failed.error, Error::FirstFailed { .. }), "{failed:?}");
+                assert_eq!(failed.left.state, DeviceState::Untouched);
+                let words = "not renewed: the bootloader of node 5 was the first, and could not be renewed";
+                assert_eq!(failed.error.to_string(), words);
+            }
+        }
+    }
+}
+
+/// The command line, over a socket.
+#[test]
+fn flash_knows_a_bootloader_by_its_header() {
+    let folder = folder("renew");
+    let file = folder.file("new.bin", &image(NEW));
+    let report = folder.path("report.json");
+    let (url, server) = serve(device(APPLICATION, |_| {}).0);
+    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5", "--report", &report]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let crc = word_of(&image(NEW), 4);
+    for words in [
+        &format!("{file}: bootloader 1.3 of 320 bytes, CRC {crc:08X}h\n")[..],
+        "  renewing the bootloader (program 2): version 1.2 -> 1.3; the program stays\n",
+        "  installed: bootloader 1.3\n",
+        "  running: an application",
+        "s: bootloader 1.2 -> 1.3, installed\n",
+    ] {
+        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
+    }
+    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+    let written: Value = serde_json::from_str(&fs::read_to_string(&report).unwrap()).unwrap();
+    let renewal = &written["devices"][0]["report"]["renewal"];
+    assert_eq!((&renewal["number"], &renewal["from"], &renewal["to"]), (&2.into(), &OLD.into(), &NEW.into()));
+
+    // By a job file, too.
+    let job = folder.file("job.toml", b"image = 'new.bin'\n[[device]]\nnode = 5\n");
+    let (url, server) = serve(device(BOOTLOADER, |_| {}).0);
+    let done = coflash(&["--bus", &url, "flash", "--job", &job]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    assert!(done.out.ends_with("1 of 1 devices are done\n"), "{}", done.out);
+    drop(server.join());
+}
+
+/// What is refused before a device is asked.
+#[test]
+fn flash_refuses_what_is_no_bootloader_for_a_device() {
+    let folder = folder("renew-refused");
+    let file = folder.file("new.bin", &image(NEW));
+    for option in ["--no-trial", "--no-start"] {
+        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file, option]);
+        assert_eq!(done.exit, 2, "{}", done.err);
+        assert!(
+            done.err.contains("a new bootloader is tried before it replaces the old one"),
+            "{}",
+            done.err
+        );
+    }
+    let mut bench = image(NEW);
+    bench[4..8].fill(0);
+    let bench = folder.file("bench.bin", &bench);
+    let mut damaged = image(NEW);
+    damaged[100] ^= 1;
+    let damaged = folder.file("damaged.bin", &damaged);
+    for (file, words) in [
+        (bench, "it is a bootloader without a CRC: build it by `cargo xtask build`, which writes the CRC"),
+        (damaged, "it is a damaged bootloader: its header has the CRC"),
+    ] {
+        let done = coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file]);
+        assert_eq!(done.exit, 3, "{}", done.err);
+        assert!(done.err.contains(words), "{}", done.err);
     }
 }
