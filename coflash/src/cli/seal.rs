@@ -8,9 +8,11 @@ use coflash::file::convert::{blocks_of, blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use coflash::file::judge::judge;
 use coflash::file::label::label_of;
 use coflash::file::limit;
+use coflash::file::ram_image::RamImage;
+use coflash::file::read::{self, Firmware};
 use coflash::file::sealed::sealer::CHUNK;
 use coflash::file::sealed::{hash, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
-use seal::wire::{flag, MAX_CHUNK, MIN_CHUNK};
+use seal::wire::{flag, BOOTLOADER, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout::Layout;
 
@@ -48,8 +50,13 @@ pub(super) struct Seal {
 
     /// The security counter: a device refuses a program with a counter lower than the highest one
     /// that it has accepted.
-    #[arg(long, value_name = "NUMBER", value_parser = number, required_unless_present = "attach")]
+    #[arg(long, value_name = "NUMBER", value_parser = number, required_unless_present_any = ["attach", "bootloader"], conflicts_with = "bootloader")]
     counter: Option<u32>,
+
+    /// Seal the bootloader in the file, for a renewal. Counter, version and target are those of its header; the
+    /// certificate must be for bootloaders (coflash key certify --role bootloader).
+    #[arg(long, conflicts_with_all = ["program", "data", "writes_flash", "base", "vendor", "product", "ver", "tbs", "attach"])]
+    bootloader: bool,
 
     /// Vendor-ID of the devices (1018h/1); by default that of the label in the image.
     #[arg(long, alias = "vid", value_name = "NUMBER", value_parser = number)]
@@ -263,6 +270,9 @@ impl Seal {
             let what = format!("the result would overwrite {}", output.display());
             return Err(Failure::usage(what, "name another file for the result: --output"));
         }
+        if self.bootloader {
+            return self.seal_bootloader(context, path, &output);
+        }
         let (firmware, _) = self.place.load(path, self.program)?;
         let done = blocks_of(firmware, &self.place.options(self.program)?);
         let done = done.map_err(|error| Failure::convert(error, path))?;
@@ -314,6 +324,55 @@ impl Seal {
         };
         let file = put(&output, image, self.form(|| Ok(program.blocks.program_start()))?)?;
         tell(context, "seal", &output, &file, self.tbs.is_none());
+        Ok(())
+    }
+
+    /// Seals the RAM image of a bootloader.
+    fn seal_bootloader(&self, context: &Context, path: &Path, output: &Path) -> Result<(), Failure> {
+        let (firmware, _) = read::load_telling(path, None, Some(0))?;
+        let image = match firmware {
+            Firmware::Image(image) => image,
+            Firmware::Blocks(file) => file.image(),
+        };
+        let image =
+            RamImage::find(&image).ok_or_else(|| Failure::file(path, "it contains no bootloader (CBI2)"))?;
+        image.check().map_err(|fault| Failure::file(path, &format!("it {fault}")))?;
+        let encrypt_for = keys::keks(&self.encrypt)?;
+        let sbom = self.sbom.as_deref().map(limit::read).transpose();
+        let sbom =
+            sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
+        let header = image.header();
+        let sealer = Sealer {
+            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
+            vendor_id: header.vendor,
+            product_code: header.product,
+            version: header.version,
+            counter: header.counter,
+            program: BOOTLOADER,
+            chunk: self.chunk,
+            encrypt_for: &encrypt_for,
+            compress: self.compress,
+            unique_id: self.device.unwrap_or_default(),
+            hardware: header.revisions,
+            created: self.date.unwrap_or(0),
+            test: self.test,
+            text: self.text.as_deref(),
+            sbom: sbom.as_deref().map(hash),
+            ..Sealer::default()
+        };
+        let sealed = sealer.seal(image.bytes(), &keys::signing_key(&self.key)?);
+        let sealed = sealed.map_err(|fault| Failure::file(path, &fault.to_string()))?;
+        let home = || {
+            let home = self.place.layout()?.and_then(|layout| layout.home);
+            home.map(|home| home.base).ok_or_else(|| {
+                Failure::usage(
+                    "the address of the bootloader is unknown",
+                    "give --board, of a board with the split map",
+                )
+            })
+        };
+        let file = put(output, sealed, self.form(home)?)?;
+        tell(context, "seal", output, &file, true);
         Ok(())
     }
 

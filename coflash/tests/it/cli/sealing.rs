@@ -1003,3 +1003,45 @@ fn the_commands_make_what_the_library_verifies() {
     let device = Device { roots: &[root], keks: &[kek], ..Device::default() };
     assert_eq!(verify(&room.bytes("app.cbs"), &device).unwrap().image, Some(program()));
 }
+
+/// A RAM image of a bootloader, with the fields of its header typed from docs/adr/0020, and 4096 bytes.
+fn ram_image(counter: u32) -> Vec<u8> {
+    let mut image = b"CBI2".to_vec();
+    let words = [0, 64, 4096, 0x2000_0000, 0x2001_FFC0, 1, 1, 7, 0x3F, 0x40, 0, 0x0001_0002, counter, 0, 0];
+    image.extend(words.into_iter().flat_map(u32::to_le_bytes));
+    image.extend((0..4096_u32).map(|at| at as u8));
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image[8..]);
+    image[4..8].copy_from_slice(&crc.to_le_bytes());
+    image
+}
+
+/// Everything about a sealed bootloader is in its header.
+#[test]
+fn a_bootloader_is_sealed_by_a_key_for_bootloaders() {
+    let room = Room::new("bootloader");
+    let (root, key) = (room.path("root.pem"), room.path("release.pem"));
+    let file = room.0.file("boot.bin", &ram_image(3));
+    let (out, cert) = (room.path("boot.cbs"), room.path("boot.cert"));
+    let certify = ["key", "certify", "--root", &root, "--key", &room.path("release.pub"), "--epoch", "1"];
+    let certify = [&certify[..], &["--vendor", "0x3F", "-o", &cert]].concat();
+    let seal = ["seal", &file, "-o", &out, "--bootloader", "--key", &key, "--cert", &cert];
+    room.good(&[&certify[..], &["--role", "release"]].concat());
+    let done = coflash(&seal);
+    assert_eq!(done.exit, 3, "a key for programs: {}", done.err);
+    fs::remove_file(&cert).unwrap();
+    room.good(&[&certify[..], &["--role", "bootloader"]].concat());
+    assert_eq!(json(&["key", "show", &cert])["role"], "bootloader");
+    let done = room.good(&seal);
+    assert!(done.out.contains("counter 3, 4160 bytes"), "{}", done.out);
+    let shown = json(&["show", &out]);
+    assert_eq!((&shown["program"], &shown["counter"]), (&255.into(), &3.into()));
+    assert!(room.verify("boot.cbs", &[]).out.contains("4160 bytes"));
+    // A key for bootloaders signs no program.
+    let program = ["seal", &room.path("app.hex"), "--board", "nucleo-f446re", "--counter", "7"];
+    let done =
+        coflash(&[&program[..], &["--key", &key, "--cert", &cert, "-o", &room.path("app.cbs")]].concat());
+    assert_eq!(done.exit, 3, "{}", done.err);
+    assert_eq!(coflash(&[&seal[..], &["--counter", "4"]].concat()).exit, 2);
+    let none = room.path("app.hex");
+    assert_eq!(coflash(&["seal", &none, "--bootloader", "--key", &key, "-o", &out]).exit, 3);
+}
