@@ -5,6 +5,8 @@
 //! start. It knows no other address of the image, so any RAM image runs on any resident part that
 //! has the services it needs.
 
+use core::fmt;
+
 use crate::geometry::{Region, CORE_VECTORS_SIZE};
 use crate::layout::LEAST_STACK;
 use crate::vectors::VectorTable;
@@ -167,6 +169,16 @@ impl Header {
             Some(vectors) => Ok(vectors),
             None => Err(Damage::Vectors),
         }
+    }
+}
+
+/// The version of a RAM image, as 1018h/3 has it: major in the upper half, minor in the lower.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Version(pub u32);
+
+impl fmt::Display for Version {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{}", self.0 >> 16, self.0 & 0xFFFF)
     }
 }
 

@@ -10,13 +10,14 @@ use coboot_tests::firmware;
 use coboot_tests::renewal::{number, running, version};
 use coboot_tests::sealed_board;
 use coflash::device::info;
-use coflash::file::ram_image::{RamImage, Version};
+use coflash::file::ram_image::RamImage;
 use coflash::file::read::{read, Firmware, Format};
 use coflash::update::event::Phase;
 use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Renewal};
 use coflash::Error;
 use emulator::machine::{Cut, FlashCut, Operation};
 use shared_abi::handoff::ResetCause;
+use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Progress, State, TrialEnd};
 
 const NEW: u32 = 0x0009_0001;

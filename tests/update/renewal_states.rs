@@ -10,10 +10,11 @@ use coboot_tests::renewal::{
     confirm, crc_of, identification, number, progress, running, stage, start, version,
 };
 use coflash::device::Doing;
-use coflash::file::ram_image::{RamImage, Version};
+use coflash::file::ram_image::RamImage;
 use coflash::file::read::{read, Firmware, Format};
 use coflash::update::{renew, FlashOptions, NewBootloader, Renewal};
 use coflash::Error;
+use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, State};
 
 const FIRST: u32 = 0x0009_0001;

@@ -22,17 +22,21 @@ const BOOT_CORE: &[Rule] = &[
     ("keys", "flash store"),
     ("queue", "session"),
     ("refusal", ""),
+    ("renewal", "flash store"),
     ("resume", ""),
     ("policy", "crc keys refusal resume session"),
     ("session", ""),
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
     ("intake", "keys policy program queue refusal resume session"),
     // It works from the queue to the flash: no session, no object.
-    ("unseal", "flash keys policy program queue store"),
+    ("unseal", "flash keys policy program queue renewal store"),
     ("source", "flash program queue store unseal"),
     // It works on pieces and addresses: no format, no object.
-    ("programmer", "crc flash program queue resume sequence source store"),
-    ("control", "flash intake keys policy program programmer refusal resume session source store unseal"),
+    ("programmer", "crc flash policy program queue renewal resume sequence source store"),
+    (
+        "control",
+        "flash intake keys policy program programmer refusal renewal resume session source store unseal",
+    ),
     ("stored_version", "flash programmer"),
     ("bootloader", "control decision flash resume store stored_version"),
     ("profile", "bootloader policy"),

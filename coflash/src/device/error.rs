@@ -12,8 +12,7 @@ use shared_abi::renewal::TrialEnd;
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
-use super::renewal::trial_end;
-use super::state::{reason, source, BootloaderState};
+use super::state::{reason, source, trial_end, BootloaderState};
 use crate::bus::gateway::GatewayError;
 use crate::bus::AdapterError;
 

@@ -7,12 +7,11 @@ use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
-use shared_abi::warm_start::Damage;
 
 use super::error::{told, Error};
 use super::session::Session;
-use super::state::source;
-use crate::file::ram_image::Version;
+use super::state::trial_end;
+use shared_abi::ram_image::Version;
 
 /// What a device reports about its bootloader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,29 +54,6 @@ pub fn bootloader(session: &mut Session<'_>) -> Result<Option<Bootloader>, Error
 pub fn progress(session: &mut Session<'_>) -> Result<Option<Progress>, Error> {
     let word = session.read_number(Address::new(DEVICE_STATE, STATE_RENEWAL))?;
     Ok(Progress::from_bytes(word.to_le_bytes()))
-}
-
-/// The end of a trial, in words: the rest of a sentence about the new bootloader.
-#[must_use]
-pub fn trial_end(end: TrialEnd) -> String {
-    match end {
-        TrialEnd::None => "did not run".to_string(),
-        TrialEnd::Late => "was not confirmed in time".to_string(),
-        TrialEnd::GivenUp => "was given up by a master".to_string(),
-        TrialEnd::Reset(cause) => format!("ended by a reset: {}", source(cause)),
-        TrialEnd::Damaged(damage) => format!("could not be loaded: {}", damage_words(damage)),
-    }
-}
-
-/// A damage of a RAM image, in words.
-const fn damage_words(damage: Damage) -> &'static str {
-    match damage {
-        Damage::Header => "its header is wrong",
-        Damage::Services => "it needs a newer resident part, or another ability of it",
-        Damage::Crc => "its CRC is wrong",
-        Damage::Board => "it is for another board",
-        Damage::Vectors => "its stack or its entry is outside its RAM",
-    }
 }
 
 impl fmt::Display for Bootloader {

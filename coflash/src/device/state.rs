@@ -6,6 +6,8 @@ use canopen::program::{ClockSource, Supply};
 use serde::Serialize;
 use shared_abi::boot_report::Reason;
 use shared_abi::handoff::ResetCause;
+use shared_abi::renewal::TrialEnd;
+use shared_abi::warm_start::Damage;
 
 use super::option_bytes::OptionBytes;
 
@@ -87,6 +89,29 @@ pub fn reason(number: u8) -> String {
         None => return format!("for a reason that this tool does not know ({number})"),
     }
     .to_string()
+}
+
+/// The end of a trial, in words: the rest of a sentence about the new bootloader.
+#[must_use]
+pub fn trial_end(end: TrialEnd) -> String {
+    match end {
+        TrialEnd::None => "did not run".to_string(),
+        TrialEnd::Late => "was not confirmed in time".to_string(),
+        TrialEnd::GivenUp => "was given up by a master".to_string(),
+        TrialEnd::Reset(cause) => format!("ended by a reset: {}", source(cause)),
+        TrialEnd::Damaged(damage) => format!("could not be loaded: {}", damage_words(damage)),
+    }
+}
+
+/// A damage of a RAM image, in words.
+const fn damage_words(damage: Damage) -> &'static str {
+    match damage {
+        Damage::Header => "its header is wrong",
+        Damage::Services => "it needs a newer resident part, or another ability of it",
+        Damage::Crc => "its CRC is wrong",
+        Damage::Board => "it is for another board",
+        Damage::Vectors => "its stack or its entry is outside its RAM",
+    }
 }
 
 impl fmt::Display for BootloaderState {

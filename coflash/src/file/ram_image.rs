@@ -1,7 +1,5 @@
 //! The RAM image of a bootloader in a firmware file: what `coflash flash` renews a bootloader with.
 
-use std::fmt;
-
 use shared_abi::ram_image::{Header, MAGIC};
 
 use super::block_file::CRC;
@@ -92,18 +90,10 @@ impl RamImage {
     }
 }
 
-/// A version of a bootloader, as 1018h/3 has it: major in the upper half, minor in the lower.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Version(pub u32);
-
-impl fmt::Display for Version {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}.{}", self.0 >> 16, self.0 & 0xFFFF)
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use shared_abi::ram_image::Version;
+
     use super::*;
     use crate::file::read::{read, Firmware, Format};
 

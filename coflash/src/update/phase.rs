@@ -10,8 +10,8 @@ use super::options::Target;
 use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
 use crate::file::block_file::Checksum;
-use crate::file::ram_image::Version;
 use crate::json;
+use shared_abi::ram_image::Version;
 
 /// An erase that ends within this time was postponed by the device, or had nothing to do: to erase
 /// a flash sector takes longer.

@@ -2,14 +2,13 @@
 //! then the device installs it (docs/renewal.md).
 
 use std::cell::RefCell;
-use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::Address;
 use seal::wire::BOOTLOADER;
-use serde::Serialize;
+use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 use super::catch::knock;
@@ -17,15 +16,15 @@ use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Done, Event, Note, Phase, Report, Retry, Warning};
 use super::judge::{judge, Judgement};
 use super::options::{FlashOptions, Target};
+use super::renewal::Renewal;
 use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::session::Silence;
-use crate::device::{DeviceType, Dialect, Doing, Error, Session};
-use crate::file::ram_image::{Fault, RamImage, Version};
+use crate::device::{Dialect, Doing, Error, Session};
+use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Firmware, Format};
 use crate::file::sealed::SealedFile;
-use crate::json;
 
 /// A device leaves its bootloader within this time after the answer to START.
 const LEAVES_WITHIN: Duration = Duration::from_millis(200);
@@ -120,51 +119,6 @@ impl NewBootloader {
             Self::Plain(image) => Version(image.header().version),
             Self::Sealed(file) => Version(file.head().version()),
         }
-    }
-}
-
-/// The results of a renewal.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[non_exhaustive]
-pub struct Renewal {
-    /// The program number of the bootloader.
-    pub number: u8,
-    /// The version that ran before.
-    #[serde(serialize_with = "number_of")]
-    pub from: Version,
-    /// The version that runs now.
-    #[serde(serialize_with = "number_of")]
-    pub to: Version,
-    /// Whether the device had this bootloader already: nothing was changed.
-    pub unchanged: bool,
-    /// How many times it had to be sent again.
-    pub repeats: u32,
-    /// The time for the download.
-    #[serde(rename = "transfer_seconds", serialize_with = "json::seconds")]
-    pub transfer: Duration,
-    /// The total time, on the bus's clock.
-    #[serde(rename = "seconds", serialize_with = "json::seconds")]
-    pub took: Duration,
-    /// The device type of the program, if one ran before and was started again.
-    #[serde(serialize_with = "device_type")]
-    pub running: Option<DeviceType>,
-}
-
-fn number_of<S: serde::Serializer>(version: &Version, serializer: S) -> Result<S::Ok, S::Error> {
-    version.0.serialize(serializer)
-}
-
-fn device_type<S: serde::Serializer>(running: &Option<DeviceType>, serializer: S) -> Result<S::Ok, S::Error> {
-    running.map(|running| running.0).serialize(serializer)
-}
-
-impl fmt::Display for Renewal {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { from, to, .. } = self;
-        if self.unchanged {
-            return write!(f, "nothing to do: the device has this bootloader (version {to})");
-        }
-        write!(f, "done in {:.1} s: bootloader {from} -> {to}, installed", self.took.as_secs_f64())
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::{Serialize, Serializer};
 
-use super::renew::Renewal;
+use super::renewal::Renewal;
 use crate::device::{DeviceType, Dialect, Transfers};
 use crate::json;
 

@@ -8,13 +8,14 @@ use std::time::Duration;
 use canopen::NodeId;
 use coflash::device::info::info;
 use coflash::device::{Session, Timing};
-use coflash::file::ram_image::{RamImage, Version};
+use coflash::file::ram_image::RamImage;
 use coflash::file::raw;
 use coflash::update::event::{Phase, Warning};
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{renew, DeviceState, Event, FlashOptions, NewBootloader, Renewal};
 use coflash::Error;
 use serde_json::Value;
+use shared_abi::ram_image::Version;
 
 use crate::fake::{Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 use crate::tool::{coflash, folder, serve};

@@ -12,6 +12,7 @@
 //! [`Erase`].
 
 mod commands;
+mod progress;
 mod renewal;
 mod rights;
 mod sealed;
@@ -41,6 +42,7 @@ use crate::session::Session;
 use crate::source::Source;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Outcome;
+use progress::Renewal as Known;
 use rights::Rights;
 
 pub use crate::policy::{Erase, Policy, Renewal, Verdict};
@@ -111,7 +113,7 @@ pub struct Downloader<'b, P, const PROGRAMS: usize> {
     /// The result of the last storing of node-ID and bit rate.
     node_stored: Result<(), FlashError>,
     /// `None` if the bootloader cannot be renewed.
-    renewal: Option<renewal::Renewal>,
+    renewal: Option<Known>,
 }
 
 impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {

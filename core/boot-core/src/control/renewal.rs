@@ -6,9 +6,10 @@ use canopen::{AbortCode, Instant};
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::Host;
-use shared_abi::renewal::{Origin, Progress, State, TrialEnd, BOOTLOADER};
+use shared_abi::renewal::{Origin, Progress, State, BOOTLOADER};
 use shared_abi::warm_start::BootRequest;
 
+use super::progress::Renewal;
 use super::{find, Downloader, Failure};
 use crate::flash::Flash;
 use crate::program::Expected;
@@ -18,41 +19,6 @@ use crate::renewal::{check, header, Places};
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
-
-/// What is known about a renewal.
-#[derive(Clone, Copy)]
-pub(super) struct Renewal {
-    /// The stored record; a copy, because the flash cannot be read while it is busy.
-    record: Option<RenewalRecord>,
-    /// The place of the running image.
-    origin: Origin,
-    trial_end: TrialEnd,
-    /// The version of the running image.
-    version: u32,
-    /// 1F56h of the running image.
-    identification: u32,
-    /// What the device has for a RAM image; a copy for the same reason.
-    host: Host,
-}
-
-impl Renewal {
-    /// The running image is that of home.
-    pub(super) const NONE: Self = Self {
-        record: None,
-        origin: Origin::Home,
-        trial_end: TrialEnd::None,
-        version: 0,
-        identification: 0,
-        host: Host { board: 0, services: 0, features: 0 },
-    };
-
-    const fn state(&self) -> State {
-        match self.record {
-            Some(record) => record.state,
-            None => State::None,
-        }
-    }
-}
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// What is known; of a device without renewal, nothing.
