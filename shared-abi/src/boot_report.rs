@@ -5,7 +5,6 @@
 //! image, never both.
 
 use crate::check_word;
-use crate::renewal::{Origin, TrialEnd};
 use crate::warm_start::Owed;
 
 /// Identifies a boot report ("CBBR" read as little-endian bytes).
@@ -98,10 +97,9 @@ pub struct BootReport {
     pub node_id: u8,
     /// Bit rate in force from this reset on, as the index of CiA 305 table 1.
     pub bit_rate: u8,
-    /// Where the RAM image was loaded from.
-    pub origin: Origin,
-    /// How the last trial of a RAM image ended.
-    pub trial_end: TrialEnd,
+    /// Where the RAM image was loaded from, and how the last trial of one ended:
+    /// see [`renewal::word`](crate::renewal::word).
+    pub renewal: u32,
 }
 
 /// The record in RAM: twelve words, little-endian.
@@ -133,8 +131,7 @@ impl BootReport {
         returned: 0,
         node_id: 255,
         bit_rate: 9,
-        origin: Origin::Home,
-        trial_end: TrialEnd::None,
+        renewal: 0,
     };
 
     /// The record with this report.
@@ -149,8 +146,7 @@ impl BootReport {
         words[3] = u32::from_le_bytes([program, value, node_id, self.returned]);
         words[4] = u32::from_le_bytes([self.node_id, self.bit_rate, self.program_reset, self.crash_resets]);
         words[5] = self.refused as u32;
-        let [end, detail] = self.trial_end.bytes();
-        words[6] = u32::from_le_bytes([self.origin as u8, end, detail, 0]);
+        words[6] = self.renewal;
         words[11] = check_of(&words);
         words
     }
@@ -167,7 +163,6 @@ impl BootReport {
         let [program, value, node, returned] = words[3].to_le_bytes();
         let [node_id, bit_rate, program_reset, crash_resets] = words[4].to_le_bytes();
         let [refused, ..] = words[5].to_le_bytes();
-        let [origin, end, detail, _] = words[6].to_le_bytes();
         Some(Self {
             reason,
             refused,
@@ -179,8 +174,7 @@ impl BootReport {
             returned,
             node_id,
             bit_rate,
-            origin: Origin::from_byte(origin),
-            trial_end: TrialEnd::from_bytes([end, detail]),
+            renewal: words[6],
         })
     }
 }
@@ -193,7 +187,6 @@ const fn check_of(words: &Words) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::handoff::ResetCause;
 
     const REPORT: BootReport = BootReport {
         reason: 1,
@@ -206,8 +199,7 @@ mod tests {
         program_reset: 4,
         crash_resets: 12,
         refused: 13,
-        origin: Origin::Confirmed,
-        trial_end: TrialEnd::Reset(ResetCause::Software),
+        renewal: 0x0003_0302,
     };
 
     /// Written down by hand from the table above.

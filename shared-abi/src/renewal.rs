@@ -96,6 +96,21 @@ impl TrialEnd {
     }
 }
 
+/// The word of a [boot report](crate::boot_report): the number of an origin in the lowest byte, then the
+/// [bytes](TrialEnd::bytes) of the end of a trial.
+#[must_use]
+pub const fn word(origin: Origin, end: TrialEnd) -> u32 {
+    let [number, detail] = end.bytes();
+    u32::from_le_bytes([origin as u8, number, detail, 0])
+}
+
+/// From the [`word`].
+#[must_use]
+pub const fn of_word(word: u32) -> (Origin, TrialEnd) {
+    let [origin, number, detail, _] = word.to_le_bytes();
+    (Origin::from_byte(origin), TrialEnd::from_bytes([number, detail]))
+}
+
 /// 2007h/9: the state of a renewal. On the bus it has four bytes: the number of the [`State`], that of
 /// the [`Origin`], and the two of the [`TrialEnd`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

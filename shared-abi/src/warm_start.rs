@@ -82,13 +82,34 @@ pub enum BootRequest {
     Invalidate(u8) = 11,
     /// Store node parameters, then start as after a power-on.
     StoreNode(StoredNode) = 12,
-    /// Load the RAM image from staging once, on trial. The bootloader writes this request itself, and
-    /// the next two ([`crate::renewal`]).
-    Try = 13,
-    /// The image on trial was not confirmed in time: load the one at home, and stay.
-    TrialLate = 14,
-    /// A master has given up the image on trial: load the one at home, and stay.
-    TrialGivenUp = 15,
+    /// A step in the trial of a new RAM image ([`crate::renewal`]). The bootloader writes this request
+    /// itself.
+    Renewal(TrialStep) = 13,
+}
+
+/// A step in the trial of a new RAM image.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub enum TrialStep {
+    /// Load the image from staging once.
+    Try = 1,
+    /// It was not confirmed in time: load the one at home, and stay.
+    Late = 2,
+    /// A master has given it up: load the one at home, and stay.
+    GivenUp = 3,
+}
+
+impl TrialStep {
+    /// The step with this number.
+    #[must_use]
+    pub const fn from_number(number: u8) -> Option<Self> {
+        Some(match number {
+            1 => Self::Try,
+            2 => Self::Late,
+            3 => Self::GivenUp,
+            _ => return None,
+        })
+    }
 }
 
 /// Node parameters in the cell.
@@ -141,13 +162,12 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 try, 14 trial late, 15 trial
-    /// given up.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
     /// the value in bits 8 to 15 and the node-ID in bits 16 to 22; for node parameters, the node-ID
-    /// in bits 0 to 7 and the bit rate in bits 8 to 15; otherwise 0.
+    /// in bits 0 to 7 and the bit rate in bits 8 to 15; the number of a [`TrialStep`]; otherwise 0.
     pub argument: u32,
     /// [`check_word`] of the three words before.
     pub check: u32,
@@ -177,9 +197,7 @@ impl WarmStart {
             BootRequest::StoreNode(StoredNode { node_id, bit_rate }) => {
                 (12, u32::from_le_bytes([node_id, bit_rate, 0, 0]))
             }
-            BootRequest::Try => (13, 0),
-            BootRequest::TrialLate => (14, 0),
-            BootRequest::TrialGivenUp => (15, 0),
+            BootRequest::Renewal(step) => (13, step as u32),
         };
         Self::encode(request, argument)
     }
@@ -214,9 +232,7 @@ impl WarmStart {
             (10, 1..=254) => BootRequest::Confirm(program),
             (11, 1..=254) => BootRequest::Invalidate(program),
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
-            (13, 0) => BootRequest::Try,
-            (14, 0) => BootRequest::TrialLate,
-            (15, 0) => BootRequest::TrialGivenUp,
+            (13, ..=0xFF) => BootRequest::Renewal(TrialStep::from_number(program)?),
             _ => return None,
         })
     }
@@ -295,9 +311,9 @@ mod tests {
             BootRequest::Invalidate(254),
             BootRequest::StoreNode(StoredNode::new(127, 1_000_000)),
             BootRequest::StoreNode(StoredNode::new(255, 0)),
-            BootRequest::Try,
-            BootRequest::TrialLate,
-            BootRequest::TrialGivenUp,
+            BootRequest::Renewal(TrialStep::Try),
+            BootRequest::Renewal(TrialStep::Late),
+            BootRequest::Renewal(TrialStep::GivenUp),
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -365,10 +381,10 @@ mod tests {
             (10, 255),
             (11, 0x0101),
             (12, 0x0001_0001),
-            (13, 1),
-            (14, 1),
-            (15, 4),
-            (16, 0),
+            (13, 0),
+            (13, 4),
+            (13, 0x0101),
+            (14, 0),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

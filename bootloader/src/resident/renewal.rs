@@ -6,9 +6,9 @@ use boot_core::store::RenewalRecord;
 use bsp::LAYOUT;
 use shared_abi::boot_report::{BootReport, Words};
 use shared_abi::handoff::ResetCause;
-use shared_abi::renewal::{Origin, TrialEnd};
+use shared_abi::renewal::{of_word, Origin, TrialEnd};
 use shared_abi::vectors::VectorTable;
-use shared_abi::warm_start::{BootRequest, Damage};
+use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
 use crate::flash::ResidentFlash;
 use crate::product::{Parameters, PRODUCT};
@@ -33,7 +33,7 @@ pub unsafe fn load(
     };
     let Some(places) = Places::of(LAYOUT).filter(|_| PRODUCT.renewal) else { return home() };
     let record = RenewalRecord::load(parameters, flash);
-    let tries = request == Some(BootRequest::Try);
+    let tries = request == Some(BootRequest::Renewal(TrialStep::Try));
     let mut damage = Damage::Header;
     for (place, origin) in places.order(flash, record, tries).into_iter().flatten() {
         // SAFETY: it is a place of the layout; the caller guarantees the rest.
@@ -57,9 +57,11 @@ pub fn last_report() -> Option<BootReport> {
 /// How a trial has ended by this reset, if the image that ran was on trial.
 pub fn trial_end(request: Option<BootRequest>, cause: ResetCause) -> TrialEnd {
     match request {
-        Some(BootRequest::TrialLate) => TrialEnd::Late,
-        Some(BootRequest::TrialGivenUp) => TrialEnd::GivenUp,
-        _ if last_report().is_some_and(|report| report.origin == Origin::Trial) => TrialEnd::Reset(cause),
+        Some(BootRequest::Renewal(TrialStep::Late)) => TrialEnd::Late,
+        Some(BootRequest::Renewal(TrialStep::GivenUp)) => TrialEnd::GivenUp,
+        _ if last_report().is_some_and(|report| of_word(report.renewal).0 == Origin::Trial) => {
+            TrialEnd::Reset(cause)
+        }
         _ => TrialEnd::None,
     }
 }

@@ -15,8 +15,8 @@ use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
-use shared_abi::renewal::{Origin, TrialEnd};
-use shared_abi::warm_start::{BootRequest, Owed};
+use shared_abi::renewal::{word, Origin, TrialEnd};
+use shared_abi::warm_start::{BootRequest, Owed, TrialStep};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
@@ -92,7 +92,7 @@ pub unsafe extern "C" fn stage() -> ! {
         trial_end = renewal::trial_end(request, reset_cause);
         if matches!(trial_end, TrialEnd::Reset(_)) && matches!(request, None | Some(BootRequest::Fault)) {
             // The image at home says why it ended.
-            circumstances.request = Some(BootRequest::TrialGivenUp);
+            circumstances.request = Some(BootRequest::Renewal(TrialStep::GivenUp));
         }
     }
     let mut decision = decide(&circumstances);
@@ -101,8 +101,7 @@ pub unsafe extern "C" fn stage() -> ! {
         match unsafe { renewal::load(&flash, &parameters, request, &mut trial_end) } {
             Ok((vectors, origin)) => {
                 let report = BootReport {
-                    origin,
-                    trial_end,
+                    renewal: word(origin, trial_end),
                     crash_resets: crash_resets.min(u32::from(u8::MAX)) as u8,
                     node_id,
                     bit_rate: node.bit_rate as u8,

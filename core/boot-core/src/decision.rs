@@ -58,9 +58,7 @@ impl Policy {
                 BootRequest::Fault
                 | BootRequest::Resume(_)
                 | BootRequest::Damaged(_)
-                | BootRequest::Try
-                | BootRequest::TrialLate
-                | BootRequest::TrialGivenUp,
+                | BootRequest::Renewal(_),
             ) => before,
             Some(_) => 0,
             None if matches!(cause, IndependentWatchdog | WindowWatchdog | Software | LowPower) => {
@@ -124,9 +122,7 @@ pub fn decide(
     match circumstances.request {
         Some(BootRequest::Stay | BootRequest::Owed(_)) => return stay(Reason::Requested),
         Some(BootRequest::Fault) => return stay(Reason::Fault),
-        Some(BootRequest::Try | BootRequest::TrialLate | BootRequest::TrialGivenUp) => {
-            return stay(Reason::Renewal);
-        }
+        Some(BootRequest::Renewal(_)) => return stay(Reason::Renewal),
         _ => {}
     }
     if circumstances.strap {

@@ -20,6 +20,9 @@ pub struct Places {
 }
 
 impl Places {
+    /// Of a layout without staging.
+    pub(crate) const NONE: Self = Self { home: Region::new(0, 0), staging: Region::new(0, 0) };
+
     /// The places of a layout; `None` if its RAM image cannot be renewed.
     #[must_use]
     pub const fn of(layout: &Layout) -> Option<Self> {

@@ -1,6 +1,5 @@
 //! What the device knows about a renewal of its bootloader.
 
-use shared_abi::ram_image::Host;
 use shared_abi::renewal::{Origin, State, TrialEnd};
 
 use crate::store::RenewalRecord;
@@ -17,20 +16,12 @@ pub(super) struct Renewal {
     pub version: u32,
     /// 1F56h of the running image.
     pub identification: u32,
-    /// What the device has for a RAM image; a copy for the same reason.
-    pub host: Host,
 }
 
 impl Renewal {
     /// The running image is that of home.
-    pub(super) const NONE: Self = Self {
-        record: None,
-        origin: Origin::Home,
-        trial_end: TrialEnd::None,
-        version: 0,
-        identification: 0,
-        host: Host { board: 0, services: 0, features: 0 },
-    };
+    pub(super) const NONE: Self =
+        Self { record: None, origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
 
     pub(super) const fn state(&self) -> State {
         match self.record {

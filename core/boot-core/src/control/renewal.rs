@@ -6,8 +6,8 @@ use canopen::{AbortCode, Instant};
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::Host;
-use shared_abi::renewal::{Origin, Progress, State, BOOTLOADER};
-use shared_abi::warm_start::BootRequest;
+use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
+use shared_abi::warm_start::{BootRequest, TrialStep};
 
 use super::progress::Renewal;
 use super::{find, Downloader, Failure};
@@ -19,6 +19,9 @@ use crate::renewal::{check, header, Places};
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
+
+/// Of a device without renewal.
+const NO_HOST: Host = Host { board: 0, services: 0, features: 0 };
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// What is known; of a device without renewal, nothing.
@@ -42,30 +45,28 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// 2007h/8: the version of the running image, and that of the services of the resident part.
     #[must_use]
     pub fn versions(&self) -> [u8; 8] {
-        let Renewal { version, host, .. } = self.known();
+        let (Renewal { version, .. }, host) = (self.known(), self.host());
         (u64::from(host.services) << 32 | u64::from(version)).to_le_bytes()
     }
 
     /// What the device has for a RAM image.
     pub(super) fn host(&self) -> Host {
-        self.known().host
+        self.programmer.renewing.as_ref().map_or(NO_HOST, Renewing::host)
     }
 
     /// Starts with the report of the resident part. What a cut has interrupted goes on.
     pub(super) fn begin_renewal<F: Flash>(&mut self, flash: &F, report: &BootReport) {
         let Some(places) = Places::of(self.layout) else { return };
+        let (origin, trial_end) = of_word(report.renewal);
         let record = RenewalRecord::load(&self.parameters, flash);
-        let running = if report.origin == Origin::Home { places.home } else { places.staging };
+        let running = if origin == Origin::Home { places.home } else { places.staging };
         let header = header(flash, running);
-        let BootReport { origin, trial_end, .. } = *report;
-        let host = self.policy.renewal.host(self.parameters.services());
         let identification = match header.crc {
             // An image for the bench.
             0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
             crc => crc,
         };
-        self.renewal =
-            Some(Renewal { record, origin, trial_end, version: header.version, identification, host });
+        self.renewal = Some(Renewal { record, origin, trial_end, version: header.version, identification });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = identification;
@@ -73,14 +74,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.programmer.renewing = Some(Renewing {
             layout: self.layout,
             policy: self.policy.renewal,
-            host,
-            places,
+            services: self.parameters.services(),
             has_record: record.is_some(),
         });
         let Some(record) = record else { return };
-        match (record.state, report.origin) {
+        match (record.state, origin) {
             (State::Confirmed, Origin::Confirmed) | (State::Installed, Origin::Spare) => {
-                self.programmer.install(places, record);
+                self.programmer.install(record);
             }
             // Home is an image that the record does not know, so it is void; or nothing is left in staging.
             (State::Confirmed, Origin::Home) | (State::Staged | State::Installed, Origin::Home)
@@ -102,7 +102,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let ends = u32::from(self.policy.renewal.confirm_within_s) * 1000;
         let is_open = self.known().origin == Origin::Trial && self.known().state() == State::Staged;
         if is_open && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
-            self.boot_request = Some(BootRequest::TrialLate);
+            self.boot_request = Some(BootRequest::Renewal(TrialStep::Late));
         }
     }
 
@@ -135,13 +135,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         state.failure = None;
         match command {
-            Clear | ClrSignature if on_trial => self.boot_request = Some(BootRequest::TrialGivenUp),
+            Clear | ClrSignature if on_trial => {
+                self.boot_request = Some(BootRequest::Renewal(TrialStep::GivenUp))
+            }
             Clear => {
                 state.session = Session::Cleared { just: true };
                 self.download_cancel();
                 self.programmer.abort();
             }
-            Start if is == State::Staged => self.boot_request = Some(BootRequest::Try),
+            Start if is == State::Staged => self.boot_request = Some(BootRequest::Renewal(TrialStep::Try)),
             Start => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
             SetSignature if on_trial || is == State::Confirmed => self.install(),
             SetSignature | Stop | StartBootloader | ResetStat | ClrSignature => {}
@@ -152,8 +154,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// A master has reached the image on trial, and confirms it; or an installation that has failed is
     /// tried again.
     fn install(&mut self) {
-        if let (Some(places), Some(record)) = (Places::of(self.layout), self.known().record) {
-            self.programmer.install(places, record);
+        if let Some(record) = self.known().record {
+            self.programmer.install(record);
         }
     }
 

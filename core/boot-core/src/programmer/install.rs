@@ -14,7 +14,7 @@ use crate::flash::{Flash, FlashFault, Next};
 use crate::policy::Renewal;
 use crate::program::FlashCrc;
 use crate::queue::Piece;
-use crate::renewal::{header, Places};
+use crate::renewal::Places;
 use crate::sequence::{EraseSectors, ProgramWords};
 use crate::store::{RenewalRecord, Value};
 
@@ -23,13 +23,23 @@ use crate::store::{RenewalRecord, Value};
 pub(crate) struct Renewing {
     pub layout: &'static Layout,
     pub policy: &'static Renewal,
-    pub host: Host,
-    pub places: Places,
+    /// The version of the services of the resident part.
+    pub services: u32,
     /// A record of staging is stored: it must be removed before a program changes that flash.
     pub has_record: bool,
 }
 
 impl Renewing {
+    /// The two places of a RAM image.
+    pub(super) fn places(&self) -> Places {
+        Places::of(self.layout).unwrap_or(Places::NONE)
+    }
+
+    /// What the device has for a RAM image.
+    pub(crate) const fn host(&self) -> Host {
+        self.policy.host(self.services)
+    }
+
     /// Whether an image with this header may become the bootloader. `counter`: that of its manifest, if it
     /// is sealed.
     pub(super) fn judge(
@@ -39,8 +49,8 @@ impl Renewing {
     ) -> Result<(), FlashError> {
         let header = Header::of_bytes(bytes);
         let Renewal { identity, revision, .. } = *self.policy;
-        let room = self.places.staging.size - Header::SIZE;
-        if header.check(room, self.layout.ram, self.host).is_err()
+        let room = self.places().staging.size.saturating_sub(Header::SIZE);
+        if header.check(room, self.layout.ram, self.host()).is_err()
             || header.crc == 0
             || counter.is_some_and(|counter| counter != header.counter)
         {
@@ -58,7 +68,7 @@ impl Renewing {
 
     /// A piece of a new RAM image at its place in staging. Those of a sealed one are there already.
     pub(super) fn placed(&self, piece: Piece, is_sealed: bool) -> Piece {
-        let Places { home, staging } = self.places;
+        let Places { home, staging } = self.places();
         let offset = if is_sealed { 0 } else { staging.base.wrapping_sub(home.base) };
         Piece { address: piece.address.wrapping_add(offset), ..piece }
     }
@@ -67,13 +77,12 @@ impl Renewing {
     pub(super) fn is_reached(&self, program: u8, end: u32) -> bool {
         self.has_record
             && usize::from(program) == self.layout.programs.len()
-            && end > self.places.staging.base
+            && end > self.places().staging.base
     }
 }
 
 /// The installation of a confirmed image.
 pub(super) struct Install {
-    places: Places,
     record: RenewalRecord,
     pub phase: Phase,
 }
@@ -96,18 +105,8 @@ pub(super) enum Phase {
 }
 
 impl Install {
-    pub(super) const fn new(places: Places, record: RenewalRecord) -> Self {
-        Self { places, record, phase: Phase::Counter }
-    }
-
-    /// The security counter of the image, from its header in staging.
-    pub(super) fn counter<F: Flash>(&self, flash: &F) -> u32 {
-        header(flash, self.places.staging).counter
-    }
-
-    /// The flash that it writes.
-    pub(super) const fn region(&self) -> Region {
-        self.places.home
+    pub(super) const fn new(record: RenewalRecord) -> Self {
+        Self { record, phase: Phase::Counter }
     }
 
     /// The stored form of its record in this state.
@@ -120,13 +119,13 @@ impl Install {
     }
 
     /// The record is certain: home may be erased.
-    pub(super) const fn permitted(&mut self) {
-        self.phase = Phase::Erase(EraseSectors::new(self.places.home));
+    pub(super) const fn permitted(&mut self, places: Places) {
+        self.phase = Phase::Erase(EraseSectors::new(places.home));
     }
 
     /// The next operation, until [`Phase::Done`].
-    pub(super) fn next<F: Flash>(&mut self, flash: &F, crc_step: u32) -> Next<FlashFault> {
-        let Places { home, staging } = self.places;
+    pub(super) fn next<F: Flash>(&mut self, flash: &F, places: Places, crc_step: u32) -> Next<FlashFault> {
+        let Places { home, staging } = places;
         let words = self.record.size as usize / 4;
         let next = match &mut self.phase {
             Phase::Erase(sectors) => sectors.next(flash),

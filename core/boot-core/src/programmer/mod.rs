@@ -26,7 +26,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Piece;
-use crate::renewal::Places;
+use crate::renewal::{header, Places};
 use crate::resume::Partial;
 use crate::source::{Demand, Source};
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
@@ -259,8 +259,13 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Installs the confirmed RAM image.
-    pub(crate) fn install(&mut self, places: Places, record: RenewalRecord) {
-        self.install = Some(Install::new(places, record));
+    pub(crate) fn install(&mut self, record: RenewalRecord) {
+        self.install = Some(Install::new(record));
+    }
+
+    /// The two places of a RAM image.
+    fn places(&self) -> Places {
+        self.renewing.map_or(Places::NONE, |renewing| renewing.places())
     }
 
     /// Whether a RAM image is being installed.
@@ -434,7 +439,8 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 };
             }
             (Some(Job::Install), _) if P::RENEWS => {
-                match self.install.as_mut().map(|install| install.next(flash, self.crc_step)) {
+                let places = self.places();
+                match self.install.as_mut().map(|install| install.next(flash, places, self.crc_step)) {
                     Some(Next::Start(operation)) => Ok(Some(operation)),
                     Some(Next::Again) => return Next::Again,
                     Some(Next::Done(Err(fault))) => Err(fault),
@@ -471,8 +477,9 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         match (self.job.take()?, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
             (Job::Store(Change::Permit, _), Ok(())) if P::RENEWS => {
+                let places = self.places();
                 if let Some(install) = &mut self.install {
-                    install.permitted();
+                    install.permitted(places);
                 }
                 Some(Event::Stored { program: BOOTLOADER, ends: false })
             }
@@ -638,10 +645,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
         let Some(install) = &self.install else { return Ok(None) };
-        let region = install.region();
         let (change, state) = match install.phase {
             Phase::Counter => {
-                let raised = self.raised_counter(parameters, flash, install.counter(flash));
+                let counter = header(flash, self.places().staging).counter;
+                let raised = self.raised_counter(parameters, flash, counter);
                 if let Some(install) = &mut self.install {
                     install.phase = Phase::Permit;
                 }
@@ -655,7 +662,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         if change == Change::Record {
             self.install = None;
         } else {
-            self.check_writable(flash, region)?;
+            self.check_writable(flash, self.places().home)?;
         }
         Ok(Some(store(parameters, change, BOOTLOADER, value)))
     }
@@ -781,7 +788,7 @@ fn judge_image(
     piece: Option<Piece>,
 ) -> Result<(), FlashError> {
     let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err(FlashError::Format) };
-    if piece.address != renewing.places.staging.base || piece.size < Header::SIZE {
+    if piece.address != renewing.places().staging.base || piece.size < Header::SIZE {
         return Err(FlashError::Format);
     }
     let mut header = [0; Header::SIZE as usize];

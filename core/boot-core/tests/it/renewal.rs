@@ -19,8 +19,8 @@ use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
-use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
-use shared_abi::warm_start::{BootRequest, Damage};
+use shared_abi::renewal::{word, Origin, Progress, State, TrialEnd};
+use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
 const HOME: Region = Region::new(0x0800_0800, 0x400);
 const STAGING: Region = Region::new(0x0800_3C00, 0x800);
@@ -191,11 +191,11 @@ impl Board {
         let journal = Journal::open(&self.flash, LAYOUT.parameters);
         let record = RenewalRecord::load(&journal, &self.flash);
         let mut trial_end = match (self.request, self.ran) {
-            (Some(BootRequest::TrialLate), _) => TrialEnd::Late,
-            (Some(BootRequest::TrialGivenUp), _) => TrialEnd::GivenUp,
+            (Some(BootRequest::Renewal(TrialStep::Late)), _) => TrialEnd::Late,
+            (Some(BootRequest::Renewal(TrialStep::GivenUp)), _) => TrialEnd::GivenUp,
             _ => TrialEnd::None,
         };
-        let tries = self.request == Some(BootRequest::Try);
+        let tries = self.request == Some(BootRequest::Renewal(TrialStep::Try));
         for (place, origin) in PLACES.order(&self.flash, record, tries).into_iter().flatten() {
             match load(&self.flash, place) {
                 Ok(header) => return (header, origin, trial_end),
@@ -210,7 +210,7 @@ impl Board {
         let (_, origin, trial_end) = self.loads();
         self.request = None;
         self.ran = Some(origin);
-        let report = BootReport { origin, trial_end, ..BootReport::NONE };
+        let report = BootReport { renewal: word(origin, trial_end), ..BootReport::NONE };
         let journal = Store(Journal::open(&self.flash, LAYOUT.parameters));
         let (buffer, sealed) = leaked(512);
         let boot = Boot { report, ..Boot::new(&CONFIG, node()) };
@@ -236,7 +236,7 @@ impl Board {
                 (State::Staged, _) => {
                     assert_eq!(node.command(N, START), 0);
                     let request = node.0.take_boot_request();
-                    assert_eq!(request, Some(BootRequest::Try));
+                    assert_eq!(request, Some(BootRequest::Renewal(TrialStep::Try)));
                     self.leave(request);
                     continue;
                 }
@@ -374,8 +374,8 @@ fn an_image_is_staged_tried_confirmed_and_installed() {
     assert_eq!(node.command(N, CONFIRM), 0, "before its trial this changes nothing");
     assert_eq!(node.progress(), Progress { state: State::Staged, ..Progress::default() });
     assert_eq!(node.command(N, START), 0);
-    assert_eq!(node.0.take_boot_request(), Some(BootRequest::Try));
-    board.leave(Some(BootRequest::Try));
+    assert_eq!(node.0.take_boot_request(), Some(BootRequest::Renewal(TrialStep::Try)));
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
     assert_eq!(board.loads().0.crc, crc_of(&new));
     let mut node = board.start();
     let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
@@ -415,7 +415,7 @@ fn a_trial_ends_without_anybody_there() {
     for (ends, end) in
         [(None, TrialEnd::Late), (Some(WITHDRAW), TrialEnd::GivenUp), (Some(CLEAR), TrialEnd::GivenUp)]
     {
-        board.leave(Some(BootRequest::Try));
+        board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
         let mut node = board.start();
         let request = match ends {
             Some(command) => {
@@ -438,12 +438,12 @@ fn a_trial_ends_without_anybody_there() {
         assert_eq!(node.0.take_boot_request(), None, "it stays");
     }
     // A power cut in a trial.
-    board.leave(Some(BootRequest::Try));
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
     board.start();
     board.off();
     assert_eq!(board.loads().1, Origin::Home);
     // A confirmed one stays.
-    board.leave(Some(BootRequest::Try));
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
     let mut node = board.start();
     assert_eq!(node.command(N, CONFIRM), 0);
     node.0.set_time(Instant::from_millis(100_000));
@@ -597,7 +597,7 @@ fn an_image_from_a_probe_makes_the_record_void() {
         board.start().stage(&new);
         if confirmed {
             // The power is cut when home is half erased.
-            board.leave(Some(BootRequest::Try));
+            board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
             board.flash.cut = Some((board.flash.operations + 12, Cut::Torn(1)));
             assert!(until_power_cut(|| {
                 board.start().command(N, CONFIRM);
@@ -656,7 +656,7 @@ fn a_confirmed_image_is_kept_until_it_is_installed() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
     let mut board = Board::new(&old);
     board.start().stage(&new);
-    board.leave(Some(BootRequest::Try));
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
     let mut node = board.start();
     // The installation fails: home cannot be erased.
     node.0.flash().protected = vec![4];
