@@ -327,7 +327,7 @@ impl Product {
             crc_step: self.crc_step,
             seal: if SEALED { self.seal() } else { SealPolicy::NONE },
             read_back: self.reads_back(),
-            renewal: &RENEWAL,
+            renewal: if self.renewal { Some(&RENEWAL) } else { None },
             ..self.profile.download
         }
     }

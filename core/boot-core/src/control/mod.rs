@@ -414,6 +414,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     }
                     _ => AbortCode::HARDWARE,
                 };
+                if P::RENEWS {
+                    // A record that could not be removed stays.
+                    self.image_stored(flash);
+                }
                 self.end(program, Err(error));
             }
         }

@@ -1,14 +1,10 @@
 //! What the device knows about a renewal of its bootloader.
 
-use shared_abi::renewal::{Origin, State, TrialEnd};
-
-use crate::store::RenewalRecord;
+use shared_abi::renewal::{Origin, TrialEnd};
 
 /// What is known about a renewal.
 #[derive(Clone, Copy)]
 pub(super) struct Renewal {
-    /// The stored record; a copy, because the flash cannot be read while it is busy.
-    pub record: Option<RenewalRecord>,
     /// The place of the running image.
     pub origin: Origin,
     pub trial_end: TrialEnd,
@@ -21,12 +17,5 @@ pub(super) struct Renewal {
 impl Renewal {
     /// The running image is that of home.
     pub(super) const NONE: Self =
-        Self { record: None, origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
-
-    pub(super) const fn state(&self) -> State {
-        match self.record {
-            Some(record) => record.state,
-            None => State::None,
-        }
-    }
+        Self { origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
 }

@@ -29,9 +29,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.renewal.unwrap_or(Renewal::NONE)
     }
 
+    /// What is stored of a renewal.
+    fn renewal_state(&self) -> State {
+        self.programmer.image().map_or(State::None, |record| record.state)
+    }
+
     fn set_record(&mut self, record: Option<RenewalRecord>) {
-        if let Some(renewal) = &mut self.renewal {
-            renewal.record = record;
+        if let Some(renewing) = &mut self.programmer.renewing {
+            renewing.record = record;
         }
     }
 
@@ -39,7 +44,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     #[must_use]
     pub fn renewal(&self) -> Progress {
         let Renewal { origin, trial_end, .. } = self.known();
-        Progress { state: self.known().state(), origin, trial_end }
+        Progress { state: self.renewal_state(), origin, trial_end }
     }
 
     /// 2007h/8: the version of the running image, and that of the services of the resident part.
@@ -56,7 +61,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// Starts with the report of the resident part. What a cut has interrupted goes on.
     pub(super) fn begin_renewal<F: Flash>(&mut self, flash: &F, report: &BootReport) {
-        let Some(places) = Places::of(self.layout) else { return };
+        let (Some(places), Some(policy)) = (Places::of(self.layout), self.policy.renewal) else { return };
         let (origin, trial_end) = of_word(report.renewal);
         let record = RenewalRecord::load(&self.parameters, flash);
         let running = if origin == Origin::Home { places.home } else { places.staging };
@@ -66,21 +71,17 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
             crc => crc,
         };
-        self.renewal = Some(Renewal { record, origin, trial_end, version: header.version, identification });
+        self.renewal = Some(Renewal { origin, trial_end, version: header.version, identification });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = identification;
         }
-        self.programmer.renewing = Some(Renewing {
-            layout: self.layout,
-            policy: self.policy.renewal,
-            services: self.parameters.services(),
-            has_record: record.is_some(),
-        });
+        self.programmer.renewing =
+            Some(Renewing { layout: self.layout, policy, services: self.parameters.services(), record });
         let Some(record) = record else { return };
         match (record.state, origin) {
             (State::Confirmed, Origin::Confirmed) | (State::Installed, Origin::Spare) => {
-                self.programmer.install(record);
+                self.programmer.install();
             }
             // Home is an image that the record does not know, so it is void; or nothing is left in staging.
             (State::Confirmed, Origin::Home) | (State::Staged | State::Installed, Origin::Home)
@@ -99,8 +100,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// Takes the time since the start of the image: a trial ends by itself.
     pub(crate) fn watch_trial(&mut self, now: Instant) {
-        let ends = u32::from(self.policy.renewal.confirm_within_s) * 1000;
-        let is_open = self.known().origin == Origin::Trial && self.known().state() == State::Staged;
+        let Some(policy) = self.policy.renewal else { return };
+        let ends = u32::from(policy.confirm_within_s) * 1000;
+        let is_open = self.known().origin == Origin::Trial && self.renewal_state() == State::Staged;
         if is_open && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
             self.boot_request = Some(BootRequest::Renewal(TrialStep::Late));
         }
@@ -111,7 +113,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
         let Renewal { origin, .. } = self.known();
-        let is = self.known().state();
+        let is = self.renewal_state();
         let on_trial = origin == Origin::Trial && is == State::Staged;
         let busy = self.boot_request.is_some() || self.programmer.has_work();
         let loads = self.transfer.is_some() || self.programmer.program().is_some();
@@ -154,18 +156,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// A master has reached the image on trial, and confirms it; or an installation that has failed is
     /// tried again.
     fn install(&mut self) {
-        if let Some(record) = self.known().record {
-            self.programmer.install(record);
-        }
+        self.programmer.install();
     }
 
     /// The record of the image was stored or removed.
     pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
         let record = RenewalRecord::load(&self.parameters, flash);
         self.set_record(record);
-        if let Some(renewing) = &mut self.programmer.renewing {
-            renewing.has_record = record.is_some();
-        }
         if record.is_none() {
             // Nothing is staged any more.
             let identification = self.known().identification;
@@ -208,7 +205,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Ok(());
         }
         let mut detail = 0;
-        let error = if self.known().state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
+        let error = if self.renewal_state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
         {
             Some(FlashError::Busy)
         } else if program != BOOTLOADER || self.programmer.is_busy() {
@@ -242,12 +239,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Whether a program has to leave staging alone, because its image is confirmed and not installed yet.
     pub(super) fn keeps_staging(&self, program: u8) -> bool {
         let is_last = usize::from(program) == self.layout.programs.len();
-        is_last && self.known().state() == State::Confirmed
+        is_last && self.renewal_state() == State::Confirmed
     }
 
     /// Whether the running image is on trial.
     pub(super) fn is_on_trial(&self) -> bool {
-        self.known().origin == Origin::Trial && self.known().state() != State::Confirmed
+        self.known().origin == Origin::Trial && self.renewal_state() != State::Confirmed
     }
 
     /// A download of a new image begins: a download of the last program that has reached staging does not

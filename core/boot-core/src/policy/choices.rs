@@ -71,8 +71,8 @@ pub struct Policy {
     pub crc_step: u32,
     /// The values with which a sealed image is checked.
     pub seal: SealPolicy,
-    /// The values for a renewal of the bootloader.
-    pub renewal: &'static Renewal,
+    /// The values for a renewal of the bootloader; `None` for a device without it.
+    pub renewal: Option<&'static Renewal>,
 }
 
 /// The values for a renewal of the bootloader (docs/renewal.md).
@@ -155,7 +155,7 @@ impl Policy {
         crc: CrcKind::Crc32,
         crc_step: 1024,
         seal: SealPolicy::NONE,
-        renewal: &Renewal::NONE,
+        renewal: None,
     };
 
     /// Whether a download that begins in this state first erases the flash. Otherwise each piece

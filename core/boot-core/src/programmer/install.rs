@@ -25,8 +25,9 @@ pub(crate) struct Renewing {
     pub policy: &'static Renewal,
     /// The version of the services of the resident part.
     pub services: u32,
-    /// A record of staging is stored: it must be removed before a program changes that flash.
-    pub has_record: bool,
+    /// The stored record of the image in staging; a copy, because the flash cannot be read while it is busy.
+    /// It must be removed before a program changes that flash.
+    pub record: Option<RenewalRecord>,
 }
 
 impl Renewing {
@@ -75,19 +76,13 @@ impl Renewing {
 
     /// Whether the last program's flash up to `end` is a part of staging, and has a record.
     pub(super) fn is_reached(&self, program: u8, end: u32) -> bool {
-        self.has_record
+        self.record.is_some()
             && usize::from(program) == self.layout.programs.len()
             && end > self.places().staging.base
     }
 }
 
 /// The installation of a confirmed image.
-pub(super) struct Install {
-    record: RenewalRecord,
-    pub phase: Phase,
-}
-
-/// The progress of an installation.
 pub(super) enum Phase {
     /// The security counter of a sealed image must be raised: from now on no older one is accepted.
     Counter,
@@ -104,59 +99,60 @@ pub(super) enum Phase {
     Done,
 }
 
-impl Install {
-    pub(super) const fn new(record: RenewalRecord) -> Self {
-        Self { record, phase: Phase::Counter }
-    }
-
-    /// The stored form of its record in this state.
-    pub(super) const fn value(&self, state: State) -> Value {
-        let home = match state {
-            State::Installed => self.record.crc,
-            _ => self.record.home,
-        };
-        RenewalRecord { state, home, ..self.record }.value()
-    }
-
+impl Phase {
     /// The record is certain: home may be erased.
-    pub(super) const fn permitted(&mut self, places: Places) {
-        self.phase = Phase::Erase(EraseSectors::new(places.home));
+    pub(super) const fn erase(places: Places) -> Self {
+        Self::Erase(EraseSectors::new(places.home))
     }
 
-    /// The next operation, until [`Phase::Done`].
-    pub(super) fn next<F: Flash>(&mut self, flash: &F, places: Places, crc_step: u32) -> Next<FlashFault> {
-        let Places { home, staging } = places;
-        let words = self.record.size as usize / 4;
-        let next = match &mut self.phase {
-            Phase::Erase(sectors) => sectors.next(flash),
-            Phase::Copy(copy) => {
+    /// The next operation of the installation of the image with this record, until [`Phase::Done`].
+    pub(super) fn next<F: Flash>(
+        &mut self,
+        flash: &F,
+        Places { home, staging }: Places,
+        record: &RenewalRecord,
+        crc_step: u32,
+    ) -> Next<FlashFault> {
+        let words = record.size as usize / 4;
+        let next = match self {
+            Self::Erase(sectors) => sectors.next(flash),
+            Self::Copy(copy) => {
                 copy.next(flash, words, |word| flash.read_word(staging.base + 4 * word as u32))
             }
-            Phase::Check(crc) => {
+            Self::Check(crc) => {
                 return match crc.step(flash, CrcKind::Crc32, crc_step) {
                     false => Next::Again,
-                    true if crc.value() != self.record.crc => Next::Done(Err(FlashFault::Verify)),
+                    true if crc.value() != record.crc => Next::Done(Err(FlashFault::Verify)),
                     true => {
-                        self.phase = Phase::Done;
+                        *self = Self::Done;
                         Next::Done(Ok(()))
                     }
                 };
             }
-            Phase::Counter | Phase::Permit | Phase::Done => Ok(None),
+            Self::Counter | Self::Permit | Self::Done => Ok(None),
         };
         match next {
             Ok(Some(operation)) => Next::Start(operation),
             Err(fault) => Next::Done(Err(fault)),
             Ok(None) => {
-                self.phase = match self.phase {
-                    Phase::Erase(_) => Phase::Copy(ProgramWords::new(home.base)),
+                *self = match self {
+                    Self::Erase(_) => Self::Copy(ProgramWords::new(home.base)),
                     _ => {
                         let from = home.base + Header::CRC_FROM;
-                        Phase::Check(FlashCrc::new(Region::new(from, self.record.size - Header::CRC_FROM)))
+                        Self::Check(FlashCrc::new(Region::new(from, record.size - Header::CRC_FROM)))
                     }
                 };
                 Next::Again
             }
         }
     }
+}
+
+/// The stored form of a record that permits the installation, or says that it is done.
+pub(super) const fn value(record: &RenewalRecord, state: State) -> Value {
+    let home = match state {
+        State::Installed => record.crc,
+        _ => record.home,
+    };
+    RenewalRecord { state, home, ..*record }.value()
 }

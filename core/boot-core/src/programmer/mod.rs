@@ -30,7 +30,7 @@ use crate::renewal::{header, Places};
 use crate::resume::Partial;
 use crate::source::{Demand, Source};
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
-use install::{Install, Phase};
+use install::{value, Phase};
 use write::WritePiece;
 
 pub(crate) use install::Renewing;
@@ -139,7 +139,7 @@ pub(crate) struct Programmer<'b, P> {
     kept: bool,
     job: Option<Job>,
     /// The installation of a RAM image.
-    install: Option<Install>,
+    install: Option<Phase>,
     /// `None` if the RAM image cannot be renewed.
     pub renewing: Option<Renewing>,
     /// The present operation of the flash. Without a job its result is ignored.
@@ -259,8 +259,13 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Installs the confirmed RAM image.
-    pub(crate) fn install(&mut self, record: RenewalRecord) {
-        self.install = Some(Install::new(record));
+    pub(crate) fn install(&mut self) {
+        self.install = Some(Phase::Counter);
+    }
+
+    /// The stored record of the RAM image in staging.
+    pub(crate) fn image(&self) -> Option<RenewalRecord> {
+        self.renewing.as_ref().and_then(|renewing| renewing.record)
     }
 
     /// The two places of a RAM image.
@@ -440,7 +445,14 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             }
             (Some(Job::Install), _) if P::RENEWS => {
                 let places = self.places();
-                match self.install.as_mut().map(|install| install.next(flash, places, self.crc_step)) {
+                let record = self.image();
+                let step = self.crc_step;
+                match self
+                    .install
+                    .as_mut()
+                    .zip(record)
+                    .map(|(install, record)| install.next(flash, places, &record, step))
+                {
                     Some(Next::Start(operation)) => Ok(Some(operation)),
                     Some(Next::Again) => return Next::Again,
                     Some(Next::Done(Err(fault))) => Err(fault),
@@ -478,9 +490,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
             (Job::Store(Change::Permit, _), Ok(())) if P::RENEWS => {
                 let places = self.places();
-                if let Some(install) = &mut self.install {
-                    install.permitted(places);
-                }
+                self.install = Some(Phase::erase(places));
                 Some(Event::Stored { program: BOOTLOADER, ends: false })
             }
             (Job::Store(Change::Counter | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
@@ -644,21 +654,23 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
+        let Some(record) = self.image() else {
+            self.install = None;
+            return Ok(None);
+        };
         let Some(install) = &self.install else { return Ok(None) };
-        let (change, state) = match install.phase {
+        let (change, state) = match install {
             Phase::Counter => {
                 let counter = header(flash, self.places().staging).counter;
                 let raised = self.raised_counter(parameters, flash, counter);
-                if let Some(install) = &mut self.install {
-                    install.phase = Phase::Permit;
-                }
+                self.install = Some(Phase::Permit);
                 return Ok(raised.map(|counter| store_counter(parameters, BOOTLOADER, counter)));
             }
             Phase::Permit => (Change::Permit, State::Confirmed),
             Phase::Done => (Change::Record, State::Installed),
             Phase::Erase(_) | Phase::Copy(_) | Phase::Check(_) => return Ok(Some(Job::Install)),
         };
-        let value = install.value(state);
+        let value = value(&record, state);
         if change == Change::Record {
             self.install = None;
         } else {
@@ -691,7 +703,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         }
         let end = piece.map_or(target.ahead, |piece| target.ahead.max(piece.address + piece.size));
         if renewing.is_reached(target.program, end) {
-            renewing.has_record = false;
+            renewing.record = None;
             self.void(BOOTLOADER);
         }
     }

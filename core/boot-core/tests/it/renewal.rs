@@ -50,7 +50,7 @@ static CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
     layout: &LAYOUT,
-    download: Policy { renewal: &RENEWAL, ..Policy::DEFAULT },
+    download: Policy { renewal: Some(&RENEWAL), ..Policy::DEFAULT },
     ..bench::CONFIG
 };
 
