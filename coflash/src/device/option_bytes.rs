@@ -79,8 +79,8 @@ impl OptionBytes {
             ),
             (
                 !self.protects(0),
-                "the bootloader is not write-protected: clear nWRP of its sectors with a debug probe (sector 0, and \
-                 the others that cargo xtask layout names), and of no others",
+                "the bootloader is not write-protected: clear nWRP of sector 0 with a debug probe \
+                 (of a board with the compact map sectors 0 and 1), and of no others",
             ),
             (
                 self.starts_watchdog(),

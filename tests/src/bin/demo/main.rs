@@ -1,9 +1,11 @@
-//! The main job as a demonstration: `cargo xtask demo`, and with `--sealed` the sealed device.
+//! The main job as a demonstration: `cargo xtask demo`, with `--sealed` the sealed device, and with `--renew`
+//! a new bootloader.
 //!
 //! Host tool, bus and chip run in this process, in virtual time; the firmware is the firmware for
 //! the board.
 //! onto the board.
 
+mod renew;
 mod sealed;
 
 use std::fs::File;
@@ -24,12 +26,16 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
 
 const USAGE: &str =
-    "usage: demo [--sealed] [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
+    "usage: demo [--sealed | --renew] [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
 
 fn main() -> ExitCode {
     let mut arguments: Vec<String> = std::env::args().skip(1).collect();
-    let is_sealed = arguments.first().is_some_and(|first| first == "--sealed");
-    if is_sealed {
+    let story = match arguments.first().map(String::as_str) {
+        Some("--sealed") => Story::Sealed,
+        Some("--renew") => Story::Renewal,
+        _ => Story::MainJob,
+    };
+    if story != Story::MainJob {
         arguments.remove(0);
     }
     let trace = match arguments.iter().map(String::as_str).collect::<Vec<_>>()[..] {
@@ -40,7 +46,7 @@ fn main() -> ExitCode {
             return ExitCode::from(2);
         }
     };
-    match demo(trace.as_deref(), is_sealed) {
+    match demo(trace.as_deref(), story) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("the demonstration failed: {error}");
@@ -49,10 +55,18 @@ fn main() -> ExitCode {
     }
 }
 
-fn demo(trace: Option<&str>, is_sealed: bool) -> Outcome<()> {
+/// What is shown.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Story {
+    MainJob,
+    Sealed,
+    Renewal,
+}
+
+fn demo(trace: Option<&str>, story: Story) -> Outcome<()> {
     let board = firmware::board();
     println!("An emulated {} on a CAN bus at {} kbit/s. Times are virtual.\n", board.board, BIT_RATE / 1000);
-    let mut bench = if is_sealed { open_board() } else { Bench::new() };
+    let mut bench = if story == Story::Sealed { open_board() } else { Bench::new() };
     let log = match trace {
         Some(path) => {
             let file = File::create(path).map_err(|error| format!("{path}: {error}"))?;
@@ -63,10 +77,10 @@ fn demo(trace: Option<&str>, is_sealed: bool) -> Outcome<()> {
         None => None,
     };
 
-    if is_sealed {
-        sealed::tell(&mut bench)?;
-    } else {
-        main_job(&mut bench)?;
+    match story {
+        Story::MainJob => main_job(&mut bench)?,
+        Story::Sealed => sealed::tell(&mut bench)?,
+        Story::Renewal => renew::tell(&mut bench)?,
     }
 
     let counters = bench.machine().counters();

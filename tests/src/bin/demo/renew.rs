@@ -1,0 +1,132 @@
+//! The renewal of the bootloader as a demonstration: `cargo xtask demo --renew`.
+
+use std::sync::Arc;
+
+use bsp::can::BitTiming;
+use canopen::program::{ProgramControl, DEVICE_STATE, STATE_PROGRAM_WATCHDOG};
+use canopen::Address;
+use coboot_tests::bench::{Bench, BIT_RATE, NODE};
+use coboot_tests::firmware;
+use coboot_tests::renewal::{image_of, with_crc};
+use coboot_tests::sealed_board;
+use coflash::file::ram_image::RamImage;
+use coflash::file::read::{read, Firmware, Format};
+use coflash::update::{renew, Event, FlashOptions, NewBootloader};
+use emulator::machine::{Cut, FlashCut};
+
+use super::{chapter, convert, install, introduce, print_line, Outcome};
+
+/// A bootloader is exchanged over CAN; a broken one ends by itself; the power fails.
+pub fn tell(bench: &mut Bench) -> Outcome<()> {
+    chapter("A board runs version 1 of its program");
+    bench.power_on();
+    bench.await_boot_up(1000);
+    install(bench, &convert(firmware::APP_V1))?;
+    introduce(bench)?;
+
+    chapter("A new bootloader: it starts programs with a watchdog of a second");
+    renewed(bench, &bootloader(image_of(firmware::BOOTLOADER_WATCHDOG))?)?;
+    introduce(bench)?;
+    call_back(bench)?;
+
+    chapter("A broken bootloader: its bit rate is wrong, so nobody can reach it");
+    let broken = bootloader(with_wrong_bit_rate(image_of(firmware::BOOTLOADER))?)?;
+    match renewed(bench, &broken) {
+        Ok(()) => return Err("the device has installed it".into()),
+        Err(error) => print_line(bench.time(), &error.to_string()),
+    }
+    introduce(bench)?;
+
+    chapter("The power fails while the device installs another bootloader");
+    let next = bootloader(image_of(firmware::BOOTLOADER))?;
+    let words = image_of(firmware::BOOTLOADER).len() as u64 / 4;
+    bench
+        .machine()
+        .cut_power_at(Some(FlashCut { operation: words + words / 2, when: Cut::Torn { seed: 1 } }));
+    match renewed(bench, &next) {
+        Ok(()) => return Err("the power did not fail".into()),
+        Err(_) => print_line(bench.time(), "the power has failed: a half of its place is written"),
+    }
+    bench.machine().cut_power_at(None);
+    bench.power_off();
+    bench.run_ms(1000);
+    bench.power_on();
+    let up = bench.await_program(1000);
+    print_line(up, "power on, boot-up: the program starts as ever");
+    renewed(bench, &next)?;
+    introduce(bench)?;
+    call_back(bench)?;
+    bench.assert_nothing_unmodelled();
+
+    chapter("A sealed device, and a bootloader that nobody has signed");
+    let mut sealed = sealed_board::board();
+    sealed.power_on();
+    sealed.await_boot_up(1000);
+    match renewed(&mut sealed, &next) {
+        Ok(()) => Err("the device took it".into()),
+        Err(error) => {
+            print_line(sealed.time(), &error.to_string());
+            introduce(&mut sealed)
+        }
+    }
+}
+
+fn bootloader(bytes: Vec<u8>) -> Outcome<NewBootloader> {
+    let Firmware::Image(image) = read(&bytes, Some(Format::Raw), Some(0))? else {
+        return Err("a raw file is an image".into());
+    };
+    let image = RamImage::find(&image).ok_or("there is no RAM image")?;
+    Ok(NewBootloader::Plain(Arc::new(image)))
+}
+
+/// The whole procedure of the tool, printed step by step.
+fn renewed(bench: &mut Bench, new: &NewBootloader) -> Outcome<()> {
+    let clock = bench.clock();
+    let outcome = renew(&mut bench.session(), new, &FlashOptions::default(), &mut |event| match event {
+        Event::Progress { .. } | Event::Done(_) => {}
+        event => print_line(clock.get(), &event.to_string()),
+    });
+    print_line(bench.time(), &outcome?.to_string());
+    Ok(())
+}
+
+fn call_back(bench: &mut Bench) -> Outcome<()> {
+    bench.session().command(1, ProgramControl::StartBootloader)?;
+    bench.await_boot_up(1000);
+    let watchdog = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG))?;
+    print_line(bench.time(), &format!("2007h/10 of the bootloader: {watchdog} ms"));
+    introduce(bench)?;
+    bench.session().command(1, ProgramControl::Start)?;
+    bench.await_boot_up(1000);
+    if bench.is_bootloader(NODE) {
+        return Err("the program does not start".into());
+    }
+    Ok(())
+}
+
+/// The image with another prescaler in the table of its bit rates, as if it were built for another crystal.
+fn with_wrong_bit_rate(mut image: Vec<u8>) -> Outcome<Vec<u8>> {
+    /// The bytes of an entry of the table.
+    const ENTRY: usize = 6;
+    let timings: Vec<[u8; 4]> = bsp::line::TIMINGS
+        .iter()
+        .flatten()
+        .map(|timing| {
+            let [low, high] = timing.prescaler.to_le_bytes();
+            [low, high, timing.segment_1, timing.segment_2]
+        })
+        .collect();
+    let is_table = |at: &usize| {
+        let entries = (*at..).step_by(ENTRY);
+        timings.iter().zip(entries).all(|(timing, at)| image.get(at..at + 4) == Some(timing))
+    };
+    let table = (0..image.len()).find(is_table).ok_or("the table of the bit rates is elsewhere")?;
+    let own = bsp::line::TIMINGS
+        .iter()
+        .position(|timing| timing.is_some() && *timing == BitTiming::new(bsp::CAN_CLOCK, BIT_RATE))
+        .ok_or("the board cannot run at this bit rate")?;
+    let at = table + own * ENTRY;
+    let prescaler = u16::from_le_bytes([image[at], image[at + 1]]) * 2;
+    image[at..at + 2].copy_from_slice(&prescaler.to_le_bytes());
+    Ok(with_crc(image))
+}
