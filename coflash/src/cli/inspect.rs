@@ -89,7 +89,14 @@ fn value(inspection: &Inspection) -> Value {
         "label": inspection.label.map(|label| json!({
             "vendor_id": label.vendor_id, "product_code": label.product_code, "version": label.version,
         })),
-        "fault": inspection.judgement.err().map(|fault| fault.to_string()),
+        "bootloader": inspection.bootloader.as_ref().map(|(header, _)| json!({
+            "version": header.version, "size": header.total(), "crc": header.crc, "vendor_id": header.vendor,
+            "product_code": header.product, "board": header.board, "services": header.services,
+        })),
+        "fault": match inspection.bootloader {
+            Some((_, judgement)) => judgement.err().map(|fault| fault.to_string()),
+            None => inspection.judgement.err().map(|fault| fault.to_string()),
+        },
         "stack_at_end_of_sram": inspection.stack_at_end.map(|at| at.stack),
         "notes": inspection.notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "blocks": blocks,

@@ -6,6 +6,7 @@ use std::fmt;
 use shared_abi::block_file::{Control, Identity, ProgramVersion, NUMBER_CONTROL, NUMBER_LAST};
 use shared_abi::label::Label;
 use shared_abi::layout::Layout;
+use shared_abi::ram_image::{Header, Version};
 
 use super::area::Area;
 use super::block_file::{Block, BlockFile, Checksum};
@@ -13,6 +14,7 @@ use super::image::Image;
 use super::judge::{judge, Fault, StackAtEnd};
 use super::label::{label_of, Words};
 use super::note::Note;
+use super::ram_image::{self, RamImage};
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
 
@@ -29,6 +31,8 @@ pub struct Inspection {
     pub software_version: Option<String>,
     /// The target of the program, from its own label.
     pub label: Option<Label>,
+    /// The bootloader in it, if it is one, and whether it can be sent to a device.
+    pub bootloader: Option<(Header, Result<(), ram_image::Fault>)>,
     /// Whether the image can be a program.
     pub judgement: Result<(), Fault>,
     /// A stack at the end of a chip's SRAM, if the board is not known.
@@ -98,6 +102,7 @@ impl Inspection {
             bytes: image.byte_count(),
             software_version: image.software_version(),
             label: label_of(image, start),
+            bootloader: RamImage::find(image).map(|found| (*found.header(), found.check())),
             judgement: judge(image, start, board),
             stack_at_end: StackAtEnd::of(image, start).filter(|_| board.is_none()),
             notes: image.notes().to_vec(),
@@ -215,11 +220,23 @@ impl fmt::Display for Inspection {
         if let Some(label) = &self.label {
             writeln!(f, "  label        {}", Words(label))?;
         }
-        match &self.judgement {
-            Ok(()) => {
-                writeln!(f, "  judged       can be a program: stack pointer and reset vector are plausible")?
+        if let Some((header, _)) = &self.bootloader {
+            let Header { version, vendor, product, board, services, crc, .. } = *header;
+            let (version, size) = (Version(version), header.total());
+            writeln!(f, "  bootloader   version {version}, {size} bytes, CRC {crc:08X}h")?;
+            writeln!(f, "  for          vendor-ID {vendor:08X}h, product code {product:08X}h, board {board:08X}h, services {services}")?;
+        }
+        match (&self.bootloader, &self.judgement) {
+            (Some((_, Ok(()))), _) => {
+                writeln!(f, "  judged       a bootloader: coflash flash renews that of a device")?;
             }
-            Err(fault) => writeln!(f, "  judged       {fault}: coflash flash refuses it")?,
+            (Some((_, Err(fault))), _) => {
+                writeln!(f, "  judged       {fault}: coflash flash refuses it")?;
+            }
+            (None, Ok(())) => {
+                writeln!(f, "  judged       can be a program: stack pointer and reset vector are plausible")?;
+            }
+            (None, Err(fault)) => writeln!(f, "  judged       {fault}: coflash flash refuses it")?,
         }
         if let (Ok(()), Some(stack)) = (&self.judgement, self.stack_at_end) {
             writeln!(f, "  caution      {stack}")?;

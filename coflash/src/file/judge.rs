@@ -96,7 +96,8 @@ impl Fault {
     pub fn advice(&self) -> &'static str {
         match self {
             Self::Bootloader => {
-                "give the program, linked for an address after the bootloader; use a debug probe to write a bootloader"
+                "give the program, linked for an address after the bootloader; coflash flash renews a bootloader whose \
+                 RAM image has a header, and a debug probe writes any other"
             }
             Self::Elsewhere { area, .. } => area.advice(),
             Self::OtherPlace { .. } => {

@@ -11,12 +11,14 @@ use seal::wire::BOOTLOADER;
 use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
+use super::aftermath::look;
 use super::catch::knock;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Done, Event, Note, Phase, Report, Retry, Warning};
 use super::judge::{judge, Judgement};
 use super::options::{FlashOptions, Target};
 use super::renewal::Renewal;
+use super::running::RunningUpdate;
 use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::renewal::{bootloader, progress, Bootloader};
@@ -168,22 +170,23 @@ pub(super) fn update(
         dialect: Dialect::Block,
         renewal: Some(renewal),
     });
-    let state = match &result {
-        Ok(_) => DeviceState::Untouched,
-        Err(error) => left_by(session, error),
+    let left = match &result {
+        Ok(_) | Err(Error::NotAlone { .. }) => {
+            DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked }
+        }
+        Err(error) => left_by(session, error, options.program),
     };
-    let left = DeviceAfterUpdate { state, answer: DeviceAnswer::NotAsked };
     tell(Event::Done(Box::new(Done::new(left, &result))));
     result
 }
 
-/// The state of the program after a renewal that has failed: it is always complete.
-fn left_by(session: &mut Session<'_>, error: &Error) -> DeviceState {
-    let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
-    match session.device_type() {
-        Ok(Some(running)) if !is_lost && running.is_bootloader() => DeviceState::Called,
-        _ => DeviceState::Untouched,
-    }
+/// The state of a device after a renewal that has failed: its program is as it was.
+fn left_by(session: &mut Session<'_>, error: &Error, program: u8) -> DeviceAfterUpdate {
+    let mut nobody = |_| {};
+    let mut ended = RunningUpdate::new(&mut nobody);
+    (ended.state, ended.touched) = (DeviceState::Called, true);
+    let node = session.node();
+    look(session, error, &ended, node, program, [0; 2])
 }
 
 fn procedure(
@@ -260,7 +263,15 @@ fn in_bootloader(
         try_it(session, number)?;
     }
     tell(Phase::OnTrial.into());
-    install(session, number)?;
+    if let Err(error) = install(session, number) {
+        let is_refusal = matches!(error, Error::Failed { .. } | Error::Refused { .. });
+        // A bootloader that is not confirmed need not wait for its end. The reason stays the result.
+        match progress(session) {
+            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, tell)),
+            _ => {}
+        }
+        return Err(error);
+    }
     match progress(session)? {
         Some(progress) if progress.state == State::Installed => {}
         other => {
@@ -300,17 +311,24 @@ fn leave_trial(
 ) -> Result<(), Error> {
     match running {
         Progress { origin: Origin::Trial, state: State::Staged, .. } => {
-            session.command(number, ProgramControl::ClrSignature)?;
-            await_other_image(session).map(drop)
+            match session.command(number, ProgramControl::ClrSignature) {
+                // One that wants a password, for example. Any reset ends its trial.
+                Err(Error::Refused { .. }) => restart(session, tell),
+                Err(error) => Err(error),
+                Ok(()) => await_other_image(session).map(drop),
+            }
         }
         // It is installed: the next start loads it from home.
-        Progress { origin: Origin::Trial, .. } => {
-            session.reset_node()?;
-            session.wait(LEAVES_WITHIN)?;
-            enter_bootloader(session, tell)
-        }
+        Progress { origin: Origin::Trial, state: State::Installed, .. } => restart(session, tell),
         _ => Ok(()),
     }
+}
+
+/// Restarts the device, and brings it into its bootloader again.
+fn restart(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+    session.reset_node()?;
+    session.wait(LEAVES_WITHIN)?;
+    enter_bootloader(session, tell)
 }
 
 /// Downloads the image into staging; returns the number of repetitions.

@@ -86,6 +86,8 @@ struct Board {
     refuses: Option<(u32, u32)>,
     /// How the installation fails: 1F57h.
     fails: Option<u32>,
+    /// Whether the image on trial wants a password.
+    locked: bool,
     log: Log,
 }
 
@@ -107,6 +109,7 @@ impl Board {
             status: 0,
             refuses: None,
             fails: None,
+            locked: false,
             log: log.clone(),
         }
     }
@@ -129,6 +132,10 @@ impl Board {
         }
         self.status = 0;
         let on_trial = self.origin == TRIAL && self.state == STAGED;
+        if self.locked && on_trial {
+            self.status = 0x84;
+            return Err(NOT_NOW);
+        }
         Ok(match command {
             0x03 | 0x84 if on_trial => self.restart(HOME, [2, 0]),
             0x01 if self.state == STAGED && self.origin != TRIAL => match self.trial {
@@ -403,6 +410,20 @@ fn an_installation_that_fails_says_so_and_can_be_tried_again() {
     assert_eq!(written(&log), ["83"]);
 }
 
+/// A new bootloader that takes no command without a password is not confirmed: a reset ends its trial.
+#[test]
+fn a_bootloader_that_takes_no_confirmation_is_given_up() {
+    let (mut fake, log) = device(BOOTLOADER, |board| board.locked = true);
+    let job = Job::new(NodeId::new(NODE).unwrap(), new(), FlashOptions::default());
+    let results = flash_many(&mut fake, &[job], &ManyOptions::default(), &|_, _| {});
+    let [Err(failed)] = &results[..] else { panic!("{results:?}") };
+    let words = "installing the bootloader failed: programming is not allowed at present (1F57h reads 84h";
+    assert!(failed.error.to_string().starts_with(words), "{}", failed.error);
+    assert!(failed.left.to_string().starts_with("its bootloader is running; "), "{}", failed.left);
+    assert_eq!(written(&log), [&WHOLE[..], &["84"]].concat());
+    assert_eq!(fake.writes().iter().filter(|entry| entry.starts_with("nmt")).count(), 1);
+}
+
 /// The bootloader is no program in `info`, and has a line of its own.
 #[test]
 fn info_shows_the_bootloader_and_its_renewal() {
@@ -507,6 +528,15 @@ fn flash_knows_a_bootloader_by_its_header() {
     let written: Value = serde_json::from_str(&fs::read_to_string(&report).unwrap()).unwrap();
     let renewal = &written["devices"][0]["report"]["renewal"];
     assert_eq!((&renewal["number"], &renewal["from"], &renewal["to"]), (&2.into(), &OLD.into(), &NEW.into()));
+
+    let done = coflash(&["inspect", &file, "--start-address", "0x08010000"]);
+    for words in ["  bootloader   version 1.3, 320 bytes, CRC ", "a bootloader: coflash flash renews that of"]
+    {
+        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
+    }
+    let done = coflash(&["inspect", &file, "--start-address", "0x08010000", "--json"]);
+    let json: Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!((&json["bootloader"]["version"], &json["fault"]), (&NEW.into(), &Value::Null));
 
     // By a job file, too.
     let job = folder.file("job.toml", b"image = 'new.bin'\n[[device]]\nnode = 5\n");
