@@ -552,6 +552,7 @@ impl From<Error> for Failure {
             | Error::TrialFailed { .. }
             | Error::RenewalFailed { .. }
             | Error::FirstFailed { .. }
+            | Error::Unconfirmable { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
         let legacy = legacy::exit_code(&error);

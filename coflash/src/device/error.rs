@@ -217,6 +217,11 @@ pub enum Error {
         /// The end of its trial.
         end: TrialEnd,
     },
+    /// The new bootloader runs on trial, and cannot be confirmed: it is built without renewal.
+    Unconfirmable {
+        /// The device.
+        node: NodeId,
+    },
     /// The bootloader of the first device could not be renewed, so that of this one was left alone.
     FirstFailed {
         /// The first device.
@@ -401,6 +406,7 @@ impl Error {
             | Self::TrialFailed { .. }
             | Self::RenewalFailed { .. }
             | Self::FirstFailed { .. }
+            | Self::Unconfirmable { .. }
             | Self::OtherIdentity { .. } => 0x6000_0014,
             Self::Busy { .. } => 0x6000_0016,
             Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
@@ -572,6 +578,11 @@ impl fmt::Display for Error {
             Self::RenewalFailed { node, end } => {
                 write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
             }
+            Self::Unconfirmable { node } => write!(
+                f,
+                "the new bootloader of node {node} cannot be confirmed: it is built without renewal; a reset brings \
+                 the old one back"
+            ),
             Self::FirstFailed { first } => {
                 write!(
                     f,

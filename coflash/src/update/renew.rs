@@ -21,6 +21,7 @@ use super::renewal::Renewal;
 use super::running::RunningUpdate;
 use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
+use crate::device::error::told;
 use crate::device::renewal::{bootloader, progress, Bootloader};
 use crate::device::session::Silence;
 use crate::device::{Dialect, Doing, Error, Session};
@@ -397,11 +398,16 @@ fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
     loop {
         let pause = session.timing().sdo;
         match session.device_type()? {
-            Some(running) if running.is_bootloader() => {
-                if let Some(progress) = progress(session)? {
-                    return Ok(progress);
+            Some(running) if running.is_bootloader() => match told(progress(session))? {
+                Some(Some(progress)) => return Ok(progress),
+                // A state of a later version.
+                Some(None) => return Err(Error::Unconfirmable { node: session.node() }),
+                None => {
+                    // It knows nothing of its trial, and does not end it. Any reset does.
+                    session.reset_node()?;
+                    return Err(Error::Unconfirmable { node: session.node() });
                 }
-            }
+            },
             _ if session.now() >= began + limit => {
                 return Err(Error::NoAnswer { node: session.node(), doing: Doing::Restart });
             }

@@ -77,6 +77,9 @@ impl Error {
             Self::NotRenewable { .. } => "write it with a debug probe; a product with renewal needs a layout with staging \
                                           (docs/renewal.md)"
                 .to_string(),
+            Self::Unconfirmable { .. } => "build the bootloader for a product with renewal (docs/renewal.md): it could not be \
+                                           renewed again"
+                .to_string(),
             Self::FirstFailed { first } => format!("find out why node {first} has failed, and run the command again"),
             Self::RenewalFailed { .. } => "nothing is lost: look whether the file is the bootloader of this product and of its \
                                            bit rate, and run the command again; a reset that nobody asked for has its cause \

@@ -126,6 +126,16 @@ fn the_names_stay() {
             json!({ "event": "phase", "phase": "trial_passed", "device_type": 131_474, "bootloader": false }),
         ),
         (Phase::Released.into(), json!({ "event": "phase", "phase": "released" })),
+        (
+            Phase::Renewing { number: 2, from: 1, to: 65_536 }.into(),
+            json!({ "event": "phase", "phase": "renewing", "number": 2, "from": 1, "to": 65_536 }),
+        ),
+        (Phase::Staged.into(), json!({ "event": "phase", "phase": "staged" })),
+        (Phase::OnTrial.into(), json!({ "event": "phase", "phase": "on_trial" })),
+        (
+            Phase::Installed { version: 65_536 }.into(),
+            json!({ "event": "phase", "phase": "installed", "version": 65_536 }),
+        ),
         (Phase::Starting.into(), json!({ "event": "phase", "phase": "starting" })),
         (
             Phase::Started(application).into(),

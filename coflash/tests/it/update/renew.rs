@@ -64,6 +64,8 @@ fn new() -> NewBootloader {
 enum Trial {
     /// It answers.
     Works,
+    /// It answers, and knows nothing of a renewal.
+    Without,
     /// The old one is back, with these bytes in 2007h/9.
     Ends([u8; 2]),
 }
@@ -139,7 +141,7 @@ impl Board {
         Ok(match command {
             0x03 | 0x84 if on_trial => self.restart(HOME, [2, 0]),
             0x01 if self.state == STAGED && self.origin != TRIAL => match self.trial {
-                Trial::Works => self.restart(TRIAL, [0; 2]),
+                Trial::Works | Trial::Without => self.restart(TRIAL, [0; 2]),
                 Trial::Ends(end) => self.restart(HOME, end),
             },
             0x83 if on_trial || self.state == CONFIRMED => {
@@ -182,6 +184,9 @@ impl Maker for Board {
         match at {
             (0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, 0) => Some(Ok(vec![number])),
             (0x2007, 8) => Some(Ok((u64::from(self.runs().0) | 1 << 32).to_le_bytes().to_vec())),
+            (0x2007, 9) if self.origin == TRIAL && matches!(self.trial, Trial::Without) => {
+                Some(Err(NO_OBJECT))
+            }
             (0x2007, 9) => Some(Ok([&[self.state, self.origin][..], &self.end].concat())),
             (0x1F51, 2) => Some(Ok(vec![1])),
             (0x1F56, 2) => Some(Ok(self.runs().1.to_le_bytes().to_vec())),
@@ -421,6 +426,16 @@ fn a_bootloader_that_takes_no_confirmation_is_given_up() {
     assert!(failed.error.to_string().starts_with(words), "{}", failed.error);
     assert!(failed.left.to_string().starts_with("its bootloader is running; "), "{}", failed.left);
     assert_eq!(written(&log), [&WHOLE[..], &["84"]].concat());
+    assert_eq!(fake.writes().iter().filter(|entry| entry.starts_with("nmt")).count(), 1);
+}
+
+/// One that is built without renewal would run until the next reset.
+#[test]
+fn a_bootloader_without_renewal_is_given_up() {
+    let (mut fake, log) = device(BOOTLOADER, |board| board.trial = Trial::Without);
+    let error = run(&mut fake).0.unwrap_err();
+    assert!(error.to_string().contains("it is built without renewal"), "{error}");
+    assert_eq!(written(&log), &WHOLE[..3]);
     assert_eq!(fake.writes().iter().filter(|entry| entry.starts_with("nmt")).count(), 1);
 }
 
