@@ -32,7 +32,8 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 pub const SEALED: bool = cfg!(feature = "sealed");
 
 /// The abilities of the resident part, which the RAM image needs.
-pub const FEATURES: u32 = if SEALED { feature::SEALED } else { 0 };
+pub const FEATURES: u32 =
+    if SEALED { feature::SEALED } else { 0 } | if PRODUCT.renewal { feature::RENEWAL } else { 0 };
 
 /// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
 /// (DS8626 table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.

@@ -24,6 +24,9 @@ pub mod feature {
     /// The device takes sealed images. A resident part that knows them loads only an image that needs
     /// this: another one would take programs from anybody.
     pub const SEALED: u32 = 1;
+    /// The bootloader can be renewed: an image that takes part in a trial ends by itself, and installs itself.
+    /// One without this runs from home alone.
+    pub const RENEWAL: u32 = 2;
 }
 
 /// What a device has for a RAM image.
@@ -150,7 +153,7 @@ impl Header {
             return Err(Damage::Header);
         }
         if self.services > host.services
-            || self.features & !host.features != 0
+            || self.features & !(host.features | feature::RENEWAL) != 0
             || host.features & !self.features & feature::SEALED != 0
         {
             return Err(Damage::Services);

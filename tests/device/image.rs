@@ -112,7 +112,11 @@ fn the_header_says_what_was_linked() {
         assert_eq!(parts.get(LENGTH), 64);
         assert_eq!(parts.get(SIZE) as usize, parts.ram().len());
         assert_eq!([parts.get(RAM_BASE), parts.get(RAM_END)], [board.ram.base, board.ram.end()]);
-        assert_eq!([parts.get(SERVICES), parts.get(FEATURES)], [SERVICES_VERSION, 0]);
+        let renews = board.staging.is_some() && name == firmware::BOOTLOADER;
+        assert_eq!(
+            [parts.get(SERVICES), parts.get(FEATURES)],
+            [SERVICES_VERSION, if renews { 2 } else { 0 }]
+        );
         assert_eq!(parts.get(BOARD), crc32(Toml(board).to_string().as_bytes()));
         assert_eq!([parts.get(RESERVED), parts.get(RESERVED + 1)], [0, 0]);
         match board.home {

@@ -6,7 +6,7 @@ use canopen::program::FlashError;
 use shared_abi::block_file::{fits, Difference};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::{Header, Host};
+use shared_abi::ram_image::{feature, Header, Host};
 use shared_abi::renewal::State;
 
 use crate::crc::CrcKind;
@@ -53,6 +53,7 @@ impl Renewing {
         let room = self.places().staging.size.saturating_sub(Header::SIZE);
         if header.check(room, self.layout.ram, self.host()).is_err()
             || header.crc == 0
+            || header.features & feature::RENEWAL == 0
             || counter.is_some_and(|counter| counter != header.counter)
         {
             return Err(FlashError::Format);

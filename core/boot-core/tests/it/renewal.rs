@@ -18,7 +18,7 @@ use kit::random::Random;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
+use shared_abi::ram_image::{feature, Header, Host, MAGIC, SERVICES_VERSION};
 use shared_abi::renewal::{word, Origin, Progress, State, TrialEnd};
 use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
@@ -41,11 +41,12 @@ const PLACES: Places = match Places::of(&LAYOUT) {
 
 const BOARD: u32 = 0x1234_5678;
 /// What the resident part has.
-const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: 0 };
+const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: feature::RENEWAL };
 const N: u8 = 2;
 const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
 static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
-const RENEWAL: Renewal = Renewal { board: BOARD, identity: Some((7, 8)), ..Renewal::NONE };
+const RENEWAL: Renewal =
+    Renewal { board: BOARD, features: feature::RENEWAL, identity: Some((7, 8)), ..Renewal::NONE };
 static CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
@@ -98,7 +99,7 @@ const SOUND: Header = Header {
     ram_base: LAYOUT.ram.base,
     ram_end: LAYOUT.ram.base + LAYOUT.ram.size,
     services: SERVICES_VERSION,
-    features: 0,
+    features: feature::RENEWAL,
     board: BOARD,
     vendor: 7,
     product: 8,
@@ -460,7 +461,8 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
         ("for the bench", SOUND, false),
         ("for another board", Header { board: !BOARD, ..SOUND }, true),
         ("for newer services", Header { services: SERVICES_VERSION + 1, ..SOUND }, true),
-        ("with an unknown ability", Header { features: 1 << 7, ..SOUND }, true),
+        ("with an unknown ability", Header { features: feature::RENEWAL | 1 << 7, ..SOUND }, true),
+        ("without renewal", Header { features: 0, ..SOUND }, true),
         ("with a reserved word", Header { reserved: [0, 1], ..SOUND }, true),
         ("for another place in RAM", Header { ram_base: 0x2000_0200, ..SOUND }, true),
         ("of another format", Header { length: 64 | 1 << 16, ..SOUND }, true),
