@@ -61,7 +61,7 @@ mod app {
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
     use shared_abi::services::{StoreState, STORE_STATE_WORDS};
-    use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
+    use shared_abi::warm_start::{BootRequest, Owed, TrialStep, WarmStart};
 
     use super::{product, start, Mono};
     use crate::log::{self, log};
@@ -306,7 +306,9 @@ mod app {
                 }
             });
             if let Some(request) = bootloader.take_boot_request() {
-                *pending_reset = PendingReset { wanted: true, request, at: None };
+                // A trial ends also if nobody acknowledges a frame: the bit rate of the image may be wrong.
+                let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);
+                *pending_reset = PendingReset { wanted: true, request, at: ends.then_some(now) };
             }
             bootloader.is_finishing()
         });

@@ -178,6 +178,14 @@ fn a_trial_that_nobody_confirms_ends() {
     bench.await_boot_up(3_000);
     let over = |trial_end| Progress { state: State::Staged, origin: Origin::Home, trial_end };
     assert_eq!(progress(&mut bench), over(TrialEnd::Late));
+    // It is deaf, and nobody acknowledges its frames: another bit rate.
+    start(&mut bench);
+    bench.run_ms(50);
+    bench.set_host_bit_rate(500_000);
+    bench.run_ms(61_000);
+    bench.set_host_bit_rate(125_000);
+    bench.run_ms(6_000);
+    assert_eq!(progress(&mut bench), over(TrialEnd::Late));
     // A fault in it.
     start(&mut bench);
     bench.run_ms(20);
