@@ -99,7 +99,8 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     stage(&mut bench, &new);
     assert_eq!(cells(&mut bench, home(old.len())), old, "home is untouched");
     let silence = start(&mut bench);
-    assert!(silence <= Span::from_millis(25), "{silence:?}");
+    // The 20 ms of the answer, up to 2 until the next tick, and the start.
+    assert!(silence <= Span::from_millis(27), "{silence:?}");
     let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
     assert_eq!((progress(&mut bench), identification(&mut bench)), (trial, crc_of(&new)));
     let from = bench.time();

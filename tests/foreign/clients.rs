@@ -132,11 +132,12 @@ fn a_bad_file_touches_no_device() {
     let elf = firmware::elf(firmware::APP_V1);
     let mut damaged = firmware::blocks(firmware::APP_V1).emit();
     damaged[100] ^= 1;
+    let (_, resident) = firmware::section(&firmware::elf(firmware::BOOTLOADER), ".resident");
     let folder = kit::folder!("bad-files");
     for (name, bytes) in [
         ("truncated.elf", &elf[..elf.len() / 2]),
         ("empty.hex", &[]),
-        ("bootloader.elf", &firmware::elf(firmware::BOOTLOADER)),
+        ("resident.bin", &resident),
         ("damaged.blk", &damaged),
         ("checksum.hex", b":020000040801F1\n:0400000000C0012017\n:00000001FF\n"),
     ] {

@@ -104,7 +104,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
         PasswordObject::EnableFlash => {
             let name = "Enable flash programming of a program";
             let element = Entry::sub(ENABLE_FLASH, 1, name, DataType::Unsigned32, Access::Wo);
-            table.with_array("Enable flash programming", element, programs)
+            table.with_numbers("Enable flash programming", element, numbers)
         }
     }
 }
@@ -116,7 +116,7 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
     let password = match extras.password {
         PasswordObject::None => 0,
         PasswordObject::Unlock => UNLOCK_ENTRIES.len(),
-        PasswordObject::EnableFlash => array,
+        PasswordObject::EnableFlash => Numbers { programs, bootloader: extras.bootloader }.entries(),
     };
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
     let second_server = if extras.second_server { second::ENTRIES.len() } else { 0 };
@@ -457,8 +457,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             (ENABLE_FLASH | UNLOCK, password) if C::EXTRAS.has_password() => {
                 self.lock.open(password, self.now)?;
                 match at.index {
-                    ENABLE_FLASH => self.download.unlock(at.sub, true),
-                    _ => (1..=PROGRAMS as u8).try_for_each(|program| self.download.unlock(program, false)),
+                    ENABLE_FLASH => self.download.unlock(Self::program(at.sub), true),
+                    _ => self.download.unlock_all(),
                 }
             }
             _ => Err(AbortCode::UNSUPPORTED_ACCESS),

@@ -124,6 +124,18 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         self.rights.ask(flash, request, unsealer)
     }
 
+    /// A correct password arrived for all programs, and for the bootloader itself.
+    ///
+    /// # Errors
+    /// As [`unlock`](Self::unlock).
+    pub(crate) fn unlock_all(&mut self) -> Result<(), AbortCode> {
+        (1..=self.layout.programs.len() as u8).try_for_each(|program| self.unlock(program, false))?;
+        if P::RENEWS {
+            self.unlock(BOOTLOADER, false)?;
+        }
+        Ok(())
+    }
+
     /// A correct password arrived: from now on 1F50h accepts data, as after CLEAR. With `at_once`,
     /// the old program becomes invalid now; otherwise only when a new one replaces it. A previous
     /// download, of this program or another one, is aborted.
@@ -145,7 +157,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         // A password crosses the bus in plain text: in a sealed device it must not make a program
         // invalid.
-        let at_once = at_once && self.rights.permits(right::ERASE);
+        let is_program = !(P::RENEWS && program == BOOTLOADER);
+        let at_once = at_once && is_program && self.rights.permits(right::ERASE);
         if let (true, Some(region)) = (at_once, self.program(program).map(|state| state.region)) {
             self.programmer.void_if_writable(program, region);
         }

@@ -287,9 +287,9 @@ fn block_file_at(image: &[u8], base: u32, chunk: usize) -> Vec<Vec<u8>> {
 }
 
 /// A running bootloader.
-struct Node<'f>(Bootloader<'static, &'f mut ModelFlash, Store, 2, Renews>);
+struct Node<'f, C: Choices = Renews>(Bootloader<'static, &'f mut ModelFlash, Store, 2, C>);
 
-impl Node<'_> {
+impl<C: Choices> Node<'_, C> {
     fn settle(&mut self) {
         for _ in 0..1_000_000 {
             if self.0.step() == Step::Idle {
@@ -696,4 +696,40 @@ fn commands_by_themselves_change_nothing() {
     assert_eq!(node.0.take_boot_request(), None);
     assert_eq!(node.try_command(N, 0x55), Err(AbortCode::INVALID_VALUE));
     assert_eq!(board.flash.cells(CHIP.flash), before.cells(CHIP.flash));
+}
+
+/// A device with a password takes a new bootloader after it, as it takes a program.
+#[test]
+fn a_password_opens_the_bootloader_too() {
+    use boot_core::profile::Profile;
+
+    const LOCKED: Extras = Extras { bootloader: Some(N), ..Profile::LIFT.extras };
+    struct Locked;
+    impl Choices for Locked {
+        const EXTRAS: Extras = LOCKED;
+    }
+    static OBJECTS: [Entry; entry_count(1, LOCKED)] = entries(1, LOCKED).entries();
+    static LIFT: Config = Config {
+        entries: &OBJECTS,
+        download: Policy { renewal: Some(&RENEWAL), ..Profile::LIFT.download },
+        password: Profile::LIFT.password,
+        ..CONFIG_OF_LIFT
+    };
+    const CONFIG_OF_LIFT: Config = Config { layout: &LAYOUT, device: DEVICE, ..bench::CONFIG };
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut flash = ModelFlash::new(&CHIP);
+    flash.poke(HOME.base, &old);
+    let journal = Store(Journal::open(&flash, LAYOUT.parameters));
+    let (buffer, sealed) = leaked(512);
+    let boot = Boot::new(&LIFT, node()).with(journal, &mut flash, buffer, sealed);
+    let mut node = Node::<Locked>(boot);
+    node.settle();
+    let first = &block_file_at(&new, HOME.base, 200)[0];
+    assert_eq!(node.send(N, first), Err(AbortCode::DEVICE_STATE));
+    assert_eq!(node.word(0x1F57), 0x84);
+    node.0.write(Address::new(0x6005, 1), Profile::LIFT.password).unwrap();
+    for block in block_file_at(&new, HOME.base, 200) {
+        assert_eq!((node.send(N, &block), node.word(0x1F57)), (Ok(()), 0));
+    }
+    assert_eq!(node.progress().state, State::Staged);
 }
