@@ -157,7 +157,7 @@ pub fn write(bench: &mut Bench, file: &[u8], transfers: Transfers) -> (Option<u3
 /// The same for another program.
 ///
 /// # Panics
-/// As [`write`].
+/// As [`write`](fn@write).
 pub fn write_to(bench: &mut Bench, program: u8, file: &[u8], transfers: Transfers) -> (Option<u32>, u32) {
     let mut session = bench.session();
     session.transfer_by(transfers);

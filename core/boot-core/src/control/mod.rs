@@ -95,7 +95,7 @@ struct Transfer {
 
 /// The download of programs into flash. `PROGRAMS` is the number of programs in the layout, and one
 /// more if the bootloader can be renewed: its own image is the last one, with the number
-/// [`BOOTLOADER`](shared_abi::renewal::BOOTLOADER).
+/// [`BOOTLOADER`].
 pub struct Downloader<'b, P, const PROGRAMS: usize> {
     layout: &'static Layout,
     policy: &'static Policy,

@@ -29,6 +29,7 @@ pub(crate) struct Workshop {
 
 /// What is processed at present.
 #[repr(u8)]
+#[allow(clippy::large_enum_variant, reason = "there is one, and no heap: a smaller variant saves nothing")]
 enum Work {
     /// Nothing.
     Idle,
