@@ -86,6 +86,7 @@ mod tests {
             ("data", LAYOUT.data.unwrap()),
             ("RAM image", LAYOUT.home.unwrap()),
             ("program 1", LAYOUT.programs[0]),
+            ("staging", LAYOUT.staging.unwrap()),
             ("code and data", LAYOUT.ram),
             ("handoff", LAYOUT.handoff),
             ("warm-start cell", LAYOUT.warm_start),
