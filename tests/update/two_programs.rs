@@ -62,12 +62,12 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     let mut bench = Bench::of_image(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
-    // 1F50h to 1F57h have two sub-indices and no third.
+    // 1F50h to 1F57h have the two programs, the bootloader, and nothing more.
     for index in [0x50, 0x51, 0x56, 0x57] {
         let highest = bench.ask(0x601, &[0x40, index, 0x1F, 0, 0, 0, 0, 0], 0x581).unwrap();
-        assert_eq!((highest[0], highest[4]), (0x4F, 2));
-        let third = bench.ask(0x601, &[0x40, index, 0x1F, 3, 0, 0, 0, 0], 0x581).unwrap();
-        assert_eq!(third, [0x80, index, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+        assert_eq!((highest[0], highest[4]), (0x4F, 3));
+        let next = bench.ask(0x601, &[0x40, index, 0x1F, 4, 0, 0, 0, 0], 0x581).unwrap();
+        assert_eq!(next, [0x80, index, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
     }
 
     let (first, second) = (blocks(firmware::APP_V1, 1), blocks(firmware::PROGRAM_2, 2));

@@ -52,7 +52,7 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     ),
     (
         "Flash status identification",
-        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
+        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro),
     ),
     (
         "Program region",
