@@ -6,12 +6,12 @@ use canopen::program::{DEVICE_STATE, STATE_BOOTLOADER, STATE_RENEWAL, STATE_VERS
 use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
+use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 use super::error::{told, Error};
 use super::session::Session;
 use super::state::trial_end;
-use shared_abi::ram_image::Version;
 
 /// What a device reports about its bootloader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,8 +4,6 @@
 //! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). All checks that are
 //! possible before the device is changed are made there and in `admission`.
 
-use std::cell::RefCell;
-
 use super::aftermath::look;
 use super::content::{Content, Program};
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
@@ -14,10 +12,9 @@ use super::event::{Done, Event, Note, Phase, Report, Warning};
 use super::options::FlashOptions;
 use super::reach::reach;
 use super::renew;
-use super::running::RunningUpdate;
+use super::running::{telling_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
-use crate::device::session::Silence;
 use crate::device::{flying_master, Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
@@ -78,32 +75,27 @@ fn flash_content(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    let tell = RefCell::new(tell);
-    let silence = |silence: Silence| {
-        let Silence { doing, silent, limit, .. } = silence;
-        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
-    };
-    let mut tell = |event| (tell.borrow_mut())(event);
-    let (original, timing) = (session.node(), *session.timing());
-    let mut inner = session.with(original, timing).tell_silence(&silence);
-    let mut update = RunningUpdate::new(&mut tell);
-    let result = procedure(&mut inner, file, options, &mut update);
-    let left = match &result {
-        Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
-        Err(error) => look(&mut inner, error, &update, original, options.program, file.program_crcs()),
-    };
-    if let Some(taken) = update.mastership.take() {
-        // The result of the update remains, even if this fails.
-        if let Ok(master) = flying_master::give_back(&mut inner, taken) {
-            update.tell(match master {
-                Some(master) => Note::MasterBack { node: master.node }.into(),
-                None => Warning::MasterMissing.into(),
-            });
+    let original = session.node();
+    let (result, node, transfers) = telling_silence(session, tell, |session, tell| {
+        let mut update = RunningUpdate::new(tell);
+        let result = procedure(session, file, options, &mut update);
+        let left = match &result {
+            Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
+            Err(error) => look(session, error, &update, original, options.program, file.program_crcs()),
+        };
+        if let Some(taken) = update.mastership.take() {
+            // The result of the update remains, even if this fails.
+            if let Ok(master) = flying_master::give_back(session, taken) {
+                update.tell(match master {
+                    Some(master) => Note::MasterBack { node: master.node }.into(),
+                    None => Warning::MasterMissing.into(),
+                });
+            }
         }
-    }
-    update.tell(Event::Done(Box::new(Done::new(left, &result))));
+        update.tell(Event::Done(Box::new(Done::new(left, &result))));
+        (result, session.node(), session.transfers())
+    });
     // The session may have followed the device to another node-ID.
-    let (node, transfers) = (inner.node(), inner.transfers());
     session.talk_to(node);
     session.transfer_by(transfers);
     result

@@ -1,7 +1,6 @@
 //! The renewal of a device's bootloader: a new RAM image is staged, runs once on trial, and is confirmed;
 //! then the device installs it (docs/renewal.md).
 
-use std::cell::RefCell;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,16 +13,15 @@ use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 use super::aftermath::look;
 use super::catch::knock;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
-use super::event::{Done, Event, Note, Phase, Report, Retry, Warning};
+use super::event::{Done, Event, Note, Phase, Report, Retry};
 use super::judge::{judge, Judgement};
 use super::options::{FlashOptions, Target};
 use super::renewal::Renewal;
-use super::running::RunningUpdate;
+use super::running::{telling_silence, RunningUpdate};
 use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::error::told;
 use crate::device::renewal::{bootloader, progress, Bootloader};
-use crate::device::session::Silence;
 use crate::device::{Dialect, Doing, Error, Session};
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Firmware, Format};
@@ -139,14 +137,7 @@ pub fn renew(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
-    let tell = RefCell::new(tell);
-    let silence = |silence: Silence| {
-        let Silence { doing, silent, limit, .. } = silence;
-        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
-    };
-    let mut tell = |event| (tell.borrow_mut())(event);
-    let (node, timing) = (session.node(), *session.timing());
-    procedure(&mut session.with(node, timing).tell_silence(&silence), new, options, &mut tell)
+    telling_silence(session, tell, |session, tell| procedure(session, new, options, tell))
 }
 
 /// [`renew`] as an update of a device: with [`Event::Done`] at the end.
@@ -311,7 +302,8 @@ fn leave_trial(
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     match running {
-        Progress { origin: Origin::Trial, state: State::Staged, .. } => {
+        // Without a record, a program has taken its flash.
+        Progress { origin: Origin::Trial, state: State::Staged | State::None, .. } => {
             match session.command(number, ProgramControl::ClrSignature) {
                 // One that wants a password, for example. Any reset ends its trial.
                 Err(Error::Refused { .. }) => restart(session, tell),

@@ -1,8 +1,28 @@
 //! A running update: what it has done to the device, and the function that gets its events.
 
+use std::cell::RefCell;
+
 use super::device_after::DeviceState;
-use super::event::Event;
+use super::event::{Event, Warning};
 use crate::device::flying_master::Mastership;
+use crate::device::session::Silence;
+use crate::device::Session;
+
+/// Carries out `work` in a session that reports silence of the node as an event.
+pub(super) fn telling_silence<R>(
+    session: &mut Session<'_>,
+    tell: &mut dyn FnMut(Event),
+    work: impl FnOnce(&mut Session<'_>, &mut dyn FnMut(Event)) -> R,
+) -> R {
+    let tell = RefCell::new(tell);
+    let silence = |silence: Silence| {
+        let Silence { doing, silent, limit, .. } = silence;
+        (tell.borrow_mut())(Warning::Silent { doing, silent, limit }.into());
+    };
+    let mut tell = |event| (tell.borrow_mut())(event);
+    let (node, timing) = (session.node(), *session.timing());
+    work(&mut session.with(node, timing).tell_silence(&silence), &mut tell)
+}
 
 /// A running update.
 pub(super) struct RunningUpdate<'t> {
