@@ -93,7 +93,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     let table = if extras.resume {
         let element =
             Entry::sub(PROGRAM_PARTIAL, 1, "Begun download of a program", DataType::Unsigned64, Access::Ro);
-        table.with_array("Begun download", element, programs)
+        table.with_numbers("Begun download", element, Numbers::of_programs(programs))
     } else {
         table
     };
@@ -112,16 +112,15 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
 /// The number of entries in the object dictionary.
 #[must_use]
 pub const fn entry_count(programs: u8, extras: Extras) -> usize {
-    let array = 1 + programs as usize;
+    let numbers = Numbers { programs, bootloader: extras.bootloader };
     let password = match extras.password {
         PasswordObject::None => 0,
         PasswordObject::Unlock => UNLOCK_ENTRIES.len(),
-        PasswordObject::EnableFlash => Numbers { programs, bootloader: extras.bootloader }.entries(),
+        PasswordObject::EnableFlash => numbers.entries(),
     };
     let sealed = if extras.sealed { SEALED_ENTRIES.len() } else { 0 };
     let second_server = if extras.second_server { second::ENTRIES.len() } else { 0 };
-    let resume = if extras.resume { array } else { 0 };
-    let numbers = Numbers { programs, bootloader: extras.bootloader };
+    let resume = if extras.resume { Numbers::of_programs(programs).entries() } else { 0 };
     let renewal = if extras.bootloader.is_some() { RENEWAL_ENTRIES.len() } else { 0 };
     let always = device::ENTRIES.len()
         + emcy::ENTRIES.len()

@@ -243,6 +243,17 @@ impl Entry {
         self
     }
 
+    /// Takes the default value away.
+    #[must_use]
+    #[cfg_attr(not(feature = "names"), allow(unused_mut))]
+    pub const fn without_default(mut self) -> Self {
+        #[cfg(feature = "names")]
+        {
+            self.default = DefaultValue::None;
+        }
+        self
+    }
+
     /// Sets a text as default value.
     #[must_use]
     #[cfg_attr(not(feature = "names"), allow(unused_mut))]
@@ -299,22 +310,6 @@ impl<const LEN: usize> Table<LEN> {
             self.entries[self.len] = part[i];
             self.len += 1;
             i += 1;
-        }
-        self
-    }
-
-    /// Appends an array with elements 1 to `highest`, all like `element`: 1 + `highest` entries.
-    ///
-    /// # Panics
-    /// If the table has too few entries left.
-    #[must_use]
-    pub const fn with_array(mut self, name: &'static str, element: Entry, highest: u8) -> Self {
-        let index = element.at.index;
-        self = self.with(&[Entry::array(index, name, highest)]);
-        let mut sub = 1;
-        while sub <= highest {
-            self = self.with(&[Entry { at: Address::new(index, sub), ..element }]);
-            sub += 1;
         }
         self
     }

@@ -52,7 +52,7 @@ pub const CONTROL_ARRAYS: [(&str, Entry); 5] = [
     ),
     (
         "Flash status identification",
-        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro),
+        Entry::sub(FLASH_STATUS, 1, "Flash status of a program", DataType::Unsigned32, Access::Ro).default(0),
     ),
     (
         "Program region",
@@ -109,23 +109,32 @@ impl<const LEN: usize> Table<LEN> {
         self
     }
 
-    /// Appends an object with an element for each program; it has [`Numbers::entries`].
+    /// Appends an object with an element for each of these numbers, all like `element`; it has
+    /// [`Numbers::entries`].
     ///
     /// # Panics
     /// If the table has too few entries left.
     #[must_use]
-    pub const fn with_numbers(self, name: &'static str, element: Entry, numbers: Numbers) -> Self {
-        let Some(bootloader) = numbers.bootloader else {
-            return self.with_array(name, element, numbers.programs);
-        };
+    pub const fn with_numbers(mut self, name: &'static str, element: Entry, numbers: Numbers) -> Self {
+        let Numbers { programs, bootloader } = numbers;
         let index = element.at.index;
-        let mut table = self.with(&[Entry::array(index, name, bootloader)]);
+        let highest = match bootloader {
+            Some(number) => number,
+            None => programs,
+        };
+        self = self.with(&[Entry::array(index, name, highest)]);
         let mut sub = 1;
-        while sub <= numbers.programs {
-            table = table.with(&[Entry { at: Address::new(index, sub), ..element }]);
+        while sub <= programs {
+            self = self.with(&[Entry { at: Address::new(index, sub), ..element }]);
             sub += 1;
         }
-        table.with(&[Entry { at: Address::new(index, bootloader), ..element }])
+        match bootloader {
+            // The status of the bootloader without anything staged is not that of a program.
+            Some(number) => {
+                self.with(&[Entry { at: Address::new(index, number), ..element.without_default() }])
+            }
+            None => self,
+        }
     }
 }
 

@@ -12,7 +12,6 @@
 //! [`Erase`].
 
 mod commands;
-mod progress;
 mod renewal;
 mod rights;
 mod sealed;
@@ -42,7 +41,7 @@ use crate::session::Session;
 use crate::source::Source;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Outcome;
-use progress::Renewal as Known;
+use renewal::Known;
 use rights::Rights;
 
 pub use crate::policy::{Erase, Policy, Renewal, Verdict};

@@ -6,10 +6,9 @@ use canopen::{AbortCode, Instant};
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::Host;
-use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
+use shared_abi::renewal::{of_word, Origin, Progress, State, TrialEnd, BOOTLOADER};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use super::progress::Renewal;
 use super::{find, Downloader, Failure};
 use crate::flash::Flash;
 use crate::program::Expected;
@@ -23,10 +22,27 @@ use crate::store::{Parameters, RenewalRecord};
 /// Of a device without renewal.
 const NO_HOST: Host = Host { board: 0, services: 0, features: 0 };
 
+/// What the running image knows about itself.
+#[derive(Clone, Copy)]
+pub(super) struct Known {
+    /// The place of the running image.
+    origin: Origin,
+    trial_end: TrialEnd,
+    /// The version of the running image.
+    version: u32,
+    /// 1F56h of the running image.
+    identification: u32,
+}
+
+impl Known {
+    /// Of a device without renewal.
+    const NOTHING: Self =
+        Self { origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
+}
+
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
-    /// What is known; of a device without renewal, nothing.
-    fn known(&self) -> Renewal {
-        self.renewal.unwrap_or(Renewal::NONE)
+    fn known(&self) -> Known {
+        self.renewal.unwrap_or(Known::NOTHING)
     }
 
     /// What is stored of a renewal.
@@ -43,14 +59,14 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// 2007h/9.
     #[must_use]
     pub fn renewal(&self) -> Progress {
-        let Renewal { origin, trial_end, .. } = self.known();
+        let Known { origin, trial_end, .. } = self.known();
         Progress { state: self.renewal_state(), origin, trial_end }
     }
 
     /// 2007h/8: the version of the running image, and that of the services of the resident part.
     #[must_use]
     pub fn versions(&self) -> [u8; 8] {
-        let (Renewal { version, .. }, host) = (self.known(), self.host());
+        let (Known { version, .. }, host) = (self.known(), self.host());
         (u64::from(host.services) << 32 | u64::from(version)).to_le_bytes()
     }
 
@@ -71,7 +87,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
             crc => crc,
         };
-        self.renewal = Some(Renewal { origin, trial_end, version: header.version, identification });
+        self.renewal = Some(Known { origin, trial_end, version: header.version, identification });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = identification;
@@ -102,8 +118,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(crate) fn watch_trial(&mut self, now: Instant) {
         let Some(policy) = self.policy.renewal else { return };
         let ends = u32::from(policy.confirm_within_s) * 1000;
-        let is_open = self.known().origin == Origin::Trial && self.renewal_state() == State::Staged;
-        if is_open && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
+        if self.is_on_trial() && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
             self.boot_request = Some(BootRequest::Renewal(TrialStep::Late));
         }
     }
@@ -112,9 +127,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn command_bootloader(&mut self, command: ProgramControl) -> Result<(), AbortCode> {
         use ProgramControl::{Clear, ClrSignature, ResetStat, SetSignature, Start, StartBootloader, Stop};
 
-        let Renewal { origin, .. } = self.known();
+        let Known { origin, .. } = self.known();
         let is = self.renewal_state();
-        let on_trial = origin == Origin::Trial && is == State::Staged;
+        let on_trial = self.is_on_trial();
         let busy = self.boot_request.is_some() || self.programmer.has_work();
         let loads = self.transfer.is_some() || self.programmer.program().is_some();
         let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else {
@@ -147,16 +162,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             }
             Start if is == State::Staged => self.boot_request = Some(BootRequest::Renewal(TrialStep::Try)),
             Start => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
-            SetSignature if on_trial || is == State::Confirmed => self.install(),
+            // A master has reached the image on trial; or an installation that has failed is tried again.
+            SetSignature if on_trial && is == State::Staged || is == State::Confirmed => {
+                self.programmer.install()
+            }
+            // A program has taken the flash of the image on trial.
+            SetSignature if on_trial => state.failure = Some(Failure::of(FlashError::NoValidProgram)),
             SetSignature | Stop | StartBootloader | ResetStat | ClrSignature => {}
         }
         Ok(())
-    }
-
-    /// A master has reached the image on trial, and confirms it; or an installation that has failed is
-    /// tried again.
-    fn install(&mut self) {
-        self.programmer.install();
     }
 
     /// The record of the image was stored or removed.
@@ -205,8 +219,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Ok(());
         }
         let mut detail = 0;
-        let error = if self.renewal_state() == State::Confirmed || self.is_on_trial() && program == BOOTLOADER
-        {
+        // An image on trial takes no other one, also when it is installed: it does not run from home.
+        let on_trial = self.known().origin == Origin::Trial && program == BOOTLOADER;
+        let error = if self.renewal_state() == State::Confirmed || on_trial {
             Some(FlashError::Busy)
         } else if program != BOOTLOADER || self.programmer.is_busy() {
             None
@@ -242,9 +257,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         is_last && self.renewal_state() == State::Confirmed
     }
 
-    /// Whether the running image is on trial.
-    pub(super) fn is_on_trial(&self) -> bool {
-        self.known().origin == Origin::Trial && self.renewal_state() != State::Confirmed
+    /// Whether the running image is on trial, and not confirmed.
+    fn is_on_trial(&self) -> bool {
+        let is_confirmed = matches!(self.renewal_state(), State::Confirmed | State::Installed);
+        self.known().origin == Origin::Trial && !is_confirmed
     }
 
     /// A download of a new image begins: a download of the last program that has reached staging does not

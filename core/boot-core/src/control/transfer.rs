@@ -157,14 +157,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// Carries out the results of accepted bytes.
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let staging = self.staging_of(program);
-        let has = if P::RENEWS {
-            {
-                let Host { board, services, features } = self.host();
-                Some(Requirements { board, services, features })
-            }
-        } else {
-            None
-        };
+        let has = P::RENEWS.then(|| {
+            let Host { board, services, features } = self.host();
+            Requirements { board, services, features }
+        });
         if let (Some(staging), Some(_)) = (staging, findings.begins) {
             self.drop_partial(staging);
         }

@@ -130,7 +130,7 @@ impl Phase {
                     }
                 };
             }
-            Self::Counter | Self::Permit | Self::Done => Ok(None),
+            Self::Counter | Self::Permit | Self::Done => return Next::Done(Ok(())),
         };
         match next {
             Ok(Some(operation)) => Next::Start(operation),

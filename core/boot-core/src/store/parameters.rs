@@ -25,8 +25,8 @@ impl Key {
         Self(0x0001_0000 | number as u32)
     }
 
-    /// Of a program (1 to 254, 255 for the bootloader): the lowest security counter and the lowest epoch that the device
-    /// accepts, and the counter of the installed program. This value survives the program's record.
+    /// Of a program (1 to 254, 255 for the bootloader): the lowest security counter and the lowest epoch
+    /// that the device accepts, and the counter of the installed program. This value survives the program's record.
     #[must_use]
     pub const fn counter(number: u8) -> Self {
         Self(0x0004_0000 | number as u32)

@@ -17,6 +17,9 @@ use crate::queue::{Piece, Queue};
 use crate::renewal::header;
 use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord, Value};
 
+// `seal` depends on nothing, so it has the number, too.
+const _: () = assert!(seal::wire::BOOTLOADER == BOOTLOADER);
+
 /// The place of an image in the device, and the rules for it.
 #[derive(Clone, Copy)]
 pub(crate) struct Place {

@@ -518,6 +518,27 @@ fn a_damaged_image_is_not_staged() {
     assert_eq!(node.0.take_boot_request(), None);
 }
 
+/// A program takes the flash of the image on trial: that can no longer be confirmed, and ends as well.
+#[test]
+fn a_trial_without_its_image_ends_too() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+    let mut node = board.start();
+    assert_eq!(node.command(1, CLEAR), 0);
+    for block in block_file_at(&program_of(0x3400), PROGRAM.base, 200) {
+        node.send(1, &block).unwrap();
+    }
+    assert_eq!((node.progress().state, node.progress().origin), (State::None, Origin::Trial));
+    // Bits 1 to 7 of 1F57h: 1, no valid program (CiA 302-3).
+    assert_eq!(node.command(N, CONFIRM), 1 << 1);
+    node.0.set_time(Instant::from_millis(59_999));
+    assert_eq!(node.0.take_boot_request(), None);
+    node.0.set_time(Instant::from_millis(60_000));
+    assert_eq!(node.0.take_boot_request(), Some(BootRequest::Renewal(TrialStep::Late)));
+}
+
 /// The last program and staging share a sector.
 #[test]
 fn a_program_that_reaches_into_staging_takes_it() {
