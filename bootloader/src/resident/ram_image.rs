@@ -32,8 +32,8 @@ pub fn home() -> Region {
 /// The damaged part; the RAM may then hold the image.
 ///
 /// # Safety
-/// `place` must be [`home`], or staging of the layout. Nothing may use the RAM except its last [`LEAST_STACK`](shared_abi::layout::LEAST_STACK)
-/// bytes.
+/// `place` must be [`home`], or staging of the layout. Nothing may use the RAM except its last
+/// [`LEAST_STACK`](shared_abi::layout::LEAST_STACK) bytes.
 pub unsafe fn load(flash: &ResidentFlash, place: Region) -> Result<VectorTable, Damage> {
     let at = place.base;
     // SAFETY: it is in flash, aligned; any bits are a valid `Header`, and the flash after it is part of

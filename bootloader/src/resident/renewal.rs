@@ -6,7 +6,7 @@ use boot_core::store::RenewalRecord;
 use bsp::LAYOUT;
 use shared_abi::boot_report::{BootReport, Words};
 use shared_abi::handoff::ResetCause;
-use shared_abi::renewal::{of_word, Origin, TrialEnd};
+use shared_abi::renewal::{of_word, Origin, State, TrialEnd};
 use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
@@ -54,14 +54,24 @@ pub fn last_report() -> Option<BootReport> {
     BootReport::parse(unsafe { &(LAYOUT.handoff.base as *const Words).read_volatile() })
 }
 
-/// How a trial has ended by this reset, if the image that ran was on trial.
-pub fn trial_end(request: Option<BootRequest>, cause: ResetCause) -> TrialEnd {
+/// How a trial has ended by this reset, if the image that ran was on trial. A confirmed one is not.
+pub fn trial_end(
+    flash: &ResidentFlash,
+    parameters: &Parameters,
+    request: Option<BootRequest>,
+    cause: ResetCause,
+) -> TrialEnd {
+    let ran_on_trial = || {
+        let record = RenewalRecord::load(parameters, flash);
+        let is_confirmed =
+            record.is_some_and(|record| matches!(record.state, State::Confirmed | State::Installed));
+        let last = last_report().map(|report| of_word(report.renewal).0);
+        last == Some(Origin::Trial) && !is_confirmed
+    };
     match request {
         Some(BootRequest::Renewal(TrialStep::Late)) => TrialEnd::Late,
         Some(BootRequest::Renewal(TrialStep::GivenUp)) => TrialEnd::GivenUp,
-        _ if last_report().is_some_and(|report| of_word(report.renewal).0 == Origin::Trial) => {
-            TrialEnd::Reset(cause)
-        }
+        _ if ran_on_trial() => TrialEnd::Reset(cause),
         _ => TrialEnd::None,
     }
 }

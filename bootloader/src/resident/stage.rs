@@ -89,7 +89,7 @@ pub unsafe extern "C" fn stage() -> ! {
     let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
     let mut trial_end = TrialEnd::None;
     if PRODUCT.renewal {
-        trial_end = renewal::trial_end(request, reset_cause);
+        trial_end = renewal::trial_end(&flash, &parameters, request, reset_cause);
         if matches!(trial_end, TrialEnd::Reset(_)) && matches!(request, None | Some(BootRequest::Fault)) {
             // The image at home says why it ended.
             circumstances.request = Some(BootRequest::Renewal(TrialStep::GivenUp));
