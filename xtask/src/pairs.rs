@@ -55,7 +55,7 @@ const FIELDS: [(&str, &[&str]); 41] = [
     ("block_buffer", &["80 * 1024", "1024"]),
     ("watchdog_ms", &["Some(1000)", "None"]),
     ("program_watchdog_ms", &["None", "Some(1000)"]),
-    ("answer_to_reset_ms", &["20", "50"]),
+    ("answer_to_reset_ms", &["15", "50"]),
     ("max_crash_resets", &["3", "1"]),
     ("security_counter", &["0", "5"]),
     ("counter_with_confirmation", &["false", "true"]),

@@ -29,7 +29,7 @@ use crate::supports;
 pub const BUFFER: usize = 80 * 1024;
 /// How long a device waits after the answer to the command that makes it leave, in ms: clients must
 /// get the answer before anything else happens.
-const ANSWER_TO_RESET_MS: u32 = 20;
+const ANSWER_TO_RESET_MS: u32 = 15;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
 /// The firmware's policy for the boot decision. Nothing can crash here.

@@ -486,7 +486,7 @@ fn an_abandoned_download_locks_nobody_out() {
     while heard(&mut stream) != "705#00" {
         answers += 1;
     }
-    // The reset takes 20 ms, so no request or, on a busy machine, a few requests are answered
+    // The reset takes 15 ms, so no request or, on a busy machine, a few requests are answered
     // before it; it would be twenty if the device waited for the end of the transfer.
     assert!(answers < 15, "{answers}");
     asking.join().unwrap();
