@@ -9,9 +9,9 @@ use coflash::file::judge::judge;
 use coflash::file::label::label_of;
 use coflash::file::limit;
 use coflash::file::ram_image::RamImage;
-use coflash::file::read::{self, Firmware};
+use coflash::file::read;
 use coflash::file::sealed::sealer::CHUNK;
-use coflash::file::sealed::{hash, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
+use coflash::file::sealed::{hash, Kek, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
 use seal::wire::{flag, BOOTLOADER, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout::Layout;
@@ -55,7 +55,7 @@ pub(super) struct Seal {
 
     /// Seal the bootloader in the file, for a renewal. Counter, version and target are those of its header; the
     /// certificate must be for bootloaders (coflash key certify --role bootloader).
-    #[arg(long, conflicts_with_all = ["program", "data", "writes_flash", "base", "vendor", "product", "ver", "tbs", "attach"])]
+    #[arg(long, conflicts_with_all = ["program", "data", "writes_flash", "base", "vendor", "product", "ver", "hardware", "tbs", "attach"])]
     bootloader: bool,
 
     /// Vendor-ID of the devices (1018h/1); by default that of the label in the image.
@@ -290,27 +290,15 @@ impl Seal {
         }
         let encrypt_for = keys::keks(&self.encrypt)?;
         let base = self.base.as_deref().map(base).transpose()?;
-        let sbom = self.sbom.as_deref().map(limit::read).transpose();
-        let sbom =
-            sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
         let sealer = program.sealer(Sealer {
-            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
             // clap requires the option in every case that reaches this line.
             counter: self.counter.unwrap_or(0),
             program: self.program,
-            chunk: self.chunk,
-            encrypt_for: &encrypt_for,
-            compress: self.compress,
             base: base.as_deref(),
-            unique_id: self.device.unwrap_or_default(),
             hardware: self.hardware.iter().fold(0, |mask, revision| mask | 1 << (revision & 31)),
-            created: self.date.unwrap_or(0),
             data: self.data,
             writes_flash: self.writes_flash,
-            test: self.test,
-            text: self.text.as_deref(),
-            sbom: sbom.as_deref().map(hash),
-            ..Sealer::default()
+            ..self.sealer(&encrypt_for)?
         })?;
         let image = match &self.tbs {
             None => program.seal(&sealer, &keys::signing_key(&self.key)?)?,
@@ -327,38 +315,45 @@ impl Seal {
         Ok(())
     }
 
+    /// What a program and a bootloader have in common.
+    fn sealer<'a>(&'a self, encrypt_for: &'a [Kek]) -> Result<Sealer<'a>, Failure> {
+        let sbom = match &self.sbom {
+            Some(path) => {
+                let sbom = limit::read(path).map_err(|cause| Failure::file(path, &cause.to_string()))?;
+                Some(hash(&sbom))
+            }
+            None => None,
+        };
+        Ok(Sealer {
+            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
+            chunk: self.chunk,
+            encrypt_for,
+            compress: self.compress,
+            unique_id: self.device.unwrap_or_default(),
+            created: self.date.unwrap_or(0),
+            test: self.test,
+            text: self.text.as_deref(),
+            sbom,
+            ..Sealer::default()
+        })
+    }
+
     /// Seals the RAM image of a bootloader.
     fn seal_bootloader(&self, context: &Context, path: &Path, output: &Path) -> Result<(), Failure> {
         let (firmware, _) = read::load_telling(path, None, Some(0))?;
-        let image = match firmware {
-            Firmware::Image(image) => image,
-            Firmware::Blocks(file) => file.image(),
-        };
         let image =
-            RamImage::find(&image).ok_or_else(|| Failure::file(path, "it contains no bootloader (CBI2)"))?;
+            RamImage::of(&firmware).ok_or_else(|| Failure::file(path, "it contains no bootloader (CBI2)"))?;
         image.check().map_err(|fault| Failure::file(path, &format!("it {fault}")))?;
         let encrypt_for = keys::keks(&self.encrypt)?;
-        let sbom = self.sbom.as_deref().map(limit::read).transpose();
-        let sbom =
-            sbom.map_err(|cause| Failure::file(self.sbom.as_deref().unwrap_or(path), &cause.to_string()))?;
         let header = image.header();
         let sealer = Sealer {
-            certificate: self.cert.as_deref().map(keys::certificate).transpose()?,
             vendor_id: header.vendor,
             product_code: header.product,
             version: header.version,
             counter: header.counter,
             program: BOOTLOADER,
-            chunk: self.chunk,
-            encrypt_for: &encrypt_for,
-            compress: self.compress,
-            unique_id: self.device.unwrap_or_default(),
             hardware: header.revisions,
-            created: self.date.unwrap_or(0),
-            test: self.test,
-            text: self.text.as_deref(),
-            sbom: sbom.as_deref().map(hash),
-            ..Sealer::default()
+            ..self.sealer(&encrypt_for)?
         };
         let sealed = sealer.seal(image.bytes(), &keys::signing_key(&self.key)?);
         let sealed = sealed.map_err(|fault| Failure::file(path, &fault.to_string()))?;

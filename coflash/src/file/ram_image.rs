@@ -4,6 +4,7 @@ use shared_abi::ram_image::{Header, MAGIC};
 
 use super::block_file::CRC;
 use super::image::Image;
+use super::read::Firmware;
 
 /// The start of the flash.
 const FLASH: u32 = super::area::FLASH.first;
@@ -41,6 +42,15 @@ impl Fault {
 }
 
 impl RamImage {
+    /// The RAM image in firmware that was read; as [`find`](Self::find).
+    #[must_use]
+    pub fn of(firmware: &Firmware) -> Option<Self> {
+        match firmware {
+            Firmware::Image(image) => Self::find(image),
+            Firmware::Blocks(file) => Self::find(&file.image()),
+        }
+    }
+
     /// Finds the RAM image in a file. A file with a whole bootloader has the resident part, too, which is
     /// left out: it never changes in the field. A program that carries a RAM image in its data stays a
     /// program.

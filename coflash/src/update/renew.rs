@@ -59,11 +59,7 @@ impl NewBootloader {
     /// # Errors
     /// A [`Fault`] of its RAM image.
     pub fn of(firmware: &Firmware) -> Result<Option<Self>, Fault> {
-        let found = match firmware {
-            Firmware::Image(image) => RamImage::find(image),
-            Firmware::Blocks(file) => RamImage::find(&file.image()),
-        };
-        let Some(image) = found else { return Ok(None) };
+        let Some(image) = RamImage::of(firmware) else { return Ok(None) };
         image.check()?;
         Ok(Some(Self::Plain(Arc::new(image))))
     }
