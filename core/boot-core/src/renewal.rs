@@ -4,11 +4,29 @@
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Host};
-use shared_abi::renewal::{Origin, State};
+use shared_abi::renewal::{Origin, State, TrialEnd};
 use shared_abi::warm_start::Damage;
 
 use crate::flash::Flash;
 use crate::store::RenewalRecord;
+
+/// What the running image knows about itself.
+#[derive(Clone, Copy)]
+pub(crate) struct Known {
+    /// The place of the running image.
+    pub origin: Origin,
+    pub trial_end: TrialEnd,
+    /// The version of the running image.
+    pub version: u32,
+    /// 1F56h of the running image.
+    pub identification: u32,
+}
+
+impl Known {
+    /// Of a device without renewal.
+    pub(crate) const NOTHING: Self =
+        Self { origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
+}
 
 /// The two places of a RAM image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -52,7 +52,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                     let middle = block.len() / 2;
                     block[middle] ^= 1 << (how >> 5);
                 }
-                if send(&mut device, &block).is_ok() {
+                if send(&mut device, &flash, &block).is_ok() {
                     next = number.wrapping_add(1);
                 }
                 open = false;
@@ -72,7 +72,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                     device.download_cancel();
                 }
                 let size = (action & 1 != 0).then_some(u32::from(action) * 3);
-                open = device.download_start(1, size).is_ok();
+                open = device.download_start(&flash, 1, size).is_ok();
             }
             140..=159 => {
                 let data = input.take(usize::from(action % 8));
@@ -124,7 +124,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let good = [(0, 0, vec![0; 8]), (1, 0x0800_0800, program), (LAST, 0, last)];
     for (number, flash_address, data) in good {
         let block = Block { number, flash_address, data }.emit();
-        assert_eq!(send(&mut device, &block), Ok(()), "block {number}");
+        assert_eq!(send(&mut device, &flash, &block), Ok(()), "block {number}");
         settle(&mut device, &mut flash);
         assert_eq!(device.status(1), FlashStatus::OK, "block {number}");
     }
@@ -135,9 +135,13 @@ coboot_fuzz::target!(|bytes: &[u8]| {
 });
 
 /// The calls of the SDO server for a block.
-fn send(device: &mut Downloader<'_, Journal, 1>, block: &[u8]) -> Result<(), canopen::AbortCode> {
+fn send(
+    device: &mut Downloader<'_, Journal, 1>,
+    flash: &ModelFlash,
+    block: &[u8],
+) -> Result<(), canopen::AbortCode> {
     device.download_cancel();
-    device.download_start(1, Some(block.len() as u32))?;
+    device.download_start(flash, 1, Some(block.len() as u32))?;
     for piece in block.chunks(7) {
         if let Err(code) = device.download_data(piece) {
             device.download_cancel();

@@ -36,12 +36,12 @@ use crate::policy::Judge;
 use crate::program::{check_vectors, Expected};
 use crate::programmer::{Event, Programmer};
 use crate::refusal::Refusal;
+use crate::renewal::Known;
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::source::Source;
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Outcome;
-use renewal::Known;
 use rights::Rights;
 
 pub use crate::policy::{Erase, Policy, Renewal, Verdict};

@@ -6,7 +6,7 @@ use canopen::{AbortCode, Instant};
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::Host;
-use shared_abi::renewal::{of_word, Origin, Progress, State, TrialEnd, BOOTLOADER};
+use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
 use super::{find, Downloader, Failure};
@@ -14,31 +14,13 @@ use crate::flash::Flash;
 use crate::program::Expected;
 use crate::programmer::Renewing;
 use crate::refusal::Refusal;
-use crate::renewal::{check, header, Places};
+use crate::renewal::{check, header, Known, Places};
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
 
 /// Of a device without renewal.
 const NO_HOST: Host = Host { board: 0, services: 0, features: 0 };
-
-/// What the running image knows about itself.
-#[derive(Clone, Copy)]
-pub(super) struct Known {
-    /// The place of the running image.
-    origin: Origin,
-    trial_end: TrialEnd,
-    /// The version of the running image.
-    version: u32,
-    /// 1F56h of the running image.
-    identification: u32,
-}
-
-impl Known {
-    /// Of a device without renewal.
-    const NOTHING: Self =
-        Self { origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
-}
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     fn known(&self) -> Known {
