@@ -4,7 +4,9 @@
 use canopen::device;
 use canopen::emcy;
 use canopen::od::{Access, DataType, Entry, Table};
-use canopen::program::{control_count, Numbers};
+use canopen::program::{control_count, Numbers, APPLICATION_STATE_ENTRIES};
+use coboot_app::layout::Layout;
+use coboot_app::renewal;
 
 /// How 1F51h = 80h leads back into the bootloader: 0 system reset, 1 watchdog reset, 2 jump.
 pub const REENTRY_PATH: u16 = 0x2000;
@@ -18,20 +20,30 @@ const SHOW_ENTRIES: [Entry; 2] = [
     Entry::var(CONFIRMATION, "Confirmation", DataType::Unsigned8, Access::Rw),
 ];
 
-/// How many entries the object dictionary of a device with `programs` programs has.
-pub const fn entry_count(programs: u8) -> usize {
+/// The sub-indices of program control on a device with this memory map: its programs, and the bootloader
+/// itself where the map has room for a new one (docs/renewal.md).
+pub const fn numbers(layout: &Layout) -> Numbers {
+    let programs = layout.programs.len() as u8;
+    let bootloader = if layout.staging.is_some() { Some(renewal::number(programs, None)) } else { None };
+    Numbers { programs, bootloader }
+}
+
+/// How many entries the object dictionary has.
+pub const fn entry_count(numbers: Numbers) -> usize {
     device::ENTRIES.len()
         + emcy::ENTRIES.len()
         + SHOW_ENTRIES.len()
-        + control_count(Numbers::of_programs(programs))
+        + control_count(numbers)
+        + APPLICATION_STATE_ENTRIES.len()
 }
 
-/// The object dictionary of a device with `programs` programs, [`entry_count`] entries long. coboot
+/// The object dictionary of a device with these [`numbers`], [`entry_count`] entries long. coboot
 /// needs program control in an application: keep it when you add your own objects.
-pub const fn entries<const LEN: usize>(programs: u8) -> Table<LEN> {
+pub const fn entries<const LEN: usize>(numbers: Numbers) -> Table<LEN> {
     Table::EMPTY
         .with(&device::ENTRIES)
         .with(&emcy::ENTRIES)
         .with(&SHOW_ENTRIES)
-        .with_program_control(Numbers::of_programs(programs))
+        .with_program_control(numbers)
+        .with(&APPLICATION_STATE_ENTRIES)
 }

@@ -10,7 +10,8 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::{
-    region_value, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
+    region_value, Numbers, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION,
+    PROGRAM_VERSION,
 };
 use canopen::slave::Slave;
 use canopen::slave::SlaveDevice;
@@ -20,7 +21,7 @@ use coboot_app::rules::Command;
 use coboot_app::warm_start::{BootRequest, Owed};
 use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services, Start};
 
-use crate::entries::{entries, entry_count, CONFIRMATION, REENTRY_PATH};
+use crate::entries::{entries, entry_count, numbers, CONFIRMATION, REENTRY_PATH};
 
 /// 1000h: no standardised profile. Anything but the bootloader's 10000000h shows a host that the
 /// application runs.
@@ -30,10 +31,10 @@ pub const HEARTBEAT_MS: u16 = 500;
 /// 80h to 1F51h: a master calls the bootloader (SYS TEC manual L-1112d_10, table 2).
 const START_BOOTLOADER: u8 = Command::StartBootloader as u8;
 
-/// Programs of the device, each a sub-index of 1F51h, 1F56h and 1F57h.
-const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
+/// Programs of the device and the bootloader, each a sub-index of 1F51h, 1F56h and 1F57h.
+const NUMBERS: Numbers = numbers(LAYOUT);
 /// The object dictionary.
-static ENTRIES: [Entry; entry_count(PROGRAMS)] = entries(PROGRAMS).entries();
+static ENTRIES: [Entry; entry_count(NUMBERS)] = entries(NUMBERS).entries();
 
 /// The bootloader underneath.
 const BOOTLOADER: Bootloader = Bootloader::new(LAYOUT);
@@ -72,7 +73,7 @@ impl Application {
             revision: IDENTITY.revision,
             serial_number: start.serial_number,
         };
-        let control = ProgramControl::new(start, PROGRAMS, BOOTLOADER.program_crc(start.program));
+        let control = ProgramControl::new(start, NUMBERS.programs, BOOTLOADER.program_crc(start.program));
         Self {
             device,
             control,
@@ -154,13 +155,14 @@ impl Objects for Application {
             PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
             FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_REGION => {
-                let region = LAYOUT.program(at.sub).ok_or(AbortCode::NO_DATA)?;
+                let region = control.region(at.sub, LAYOUT).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(region.base, region.size))
             }
             PROGRAM_VERSION => {
-                let version = bootloader.program_info(at.sub).map_or(0, |info| info.version);
+                let version = control.info(at.sub, bootloader).map_or(0, |info| info.version);
                 put(buf, &version.to_le_bytes())
             }
+            DEVICE_STATE => put(buf, &[control.bootloader()]),
             REENTRY_PATH => put(buf, &[self.path as u8]),
             CONFIRMATION => {
                 let info = bootloader.program_info(control.program()).map_err(|_| AbortCode::DEVICE_STATE)?;

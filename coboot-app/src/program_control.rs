@@ -4,16 +4,23 @@
 //!
 //! | request | call | answer |
 //! |---|---|---|
-//! | upload of 1F51h/1F56h/1F57h, sub-index 0 | [`programs`](ProgramControl::programs) | 1 byte |
+//! | upload of 1F51h/1F56h/1F57h, sub-index 0 | [`highest`](ProgramControl::highest) | 1 byte |
 //! | upload of 1F51h/n | [`state`](ProgramControl::state) | 1 byte |
 //! | upload of 1F56h/n | [`identification`](ProgramControl::identification) | 4 bytes, little-endian |
 //! | upload of 1F57h/n | [`flash_status`](ProgramControl::flash_status) | 4 bytes, little-endian |
+//! | upload of 2007h/1 | [`bootloader`](ProgramControl::bootloader) | 1 byte |
 //! | download to 1F51h/n | [`write`](ProgramControl::write) | as [`Answer`] says |
 //! | NMT reset node | [`restart`](ProgramControl::restart) | |
 //!
+//! On a device whose bootloader can be renewed over CAN, that has a sub-index, too: here it is a program that
+//! does not run.
+//!
 //! After each frame, and every few milliseconds, [`proceed`](ProgramControl::proceed).
 
-use shared_abi::callgate::PROGRAM_INSTALLED;
+use shared_abi::callgate::{CallgateError, ProgramArgs, PROGRAM_INSTALLED};
+use shared_abi::geometry::Region;
+use shared_abi::layout::Layout;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::abort::Abort;
@@ -28,6 +35,8 @@ pub const PROGRAM_CONTROL: u16 = 0x1F51;
 pub const PROGRAM_ID: u16 = 0x1F56;
 /// 1F57h: flash status identification.
 pub const FLASH_STATUS: u16 = 0x1F57;
+/// 2007h: device state, an object of coboot. An application has its sub-index 1 alone.
+pub const DEVICE_STATE: u16 = 0x2007;
 
 /// The value of 1F51h for a program that is installed and does not run.
 const STOPPED: u8 = 0;
@@ -55,6 +64,8 @@ pub struct ProgramControl {
     program: u8,
     /// The number of programs of the device.
     programs: u8,
+    /// The sub-index of the bootloader itself, if it can be renewed over CAN.
+    bootloader: Option<u8>,
     /// 1F56h of the program that runs.
     crc: u32,
     /// The next 80h to this program confirms it.
@@ -80,6 +91,7 @@ impl ProgramControl {
         Self {
             program: start.program,
             programs,
+            bootloader: start.bootloader_number(),
             crc,
             fresh: start.fresh,
             armed: false,
@@ -104,10 +116,40 @@ impl ProgramControl {
         self.program
     }
 
-    /// How many programs the device has: sub-index 0 of the three objects.
+    /// The highest sub-index that the three objects have: what sub-index 0 reads.
     #[must_use]
-    pub const fn programs(&self) -> u8 {
-        self.programs
+    pub const fn highest(&self) -> u8 {
+        match self.bootloader {
+            Some(number) => number,
+            None => self.programs,
+        }
+    }
+
+    /// What 2007h/1 reads: the sub-index of the bootloader itself; 0 if it cannot be renewed over CAN.
+    #[must_use]
+    pub const fn bootloader(&self) -> u8 {
+        match self.bootloader {
+            Some(number) => number,
+            None => 0,
+        }
+    }
+
+    /// What the bootloader knows of the program `sub`, or of itself.
+    ///
+    /// # Errors
+    /// What the callgate has reported.
+    pub fn info(&self, sub: u8, services: &mut impl Services) -> Result<ProgramArgs, CallgateError> {
+        services.program_info(if Some(sub) == self.bootloader { BOOTLOADER } else { sub })
+    }
+
+    /// The flash of the program `sub`, or of the bootloader.
+    #[must_use]
+    pub fn region(&self, sub: u8, layout: &Layout) -> Option<Region> {
+        if Some(sub) == self.bootloader {
+            layout.home
+        } else {
+            layout.program(sub)
+        }
     }
 
     /// The device has this node-ID from now on; `None` for none.
@@ -140,7 +182,7 @@ impl ProgramControl {
         if sub == self.program {
             return Ok(RUNNING);
         }
-        Ok(match services.program_info(sub) {
+        Ok(match self.info(sub, services) {
             Ok(info) if info.flags & PROGRAM_INSTALLED != 0 => STOPPED,
             _ => ABSENT,
         })
@@ -155,7 +197,7 @@ impl ProgramControl {
         if sub == self.program {
             return Ok(self.crc);
         }
-        Ok(services.program_info(sub).map_or(0, |info| info.crc))
+        Ok(self.info(sub, services).map_or(0, |info| info.crc))
     }
 
     /// What 1F57h/`sub` reads: 0, no command is being carried out and none failed.
@@ -282,7 +324,7 @@ impl ProgramControl {
     }
 
     fn check(&self, sub: u8) -> Result<(), Abort> {
-        if (1..=self.programs).contains(&sub) {
+        if (1..=self.programs).contains(&sub) || Some(sub) == self.bootloader {
             Ok(())
         } else {
             Err(Abort::NO_SUB_INDEX)
@@ -292,7 +334,7 @@ impl ProgramControl {
 
 #[cfg(test)]
 mod tests {
-    use shared_abi::callgate::{CallgateError, ProgramArgs};
+    use shared_abi::handoff::{BootInfo, ResetCause};
 
     use super::*;
     use crate::start::Defaults;
@@ -323,6 +365,21 @@ mod tests {
         }
     }
 
+    /// A start by a bootloader with this number.
+    fn told(bootloader_number: u8) -> BootInfo {
+        BootInfo {
+            node_id: 5,
+            bit_rate: 125_000,
+            program: 1,
+            reset_cause: ResetCause::PowerOn,
+            trial: false,
+            fresh: false,
+            bootloader_version: 0,
+            serial_number: 0,
+            bootloader_number: Some(bootloader_number),
+        }
+    }
+
     /// Program 1 of three.
     fn control(fresh: bool) -> ProgramControl {
         ProgramControl::new(&Start { fresh, ..Start::new(None, DEFAULTS) }, 3, 0xCAFE)
@@ -342,6 +399,47 @@ mod tests {
         let crcs: [_; 4] = core::array::from_fn(|sub| control.identification(sub as u8, &mut { STORES }));
         assert_eq!(crcs, [Err(none), Ok(0xCAFE), Ok(0x1122_3344), Ok(0)]);
         assert_eq!((control.flash_status(3), control.flash_status(4)), (Ok(0), Err(none)));
+    }
+
+    /// The number of the bootloader follows those of the programs, with a gap on a lift (CiA 814-1 gives
+    /// number 2 to the parameters). To the application the bootloader is a program that does not run.
+    #[test]
+    fn the_bootloader_has_a_number_where_it_can_be_renewed() {
+        struct Renewable;
+        impl Services for Renewable {
+            fn program_info(&mut self, number: u8) -> Result<ProgramArgs, CallgateError> {
+                assert_eq!(number, 255, "the number that the callgate has for the bootloader");
+                Ok(ProgramArgs { crc: 0x0B00_710A, version: 7, flags: 1, ..ProgramArgs::default() })
+            }
+
+            fn confirm(&mut self, _: u8) -> Result<Confirmed, CallgateError> {
+                Err(CallgateError::Absent)
+            }
+        }
+        let none = Abort(0x0609_0011);
+        for (programs, number) in [(1, 2), (1, 3), (2, 3)] {
+            let start = Start { fresh: true, ..Start::new(Some(told(number)), DEFAULTS) };
+            let mut control = ProgramControl::new(&start, programs, 0xCAFE);
+            assert_eq!((control.highest(), control.bootloader()), (number, number));
+            assert_eq!(control.state(number, &mut Renewable), Ok(0));
+            assert_eq!(control.identification(number, &mut Renewable), Ok(0x0B00_710A));
+            assert_eq!(control.flash_status(number), Ok(0));
+            assert_eq!(control.info(number, &mut Renewable).map(|info| info.version), Ok(7));
+            let layout = &shared_abi::layout::stm32f407g_disc1::LAYOUT;
+            assert_eq!(control.region(number, layout).map(|home| home.base), Some(0x0801_0000));
+            for absent in (programs + 1..number).chain([number + 1, 255]) {
+                assert_eq!(control.state(absent, &mut Renewable), Err(none), "{absent}");
+            }
+            // What is the bootloader's to do, it does.
+            for value in [1, 2, 0x83, 0x84] {
+                assert_eq!(control.write(number, &[value], 0, &mut Renewable), Err(STATE), "{value}");
+            }
+            let owed = Owed { program: number, value: 3, node_id: 5 };
+            assert_eq!(control.write(number, &[3], 0, &mut Renewable), Ok(Answer::Withhold(owed)));
+            // It confirms no program: that is another sub-index.
+            assert_eq!(control.write(number, &[0x80], 0, &mut Renewable), Ok(Answer::Send));
+            assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Stay));
+        }
     }
 
     #[test]
@@ -472,7 +570,7 @@ mod tests {
             }
         }
         let control = control(false);
-        assert_eq!((control.program(), control.programs()), (1, 3));
+        assert_eq!((control.program(), control.highest(), control.bootloader()), (1, 3, 0));
         let second = Start { program: 2, ..Start::new(None, DEFAULTS) };
         assert_eq!(ProgramControl::new(&second, 3, 0).program(), 2);
         for (flags, state) in [(0, 3), (2, 3), (0xFFFF_FFFE, 3), (1, 0), (3, 0)] {

@@ -14,6 +14,7 @@
 //! | 1F56h/n | ro | CRC of the program |
 //! | 1F57h/n | ro | flash status: 0 |
 //! | 2005h/n | ro | version of the program: that of its record, or of its label where a debugger wrote it |
+//! | 2007h/1 | const | sub-index of the bootloader itself in the objects above; 0 if it cannot be renewed |
 //!
 //! Every other request gets the SDO abort that CiA 301 has for it, or nothing where it is no request.
 //!
@@ -34,7 +35,9 @@ use crate::abort::Abort;
 use crate::bootloader::Services;
 use crate::departure::has_reached;
 use crate::departure::Next;
-use crate::program_control::{Answer, ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+use crate::program_control::{
+    Answer, ProgramControl, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+};
 
 const DEVICE_NAME: u16 = 0x1008;
 const SOFTWARE_VERSION: u16 = 0x100A;
@@ -413,13 +416,15 @@ impl Responder {
             (0x1018, 3) => Value::word(revision),
             (0x1018, 4) => Value::word(serial_number),
             (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS | PROGRAM_VERSION, 0) => {
-                Value::byte(self.control.programs())
+                Value::byte(self.control.highest())
             }
             (PROGRAM_CONTROL, sub) => Value::byte(self.control.state(sub, services)?),
             (PROGRAM_ID, sub) => Value::word(self.control.identification(sub, services)?),
             (FLASH_STATUS, sub) => Value::word(self.control.flash_status(sub)?),
             (PROGRAM_VERSION, sub) => Value::word(self.program_version(sub, services)?),
-            (0x1000 | 0x1001 | 0x1017 | 0x1018, _) => return Err(Abort::NO_SUB_INDEX),
+            (DEVICE_STATE, 0) => Value::byte(1),
+            (DEVICE_STATE, 1) => Value::byte(self.control.bootloader()),
+            (0x1000 | 0x1001 | 0x1017 | 0x1018 | DEVICE_STATE, _) => return Err(Abort::NO_SUB_INDEX),
             (DEVICE_NAME | SOFTWARE_VERSION, _) if self.text(index).is_some() => {
                 return Err(Abort::NO_SUB_INDEX)
             }
@@ -444,7 +449,7 @@ impl Responder {
         self.control.flash_status(sub)?;
         let own = self.device.label.filter(|_| sub == self.control.program());
         let of_label = own.map_or(0, |label| label.version);
-        Ok(services.program_info(sub).map_or(of_label, |info| info.version))
+        Ok(self.control.info(sub, services).map_or(of_label, |info| info.version))
     }
 }
 
@@ -529,6 +534,9 @@ mod tests {
             // The bootloader has no record of this program: its label counts.
             ([0x05, 0x20, 1], [0x43, 0x05, 0x20, 1, 0x01, 0x0A, 0x64, 0x00]),
             ([0x05, 0x20, 2], [0x43, 0x05, 0x20, 2, 0, 0, 0, 0]),
+            ([0x07, 0x20, 0], [0x4F, 0x07, 0x20, 0, 1, 0, 0, 0]),
+            // The bootloader has told none.
+            ([0x07, 0x20, 1], [0x4F, 0x07, 0x20, 1, 0, 0, 0, 0]),
         ] {
             let [low, high, sub] = object;
             assert_eq!(ask(&mut responder, [0x40, low, high, sub, 0, 0, 0, 0]), Some(answer), "{object:X?}");
@@ -635,6 +643,7 @@ mod tests {
             ([0x40, 0x51, 0x1F, 3, 0, 0, 0, 0], [0x11, 0, 9, 6]),
             ([0x2F, 0x51, 0x1F, 3, 0x80, 0, 0, 0], [0x11, 0, 9, 6]),
             ([0x40, 0x05, 0x20, 3, 0, 0, 0, 0], [0x11, 0, 9, 6]),
+            ([0x40, 0x07, 0x20, 2, 0, 0, 0, 0], [0x11, 0, 9, 6]),
             // 06010002h: read-only.
             ([0x23, 0x00, 0x10, 0, 1, 0, 0, 0], [2, 0, 1, 6]),
             ([0x2F, 0x51, 0x1F, 0, 1, 0, 0, 0], [2, 0, 1, 6]),

@@ -65,6 +65,16 @@ impl Start {
         }
     }
 
+    /// The sub-index of the bootloader itself in 1F51h, 1F56h and 1F57h; `None` if it cannot be renewed over
+    /// CAN, or no bootloader started the program.
+    #[must_use]
+    pub const fn bootloader_number(&self) -> Option<u8> {
+        match self.told {
+            Some(told) => told.bootloader_number,
+            None => None,
+        }
+    }
+
     /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
     /// this program's place. `None` where it has to find the bit rate out first.
     #[must_use]
@@ -92,6 +102,7 @@ mod tests {
         fresh: true,
         bootloader_version: 0x0001_0000,
         serial_number: 9,
+        bootloader_number: None,
     };
 
     #[test]

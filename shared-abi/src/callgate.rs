@@ -49,7 +49,8 @@ pub enum Selector {
     ReadNode = 2,
     /// Stores node-ID and bit rate, which take effect at the next reset; takes [`NodeArgs`].
     StoreNode = 3,
-    /// Returns the record of a program; takes [`ProgramArgs`].
+    /// Returns what is known of a program, or of the bootloader itself
+    /// ([`BOOTLOADER`](crate::renewal::BOOTLOADER)) where it can be renewed; takes [`ProgramArgs`].
     ProgramInfo = 4,
     /// Releases a program for autostart, like 1F51h = 83h, and clears its crash count: a program on
     /// trial confirms itself with this. Takes [`ProgramArgs`] and only uses the number.
@@ -128,7 +129,7 @@ pub struct NodeArgs {
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ProgramArgs {
-    /// The program's number, 1 to 254.
+    /// The program's number, 1 to 254; 255 for the bootloader.
     pub number: u32,
     /// Result: size in bytes, from the start of its flash.
     pub size: u32,

@@ -17,7 +17,8 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 /// |---|---|
 /// | 1 | |
 /// | 2 | [`Handoff::flags`] |
-pub const VERSION: u16 = 2;
+/// | 3 | [`Handoff::bootloader_number`] |
+pub const VERSION: u16 = 3;
 /// The oldest version that a reader accepts.
 pub const OLDEST: u16 = 1;
 
@@ -118,6 +119,9 @@ pub struct BootInfo {
     pub bootloader_version: u32,
     /// Serial number as in 1018h/4.
     pub serial_number: u32,
+    /// The sub-index of the bootloader itself in 1F51h, 1F56h and 1F57h; `None` if it cannot be renewed
+    /// over CAN.
+    pub bootloader_number: Option<u8>,
 }
 
 /// The handoff in RAM: 48 bytes, little-endian.
@@ -146,8 +150,10 @@ pub struct Handoff {
     pub serial_number: u32,
     /// [`FLAG_FRESH`]; the other bits are 0. Since version 2.
     pub flags: u32,
+    /// The sub-index of the bootloader itself, 0 for none. Since version 3.
+    pub bootloader_number: u32,
     /// 0; later versions may define these words.
-    pub reserved: [u32; 4],
+    pub reserved: [u32; 3],
     /// [`check_word`] of the eleven words before.
     pub check: u32,
 }
@@ -164,6 +170,10 @@ impl Handoff {
         words[4] = info.bootloader_version;
         words[5] = info.serial_number;
         words[6] = if info.fresh { FLAG_FRESH } else { 0 };
+        words[7] = match info.bootloader_number {
+            Some(number) => number as u32,
+            None => 0,
+        };
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and every bit pattern is a valid `Handoff`.
         unsafe { core::mem::transmute(words) }
@@ -188,6 +198,7 @@ impl Handoff {
             fresh: self.flags & FLAG_FRESH != 0,
             bootloader_version: self.bootloader_version,
             serial_number: self.serial_number,
+            bootloader_number: u8::try_from(self.bootloader_number).ok().filter(|number| *number != 0),
         })
     }
 
@@ -264,6 +275,7 @@ mod tests {
         fresh: true,
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
+        bootloader_number: Some(2),
     };
 
     #[test]
@@ -271,7 +283,8 @@ mod tests {
         assert_eq!(Handoff::new(&INFO).info(), Some(INFO));
     }
 
-    /// A bootloader of version 1 does not set this flag; a newer bootloader may set unknown bits.
+    /// A bootloader of version 1 does not set this flag, and no number; a newer bootloader may set unknown
+    /// bits, and a number that none can be.
     #[test]
     fn an_older_version_is_read_and_is_never_fresh() {
         let mut words = [0; WORDS];
@@ -279,13 +292,15 @@ mod tests {
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
         let old: Handoff = unsafe { core::mem::transmute(words) };
-        assert_eq!(old.info(), Some(BootInfo { fresh: false, ..INFO }));
-        words[1] = 0x0030_0003;
+        let expected = Some(BootInfo { fresh: false, bootloader_number: None, ..INFO });
+        assert_eq!(old.info(), expected);
+        words[1] = 0x0030_0004;
         words[6] = 0xFFFF_FFFE;
+        words[7] = 0x0102;
         words[WORDS - 1] = check_of(&words);
         // SAFETY: as above.
         let newer: Handoff = unsafe { core::mem::transmute(words) };
-        assert_eq!(newer.info(), Some(BootInfo { fresh: false, ..INFO }));
+        assert_eq!(newer.info(), expected);
     }
 
     #[test]
@@ -294,7 +309,8 @@ mod tests {
         assert_eq!(Handoff { node_id: 6, ..good }.info(), None);
         assert_eq!(Handoff { trial: 0, ..good }.info(), None);
         assert_eq!(Handoff { flags: 0, ..good }.info(), None);
-        assert_eq!(Handoff { reserved: [0, 0, 0, 1], ..good }.info(), None);
+        assert_eq!(Handoff { bootloader_number: 3, ..good }.info(), None);
+        assert_eq!(Handoff { reserved: [0, 0, 1], ..good }.info(), None);
         assert_eq!(Handoff { check: !good.check, ..good }.info(), None);
         let unusable = Handoff::new(&BootInfo { node_id: 0, ..INFO });
         assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");

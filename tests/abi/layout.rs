@@ -55,7 +55,8 @@ fn handoff_byte_for_byte() {
         (offset_of!(Handoff, bootloader_version), 16),
         (offset_of!(Handoff, serial_number), 20),
         (offset_of!(Handoff, flags), 24),
-        (offset_of!(Handoff, reserved), 28),
+        (offset_of!(Handoff, bootloader_number), 28),
+        (offset_of!(Handoff, reserved), 32),
         (offset_of!(Handoff, check), 44),
     ];
     for (actual, expected) in offsets {
@@ -70,14 +71,15 @@ fn handoff_byte_for_byte() {
         fresh: true,
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
+        bootloader_number: Some(2),
     });
     #[rustfmt::skip]
     let expected = [
-        b'C', b'B', b'H', b'O', 2, 0, 48, 0,
+        b'C', b'B', b'H', b'O', 3, 0, 48, 0,
         5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-        0x91, 0x69, 0x48, 0x4E,
+        1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
+        0xEA, 0xBC, 0xF3, 0x12,
     ];
     assert_eq!(bytes(&handoff), expected);
 }

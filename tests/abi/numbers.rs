@@ -7,6 +7,7 @@ use std::mem::{offset_of, size_of};
 use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
 use shared_abi::handoff::{self, Handoff, ResetCause};
 use shared_abi::label::{self, Label};
+use shared_abi::renewal;
 use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
 
 const HEADER: &str = include_str!("../../examples/c/coboot/coboot.h");
@@ -82,6 +83,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("SELECTOR_PROGRAM_INFO", Selector::ProgramInfo as u32),
         ("SELECTOR_CONFIRM", Selector::Confirm as u32),
         ("SELECTOR_INVALIDATE", Selector::Invalidate as u32),
+        ("BOOTLOADER", renewal::BOOTLOADER.into()),
         ("PROGRAM_INSTALLED", callgate::PROGRAM_INSTALLED),
         ("PROGRAM_SIGNED", callgate::PROGRAM_SIGNED),
     ]
@@ -115,6 +117,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         bootloader_version,
         serial_number,
         flags,
+        bootloader_number,
         reserved,
         check
     ));
@@ -153,7 +156,7 @@ fn what_c_sees_are_the_documented_values() {
         "#define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */",
         "#define COBOOT_REQUEST_OWED UINT32_C(0x7)",
         "#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)",
-        "    uint32_t reserved[4];",
+        "    uint32_t reserved[3];",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
         "COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",

@@ -5,15 +5,18 @@
 use std::time::Duration;
 
 use canopen::program::{ProgramControl, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
-use canopen::Address;
+use canopen::{AbortCode, Address};
 use coboot_tests::bench::{
     control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
 };
 use coboot_tests::{firmware, renewal};
+use coflash::device::info::info;
 use coflash::update::steps::call_back;
 use coflash::update::{flash, FlashOptions};
+use coflash::Error;
 use emulator::machine::Stop;
 use emulator::time::{Span, Time};
+use shared_abi::renewal::Progress;
 
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
 
@@ -493,6 +496,55 @@ fn a_start_of_a_damaged_program_is_refused_and_says_why() {
         .unwrap();
         bench.run_ms(100);
         assert!(!bench.is_bootloader(NODE));
+        bench.assert_nothing_unmodelled();
+    }
+}
+
+/// To an application the bootloader is one more program, which does not run: a master reads there which
+/// one a device has, and each command leads to it.
+#[test]
+fn the_bootloader_is_a_program_of_the_application_too() {
+    let number = renewal::number();
+    let new = renewal::image_of(firmware::BOOTLOADER);
+    let word = |at: usize| u32::from_le_bytes(new[at..at + 4].try_into().unwrap());
+    let crc = word(4);
+    let at = |index| Address::new(index, number);
+    for image in APPLICATIONS {
+        let mut bench = running_board(image);
+        // The tool shows it as what it is.
+        let seen = info(&mut bench.session()).unwrap();
+        assert_eq!(seen.programs.len(), usize::from(number) - 1, "{image}");
+        let bootloader = seen.bootloader.unwrap();
+        assert_eq!((bootloader.number, bootloader.running), (number, None), "{image}");
+        assert_eq!(bootloader.version.0, word(48), "{image}");
+        let mut session = bench.session();
+        assert_eq!(session.read(Address::new(PROGRAM_CONTROL, 0)).unwrap(), [number], "{image}");
+        assert_eq!(session.read(at(PROGRAM_CONTROL)).unwrap(), [0], "{image}");
+        assert_eq!(session.read_number(at(PROGRAM_ID)).unwrap(), crc, "{image}");
+        assert_eq!(session.read_number(at(FLASH_STATUS)).unwrap(), 0, "{image}");
+        assert_eq!(session.read(Address::new(0x2007, 1)).unwrap(), [number], "{image}");
+        let absent = session.read(Address::new(PROGRAM_CONTROL, number + 1)).unwrap_err();
+        assert!(
+            matches!(absent, Error::Refused { code: AbortCode::NO_SUB_INDEX, .. }),
+            "{image}: {absent:?}"
+        );
+        for command in [ProgramControl::Start, ProgramControl::SetSignature, ProgramControl::ClrSignature] {
+            let refused = session.command(number, command).unwrap_err();
+            assert!(
+                matches!(refused, Error::Refused { code: AbortCode::DEVICE_STATE, .. }),
+                "{image}: {refused:?}"
+            );
+        }
+        // The bootloader acknowledges CLEAR in the application's place, and changes nothing.
+        session.command(number, ProgramControl::Clear).unwrap();
+        assert!(bench.is_bootloader(NODE), "{image}");
+        assert_eq!(renewal::progress(&mut bench), Progress::default());
+        assert_eq!(renewal::identification(&mut bench), crc, "{image}");
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        bench.await_program(1000);
+        bench.session().command(number, ProgramControl::StartBootloader).unwrap();
+        bench.await_boot_up(1000);
+        assert!(bench.is_bootloader(NODE), "{image}");
         bench.assert_nothing_unmodelled();
     }
 }

@@ -12,7 +12,7 @@ use boot_core::profile::Profile;
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
-use canopen::program::{region_value, IDENTITY, PROGRAM_REGION};
+use canopen::program::{region_value, Numbers, IDENTITY, PROGRAM_REGION};
 use shared_abi::renewal;
 
 /// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
@@ -45,7 +45,8 @@ const fn len(extras: Extras) -> usize {
 
 const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
 /// The table of the application.
-static APPLICATION: [Entry; application::entry_count(PROGRAMS)] = application::entries(PROGRAMS).entries();
+static APPLICATION: [Entry; application::entry_count(NUMBERS)] = application::entries(NUMBERS).entries();
+const NUMBERS: Numbers = application::numbers(bsp::LAYOUT);
 
 /// The description of one image for its EDS file.
 pub struct Image {

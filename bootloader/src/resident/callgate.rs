@@ -11,6 +11,7 @@ use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
+use boot_core::renewal::{header, identification};
 use boot_core::store::record::Seal;
 use boot_core::store::{Key, NodeParameters, ProgramRecord, Value};
 use bsp::{pac, LAYOUT};
@@ -19,11 +20,12 @@ use shared_abi::callgate::{
 };
 use shared_abi::geometry::Region;
 use shared_abi::handoff::Handoff;
+use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
-use crate::product::{self, NO_NODE_ID, SEALED};
+use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
 use crate::storing::{crash_count, store};
 
 /// The entry of all services: it checks the argument structure, takes the flash once, calls the
@@ -150,10 +152,27 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     keep(&mut parameters, flash, Key::NODE, node.value())
 }
 
+/// The RAM image at home as a program: what 1F56h and 2005h of it read.
+fn own_info(flash: &ResidentFlash) -> ProgramArgs {
+    let home = crate::ram_image::home();
+    let header = header(flash, home);
+    ProgramArgs {
+        number: BOOTLOADER.into(),
+        size: header.total(),
+        crc: identification(flash, home, &header),
+        version: header.version,
+        flags: PROGRAM_INSTALLED,
+    }
+}
+
 /// Reports about a program, confirms it (which also signs it, so that it may start by itself), or
 /// takes back both. A confirmation clears the crash count.
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
+    if PRODUCT.renewal && number == BOOTLOADER && selector == Selector::ProgramInfo {
+        *args = own_info(flash);
+        return Ok(());
+    }
     LAYOUT.program(number).ok_or(Status::BadArgument)?;
     let mut parameters = product::parameters(flash);
     let record = ProgramRecord::load(&parameters, flash, number);

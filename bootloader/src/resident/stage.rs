@@ -156,6 +156,7 @@ pub unsafe extern "C" fn stage() -> ! {
         fresh: matches!(request, Some(BootRequest::Fresh(_))),
         bootloader_version: product::VERSION,
         serial_number: bsp::serial_number(),
+        bootloader_number: PRODUCT.bootloader_number(),
     });
     if SEALED && program.locks_flash() {
         // SAFETY: only this code runs, and it writes the flash no more.

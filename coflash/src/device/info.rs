@@ -14,7 +14,7 @@ use super::dialect::Dialect;
 use super::error::{failure_words, has_number, told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
-use super::renewal::{bootloader, Bootloader};
+use super::renewal::{self, Bootloader};
 use super::session::Session;
 use super::state::{supply, BootloaderState};
 use crate::json;
@@ -49,8 +49,8 @@ pub struct DeviceInfo {
     pub security: Option<Security>,
     /// 2007h: why it stays in its bootloader; `None` for an application.
     pub state: Option<BootloaderState>,
-    /// 2007h: its bootloader, if that can be renewed; `None` for an application. (`bootloader` says for
-    /// programs whether the bootloader runs.)
+    /// 2007h: its bootloader, if that can be renewed. (`bootloader` says for programs whether the
+    /// bootloader runs.)
     #[serde(rename = "renewal")]
     pub bootloader: Option<Bootloader>,
 }
@@ -137,8 +137,13 @@ pub fn info(session: &mut Session<'_>) -> Result<DeviceInfo, Error> {
     let error_register = number(program::ERROR_REGISTER, 0)?;
     // The highest sub-index is the number of programs; a device without the object has none.
     let count = number(program::PROGRAM_CONTROL, 0)?.map_or(0, |count| count.min(254) as u8);
-    let bootloader = if device_type.is_bootloader() { cell(session, bootloader)?.flatten() } else { None };
-    let is_program = |number: &u8| bootloader.is_none_or(|bootloader| bootloader.number > *number);
+    let of_bootloader = cell(session, renewal::number)?.flatten();
+    let bootloader = match of_bootloader {
+        None => None,
+        Some(_) if device_type.is_bootloader() => cell(session, renewal::bootloader)?.flatten(),
+        Some(number) => cell(session, |session| renewal::asleep(session, number))?.flatten(),
+    };
+    let is_program = |number: &u8| of_bootloader.is_none_or(|bootloader| bootloader > *number);
     let mut programs = Vec::new();
     for number in (1..=count).filter(is_program) {
         programs.push(program_info(session, number)?);

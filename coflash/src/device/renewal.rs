@@ -1,8 +1,8 @@
-//! The renewal of a device's bootloader, as the device reports it (2007h/1, /8, /9 of coboot).
+//! The renewal of a device's bootloader, as the device reports it (2007h/1, /8, /9 and 2005h of coboot).
 
 use std::fmt;
 
-use canopen::program::{DEVICE_STATE, STATE_BOOTLOADER, STATE_RENEWAL, STATE_VERSIONS};
+use canopen::program::{DEVICE_STATE, PROGRAM_VERSION, STATE_BOOTLOADER, STATE_RENEWAL, STATE_VERSIONS};
 use canopen::Address;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
@@ -18,33 +18,53 @@ use super::state::trial_end;
 pub struct Bootloader {
     /// Its program number: sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
     pub number: u8,
-    /// The version of its running RAM image.
+    /// The version of its RAM image.
     pub version: Version,
+    /// What it reports itself; `None` while an application runs.
+    pub running: Option<Running>,
+}
+
+/// What a bootloader that runs reports about itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Running {
     /// The version of the services of its resident part.
     pub services: u32,
     /// The state of a renewal.
     pub progress: Progress,
 }
 
-/// Reads what a device reports about its bootloader; `None` if that cannot be renewed, or an application
-/// runs.
+/// The program number of a device's bootloader; `None` if that cannot be renewed, or an application does
+/// not report it.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn number(session: &mut Session<'_>) -> Result<Option<u8>, Error> {
+    let number = told(session.read_number(Address::new(DEVICE_STATE, STATE_BOOTLOADER)))?;
+    Ok(number.and_then(|number| u8::try_from(number).ok()).filter(|number| *number != 0))
+}
+
+/// What an application reports about the bootloader with this number, which does not run.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn asleep(session: &mut Session<'_>, number: u8) -> Result<Option<Bootloader>, Error> {
+    let version = told(session.read_number(Address::new(PROGRAM_VERSION, number)))?;
+    Ok(version.map(|version| Bootloader { number, version: Version(version), running: None }))
+}
+
+/// Reads what a bootloader reports about itself; `None` if it cannot be renewed, or an application runs.
 ///
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn bootloader(session: &mut Session<'_>) -> Result<Option<Bootloader>, Error> {
-    let number = told(session.read_number(Address::new(DEVICE_STATE, STATE_BOOTLOADER)))?.unwrap_or(0);
-    let Ok(number @ 1..) = u8::try_from(number) else { return Ok(None) };
+    let Some(number) = number(session)? else { return Ok(None) };
     let versions = told(session.read(Address::new(DEVICE_STATE, STATE_VERSIONS)))?.unwrap_or_default();
     let word = |at: usize| {
         let bytes = versions.get(at..at + 4).and_then(|bytes| bytes.try_into().ok());
         bytes.map_or(0, u32::from_le_bytes)
     };
-    Ok(Some(Bootloader {
-        number,
-        version: Version(word(0)),
-        services: word(4),
-        progress: progress(session)?.unwrap_or_default(),
-    }))
+    let running = Running { services: word(4), progress: progress(session)?.unwrap_or_default() };
+    Ok(Some(Bootloader { number, version: Version(word(0)), running: Some(running) }))
 }
 
 /// 2007h/9; `None` for a state of a later version.
@@ -58,7 +78,10 @@ pub fn progress(session: &mut Session<'_>) -> Result<Option<Progress>, Error> {
 
 impl fmt::Display for Bootloader {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { number, version, services, progress: Progress { state, origin, trial_end: end } } = self;
+        let Self { number, version, running } = self;
+        let Some(Running { services, progress: Progress { state, origin, trial_end: end } }) = running else {
+            return write!(f, "version {version}, renewed as program {number}");
+        };
         write!(f, "version {version}, services {services}, renewed as program {number}")?;
         match (state, origin) {
             (State::None, _) => {}
@@ -81,11 +104,13 @@ impl fmt::Display for Bootloader {
 
 impl Serialize for Bootloader {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Progress { state, origin, trial_end: end } = self.progress;
-        let mut fields = serializer.serialize_struct("Bootloader", 6)?;
+        let fields = if self.running.is_some() { 6 } else { 2 };
+        let mut fields = serializer.serialize_struct("Bootloader", fields)?;
         fields.serialize_field("number", &self.number)?;
         fields.serialize_field("version", &self.version.0)?;
-        fields.serialize_field("services", &self.services)?;
+        let Some(Running { services, progress }) = self.running else { return fields.end() };
+        let Progress { state, origin, trial_end: end } = progress;
+        fields.serialize_field("services", &services)?;
         fields.serialize_field(
             "state",
             match state {

@@ -275,7 +275,8 @@ fn in_bootloader(
 /// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
 fn settled(session: &mut Session<'_>, old: Bootloader) -> Result<Progress, Error> {
     session.await_idle(old.number, Doing::Installation)?;
-    let known = progress(session)?.unwrap_or(old.progress);
+    let known =
+        progress(session)?.unwrap_or_else(|| old.running.map(|running| running.progress).unwrap_or_default());
     if known.state != State::Confirmed {
         return Ok(known);
     }

@@ -97,6 +97,15 @@ pub fn header<F: Flash>(flash: &F, place: Region) -> Header {
     Header::of_words(words)
 }
 
+/// 1F56h of an image: the CRC in its header; over an image for the bench, which has none, the CRC of its
+/// bytes.
+pub fn identification<F: Flash>(flash: &F, place: Region, header: &Header) -> u32 {
+    match header.crc {
+        0 => flash.crc32(0, Region::new(place.base, header.total().min(place.size))),
+        crc => crc,
+    }
+}
+
 /// Checks an image that is to replace the bootloader, completely: its header, its CRC, its entry. An
 /// image without a CRC, which is for the bench, is refused.
 ///

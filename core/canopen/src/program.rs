@@ -241,6 +241,10 @@ pub const STATE_ENTRIES: [Entry; 9] = [
     ),
 ];
 
+/// The entries of [`DEVICE_STATE`] in an application.
+pub const APPLICATION_STATE_ENTRIES: [Entry; 2] =
+    [Entry::record(DEVICE_STATE, "Device state", STATE_BOOTLOADER), STATE_ENTRIES[1]];
+
 /// The further entries of [`DEVICE_STATE`] of a device whose bootloader can be renewed.
 pub const RENEWAL_ENTRIES: [Entry; 2] = [
     Entry::sub(

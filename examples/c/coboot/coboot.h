@@ -133,7 +133,7 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 /* ---- The handoff: how the device came up ---- */
 
 #define COBOOT_HANDOFF_MAGIC UINT32_C(0x4F484243)
-#define COBOOT_HANDOFF_VERSION UINT32_C(0x2)
+#define COBOOT_HANDOFF_VERSION UINT32_C(0x3)
 #define COBOOT_HANDOFF_OLDEST UINT32_C(0x1)
 
 /* In `flags`, since version 2: the program was started right after its download in one go. */
@@ -162,7 +162,8 @@ struct coboot_handoff {
     uint32_t bootloader_version;
     uint32_t serial_number;
     uint32_t flags;
-    uint32_t reserved[4];
+    uint32_t bootloader_number;
+    uint32_t reserved[3];
     uint32_t check;
 };
 COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
@@ -177,7 +178,8 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bit_rate) == 12, "coboot_ha
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_version) == 16, "coboot_handoff: bootloader_version");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, "coboot_handoff: flags");
-COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 28, "coboot_handoff: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_number) == 28, "coboot_handoff: bootloader_number");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 32, "coboot_handoff: reserved");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
 
 /* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
@@ -195,6 +197,12 @@ static inline bool coboot_handoff_is_sound(const struct coboot_handoff *handoff)
 static inline bool coboot_is_fresh(const struct coboot_handoff *handoff)
 {
     return (handoff->flags & COBOOT_HANDOFF_FRESH) != 0;
+}
+
+/* The sub-index of the bootloader itself in 1F51h, 1F56h and 1F57h; 0 if it cannot be renewed over CAN. */
+static inline uint8_t coboot_bootloader_number(const struct coboot_handoff *handoff)
+{
+    return handoff->bootloader_number <= UINT8_MAX ? (uint8_t)handoff->bootloader_number : 0;
 }
 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----
@@ -268,6 +276,9 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, size) == 4, "coboot_pr
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, crc) == 8, "coboot_program_args: crc");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, version) == 12, "coboot_program_args: version");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, flags) == 16, "coboot_program_args: flags");
+
+/* The number of the bootloader itself. */
+#define COBOOT_BOOTLOADER UINT32_C(0xFF)
 
 /* In `flags`: downloaded completely and right; signed, so that it starts by itself. */
 #define COBOOT_PROGRAM_INSTALLED UINT32_C(0x1)
@@ -352,7 +363,7 @@ static inline int32_t coboot_store_node(const struct coboot_callgate *gate, uint
     return coboot_call(gate, COBOOT_SELECTOR_STORE_NODE, &args);
 }
 
-/* What is known of a program. */
+/* What is known of a program, or with COBOOT_BOOTLOADER of the bootloader itself where it can be renewed over CAN. */
 static inline int32_t coboot_program_info(const struct coboot_callgate *gate, uint32_t number,
                                           struct coboot_program_args *info)
 {

@@ -29,6 +29,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
     program->bit_rate = bit_rate;
     program->serial_number = 0;
     program->number = 1;
+    program->bootloader = 0;
     program->fresh = false;
     program->bootloader_answers = false;
     program->reentry.phase = COBOOT_STAYS;
@@ -38,6 +39,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
         program->bit_rate = handoff.bit_rate;
         program->serial_number = handoff.serial_number;
         program->number = handoff.program;
+        program->bootloader = coboot_bootloader_number(&handoff);
         program->fresh = coboot_is_fresh(&handoff);
         /* A bootloader that detects its bit rate first has no time to answer. */
         program->bootloader_answers = handoff.bit_rate != 0;
@@ -56,26 +58,38 @@ uint32_t coboot_program_read(const struct coboot_program *program, uint16_t inde
 {
     struct coboot_program_args info;
 
-    if (index != COBOOT_PROGRAM_CONTROL && index != COBOOT_PROGRAM_ID && index != COBOOT_FLASH_STATUS) {
+    if (index == COBOOT_DEVICE_STATE) {
+        *value = sub == 0 ? 1 : program->bootloader;
+        *size = 1;
+        return sub <= 1 ? COBOOT_ABORT_NONE : COBOOT_ABORT_NO_SUB_INDEX;
+    }
+    if (index != COBOOT_PROGRAM_CONTROL && index != COBOOT_PROGRAM_ID && index != COBOOT_FLASH_STATUS
+        && index != COBOOT_PROGRAM_VERSION) {
         return COBOOT_ABORT_NO_OBJECT;
     }
-    if (sub > programs()) {
+    /* To this program the bootloader is one that does not run. */
+    const bool is_bootloader = sub != 0 && sub == program->bootloader;
+    if (sub > programs() && !is_bootloader) {
         return COBOOT_ABORT_NO_SUB_INDEX;
     }
     if (sub == 0) {
-        *value = programs();
+        *value = program->bootloader != 0 ? program->bootloader : programs();
         *size = 1;
         return COBOOT_ABORT_NONE;
     }
     const bool own = sub == program->number;
-    const bool installed = !own && program->gate != NULL
-        && coboot_program_info(program->gate, sub, &info) == COBOOT_STATUS_OK
+    const uint32_t number = is_bootloader ? COBOOT_BOOTLOADER : sub;
+    const bool asks = !own || index == COBOOT_PROGRAM_VERSION;
+    const bool installed = asks && program->gate != NULL
+        && coboot_program_info(program->gate, number, &info) == COBOOT_STATUS_OK
         && (info.flags & COBOOT_PROGRAM_INSTALLED) != 0;
     *size = index == COBOOT_PROGRAM_CONTROL ? 1 : 4;
     if (index == COBOOT_PROGRAM_CONTROL) {
         *value = own ? RUNNING : installed ? STOPPED : ABSENT;
     } else if (index == COBOOT_PROGRAM_ID) {
         *value = own ? program->crc : installed ? info.crc : 0;
+    } else if (index == COBOOT_PROGRAM_VERSION) {
+        *value = installed ? info.version : 0;
     } else {
         *value = 0;
     }

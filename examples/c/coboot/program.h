@@ -2,7 +2,7 @@
  * bootloader.
  *
  * It works with any CANopen stack: the stack calls coboot_program_read and coboot_program_write for
- * the three objects.
+ * these objects.
  */
 #ifndef COBOOT_PROGRAM_H
 #define COBOOT_PROGRAM_H
@@ -21,6 +21,12 @@ extern "C" {
 #define COBOOT_PROGRAM_CONTROL 0x1F51
 #define COBOOT_PROGRAM_ID 0x1F56
 #define COBOOT_FLASH_STATUS 0x1F57
+/* Versions of the programs, an object of coboot. */
+#define COBOOT_PROGRAM_VERSION 0x2005
+/* Device state, an object of coboot; an application has its sub-index 1 alone: the sub-index that the bootloader itself
+ * has in the objects above, 0 if it cannot be renewed over CAN.
+ */
+#define COBOOT_DEVICE_STATE 0x2007
 
 /* SDO abort codes (CiA 301 table 22). */
 #define COBOOT_ABORT_NONE UINT32_C(0)
@@ -46,6 +52,8 @@ struct coboot_program {
 
     /* Only program.c uses the rest. */
     uint32_t crc;
+    /* The sub-index of the bootloader itself; 0 if it cannot be renewed over CAN. */
+    uint8_t bootloader;
     /* The next 80h to this program confirms it. */
     bool fresh;
     /* The bootloader starts with this node-ID and bit rate, so that it can answer for this program.
@@ -58,13 +66,13 @@ struct coboot_program {
 /* Reads the handoff and finds the callgate. Call it first, before CAN is set up. */
 void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32_t bit_rate);
 
-/* Reads an element of the three objects, and its size in bytes, for an SDO upload.
+/* Reads an element of these objects, and its size in bytes, for an SDO upload.
  * COBOOT_ABORT_NO_OBJECT for every other index.
  */
 uint32_t coboot_program_read(const struct coboot_program *program, uint16_t index, uint8_t sub, uint32_t *value,
                              uint8_t *size);
 
-/* Handles an SDO download of the right size to one of the three objects; one to 1F51h is a command.
+/* Handles an SDO download of the right size to one of these objects; one to 1F51h is a command.
  * Call it before the download is answered, and answer unless coboot_program_is_silent is true.
  * COBOOT_ABORT_DEVICE_STATE: the bootloader must be called first (80h).
  *

@@ -3,7 +3,7 @@
 
 use core::sync::atomic::{AtomicU16, Ordering};
 
-use coboot_app::program_control::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+use coboot_app::program_control::{DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{Abort, Answer, Bootloader, Next, ProgramControl, Start};
 
@@ -49,10 +49,12 @@ impl Dictionary for Objects {
     fn read(&mut self, index: u16, sub: u8) -> Result<Value, AbortCode> {
         let Self { control, bootloader, .. } = self;
         Ok(match (index, sub) {
-            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => value(&[control.programs()]),
+            (PROGRAM_CONTROL | PROGRAM_ID | FLASH_STATUS, 0) => value(&[control.highest()]),
             (PROGRAM_CONTROL, sub) => value(&[control.state(sub, bootloader)?]),
             (PROGRAM_ID, sub) => value(&control.identification(sub, bootloader)?.to_le_bytes()),
             (FLASH_STATUS, sub) => value(&control.flash_status(sub)?.to_le_bytes()),
+            (DEVICE_STATE, 0) => value(&[1]),
+            (DEVICE_STATE, 1) => value(&[control.bootloader()]),
             // The device type: anything but the bootloader's.
             (0x1000, 0) => value(&[0; 4]),
             (0x1001, 0) => value(&[0]),

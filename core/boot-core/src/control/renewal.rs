@@ -14,7 +14,7 @@ use crate::flash::Flash;
 use crate::program::Expected;
 use crate::programmer::Renewing;
 use crate::refusal::Refusal;
-use crate::renewal::{check, header, Known, Places};
+use crate::renewal::{check, header, identification, Known, Places};
 use crate::resume::Partial;
 use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
@@ -64,11 +64,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let record = RenewalRecord::load(&self.parameters, flash);
         let running = if origin == Origin::Home { places.home } else { places.staging };
         let header = header(flash, running);
-        let identification = match header.crc {
-            // An image for the bench.
-            0 => flash.crc32(0, Region::new(running.base, header.total().min(running.size))),
-            crc => crc,
-        };
+        let identification = identification(flash, running, &header);
         self.renewal = Some(Known { origin, trial_end, version: header.version, identification });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;

@@ -3,30 +3,36 @@
 
 use core::task::Poll;
 
-use app_template::entries::{entries, entry_count};
+use app_template::entries::{entries, entry_count, numbers};
 use app_template::objects::Application;
 use bsp::LAYOUT;
 use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
 use canopen::od::{Address, Entry, Objects};
 use canopen::password::Lock;
-use canopen::program::{UNLOCK, UNLOCK_ENTRIES};
+use canopen::program::{Numbers, UNLOCK, UNLOCK_ENTRIES};
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
-use coboot_app::Start;
+use coboot_app::{renewal, Start};
 
 use crate::{debugger, VERSION};
 
 /// Whether this is a lift device.
 const LIFT: bool = cfg!(feature = "lift");
 
-const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
-const ENTRY_COUNT: usize = entry_count(PROGRAMS) + debugger::ENTRIES.len();
+/// Those of the template; on a lift number 2 is for its parameters, and the bootloader's follows that.
+const NUMBERS: Numbers = match numbers(LAYOUT) {
+    Numbers { programs, bootloader: Some(_) } if LIFT => {
+        Numbers { programs, bootloader: Some(renewal::number(programs, Some(2))) }
+    }
+    numbers => numbers,
+};
+const ENTRY_COUNT: usize = entry_count(NUMBERS) + debugger::ENTRIES.len();
 /// The object dictionary, with 1025h where there is a debugger interface.
-static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS).with(&debugger::ENTRIES).entries();
+static ENTRIES: [Entry; ENTRY_COUNT] = entries(NUMBERS).with(&debugger::ENTRIES).entries();
 /// The one of a lift device.
 static WITH_PASSWORD: [Entry; ENTRY_COUNT + UNLOCK_ENTRIES.len()] =
-    entries(PROGRAMS).with(&debugger::ENTRIES).with(&UNLOCK_ENTRIES).entries();
+    entries(NUMBERS).with(&debugger::ENTRIES).with(&UNLOCK_ENTRIES).entries();
 
 /// The application and its lock.
 pub struct Device {
