@@ -1,10 +1,15 @@
 //! The renewal of the bootloader of an emulated board: the steps of a tool, one by one.
 
+use std::sync::Arc;
+
 use canopen::program::{
     FlashStatus, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, STATE_RENEWAL, STATE_VERSIONS,
 };
 use canopen::Address;
 use coflash::device::Doing;
+use coflash::file::ram_image::RamImage;
+use coflash::file::read::{read, Firmware, Format};
+use coflash::update::NewBootloader;
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::time::Span;
 use shared_abi::geometry::Region;
@@ -48,6 +53,16 @@ pub fn with_word(bootloader: &str, at: usize, word: u32) -> Vec<u8> {
 #[must_use]
 pub fn version(bootloader: &str, version: u32) -> Vec<u8> {
     with_word(bootloader, 48, version)
+}
+
+/// What the tool makes of an image in a file.
+///
+/// # Panics
+/// If the image has no header.
+#[must_use]
+pub fn plain(image: &[u8]) -> NewBootloader {
+    let Ok(Firmware::Image(image)) = read(image, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
+    NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")))
 }
 
 /// The CRC in the header of an image.

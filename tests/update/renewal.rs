@@ -1,17 +1,15 @@
 //! `coflash` renews the bootloader of a device while its program stays (docs/renewal.md).
 
 use std::process::Command;
-use std::sync::Arc;
 
 use canopen::program::FlashError;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coboot_tests::renewal::{number, running, version};
+use coboot_tests::renewal::{number, plain, running, version};
 use coboot_tests::sealed_board;
 use coflash::device::info;
-use coflash::file::ram_image::RamImage;
-use coflash::file::read::{read, Firmware, Format};
+use coflash::file::read::{read, Format};
 use coflash::update::event::Phase;
 use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Renewal};
 use coflash::Error;
@@ -21,11 +19,6 @@ use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Progress, State, TrialEnd};
 
 const NEW: u32 = 0x0009_0001;
-
-fn plain(bytes: &[u8]) -> NewBootloader {
-    let Ok(Firmware::Image(image)) = read(bytes, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
-    NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")))
-}
 
 /// A board that runs version 1 of the application.
 fn board() -> Bench {
@@ -52,7 +45,8 @@ fn renewed(bench: &mut Bench, new: &NewBootloader) -> (Result<Renewal, Error>, V
 }
 
 fn progress(bench: &mut Bench) -> Progress {
-    info(&mut bench.session()).unwrap().bootloader.expect("it can be renewed").progress
+    let bootloader = info(&mut bench.session()).unwrap().bootloader.expect("it can be renewed");
+    bootloader.running.expect("it runs").progress
 }
 
 fn call_back(bench: &mut Bench) {

@@ -11,7 +11,8 @@ use crate::setup::{self, Part};
 use crate::{build, evidence, process, workspace, Outcome};
 
 pub const HELP: &str = "\
-usage: cargo xtask powercut [--full] [--every-way] [--json] [--reproduce POINT] [--board BOARD]
+usage: cargo xtask powercut [--full] [--every-way] [--scenario NAME] [--json] [--reproduce POINT]
+                            [--board BOARD]
 
 Cuts the power at flash operations of updates, stores and erasures, in every way, and once more in the
 recovery; then looks what the device does. Fails if it finds a device that cannot be reached, half a
@@ -25,6 +26,7 @@ On the model of the flash it cuts every operation; of the real firmware it cuts 
   --every-way        every way also for the second cut on the model; takes an hour
   --json             prints the counts as JSON, an object for each board
   --reproduce POINT  tells one point in words, as update:37:torn:12:after
+  --scenario NAME    this scenario alone (docs/powercut.md)
   --board BOARD      this board alone (default: stm32f407g-disc1)
 ";
 
@@ -33,13 +35,17 @@ pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let (full, every_way, json) = (args.flag("--full"), args.flag("--every-way"), args.flag("--json"));
     let point = args.value("--reproduce")?;
+    let scenario = args.value("--scenario")?;
     args.none_left()?;
     setup::prepare(&[Part::Firmware, Part::Emulator])?;
     if let Some(point) = point {
         return process::run(&mut command(board, &["--reproduce", &point])?);
     }
-    let only: Vec<_> =
+    let mut only: Vec<_> =
         full.then_some("--full").into_iter().chain(every_way.then_some("--every-way")).collect();
+    if let Some(scenario) = &scenario {
+        only.extend(["--scenario", scenario]);
+    }
     evidence::begin("powercut")?;
     let (mut boards, mut problems) = (Vec::new(), Vec::new());
     let mut cut = |board, only: &[&str]| -> Outcome {

@@ -38,7 +38,15 @@ struct Wish {
     evidence: Option<String>,
     /// Level 2 alone, with a twentieth of the cuts.
     twentieth: bool,
+    /// This scenario alone.
+    scenario: Option<String>,
     point: Option<AnyPoint>,
+}
+
+impl Wish {
+    fn has(&self, name: &str) -> bool {
+        self.scenario.as_ref().is_none_or(|scenario| scenario == name)
+    }
 }
 
 fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
@@ -50,13 +58,14 @@ fn wish(mut arguments: impl Iterator<Item = String>) -> Result<Wish, String> {
             "--json" => wish.json = true,
             "--evidence" => wish.evidence = Some(arguments.next().ok_or("--evidence wants a file.")?),
             "--twentieth" => wish.twentieth = true,
+            "--scenario" => wish.scenario = Some(arguments.next().ok_or("--scenario wants a name.")?),
             "--reproduce" => match arguments.next().map(|text| text.parse::<AnyPoint>()) {
                 Some(point) => wish.point = Some(point?),
                 None => return Err("--reproduce wants a point, as update:37:torn.".into()),
             },
             other => {
                 return Err(format!(
-                    "{other:?} is no option; there are --full, --every-way, --twentieth, --json, --evidence FILE and --reproduce POINT."
+                    "{other:?} is no option; there are --full, --every-way, --twentieth, --scenario NAME, --json, --evidence FILE and --reproduce POINT."
                 ))
             }
         }
@@ -109,7 +118,7 @@ fn main() -> ExitCode {
             println!("Level 1: boot-core on the flash model. Each point is a cut at a flash operation, or two: the second one in the recovery.\n\n{head}");
         }
         let cuts = if wish.every_way { Cuts::EveryWay } else { Cuts::EveryOperation };
-        for scenario in SCENARIOS {
+        for scenario in SCENARIOS.iter().filter(|scenario| wish.has(scenario.name)) {
             match run(scenario, cuts) {
                 Ok(report) => sum.add(1, scenario.name, &report, wish.json),
                 Err(why) => return refuse(&format!("{} fails without any cut: {why}", scenario.name)),
@@ -122,7 +131,7 @@ fn main() -> ExitCode {
             coboot_tests::firmware::board().board
         );
     }
-    for scenario in board::scenarios() {
+    for scenario in board::scenarios().filter(|scenario| wish.has(scenario.name)) {
         // Every operation once; the other scenarios share most of them.
         let effort = match (wish.full && scenario.name == "update", wish.full || wish.twentieth) {
             (true, _) => Effort::FULL,
@@ -135,6 +144,9 @@ fn main() -> ExitCode {
         }
     }
     let Sum { rows, points, states, violations } = sum;
+    if rows.is_empty() {
+        return refuse("there is no such scenario; docs/powercut.md names them.");
+    }
     let object = format!(
         "{{\"board\": \"{}\", \"points\": {points}, \"states\": {states}, \"violations\": {violations}, \"scenarios\": [\n{}\n]}}",
         coboot_tests::firmware::board().board,

@@ -1,5 +1,7 @@
 //! The renewal of the bootloader, on the model of the flash, with the power cut at every operation.
 
+use std::collections::BTreeMap;
+
 use boot_core::bootloader::{entries, entry_count, Bootloader, Choices, Config, Extras};
 use boot_core::control::{Policy, Renewal, Step};
 use boot_core::crc::CrcKind;
@@ -8,8 +10,9 @@ use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::verify;
 use boot_core::renewal::{header, Places};
 use boot_core::store::{Journal, Key, Parameters, RenewalRecord, StoreError, Value};
+use canopen::lss::LssDevice as _;
 use canopen::od::{Address, Entry, Objects};
-use canopen::{AbortCode, Instant};
+use canopen::{AbortCode, BitRate, Instant, NodeId};
 use kit::bench::{self, block_file, node, program, DEVICE};
 use kit::boot::{leaked, Boot};
 use kit::ihex;
@@ -208,6 +211,13 @@ impl Board {
     }
 
     fn start(&mut self) -> Node<'_> {
+        let mut node = self.wake();
+        node.settle();
+        node
+    }
+
+    /// The bootloader has come up, and has done nothing yet.
+    fn wake(&mut self) -> Node<'_> {
         let (_, origin, trial_end) = self.loads();
         self.request = None;
         self.ran = Some(origin);
@@ -215,9 +225,7 @@ impl Board {
         let journal = Store(Journal::open(&self.flash, LAYOUT.parameters));
         let (buffer, sealed) = leaked(512);
         let boot = Boot { report, ..Boot::new(&CONFIG, node()) };
-        let mut node = Node(boot.with(journal, &mut self.flash, buffer, sealed));
-        node.settle();
-        node
+        Node(boot.with(journal, &mut self.flash, buffer, sealed))
     }
 
     /// What a tool does until the new image is installed, from whatever state.
@@ -299,6 +307,16 @@ impl<C: Choices> Node<'_, C> {
         panic!("the work does not end");
     }
 
+    /// Until the work is done, or for a part of it.
+    fn wait(&mut self, random: &mut Random) {
+        if random.chance(70) {
+            return self.settle();
+        }
+        for _ in 0..random.below(60) {
+            self.0.step();
+        }
+    }
+
     fn read<const LEN: usize>(&mut self, index: u16, sub: u8) -> [u8; LEN] {
         let mut bytes = [0; LEN];
         assert_eq!(self.0.read(Address::new(index, sub), &mut bytes), Ok(LEN));
@@ -326,6 +344,13 @@ impl<C: Choices> Node<'_, C> {
     }
 
     fn send(&mut self, program: u8, block: &[u8]) -> Result<(), AbortCode> {
+        self.push(program, block)?;
+        self.settle();
+        Ok(())
+    }
+
+    /// Sends a block, and does not wait until it is written.
+    fn push(&mut self, program: u8, block: &[u8]) -> Result<(), AbortCode> {
         let at = Address::new(0x1F50, program);
         self.0.download_start(at, Some(block.len() as u32))?;
         for segment in block.chunks(7) {
@@ -337,9 +362,7 @@ impl<C: Choices> Node<'_, C> {
                 return Err(abort);
             }
         }
-        self.0.download_end(at)?;
-        self.settle();
-        Ok(())
+        self.0.download_end(at)
     }
 
     /// Downloads an image in block files.
@@ -671,6 +694,167 @@ fn no_cut_leaves_a_device_without_a_bootloader() {
         }
     }
     assert!(starts > 1_000, "{starts}");
+}
+
+/// What a hostile master sends: whole files and parts of them, of images that may run here and of others.
+struct Files {
+    /// In the order of [`files`]: those of the first two may run here.
+    images: [Vec<Vec<u8>>; 4],
+    /// A program that leaves staging alone, and one that reaches into it.
+    programs: [Vec<Vec<u8>>; 2],
+}
+
+fn files(images: [&[u8]; 4]) -> Files {
+    Files {
+        images: images.map(|image| block_file_at(image, HOME.base, 200)),
+        programs: [0x800, 0x3400].map(|size| block_file_at(&program_of(size), PROGRAM.base, 200)),
+    }
+}
+
+/// One life of a device with a master that knows everything and wants the worst, until a reset; the request
+/// that is left for the next one.
+fn hostile_life(board: &mut Board, files: &Files, random: &mut Random) -> Option<BootRequest> {
+    let mut node = board.wake();
+    let mut now = 0;
+    for _ in 0..random.below(40) {
+        let sub = 1 + random.below(3) as u8;
+        match random.below(16) {
+            0..=4 => {
+                let commands =
+                    [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, WITHDRAW, random.next() as u8];
+                let _ = node.try_command(sub, random.pick(&commands));
+            }
+            5 | 6 => {
+                let file = random.pick(&[0, 0, 1, 1, 2, 3]);
+                // All of it, or a few blocks that nobody has announced.
+                let blocks = &files.images[file];
+                let from = if random.chance(80) { 0 } else { random.below(blocks.len()) };
+                for block in &blocks[from..] {
+                    if node.push(N, block).is_err() || random.chance(3) {
+                        break;
+                    }
+                    node.wait(random);
+                }
+            }
+            7 => {
+                for block in &files.programs[random.below(2)] {
+                    if node.push(1, block).is_err() || random.chance(3) {
+                        break;
+                    }
+                    node.wait(random);
+                }
+            }
+            8 => {
+                // A download that is never ended, of one of two masters.
+                let block = &files.images[random.below(4)][random.below(2)];
+                let at = Address::new(0x1F50, sub);
+                if node.0.download_start(at, Some(block.len() as u32)).is_ok() {
+                    let _ = node.0.download_data(at, &block[..random.below(block.len()).min(100)]);
+                    if random.chance(50) {
+                        node.0.download_cancel(at);
+                    }
+                }
+            }
+            9 => {
+                now += random.below(40_000) as u32;
+                node.0.set_time(Instant::from_millis(now));
+            }
+            10 => {
+                let id = NodeId::new(1 + random.below(127) as u8);
+                let _ = node.0.store(id, Some(BitRate::K250));
+            }
+            11 => node.settle(),
+            // An operation that the flash refuses.
+            12 => {
+                let flash = node.0.flash();
+                flash.fail = Some((flash.operations + 1 + random.below(20) as u32, FlashFault::Failed));
+            }
+            // A tool that knows what comes next.
+            _ if node.progress().origin == Origin::Trial => drop(node.try_command(N, CONFIRM)),
+            _ if node.progress().state == State::Staged => drop(node.try_command(N, START)),
+            _ => {
+                let _ = node.try_command(N, CLEAR);
+                let blocks = &files.images[random.below(2)];
+                let _ = blocks.iter().try_for_each(|block| node.send(N, block));
+            }
+        }
+        node.wait(random);
+        if let Some(request) = node.0.take_boot_request() {
+            node.settle();
+            return Some(request);
+        }
+    }
+    node.settle();
+    None
+}
+
+/// Whoever writes whatever, in whatever order, with cuts of the power and bits that rot: there is a
+/// bootloader, it is one of those that may run here, and a tool gets through afterwards.
+#[test]
+fn a_hostile_master_never_takes_the_last_bootloader() {
+    let (old, a, b) = (image(0x200, 1), image(0x300, 2), image(0x280, 3));
+    let mut damaged = image(0x300, 4);
+    damaged[0x100] ^= 1;
+    let foreign = image_of(Header { board: BOARD ^ 1, ..SOUND }, 0x300, 5, true);
+    let files = files([&a, &b, &damaged, &foreign]);
+    let may_run = [&old, &a, &b].map(|image| crc_of(image));
+    let mut states = BTreeMap::new();
+    for seed in 0..400 {
+        let random = &mut Random(seed);
+        let mut board = Board::new(&old);
+        for life in 0..20 {
+            if random.chance(40) {
+                let kinds = [Cut::Before, Cut::After, Cut::Torn(seed), Cut::Unstable(seed)];
+                let operation = board.flash.operations + 1 + random.below(300) as u32;
+                board.flash.cut = Some((operation, random.pick(&kinds)));
+            }
+            let mut request = None;
+            let is_cut = until_power_cut(|| request = hostile_life(&mut board, &files, random));
+            board.flash.fail = None;
+            if is_cut || random.chance(20) {
+                board.off();
+            } else {
+                board.flash.cut = None;
+                board.leave(request);
+            }
+            let journal = Journal::open(&board.flash, LAYOUT.parameters);
+            let state =
+                RenewalRecord::load(&journal, &board.flash).map_or(State::None, |record| record.state);
+            let (header, origin, _) = board.loads();
+            assert!(may_run.contains(&header.crc), "seed {seed}, life {life}: an image of nobody");
+            *states.entry((state as u8, origin as u8)).or_insert(0) += 1;
+            // One bit rots where another image is certain.
+            let place = match (state, origin) {
+                (State::Installed, Origin::Home) if load(&board.flash, STAGING).is_ok() => HOME,
+                (State::Staged, Origin::Home | Origin::Trial) | (State::Installed, Origin::Home) => STAGING,
+                _ => continue,
+            };
+            if random.chance(10) {
+                let mut cells = board.flash.cells(place).to_vec();
+                let at = random.below(cells.len());
+                cells[at] &= random.next() as u8;
+                board.flash.poke(place.base, &cells);
+                *states.entry((state as u8, board.loads().1 as u8)).or_insert(0) += 1;
+            }
+        }
+        board.off();
+        // A tool that always gets through: it clears the program, which may lie in staging.
+        let mut node = board.start();
+        if node.progress().state != State::Confirmed {
+            for _ in 0..2 {
+                assert_eq!(node.command(1, CLEAR), 0, "seed {seed}");
+            }
+        }
+        board.off();
+        board.renew(&a);
+        board.off();
+        assert_eq!(board.loads().0.crc, crc_of(&a), "seed {seed}");
+    }
+    // Each state of the record, and each place that an image can come from, was met.
+    let met: Vec<_> = states.keys().collect();
+    for wanted in [(0, 0), (1, 0), (1, 1), (2, 2), (3, 0), (3, 3)] {
+        assert!(states.contains_key(&wanted), "{wanted:?} was not met, only {met:?}");
+    }
 }
 
 /// While an image is confirmed and not installed, nothing else touches its flash.

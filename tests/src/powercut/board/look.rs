@@ -1,6 +1,8 @@
 //! What a board does after the power returns, with its flash in some state.
 
+use canopen::program::{ProgramControl, DEVICE_STATE, STATE_VERSIONS};
 use canopen::Address;
+use coflash::device::{Doing, Session};
 use emulator::machine::{Cells, ResetCause, Stop};
 use shared_abi::geometry::Region;
 
@@ -9,7 +11,7 @@ use boot_core::store::{Journal, ProgramRecord};
 
 use super::story::{program_flash, Outcome, Seen, Story, BOOT_MS};
 use crate::bench::Bench;
-use crate::firmware;
+use crate::{firmware, renewal};
 use kit::model::ModelFlash;
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -62,6 +64,7 @@ pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
             outcome
         }
     };
+    let bootloader = story.from.bootloader.map(|_| called_back(bench, node)).transpose()?;
     let events = bench.events();
     if !events.is_empty() {
         return Err(format!("{} answers after {events:?}", outcome.name()));
@@ -70,7 +73,28 @@ pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
     if !reports.is_empty() {
         return Err(format!("the firmware touched what the emulator does not model: {reports:?}"));
     }
-    Ok(Seen { outcome, node })
+    Ok(Seen { outcome, node, bootloader })
+}
+
+/// Calls the bootloader, which mends what a cut has left of a renewal; returns its version.
+fn called_back(bench: &mut Bench, node: u8) -> Result<u32, String> {
+    bench
+        .session_with(node)
+        .command(1, ProgramControl::StartBootloader)
+        .map_err(|error| error.to_string())?;
+    bench.run_ms(BOOT_MS);
+    let events = bench.events();
+    if !matches!(events[..], [(_, Stop::Reset(ResetCause::Software))]) {
+        return Err(format!("the call back ends in {events:?}"));
+    }
+    let mut session = bench.session_with(node);
+    let read = |session: &mut Session<'_>| {
+        session.await_idle(renewal::number(), Doing::Installation)?;
+        session.read(Address::new(DEVICE_STATE, STATE_VERSIONS))
+    };
+    let versions = read(&mut session).map_err(|error| format!("the bootloader does not answer: {error}"))?;
+    let version = versions.first_chunk().ok_or("it has no version")?;
+    Ok(u32::from_le_bytes(*version))
 }
 
 /// No program has a false record, not even one that the CRC at the start would reject.

@@ -7,12 +7,12 @@ use canopen::BitRate;
 use coflash::device::Dialect;
 use coflash::file::block_file::BlockFile;
 use coflash::file::sealed::{SealedFile, Sealer};
-use coflash::update::{flash, FlashOptions, Program};
+use coflash::update::{flash, renew, FlashOptions, Program};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
 use crate::bench::{Bench, NODE, RESCUE_WINDOW_MS};
-use crate::{firmware, sealed_board};
+use crate::{firmware, renewal, sealed_board};
 
 /// A board with a program, confirmed or not, runs it within this time, in ms.
 pub const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
@@ -31,6 +31,9 @@ const RATE: BitRate = BitRate::K1000;
 pub const BIT_RATE: u32 = 1_000_000;
 /// The node-ID that a scenario stores.
 const OTHER_NODE: u8 = 9;
+
+/// The scenario of a device whose bootloader is renewed; not every board has room for that.
+const RENEWAL: &str = "renewal";
 
 /// The program that answers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -62,6 +65,8 @@ pub struct Seen {
     pub outcome: Outcome,
     /// The node-ID.
     pub node: u8,
+    /// The version of the bootloader, if the scenario renews it: the program is called back for that.
+    pub bootloader: Option<u32>,
 }
 
 /// What the host does; it does it again after a cut.
@@ -119,8 +124,11 @@ impl Scenario {
 
 /// The scenarios of the tested board.
 pub fn scenarios() -> impl Iterator<Item = &'static Scenario> {
-    let has_sealed = firmware::board().home.is_some();
-    SCENARIOS.iter().filter(move |scenario| has_sealed || !scenario.is_sealed)
+    let board = firmware::board();
+    let (has_sealed, renews) = (board.home.is_some(), board.staging.is_some());
+    SCENARIOS
+        .iter()
+        .filter(move |scenario| (has_sealed || !scenario.is_sealed) && (renews || scenario.name != RENEWAL))
 }
 
 /// All of them.
@@ -166,6 +174,12 @@ pub(super) const SCENARIOS: &[Scenario] = &[
         about: "another node-ID is stored by layer setting services, while version 1 runs",
         is_sealed: false,
         prepare: store,
+    },
+    Scenario {
+        name: RENEWAL,
+        about: "the bootloader is renewed, while version 1 runs before and afterwards",
+        is_sealed: false,
+        prepare: renew_bootloader,
     },
     Scenario {
         name: "sealed",
@@ -225,8 +239,8 @@ fn from_version_1(
     Ok(Story {
         bootloader,
         start: bench.machine().flash_cells(),
-        from: Seen { outcome: Outcome::Old, node: NODE },
-        to: Seen { outcome: Outcome::New, node: NODE },
+        from: Seen { outcome: Outcome::Old, node: NODE, bootloader: None },
+        to: Seen { outcome: Outcome::New, node: NODE, bootloader: None },
         between: &[Outcome::Bootloader],
         programs: [program_of(firmware::APP_V1)?, program_of(firmware::APP_V2)?],
         act: Box::new(act),
@@ -292,7 +306,7 @@ fn control(bench: &mut Bench, command: ProgramControl) -> Result<(), String> {
 
 fn store() -> Result<Story, String> {
     let mut story = update(|_| Ok(()))?;
-    story.to = Seen { outcome: Outcome::Old, node: OTHER_NODE };
+    story.to = Seen { node: OTHER_NODE, ..story.from };
     story.between = &[];
     story.act = Box::new(|bench| {
         // Switch state global: configuration. Configure node-ID. Store (CiA 305). Then a reset.
@@ -305,6 +319,21 @@ fn store() -> Result<Story, String> {
         }
         Ok(())
     });
+    Ok(story)
+}
+
+/// The program is the same before and afterwards, and no cut keeps it from starting.
+fn renew_bootloader() -> Result<Story, String> {
+    const OLD: u32 = 1;
+    const NEW: u32 = 0x0009_0001;
+    let new = renewal::plain(&renewal::version(firmware::BOOTLOADER, NEW));
+    let mut story = update(move |bench| {
+        let renewed = renew(&mut bench.session(), &new, &FlashOptions::default(), &mut |_| {});
+        renewed.map(drop).map_err(|error| error.to_string())
+    })?;
+    story.from.bootloader = Some(OLD);
+    story.to = Seen { bootloader: Some(NEW), ..story.from };
+    story.between = &[];
     Ok(story)
 }
 
