@@ -89,10 +89,8 @@ impl fmt::Display for Bootloader {
                 f.write_str("; it is on trial: coflash flash with its file confirms it")?;
             }
             (State::Staged, _) => f.write_str("; another one waits for its trial")?,
+            (_, Origin::Spare) => f.write_str("; its place was damaged, and is being repaired")?,
             (State::Confirmed, _) => f.write_str("; it is confirmed, and not installed yet")?,
-            (State::Installed, Origin::Spare) => {
-                f.write_str("; its place was damaged, and is being repaired")?
-            }
             (State::Installed, _) => f.write_str("; a spare of it is in the flash of the last program")?,
         }
         match end {

@@ -455,6 +455,7 @@ fn info_shows_the_bootloader_and_its_renewal() {
         (CONFIRMED, 2, [0, 0], "; it is confirmed, and not installed yet"),
         (INSTALLED, TRIAL, [0, 0], "; a spare of it is in the flash of the last program"),
         (INSTALLED, HOME, [0, 0], "; a spare of it is in the flash of the last program"),
+        (CONFIRMED, 3, [0, 0], "; its place was damaged, and is being repaired"),
         (INSTALLED, 3, [0, 0], "; its place was damaged, and is being repaired"),
     ] {
         let (mut fake, _) = device(BOOTLOADER, |board| {

@@ -61,7 +61,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn begin_renewal<F: Flash>(&mut self, flash: &F, report: &BootReport) {
         let (Some(places), Some(policy)) = (Places::of(self.layout), self.policy.renewal) else { return };
         let (origin, trial_end) = of_word(report.renewal);
-        let record = RenewalRecord::load(&self.parameters, flash);
         let running = if origin == Origin::Home { places.home } else { places.staging };
         let header = header(flash, running);
         let identification = identification(flash, running, &header);
@@ -70,26 +69,40 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.region = places.home;
             state.identification = identification;
         }
-        self.programmer.renewing =
-            Some(Renewing { layout: self.layout, policy, services: self.parameters.services(), record });
+        let services = self.parameters.services();
+        self.programmer.renewing = Some(Renewing { layout: self.layout, policy, services, record: None });
+        let record = self.image_record(flash);
+        self.set_record(record);
         let Some(record) = record else { return };
         match (record.state, origin) {
-            (State::Confirmed, Origin::Confirmed) | (State::Installed, Origin::Spare) => {
-                self.programmer.install();
-            }
+            (State::Confirmed, Origin::Confirmed | Origin::Spare) => self.programmer.install(),
             // Home is an image that the record does not know, so it is void; or nothing is left in staging.
-            (State::Confirmed, Origin::Home) | (State::Staged | State::Installed, Origin::Home)
+            (State::Staged | State::Installed, Origin::Home)
                 if places.is_home_foreign(flash, &record) || !places.is_in_staging(flash, &record) =>
             {
                 self.programmer.void(BOOTLOADER);
             }
-            // Such a record may read differently each time: it is not relied upon before a master confirms
-            // the image again.
-            (State::Confirmed, Origin::Home) => {
-                self.set_record(Some(RenewalRecord { state: State::Staged, ..record }));
-            }
             _ => {}
         }
+    }
+
+    /// What is stored about the image in staging, and can be relied upon.
+    fn image_record<F: Flash>(&self, flash: &F) -> Option<RenewalRecord> {
+        let record = RenewalRecord::load(&self.parameters, flash)?;
+        let places = Places::of(self.layout)?;
+        let state = match (record.state, self.known().origin) {
+            // The image in staging would have been loaded: this record may read differently each time, and
+            // a master has to confirm the image again.
+            (State::Confirmed, Origin::Home) => State::Staged,
+            // As long as home is damaged the spare is needed, as a confirmed image is.
+            (State::Installed, Origin::Spare)
+                if check(flash, places.home, self.layout, self.host()).is_err() =>
+            {
+                State::Confirmed
+            }
+            (state, _) => state,
+        };
+        Some(RenewalRecord { state, ..record })
     }
 
     /// Takes the time since the start of the image: a trial ends by itself.
@@ -153,7 +166,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// The record of the image was stored or removed.
     pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
-        let record = RenewalRecord::load(&self.parameters, flash);
+        let record = self.image_record(flash);
         self.set_record(record);
         if record.is_none() {
             // Nothing is staged any more.

@@ -634,6 +634,46 @@ fn a_damaged_home_is_repaired_from_the_spare() {
     }
 }
 
+/// The seeded master has found it: the repair fails, and the only good image lies in staging.
+#[test]
+fn a_spare_is_kept_until_home_is_repaired() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    // The first store of the repair, and a word of home.
+    for after in [1, 12] {
+        let mut board = Board::new(&old);
+        board.renew(&new);
+        board.off();
+        let mut cells = board.flash.cells(HOME).to_vec();
+        cells[0x80] = 0;
+        board.flash.poke(HOME.base, &cells);
+        board.flash.fail = Some((board.flash.operations + after, FlashFault::Failed));
+        let mut node = board.start();
+        assert_ne!(node.word(0x1F57), 0, "{after}: the repair has failed");
+        assert_eq!(node.progress().origin, Origin::Spare);
+        for program in [1, N] {
+            let image = if program == N {
+                block_file_at(&old, HOME.base, 200)
+            } else {
+                block_file_at(&program_of(0x3400), PROGRAM.base, 200)
+            };
+            let _ = node.try_command(program, CLEAR);
+            assert_eq!(node.send(program, &image[0]), Err(AbortCode::DEVICE_STATE), "{after}: {program}");
+            assert_eq!(u32::from_le_bytes(node.read(0x1F57, program)), BUSY, "{after}: {program}");
+        }
+        assert_eq!(node.command(N, CONFIRM), 0, "83h tries again");
+        assert_eq!(board.flash.cells(HOME)[..new.len()], new);
+        board.off();
+        let mut node = board.start();
+        assert_eq!((node.progress().state, node.progress().origin), (State::Installed, Origin::Home));
+        assert_eq!(node.command(N, CLEAR), 0);
+        assert_eq!(
+            node.send(N, &block_file_at(&old, HOME.base, 200)[0]),
+            Ok(()),
+            "the spare is none any more"
+        );
+    }
+}
+
 /// A debug probe writes another bootloader while a record of the old one is stored.
 #[test]
 fn an_image_from_a_probe_makes_the_record_void() {
