@@ -14,7 +14,7 @@ use coboot_tests::renewal::{
 use coflash::device::Doing;
 use coflash::update::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Options, Stop};
-use emulator::silicon::Silicon;
+use emulator::silicon::{Silicon, WORST};
 use emulator::time::Span;
 use kit::random::Random;
 use shared_abi::geometry::Region;
@@ -123,6 +123,28 @@ fn a_new_bootloader_is_installed_while_the_program_stays() {
     call_back(&mut bench);
     let installed = Progress { state: State::Installed, ..Progress::default() };
     assert_eq!((progress(&mut bench), identification(&mut bench)), (installed, crc_of(&new)));
+    bench.assert_nothing_unmodelled();
+}
+
+/// The fastest LSI makes the watchdog of the option bytes short (349 ms as it comes out of reset), and the slowest flash
+/// makes each erase long: the only reset of a renewal is the one of START.
+#[test]
+fn the_watchdog_of_the_option_bytes_bites_in_no_step_of_a_renewal() {
+    let mut bench = Bench::with(Options { silicon: WORST, ..Options::default() });
+    bench.machine().set_hardware_watchdog(true);
+    bench.power_on();
+    bench.await_boot_up(100);
+    let new = version(firmware::BOOTLOADER, NEW);
+    stage(&mut bench, &new);
+    assert_eq!(bench.events(), []);
+    start(&mut bench);
+    let events = bench.events();
+    assert!(matches!(events[..], [(_, Stop::Reset(emulator::machine::ResetCause::Software))]), "{events:?}");
+    confirm(&mut bench);
+    bench.run_ms(1000);
+    assert_eq!(bench.events(), []);
+    assert_eq!(cells(&mut bench, home(new.len())), new);
+    assert_eq!(progress(&mut bench).state, State::Installed);
     bench.assert_nothing_unmodelled();
 }
 
