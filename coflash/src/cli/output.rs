@@ -551,6 +551,7 @@ impl From<Error> for Failure {
             | Error::FellSilent { .. }
             | Error::TrialFailed { .. }
             | Error::RenewalFailed { .. }
+            | Error::SilentOnTrial { .. }
             | Error::FirstFailed { .. }
             | Error::Unconfirmable { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,

@@ -29,8 +29,9 @@ use crate::file::sealed::SealedFile;
 
 /// A device leaves its bootloader within this time after the answer to START.
 const LEAVES_WITHIN: Duration = Duration::from_millis(200);
-/// The old bootloader is back within this time: an image that nobody reaches, for example with another
-/// bit rate, ends after 60 s (`renewal_s` of the product); the watchdog ends one that hangs earlier.
+/// The old bootloader is usually back within this time: an image that nobody reaches, for example with
+/// another bit rate, ends after 60 s; the watchdog ends one that hangs earlier. A product may have another
+/// time (`renewal_s`), and no object has it: the user gives a longer one.
 const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(75);
 
 /// A new bootloader.
@@ -126,7 +127,9 @@ impl NewBootloader {
 ///
 /// # Errors
 /// [`Error::NotRenewable`] for a device whose bootloader cannot be renewed, [`Error::RenewalFailed`] for
-/// one whose new bootloader did not come up, and the errors of [`flash`](super::flash()).
+/// one whose new bootloader did not come up, [`Error::SilentOnTrial`] for one that does not answer on trial
+/// and whose old bootloader is not back within 75 s or [`Timing::boot`](crate::device::Timing::boot),
+/// whichever is longer, and the errors of [`flash`](super::flash()).
 pub fn renew(
     session: &mut Session<'_>,
     new: &NewBootloader,
@@ -199,8 +202,10 @@ fn procedure(
     let ran = session.device_type()?.is_some_and(|running| !running.is_bootloader());
     enter_bootloader(session, tell)?;
     let result = in_bootloader(session, new, options, tell);
-    // A program that ran before runs again, whatever became of the renewal.
-    let again = program.filter(|_| ran && options.start).map(|number| {
+    // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in a
+    // device that is silent; the next power-on starts it there.
+    let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
+    let again = program.filter(|_| ran && options.start && !is_silent).map(|number| {
         tell(Phase::Starting.into());
         start(session, number)
     });
@@ -304,7 +309,12 @@ fn leave_trial(
                 // One that wants a password, for example. Any reset ends its trial.
                 Err(Error::Refused { .. }) => restart(session, tell),
                 Err(error) => Err(error),
-                Ok(()) => await_other_image(session).map(drop),
+                Ok(()) => {
+                    let limit = session.timing().boot;
+                    let other = await_other_image(session, limit)?;
+                    let node = session.node();
+                    other.map(drop).ok_or(Error::NoAnswer { node, doing: Doing::Restart })
+                }
             }
         }
         // It is installed: the next start loads it from home.
@@ -371,23 +381,25 @@ fn try_it(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(error) => return Err(error),
     }
-    let progress = await_other_image(session)?;
+    let (node, limit) = (session.node(), TRIAL_ENDS_WITHIN.max(session.timing().boot));
+    let progress = await_other_image(session, limit)?.ok_or(Error::SilentOnTrial { node, waited: limit })?;
     if progress.origin == Origin::Trial {
         return Ok(());
     }
-    Err(Error::RenewalFailed { node: session.node(), end: progress.trial_end })
+    Err(Error::RenewalFailed { node, end: progress.trial_end })
 }
 
-/// Waits for the bootloader that comes up after a reset; what it reports.
-fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
+/// Waits for the bootloader that comes up after a reset; what it reports, `None` if no bootloader answers
+/// within `limit`.
+fn await_other_image(session: &mut Session<'_>, limit: Duration) -> Result<Option<Progress>, Error> {
     // The old one still answers for a moment.
     session.wait(LEAVES_WITHIN)?;
-    let (began, limit) = (session.now(), TRIAL_ENDS_WITHIN.max(session.timing().boot));
+    let began = session.now();
     loop {
         let pause = session.timing().sdo;
         match session.device_type()? {
             Some(running) if running.is_bootloader() => match told(progress(session))? {
-                Some(Some(progress)) => return Ok(progress),
+                Some(Some(progress)) => return Ok(Some(progress)),
                 // A state of a later version.
                 Some(None) => return Err(Error::Unconfirmable { node: session.node() }),
                 None => {
@@ -396,9 +408,7 @@ fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
                     return Err(Error::Unconfirmable { node: session.node() });
                 }
             },
-            _ if session.now() >= began + limit => {
-                return Err(Error::NoAnswer { node: session.node(), doing: Doing::Restart });
-            }
+            _ if session.now() >= began + limit => return Ok(None),
             _ => session.note_silence(began, limit, Doing::Restart),
         }
         session.await_boot_up(pause)?;
