@@ -15,7 +15,8 @@ use super::renew;
 use super::running::{telling_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
-use crate::device::{flying_master, Dialect, Error, Session};
+use crate::device::flying_master::{self, Mastership};
+use crate::device::{Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
@@ -69,6 +70,16 @@ pub fn flash_program(
     }
 }
 
+/// Gives the NMT mastership back. The result of the update remains, even if this fails.
+pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut dyn FnMut(Event)) {
+    if let Ok(master) = flying_master::give_back(session, taken) {
+        tell(match master {
+            Some(master) => Note::MasterBack { node: master.node }.into(),
+            None => Warning::MasterMissing.into(),
+        });
+    }
+}
+
 fn flash_content(
     session: &mut Session<'_>,
     file: Content<'_>,
@@ -84,13 +95,7 @@ fn flash_content(
             Err(error) => look(session, error, &update, original, options.program, file.program_crcs()),
         };
         if let Some(taken) = update.mastership.take() {
-            // The result of the update remains, even if this fails.
-            if let Ok(master) = flying_master::give_back(session, taken) {
-                update.tell(match master {
-                    Some(master) => Note::MasterBack { node: master.node }.into(),
-                    None => Warning::MasterMissing.into(),
-                });
-            }
+            give_back(session, taken, &mut |event| update.tell(event));
         }
         update.tell(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())

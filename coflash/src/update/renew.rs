@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
-use canopen::Address;
+use canopen::{Address, NodeId};
 use seal::wire::BOOTLOADER;
 use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
@@ -13,16 +13,19 @@ use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 use super::aftermath::look;
 use super::catch::knock;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
+use super::dialect;
 use super::event::{Done, Event, Note, Phase, Report, Retry};
+use super::flash::give_back;
 use super::judge::{judge, Judgement};
 use super::options::{FlashOptions, Target};
 use super::renewal::Renewal;
 use super::running::{telling_silence, RunningUpdate};
-use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
+use super::steps::{check_target, enter_bootloader, execute, identification, running_program, CALL_BACK};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::error::told;
+use crate::device::flying_master::Mastership;
 use crate::device::renewal::{bootloader, progress, Bootloader};
-use crate::device::{Dialect, Doing, Error, Session};
+use crate::device::{recognise, Dialect, Doing, Error, Session};
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Firmware, Format};
 use crate::file::sealed::SealedFile;
@@ -136,7 +139,13 @@ pub fn renew(
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
-    telling_silence(session, tell, |session, tell| procedure(session, new, options, tell))
+    let (result, node) = telling_silence(session, tell, |session, tell| {
+        let result = procedure(session, new, options, tell);
+        (result, session.node())
+    });
+    // The session may have followed a lift to its bootloader.
+    session.talk_to(node);
+    result
 }
 
 /// [`renew`] as an update of a device: with [`Event::Done`] at the end.
@@ -198,17 +207,22 @@ fn procedure(
         check_target(session, target)?;
         tell(Note::TargetRight(target).into());
     }
-    let program = running_program(session, 1)?;
+    let program = running_program(session, CALL_BACK)?;
     let ran = session.device_type()?.is_some_and(|running| !running.is_bootloader());
-    enter_bootloader(session, tell)?;
-    let result = in_bootloader(session, new, options, tell);
+    let mut way = Way { original: session.node(), dialect: Dialect::Block, mastership: None, options };
+    let entered = way.enter(session, tell);
+    let is_entered = entered.is_ok();
+    let result = entered.and_then(|()| in_bootloader(session, new, &way, tell));
     // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in a
     // device that is silent; the next power-on starts it there.
     let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
-    let again = program.filter(|_| ran && options.start && !is_silent).map(|number| {
+    let again = program.filter(|_| ran && options.start && is_entered && !is_silent).map(|number| {
         tell(Phase::Starting.into());
-        start(session, number)
+        dialect::of(way.dialect).start(session, way.original, number)
     });
+    if let Some(taken) = way.mastership.take() {
+        give_back(session, taken, tell);
+    }
     let renewal = result?;
     let running = again.transpose()?;
     if let Some(running) = running {
@@ -217,13 +231,53 @@ fn procedure(
     Ok(Renewal { running, took: session.now().saturating_sub(began), ..renewal })
 }
 
+/// The way into the bootloader, and what it wants there.
+struct Way<'o> {
+    /// The node at the start of the renewal: a lift's bootloader has another one.
+    original: NodeId,
+    /// The dialect of the bootloader.
+    dialect: Dialect,
+    /// The NMT mastership, while the tool holds it.
+    mastership: Option<Mastership>,
+    options: &'o FlashOptions,
+}
+
+impl Way<'_> {
+    /// Makes the bootloader run. A lift gets its password for that, and the tool the NMT mastership.
+    fn enter(&mut self, session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+        let running = session.find()?;
+        let found = match self.options.dialect {
+            Some(dialect) => dialect,
+            None => recognise(session, running, CALL_BACK)?,
+        };
+        if found == Dialect::Lift {
+            tell(Event::Found(running));
+            let mut update = RunningUpdate::new(tell);
+            let entered = dialect::of(found).enter(session, running, self.options, &mut update);
+            self.mastership = update.mastership.take();
+            self.dialect = entered?;
+            return Ok(());
+        }
+        enter_bootloader(session, tell)?;
+        let running = session.device_type()?;
+        let its = running.and_then(|running| Dialect::of_bootloader(running, session.node()));
+        self.dialect = its.unwrap_or(found);
+        Ok(())
+    }
+
+    /// Writes the password of the bootloader, if it has one: also after each reset.
+    fn unlock(&self, session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+        dialect::of(self.dialect).unlock(session, self.options, number).map(drop)
+    }
+}
+
 fn in_bootloader(
     session: &mut Session<'_>,
     new: &NewBootloader,
-    options: &FlashOptions,
+    way: &Way<'_>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
-    let node = session.node();
+    let (node, options) = (session.node(), way.options);
     let old = bootloader(session)?.ok_or(Error::NotRenewable { node })?;
     if let (NewBootloader::Plain(_), Some(challenge)) = (new, told_challenge(session)?) {
         if challenge.is_sealed() {
@@ -232,7 +286,7 @@ fn in_bootloader(
         }
     }
     let number = old.number;
-    let running = settled(session, old)?;
+    let running = settled(session, old, way)?;
     let (from, to) = (old.version, new.version());
     let (mut repeats, mut transfer) = (0, Duration::ZERO);
     let unchanged =
@@ -244,7 +298,7 @@ fn in_bootloader(
     }
     tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
     if !(is_same && is_open) {
-        leave_trial(session, number, running, tell)?;
+        leave_trial(session, number, running, way, tell)?;
         let began = session.now();
         repeats = stage(session, number, new, options, tell)?;
         transfer = session.now().saturating_sub(began);
@@ -256,11 +310,11 @@ fn in_bootloader(
         try_it(session, number)?;
     }
     tell(Phase::OnTrial.into());
-    if let Err(error) = install(session, number) {
+    if let Err(error) = way.unlock(session, number).and_then(|()| install(session, number)) {
         let is_refusal = matches!(error, Error::Failed { .. } | Error::Refused { .. });
         // A bootloader that is not confirmed need not wait for its end. The reason stays the result.
         match progress(session) {
-            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, tell)),
+            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, way, tell)),
             _ => {}
         }
         return Err(error);
@@ -278,8 +332,10 @@ fn in_bootloader(
 }
 
 /// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
-fn settled(session: &mut Session<'_>, old: Bootloader) -> Result<Progress, Error> {
+/// From then on it is unlocked.
+fn settled(session: &mut Session<'_>, old: Bootloader, way: &Way<'_>) -> Result<Progress, Error> {
     session.await_idle(old.number, Doing::Installation)?;
+    way.unlock(session, old.number)?;
     let known = progress(session)?.unwrap_or(old.progress);
     if known.state != State::Confirmed {
         return Ok(known);
@@ -295,11 +351,12 @@ fn is_same(session: &mut Session<'_>, new: &NewBootloader, number: u8) -> Result
     Ok(identification(session, number)? == image.header().crc)
 }
 
-/// Ends a trial, whose image takes no other one.
+/// Ends a trial, whose image takes no other one. The one that comes back is unlocked.
 fn leave_trial(
     session: &mut Session<'_>,
     number: u8,
     running: Progress,
+    way: &Way<'_>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     match running {
@@ -307,27 +364,39 @@ fn leave_trial(
         Progress { origin: Origin::Trial, state: State::Staged | State::None, .. } => {
             match session.command(number, ProgramControl::ClrSignature) {
                 // One that wants a password, for example. Any reset ends its trial.
-                Err(Error::Refused { .. }) => restart(session, tell),
+                Err(Error::Refused { .. }) => restart(session, number, way, tell),
                 Err(error) => Err(error),
                 Ok(()) => {
                     let limit = session.timing().boot;
                     let other = await_other_image(session, limit)?;
                     let node = session.node();
-                    other.map(drop).ok_or(Error::NoAnswer { node, doing: Doing::Restart })
+                    other.ok_or(Error::NoAnswer { node, doing: Doing::Restart })?;
+                    way.unlock(session, number)
                 }
             }
         }
         // It is installed: the next start loads it from home.
-        Progress { origin: Origin::Trial, state: State::Installed, .. } => restart(session, tell),
+        Progress { origin: Origin::Trial, state: State::Installed, .. } => {
+            restart(session, number, way, tell)
+        }
         _ => Ok(()),
     }
 }
 
 /// Restarts the device, and brings it into its bootloader again.
-fn restart(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+fn restart(
+    session: &mut Session<'_>,
+    number: u8,
+    way: &Way<'_>,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
     session.reset_node()?;
     session.wait(LEAVES_WITHIN)?;
-    enter_bootloader(session, tell)
+    session.talk_to(way.original);
+    let options = FlashOptions { mastership: false, ..*way.options };
+    let mut again = Way { options: &options, mastership: None, ..*way };
+    again.enter(session, tell)?;
+    again.unlock(session, number)
 }
 
 /// Downloads the image into staging; returns the number of repetitions.
