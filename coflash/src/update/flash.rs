@@ -8,14 +8,13 @@ use super::aftermath::look;
 use super::content::{Content, Program};
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
-use super::event::{Done, Event, Note, Phase, Report, Warning};
+use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
 use super::reach::reach;
 use super::renew;
-use super::running::{telling_silence, RunningUpdate};
+use super::running::{give_back, telling_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
-use crate::device::flying_master::{self, Mastership};
 use crate::device::{Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
@@ -67,16 +66,6 @@ pub fn flash_program(
         Program::Blocks(file) => flash_content(session, Content::Blocks(file), options, tell),
         Program::Sealed(file) => flash_content(session, Content::Sealed(file), options, tell),
         Program::Bootloader(new) => renew::update(session, new, options, tell),
-    }
-}
-
-/// Gives the NMT mastership back. The result of the update remains, even if this fails.
-pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut dyn FnMut(Event)) {
-    if let Ok(master) = flying_master::give_back(session, taken) {
-        tell(match master {
-            Some(master) => Note::MasterBack { node: master.node }.into(),
-            None => Warning::MasterMissing.into(),
-        });
     }
 }
 
