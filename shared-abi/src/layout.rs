@@ -301,6 +301,19 @@ impl Layout {
         }
     }
 
+    /// The sectors that belong under the write protection of a product: bit *n* for sector *n*, as in nWRP,
+    /// where a 0 protects. They are all sectors of the bootloader. One that can be renewed has to write its
+    /// home, so there it is the resident part alone.
+    #[must_use]
+    pub fn protected_sectors(&self, renewal: bool) -> u32 {
+        let home = self.home.filter(|_| !renewal);
+        let is_protected = |place: Region| {
+            self.bootloader.overlaps(&place) || home.is_some_and(|home| home.overlaps(&place))
+        };
+        let sectors = self.chip.sectors().filter(|sector| is_protected(sector.region));
+        sectors.fold(0, |mask, sector| mask | 1 << sector.number)
+    }
+
     /// The flash of program `number` (1 is the first, as in the sub-index).
     #[must_use]
     pub fn program(&self, number: u8) -> Option<Region> {

@@ -126,6 +126,8 @@ impl Header {
     pub const SIZE: u32 = size_of::<Self>() as u32;
     /// The offset of the CRC.
     pub const CRC: u32 = core::mem::offset_of!(Self, crc) as u32;
+    /// Offset of the abilities that the image needs.
+    pub const FEATURES: u32 = core::mem::offset_of!(Self, features) as u32;
     /// The offset of the first byte that the CRC covers.
     pub const CRC_FROM: u32 = Self::CRC + 4;
 

@@ -1,7 +1,8 @@
-//! Which of the built bootloaders accepts keys: only the one for sealed images.
+//! Which of the built bootloaders accepts keys: only the one for sealed images. And which sectors its
+//! devices protect.
 
 use coboot_tests::firmware;
-use coflash::file::sealed::provision::{provision, ProvisionFault};
+use coflash::file::sealed::provision::{protected_sectors, provision, ProvisionFault};
 use coflash::file::sealed::{key_block, SigningKey};
 use coflash::file::{load, Firmware};
 
@@ -17,5 +18,15 @@ fn only_the_bootloader_for_sealed_images_gets_keys() {
     assert_eq!(provisioned(firmware::BOOTLOADER_SEALED), Ok(()));
     for name in [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST, firmware::BOOTLOADER_LIFT] {
         assert_eq!(provisioned(name), Err(ProvisionFault::Open), "{name}");
+    }
+}
+
+/// With renewal the home of the RAM image (sector 4) has to stay writable.
+#[test]
+fn a_bootloader_that_can_be_renewed_leaves_its_home_writable() {
+    for (name, mask) in [(firmware::BOOTLOADER_SEALED, 0b0_0001), (firmware::BOOTLOADER_LEAST, 0b1_0001)] {
+        let loaded = load(&firmware::dir().join(name), None, None);
+        let Ok(Firmware::Image(image)) = loaded else { panic!("{name}: {loaded:?}") };
+        assert_eq!(protected_sectors(&image, firmware::board()), mask, "{name}");
     }
 }

@@ -1,5 +1,6 @@
 //! Masters that support CiA 302-3 and know nothing of coboot, with their sequence of requests and
-//! its timing: Zephyr's `canopen_program.py` and the boot slave process of Lely's NMT master.
+//! its timing: Zephyr's `canopen_program.py` and the boot slave process of Lely's NMT master; and the order
+//! of SYS TEC's tools.
 //!
 //! Each request is sent once unless the original repeats it, and its answer is the next frame of
 //! the node's SDO server.
@@ -9,6 +10,7 @@ use std::time::Duration;
 use canopen::{Address, Frame, NodeId};
 use coflash::bus::Adapter;
 use coflash::device::{Doing, Session, Timing, Transfers};
+use coflash::file::block_file::BlockFile;
 use embedded_can::{Frame as _, StandardId};
 
 /// The values of 1F51h (CiA 302-3; 80h is Zephyr's).
@@ -16,6 +18,8 @@ const STOP: u8 = 0;
 const START: u8 = 1;
 const CLEAR: u8 = 3;
 const CONFIRM: u8 = 0x80;
+/// SYS TEC's.
+const SET_SIGNATURE: u8 = 0x83;
 
 /// An SDO client with this time-out, on any bus.
 pub struct Master<'a> {
@@ -33,8 +37,8 @@ impl<'a> Master<'a> {
 
     /// Sends a frame.
     ///
-    /// If the frame is invalid.
-    /// If it is no frame.
+    /// # Panics
+    /// If it is no frame, or the bus is gone.
     pub fn post(&mut self, id: u16, data: &[u8]) {
         let id = StandardId::new(id).expect("11 bits");
         self.bus.send(&Frame::new(id, data).expect("8 bytes at most")).expect("the bus is there");
@@ -125,39 +129,39 @@ pub struct Zephyr {
 /// The time between an answer and the next request of the runner, from a trace of it.
 pub const ZEPHYR_PAUSE: Duration = Duration::from_micros(1400);
 
-/// Runs Zephyr's procedure.
+/// Runs Zephyr's procedure for this program number (`--program-number`, 1 by default).
 ///
 /// # Errors
 /// The first step that fails; the runner gives up there.
-pub fn zephyr(bus: &mut dyn Adapter, node: u8, image: &[u8]) -> Result<Zephyr, String> {
+pub fn zephyr(bus: &mut dyn Adapter, node: u8, program: u8, image: &[u8]) -> Result<Zephyr, String> {
     let limit = Duration::from_secs(10);
     let mut master = Master::new(bus, node, Duration::from_secs(1));
     let status_ok = |master: &mut Master<'_>| {
         let until = master.bus.now() + limit;
         loop {
-            let status = master.number(0x1F57, 1)?;
+            let status = master.number(0x1F57, program)?;
             if status == 0 || master.bus.now() > until {
                 return Ok::<u32, String>(status);
             }
         }
     };
     if status_ok(&mut master)? == 0 {
-        master.number(0x1F56, 1)?;
+        master.number(0x1F56, program)?;
     }
     master.post(0x000, &[0x80, node]);
     master.pause(ZEPHYR_PAUSE);
-    let stop = master.control(1, STOP)?;
+    let stop = master.control(program, STOP)?;
     master.pause(ZEPHYR_PAUSE);
-    let clear = master.control(1, CLEAR)?;
+    let clear = master.control(program, CLEAR)?;
     master.pause(ZEPHYR_PAUSE);
     status_ok(&mut master)?;
-    master.download(1, image, Transfers::Segments)?;
+    master.download(program, image, Transfers::Segments)?;
     let status = status_ok(&mut master)?;
     if status != 0 {
         return Err(format!("1F57h reads {status:08X}h"));
     }
-    master.number(0x1F56, 1)?;
-    master.control(1, START)?;
+    master.number(0x1F56, program)?;
+    master.control(program, START)?;
     let boot_up = 0x700 + u16::from(node);
     loop {
         let state = master.await_frame(boot_up, limit).ok_or("no boot-up")?;
@@ -165,11 +169,56 @@ pub fn zephyr(bus: &mut dyn Adapter, node: u8, image: &[u8]) -> Result<Zephyr, S
             break;
         }
     }
-    master.number(0x1F56, 1)?;
+    master.number(0x1F56, program)?;
     master.post(0x000, &[0x80, node]);
     master.pause(ZEPHYR_PAUSE);
-    master.control(1, CONFIRM)?;
+    master.control(program, CONFIRM)?;
     Ok(Zephyr { answers: [stop, clear] })
+}
+
+/// Waits until 1F57h is not busy; its value.
+///
+/// # Errors
+/// The frame in place of the answer.
+fn idle(master: &mut Master<'_>, program: u8) -> Result<(), String> {
+    loop {
+        match master.number(0x1F57, program)? {
+            0 => return Ok(()),
+            busy if busy & 1 != 0 => master.pause(Duration::from_millis(10)),
+            error => return Err(format!("1F57h reads {error:08X}h")),
+        }
+    }
+}
+
+/// The order of SYS TEC's DotNetFlashtool: CLEAR, block by block, SET_SIGNATURE, START (L-1112d_10, the
+/// sequence after figure 3 without its steps 10 to 13). It ends with the next boot-up message.
+///
+/// # Errors
+/// The first step that fails.
+pub fn systec(bus: &mut dyn Adapter, node: u8, program: u8, file: &BlockFile) -> Result<(), String> {
+    let mut master = Master::new(bus, node, Duration::from_millis(500));
+    master.control(program, CLEAR)?;
+    idle(&mut master, program)?;
+    for block in file.blocks() {
+        master.download(program, &block.emit(), Transfers::Segments)?;
+        idle(&mut master, program)?;
+    }
+    master.control(program, SET_SIGNATURE)?;
+    idle(&mut master, program)?;
+    master.control(program, START)?;
+    let boot_up = master.await_frame(0x700 + u16::from(node), Duration::from_secs(10));
+    boot_up.map(drop).ok_or("no boot-up".to_string())
+}
+
+/// What a master adds to its sequence to renew a bootloader: SET_SIGNATURE on trial, and the wait for the
+/// installation (docs/masters.md).
+///
+/// # Errors
+/// The first step that fails.
+pub fn confirm(bus: &mut dyn Adapter, node: u8, program: u8) -> Result<(), String> {
+    let mut master = Master::new(bus, node, Duration::from_millis(500));
+    master.control(program, SET_SIGNATURE)?;
+    idle(&mut master, program)
 }
 
 /// How many times Lely's master repeats a request that may meet a restarting device.

@@ -21,7 +21,7 @@ use crate::firmware;
 /// The program number of the bootloader of the tested board: it follows those of the layout.
 #[must_use]
 pub fn number() -> u8 {
-    firmware::board().programs.len() as u8 + 1
+    shared_abi::renewal::number(firmware::board().programs.len() as u8, None)
 }
 
 /// The RAM image of a built bootloader, with its header.

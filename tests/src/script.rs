@@ -33,6 +33,7 @@ use coflash::bus::Adapter;
 use coflash::device::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;
+use shared_abi::renewal;
 
 use crate::bench::Bench;
 use crate::firmware;
@@ -109,7 +110,8 @@ pub fn play(bench: &mut Bench, script: &str) {
 pub fn play_on(wire: &mut dyn Wire, script: &str, board: &Layout, image: &dyn Fn(&str) -> String) {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("expected").join(script);
     let text = fs::read_to_string(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    let highest = board.programs.len() as u8 + u8::from(board.staging.is_some());
+    let programs = board.programs.len() as u8;
+    let highest = board.staging.map_or(programs, |_| renewal::number(programs, None));
     let named = HashMap::from([("p0".to_owned(), highest)]);
     let mut player = Player { seen: wire.time(), node: 1, wire, board, image, named };
     for (number, line) in (1..).zip(text.lines()) {

@@ -1,18 +1,23 @@
 //! `coflash` detects the dialect of the firmware and updates it accordingly: images and Intel HEX
 //! into the standard bootloader, the profiles of ESAcademy and lifts.
 
+use std::sync::Arc;
+
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coboot_tests::renewal::version as version_of;
 use coflash::device::{recognise, Dialect, Doing};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Format};
+use coflash::file::ram_image::RamImage;
+use coflash::file::read::{read, Firmware, Format};
 use coflash::update::dialect::read_locked;
 use coflash::update::event::{Note, Phase};
-use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
+use coflash::update::{flash, renew, DeviceState, Event, FlashOptions, NewBootloader, Password, Report};
 use coflash::Error;
 use shared_abi::layout::stm32f407g_disc1_two;
+use shared_abi::ram_image::Version;
 
 const VERSION: Address = Address::new(0x100A, 0);
 
@@ -152,6 +157,17 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let stored = read_locked(&mut session, parameters, None, Password::new(PASSWORD), &mut |_| {}).unwrap();
     assert_eq!(stored, set);
     bench.await_boot_up(2000);
+
+    // Its bootloader, from the running program and back; each restart wants the password again.
+    let new = version_of(&firmware::of_board(layout.board, LIFT), 0x0009_0001);
+    let Ok(Firmware::Image(image)) = read(&new, Some(Format::Raw), Some(0)) else { panic!("a raw file") };
+    let new = NewBootloader::Plain(Arc::new(RamImage::find(&image).expect("a RAM image")));
+    let none = FlashOptions::default();
+    let refused = renew(&mut bench.session_with(NODE), &new, &none, &mut |_| {});
+    assert!(matches!(refused, Err(Error::NoPassword { .. })), "{refused:?}");
+    let renewal = renew(&mut bench.session_with(NODE), &new, &options, &mut |_| {}).unwrap();
+    assert_eq!((renewal.number, renewal.to), (3, Version(0x0009_0001)), "it follows the set of parameters");
+    assert!(version(&mut bench, NODE).contains("2.0.0"), "the program runs again");
 
     let wrong = FlashOptions::default().unlock(Password::new("Coboot"));
     let (result, events) = update(&mut bench, NODE, &blocks(APP_LIFT), &wrong);

@@ -2,7 +2,7 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU8, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use coflash::bus::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Check, Means, Outcome};
 use coflash::device::Error;
 use coflash::update::{flash, FlashOptions};
-use emulator::machine::Options;
+use emulator::machine::{Operation, Options};
 use emulator::silicon::{Silicon, TYPICAL, WORST};
 
 /// The checks that fail, and those that cannot be judged.
@@ -163,10 +163,128 @@ fn the_bootloader_passes() {
     let expected = checks.iter().map(|check| check.id).filter(|id| is_compact && by_blocks(id));
     let found = ids(&skipped).into_iter().filter(by_blocks);
     assert_eq!(found.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
+    // A board without staging has no bootloader that can be renewed.
+    let of_renewal = |id: &&str| id.starts_with("REN-");
+    let expected = checks.iter().map(|check| check.id).filter(of_renewal);
+    let expected = expected.filter(|_| firmware::board().staging.is_none());
+    let found = ids(&skipped).into_iter().filter(of_renewal);
+    assert_eq!(found.collect::<Vec<_>>(), expected.collect::<Vec<_>>());
     // 1017h is const, and a bootloader has no operational state.
-    let others: Vec<_> = ids(&skipped).into_iter().filter(|id| !by_blocks(id)).collect();
+    let others = ids(&skipped).into_iter().filter(|id| !by_blocks(id) && !of_renewal(id));
+    let others: Vec<_> = others.collect();
     assert_eq!(others, ["HB-004", "NMT-001", "NMT-002", "NMT-003", "NMT-006"], "{skipped:#?}");
     bench.assert_nothing_unmodelled();
+}
+
+/// The checks of the bootloader's own number, on a board with this fault.
+fn of_renewal(answer: fn([u8; 8], [u8; 8]) -> Option<[u8; 8]>) -> (Vec<String>, Vec<String>, Vec<Operation>) {
+    let mut bench = Bench::new();
+    bench.power_on();
+    bench.await_boot_up(100);
+    bench.machine().keep_flash_log();
+    let all: Vec<_> = checks().into_iter().filter(|check| check.group() == "REN").collect();
+    let mut faulty = Faulty { bench: &mut bench, power: Rc::default(), answer, asked: [0; 8] };
+    let (failed, skipped) = verdicts(&mut faulty, &all, means());
+    let log = bench.machine().take_flash_log();
+    bench.assert_nothing_unmodelled();
+    (failed, skipped, log)
+}
+
+/// An upload of this object, of the bootloader's number by sub-index 2.
+const fn reads(asked: [u8; 8], index: u16, sub: u8) -> bool {
+    let [low, high] = index.to_le_bytes();
+    matches!(asked, [0x40, l, h, s, ..] if l == low && h == high && s == sub)
+}
+
+#[test]
+fn faults_of_the_bootloaders_own_number_are_found() {
+    if firmware::board().staging.is_none() {
+        return;
+    }
+    let (failed, skipped, log) = of_renewal(|_, answer| Some(answer));
+    assert_eq!((&failed[..], &skipped[..], &log[..]), (&[][..], &[][..], &[][..]), "and it writes nothing");
+
+    let found = |answer| ids(&of_renewal(answer).0).into_iter().map(str::to_owned).collect::<Vec<_>>();
+    // 1F51h/0 ends before it.
+    let all = found(|asked, mut answer| {
+        answer[4] -= u8::from(reads(asked, 0x1F51, 0));
+        Some(answer)
+    });
+    assert_eq!(all, ["REN-001"]);
+    // 1F51h/2 reads "stopped", and 1F56h/2 a program that is not there.
+    let all = found(|asked, mut answer| {
+        if reads(asked, 0x1F51, 2) || reads(asked, 0x1F56, 2) {
+            answer[4..].fill(0);
+        }
+        Some(answer)
+    });
+    assert_eq!(all, ["REN-002", "REN-003"]);
+    // Each command changes what 2007h/9, or 1F56h/2, reads.
+    for index in [0x2007, 0x1F56] {
+        static READS: AtomicU8 = AtomicU8::new(0);
+        static INDEX: AtomicU16 = AtomicU16::new(0);
+        INDEX.store(index, Ordering::Relaxed);
+        let all = found(|asked, mut answer| {
+            let index = INDEX.load(Ordering::Relaxed);
+            if reads(asked, index, if index == 0x2007 { 9 } else { 2 }) {
+                // The reset or the damage of the last trial; the CRC.
+                answer[7] = READS.fetch_add(1, Ordering::Relaxed) % 4;
+                answer[6] = if index == 0x2007 { 3 } else { answer[6] };
+            }
+            Some(answer)
+        });
+        let expected =
+            ["REN-004", "REN-005", "REN-006", "REN-007", "REN-008", "REN-009", "REN-010", "REN-011"];
+        assert_eq!(all, expected, "{index:04X}h");
+    }
+    // The commands are refused.
+    let all = found(|asked, answer| {
+        let refused = [0x80, 0x51, 0x1F, 2, 0x30, 0, 0x09, 0x06];
+        Some(if asked[..4] == [0x2F, 0x51, 0x1F, 2] { refused } else { answer })
+    });
+    assert_eq!(all, ["REN-004", "REN-005", "REN-006", "REN-007", "REN-008", "REN-009", "REN-010", "REN-011"]);
+    // 1F57h/2 never reports an error; then another one than the right one.
+    for error in [0x00, 0x06] {
+        static ERROR: AtomicU8 = AtomicU8::new(0);
+        ERROR.store(error, Ordering::Relaxed);
+        let all = found(|asked, mut answer| {
+            if reads(asked, 0x1F57, 2) && answer[4] > 1 {
+                answer[4] = ERROR.load(Ordering::Relaxed);
+            }
+            Some(answer)
+        });
+        assert_eq!(all, ["REN-009", "REN-010", "REN-011"], "{error:02X}h");
+    }
+    // The bootloader leaves after START: 1000h reads that of an application.
+    let all = found(|asked, mut answer| {
+        static STARTED: AtomicBool = AtomicBool::new(false);
+        STARTED.fetch_or(asked[..5] == [0x2F, 0x51, 0x1F, 2, 1], Ordering::Relaxed);
+        if reads(asked, 0x1000, 0) && STARTED.swap(false, Ordering::Relaxed) {
+            answer[4..].fill(0);
+        }
+        Some(answer)
+    });
+    assert_eq!(all, ["REN-009"]);
+}
+
+/// A device in the middle of a renewal is left alone: 84h would give the image on trial up.
+#[test]
+fn a_device_in_the_middle_of_a_renewal_is_left_alone() {
+    if firmware::board().staging.is_none() {
+        return;
+    }
+    for progress in [[1, 0, 0, 0], [1, 1, 0, 0], [2, 2, 0, 0]] {
+        static PROGRESS: AtomicU32 = AtomicU32::new(0);
+        PROGRESS.store(u32::from_le_bytes(progress), Ordering::Relaxed);
+        let (failed, skipped, log) = of_renewal(|asked, mut answer| {
+            if reads(asked, 0x2007, 9) {
+                answer[4..].copy_from_slice(&PROGRESS.load(Ordering::Relaxed).to_le_bytes());
+            }
+            assert_ne!(asked[..3], [0x2F, 0x51, 0x1F], "no command is sent");
+            Some(answer)
+        });
+        assert_eq!((&failed[..], skipped.len(), &log[..]), (&[][..], 11, &[][..]), "{progress:?}");
+    }
 }
 
 #[test]
@@ -182,7 +300,7 @@ fn an_application_passes_and_keeps_its_state() {
     let (failed, skipped) = verdicts(&mut bench, &checks, means());
     assert!(failed.is_empty(), "{failed:#?}");
     assert!(
-        skipped.iter().all(|line| line.starts_with("PRG-") || line.starts_with("HB-004")),
+        skipped.iter().all(|line| ["PRG-", "REN-", "HB-004"].iter().any(|id| line.starts_with(id))),
         "{skipped:#?}"
     );
     let operational = |bench: &mut Bench| {
@@ -200,7 +318,7 @@ fn an_application_passes_and_keeps_its_state() {
     let flag = Arc::clone(&cancelled);
     let node = NodeId::new(NODE).unwrap();
     let result = run(&mut bench, node, &checks, means(), &cancelled, &mut |_| {
-        flag.store(true, std::sync::atomic::Ordering::Relaxed);
+        flag.store(true, Ordering::Relaxed);
     });
     assert!(matches!(result, Err(Error::Cancelled)), "{result:?}");
     operational(&mut bench);

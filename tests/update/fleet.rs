@@ -1,13 +1,17 @@
 //! Boards that get the same program at the same time, with the real firmware.
 
+use std::process::Command;
 use std::sync::atomic::Ordering;
 use std::sync::Arc;
 use std::time::Duration;
 
-use canopen::program::{FlashError, PROGRAM_ID};
+use canopen::program::{FlashError, DEVICE_STATE, PROGRAM_ID, STATE_RENEWAL};
 use canopen::{Address, BitRate};
+use coboot_tests::bench::Bench;
+use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::fleet::{file, Fleet, Update};
+use coboot_tests::renewal::{crc_of, image_of, number};
 use coflash::bus::Adapter as _;
 use coflash::device::Doing;
 use coflash::file::block_file::BlockFile;
@@ -17,9 +21,10 @@ use coflash::update::Event;
 use coflash::Error;
 use emulator::bus::fault::FaultAction;
 use emulator::frame::Frame;
-use emulator::machine::Machine;
+use emulator::machine::{Machine, Operation};
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two;
+use shared_abi::renewal::{Progress, State};
 
 const KIB: u32 = 40;
 
@@ -289,4 +294,78 @@ fn a_device_without_room_refuses_alone() {
         &file(size),
     );
     assert!(matches!(error, Error::OtherRegion { program: 1, .. }), "{error}");
+}
+
+/// `coflash flash bootloader.elf --node 1-8`, where the home of the bootloader of one board is
+/// write-protected: the boards, the exit code, and what the command has said.
+fn renewed(refusing: usize) -> (Bench, Option<i32>, String) {
+    let mut bench = Fleet::new(8, BitRate::K1000).bench;
+    let layout = firmware::board();
+    let home = layout.chip.sector_at(layout.home.unwrap().base).unwrap();
+    for (board, place) in bench.boards().into_iter().zip(1..) {
+        let machine = bench.world.machine_mut(board);
+        machine.keep_flash_log();
+        if place == refusing {
+            machine.protect_sector(home.number, true);
+        }
+    }
+    let mut endpoint = Endpoint::new(bench);
+    let coflash = std::env::var("COBOOT_COFLASH").expect("cargo xtask test sets it");
+    let file = firmware::dir().join(firmware::BOOTLOADER_WATCHDOG);
+    let url = endpoint.url();
+    let output =
+        endpoint.run(Command::new(coflash).args(["--bus", &url, "flash", "--node", "1-8"]).arg(file));
+    let said = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
+    println!("{said}");
+    (endpoint.bench, output.status.code(), said.into_owned())
+}
+
+/// What each device says: the state of its renewal, and 1F56h of its bootloader.
+fn bootloaders(bench: &mut Bench) -> Vec<(State, u32)> {
+    let each = |node| {
+        let mut session = bench.session_with(node);
+        let state = session.read_number(Address::new(DEVICE_STATE, STATE_RENEWAL)).unwrap();
+        let crc = session.read_number(Address::new(PROGRAM_ID, number())).unwrap();
+        (Progress::from_bytes(state.to_le_bytes()).unwrap().state, crc)
+    };
+    (1..=8).map(each).collect()
+}
+
+fn erases(bench: &mut Bench, place: usize) -> usize {
+    let board = bench.boards()[place - 1];
+    let log = bench.world.machine_mut(board).take_flash_log();
+    log.iter().filter(|operation| matches!(operation, Operation::Erase { .. })).count()
+}
+
+/// The first device shows whether the new bootloader is good: without it the others stay as they are.
+#[test]
+fn if_the_first_device_refuses_a_bootloader_the_others_are_left_alone() {
+    let (mut bench, exit, said) = renewed(1);
+    assert_eq!(exit, Some(8), "{said}");
+    assert!(said.contains("sector 4 of the flash is write-protected"), "{said}");
+    let others = "error: not renewed: the bootloader of node 1 was the first, and could not be renewed";
+    for node in 2..=8 {
+        assert!(said.contains(&format!("node {node}: {others}")), "{node}: {said}");
+    }
+    assert!(said.contains("0 of 8 devices are done"), "{said}");
+    let old = crc_of(&image_of(firmware::BOOTLOADER));
+    assert_eq!(bootloaders(&mut bench), [(State::None, old); 8]);
+    assert!((1..=8).all(|place| erases(&mut bench, place) == 0), "nothing was erased");
+}
+
+/// A later device is named, and the others are renewed.
+#[test]
+fn a_later_device_that_refuses_a_bootloader_is_named_and_the_others_are_renewed() {
+    let (mut bench, exit, said) = renewed(5);
+    assert_eq!(exit, Some(8), "{said}");
+    let line = said.lines().find(|line| line.starts_with("node 5: error: ")).expect("it is named");
+    assert!(line.contains("sector 4 of the flash is write-protected"), "{line}");
+    assert_eq!(said.matches(": error: ").count(), 1, "{said}");
+    assert!(said.contains("7 of 8 devices are done"), "{said}");
+    let old = crc_of(&image_of(firmware::BOOTLOADER));
+    let new = crc_of(&image_of(firmware::BOOTLOADER_WATCHDOG));
+    let mut expected = [(State::Installed, new); 8];
+    expected[4] = (State::None, old);
+    assert_eq!(bootloaders(&mut bench), expected);
+    assert_eq!(erases(&mut bench, 5), 0);
 }

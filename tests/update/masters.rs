@@ -1,5 +1,6 @@
 //! Masters that support CiA 302-3 and do not know coboot update a device with a running program:
-//! the sequences of requests of Zephyr's runner and of Lely's NMT master, with their timing.
+//! the sequences of requests of Zephyr's runner and of Lely's NMT master, with their timing. And they renew its
+//! bootloader, as does the order of SYS TEC's tools (docs/masters.md).
 
 use std::time::Duration;
 
@@ -7,9 +8,13 @@ use canopen::BitRate;
 use coboot_node::device::Event;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::masters::{lely, zephyr, Master};
+use coboot_tests::masters::{confirm, lely, systec, zephyr, Master};
 use coboot_tests::node::NodeBus;
+use coboot_tests::renewal::{crc_of, identification, number, progress, running, version};
+use coflash::file::convert::{blocks_of, Options};
+use coflash::file::read::{read, Format};
 use coflash::update::{flash, FlashOptions};
+use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 /// The applications that run on the device.
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
@@ -49,7 +54,7 @@ fn crc32(bytes: &[u8]) -> u32 {
 fn zephyrs_runner_updates_and_confirms_a_running_device() {
     for image in APPLICATIONS {
         let mut bench = board_at(BitRate::K125, 125_000, image);
-        let done = zephyr(&mut bench, NODE, &firmware::raw(firmware::APP_V2));
+        let done = zephyr(&mut bench, NODE, 1, &firmware::raw(firmware::APP_V2));
         let [stop, clear] = done.unwrap_or_else(|error| panic!("{image}: {error}")).answers;
         println!("{image}: STOP answered in {stop:?}, CLEAR in {clear:?}");
         assert!(stop <= Duration::from_millis(25), "{image}: {stop:?}");
@@ -92,7 +97,7 @@ fn both_masters_update_a_node_without_a_chip() {
     let mut node = NodeBus::new("masters");
     // Twice: the second time from the running program.
     for first in [1, 2] {
-        let done = zephyr(&mut node, NODE, &program(first)).unwrap();
+        let done = zephyr(&mut node, NODE, 1, &program(first)).unwrap();
         assert!(done.answers[0] <= Duration::from_millis(25), "{:?}", done.answers);
         node.run(Duration::from_millis(100));
         let last = *node.events.last().unwrap();
@@ -154,4 +159,66 @@ fn stop_is_answered_as_soon_as_the_wire_allows_at_every_bit_rate() {
         bench.run_ms(50);
         assert!(bench.is_bootloader(NODE));
     }
+}
+
+/// The version of the new bootloader.
+const NEW: u32 = 0x0009_0001;
+
+/// A device that runs a program, and whose master has called its bootloader (1F51h/1 = 80h).
+fn called_back() -> Bench {
+    let mut bench = board_at(BitRate::K125, 125_000, firmware::APP_V1);
+    coflash::update::steps::call_back(&mut bench.session()).unwrap();
+    bench
+}
+
+/// The new image is on trial, staged and not confirmed.
+fn assert_on_trial(bench: &mut Bench) {
+    let Progress { state, origin, .. } = progress(bench);
+    assert_eq!((state, origin, running(bench)), (State::Staged, Origin::Trial, NEW));
+}
+
+/// It is installed, 1F56h reads the CRC in its header, and the program is there as before.
+fn assert_renewed(bench: &mut Bench, image: &[u8]) {
+    assert_eq!((progress(bench).state, running(bench)), (State::Installed, NEW));
+    assert_eq!(identification(bench), crc_of(image));
+    let mut master = Master::new(bench, NODE, Duration::from_millis(500));
+    master.control(1, 1).unwrap();
+    bench.await_program(1000);
+    assert!(!bench.is_bootloader(NODE));
+    bench.assert_nothing_unmodelled();
+}
+
+/// Zephyr's runner with `--program-number` of the bootloader. Its own confirmation, 80h, changes nothing
+/// here: without 83h the old bootloader is back after 60 s.
+#[test]
+fn zephyrs_runner_renews_a_bootloader_with_one_request_more() {
+    let image = version(firmware::BOOTLOADER, NEW);
+    for is_confirmed in [true, false] {
+        let mut bench = called_back();
+        let old = running(&mut bench);
+        zephyr(&mut bench, NODE, number(), &image).unwrap();
+        assert_on_trial(&mut bench);
+        if is_confirmed {
+            confirm(&mut bench, NODE, number()).unwrap();
+            assert_renewed(&mut bench, &image);
+            continue;
+        }
+        bench.await_boot_up(61_000);
+        let expected = Progress { state: State::Staged, origin: Origin::Home, trial_end: TrialEnd::Late };
+        assert_eq!((progress(&mut bench), running(&mut bench)), (expected, old));
+    }
+}
+
+/// SYS TEC's tools write 83h directly after the data. It is acknowledged and changes nothing; the second one,
+/// after the boot-up, confirms.
+#[test]
+fn systecs_order_renews_a_bootloader_with_a_second_83h() {
+    let image = version(firmware::BOOTLOADER, NEW);
+    let home = firmware::board().home.unwrap().base;
+    let file = blocks_of(read(&image, Some(Format::Raw), Some(home)).unwrap(), &Options::default());
+    let mut bench = called_back();
+    systec(&mut bench, NODE, number(), &file.unwrap().file).unwrap();
+    assert_on_trial(&mut bench);
+    confirm(&mut bench, NODE, number()).unwrap();
+    assert_renewed(&mut bench, &image);
 }

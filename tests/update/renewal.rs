@@ -8,10 +8,10 @@ use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::renewal::{number, plain, running, version};
 use coboot_tests::sealed_board;
-use coflash::device::info;
+use coflash::device::{info, Doing};
 use coflash::file::read::{read, Format};
 use coflash::update::event::Phase;
-use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Renewal};
+use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Password, Renewal};
 use coflash::Error;
 use emulator::machine::{Cut, FlashCut, Operation};
 use shared_abi::handoff::ResetCause;
@@ -182,6 +182,45 @@ fn a_bootloader_without_renewal_says_so() {
     bench.await_boot_up(100);
     let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
     assert!(matches!(result, Err(Error::NotRenewable { .. })), "{result:?}");
+}
+
+/// A bootloader with a password, at this node: with the right one it is renewed, with another one refused
+/// before anything is erased.
+fn assert_wants_a_password(bootloader: &str, node: u8, right: Option<&str>, others: &[Option<&str>]) {
+    let mut bench = Bench::of_image(bootloader);
+    bench.power_on();
+    bench.await_boot_up_of(node, 100);
+    let new = plain(&version(bootloader, NEW));
+    let renewed = |bench: &mut Bench, password: Option<&str>| {
+        let options = FlashOptions::default().unlock(password.and_then(Password::new));
+        renew(&mut bench.session_with(node), &new, &options, &mut |_| {})
+    };
+    bench.machine().keep_flash_log();
+    for other in others {
+        let error = renewed(&mut bench, *other).unwrap_err();
+        let is_unlock = matches!(error, Error::Refused { doing: Doing::Unlock, .. });
+        assert!(is_unlock || matches!(error, Error::NoPassword { .. }), "{other:?}: {error}");
+        assert!(error.advice().contains("password"), "{}", error.advice());
+        // The next attempt must wait.
+        bench.run_ms(600);
+    }
+    assert_eq!(bench.machine().take_flash_log(), []);
+    let Renewal { to, unchanged, .. } = renewed(&mut bench, right).unwrap();
+    assert_eq!((to, unchanged), (Version(NEW), false));
+    let now = info(&mut bench.session_with(node)).unwrap().bootloader.unwrap();
+    assert_eq!(
+        (now.version, now.running.map(|running| running.progress.state)),
+        (Version(NEW), Some(State::Installed))
+    );
+    bench.assert_nothing_unmodelled();
+}
+
+/// The default password of ESAcademy's boot loader is INIT, and the tool knows it. A lift has one of its
+/// own; this repository's is "coboot".
+#[test]
+fn a_bootloader_with_a_password_is_renewed_with_it_and_refused_without() {
+    assert_wants_a_password(firmware::BOOTLOADER_ESACADEMY, 64, None, &[Some("0x57726F6E")]);
+    assert_wants_a_password(firmware::BOOTLOADER_LIFT, 126, Some("coboot"), &[None, Some("Coboot")]);
 }
 
 /// The command line, in real time.

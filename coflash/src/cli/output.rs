@@ -329,6 +329,15 @@ impl Failure {
         Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
     }
 
+    /// A device whose state or option bytes forbid its delivery; each reason was shown.
+    pub(super) fn not_ready(node: NodeId) -> Self {
+        let advice = "do what each line says, and run the command again".to_string();
+        Self {
+            told: true,
+            ..Self::new(Exit::Device, None, format!("node {node} is not ready"), Some(advice))
+        }
+    }
+
     /// A device that has failed `count` conformance checks; each one was shown.
     #[cfg(feature = "conform")]
     pub(super) fn nonconforming(node: NodeId, count: usize) -> Self {
@@ -551,6 +560,7 @@ impl From<Error> for Failure {
             | Error::FellSilent { .. }
             | Error::TrialFailed { .. }
             | Error::RenewalFailed { .. }
+            | Error::SilentOnTrial { .. }
             | Error::FirstFailed { .. }
             | Error::Unconfirmable { .. }
             | Error::OtherIdentity { .. } => Exit::NoStart,

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use coflash::device::option_bytes::sector_list;
 use coflash::file::ihex;
 use coflash::file::read::{self, Firmware, Format};
-use coflash::file::sealed::provision::provision;
+use coflash::file::sealed::provision::{protected_sectors, provision};
 use coflash::file::sealed::{key_block, Kek, PublicKey};
 use serde_json::json;
 
@@ -19,6 +20,9 @@ use super::output::Failure;
 /// There is room for two roots and three key-encryption keys. A debug probe writes the result into
 /// the device in production. With key-encryption keys in it, the file is as secret as the keys;
 /// only its owner can read it.
+///
+/// The output names the sectors that belong under write protection: with renewal the first one
+/// alone, because the home of the bootloader's RAM image has to stay writable.
 #[derive(Debug, Args)]
 pub(super) struct Provision {
     #[command(flatten)]
@@ -77,15 +81,18 @@ impl Provision {
                 all.join(", ")
             }
         };
+        let protect = protected_sectors(&made, layout);
         let words = format!(
             "{}: {} with keys at {:#010x}\n  roots                {}\n  key-encryption keys  {}\n  \
-             counter {counter}, epoch {epoch}{}",
+             counter {counter}, epoch {epoch}{}\n  option bytes         write protection (nWRP) of {} and of no \
+             others, SPRMOD 0, BFB2 0; RDP last",
             output.display(),
             layout.board,
             layout.key_block().base,
             ids(&root_ids),
             ids(&kek_ids),
             if for_tests { ", for tests" } else { "" },
+            sector_list(protect),
         );
         context.out.result(words, || {
             json!({
@@ -98,6 +105,7 @@ impl Provision {
                 "counter": counter,
                 "epoch": epoch,
                 "for_tests": for_tests,
+                "protect": protect,
             })
         });
         Ok(())

@@ -1,6 +1,8 @@
 //! `coflash verify-device`: checks whether a device holds the program of a sealed image.
 
 use clap::Args;
+use coflash::device::delivery::{delivery, Delivery};
+use coflash::device::option_bytes::sector_list;
 use coflash::file::sealed::Device as Its;
 use coflash::update::{compare_sealed, Comparison};
 use serde_json::json;
@@ -16,6 +18,10 @@ use super::verify::Checked;
 /// bootloader or in the application: vendor-ID, product code, hardware revision, unique ID and keys
 /// of the device, CRC and version of the program, and the last installation. The command changes
 /// nothing in the device.
+///
+/// A device fails also if its bootloader runs on trial, waits for a trial, is confirmed and not
+/// installed, or is damaged, and if SPRMOD or BFB2 is set in its option bytes. An application
+/// reports none of this: coflash enter calls the bootloader first.
 ///
 /// The answers come from the device's own software: a device with foreign software may give any
 /// answers.
@@ -36,8 +42,11 @@ impl VerifyDevice {
         let mut session = self.device.session(&mut link)?;
         let comparison =
             compare_sealed(&mut session, &file).map_err(|error| Failure::diagnosed(error, &mut session))?;
+        let Delivery { renewal, option_bytes, faults, untold: unknown, .. } =
+            delivery(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
         let (node, program) = (session.node(), file.head().program());
         let Comparison { running, runs, differences, untold, .. } = &comparison;
+        let untold = [&untold[..], &unknown].concat();
         let which = format!("program {program} of {}", path.display());
         let verdict = match (comparison.is_same(), runs) {
             (true, true) => format!("runs {which}, according to its own answers"),
@@ -48,6 +57,18 @@ impl VerifyDevice {
         words += &format!("\n  signed by    key {:08X}h", opened.signed_by.id());
         for difference in differences {
             words += &format!("\n  differs      {difference}");
+        }
+        for fault in &faults {
+            words += &format!("\n  not ready    {fault}");
+        }
+        let protected = option_bytes.map(|bytes| bytes.protected());
+        if let (Some(renewal), Some(protected)) = (renewal, protected) {
+            let wanted = match renewal {
+                true => "sector 0 and no others: the bootloader can be renewed",
+                false => "the sectors that coflash provision names (0 and 4 on the boards of coboot)",
+            };
+            words +=
+                &format!("\n  protection   the device has {}; it needs {wanted}", sector_list(protected));
         }
         if !untold.is_empty() {
             let objects: Vec<String> = untold.iter().map(ToString::to_string).collect();
@@ -64,12 +85,18 @@ impl VerifyDevice {
                 "bootloader": running.is_bootloader(),
                 "signed_by": opened.signed_by.id(),
                 "differences": differences,
+                "ready": faults.is_empty(),
+                "faults": faults,
+                "renewal": renewal,
+                "option_bytes": option_bytes,
+                "protected": protected,
                 "untold": untold.iter().map(ToString::to_string).collect::<Vec<_>>(),
             })
         });
-        match comparison.is_same() {
-            true => Ok(()),
-            false => Err(Failure::differs(node, differences.len())),
+        match (comparison.is_same(), faults.is_empty()) {
+            (true, true) => Ok(()),
+            (true, false) => Err(Failure::not_ready(node)),
+            (false, _) => Err(Failure::differs(node, differences.len())),
         }
     }
 }

@@ -15,6 +15,7 @@
 //! | `network` | boot-up, heartbeat and NMT |
 //! | `lss` | layer setting services |
 //! | `program` | 1F50h to 1F57h, without a change of the program |
+//! | `renewal` | the bootloader's own number in 1F50h to 1F57h, without a renewal |
 //! | `update` | updates, whole and interrupted, with a program that the user gives |
 //! | `junit` | the report for a test system |
 
@@ -27,6 +28,7 @@ mod lss;
 mod network;
 mod objects;
 mod program;
+mod renewal;
 mod sdo;
 mod update;
 
@@ -53,6 +55,7 @@ pub fn checks() -> Vec<Check> {
         frames::CHECKS,
         lss::CHECKS,
         program::CHECKS,
+        renewal::CHECKS,
         update::CHECKS,
     ]
     .concat()

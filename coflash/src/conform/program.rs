@@ -168,25 +168,29 @@ pub(super) const CHECKS: &[Check] = &[
     }),
     check("PRG-041", "RESET_STAT sets 1F57h/1 to 0", COMMANDS, |b| {
         b.takes(request(0x2F, 0x1F51, 1, [2, 0, 0, 0]), 0x60)?;
-        let mut status = 1;
-        for _ in 0..20 {
-            status = b.value(0x1F57, 1, 4)?;
-            if status & 1 == 0 {
-                break;
-            }
-            b.hear(CobId::NMT, Duration::from_millis(20))?;
-        }
-        if status == 0 {
-            Ok(())
-        } else {
-            failed(format!("1F57h/1 is {status:08X}h"))
+        match idle(b, 1)? {
+            0 => Ok(()),
+            status => failed(format!("1F57h/1 is {status:08X}h")),
         }
     }),
     check("PRG-042", "1F56h/1 is the same when it is read again", OBJECTS, |b| unchanged(b, |_| Ok(()))),
 ];
 
+/// 1F57h of a program, when it is no longer busy, or after 400 ms.
+pub(super) fn idle(b: &mut Bench<'_>, program: u8) -> Result<u32, Stop> {
+    let mut status = 1;
+    for _ in 0..20 {
+        status = b.value(0x1F57, program, 4)?;
+        if status & 1 == 0 {
+            break;
+        }
+        b.hear(CobId::NMT, Duration::from_millis(20))?;
+    }
+    Ok(status)
+}
+
 /// Skips the checks of this group in a device that is no bootloader by these documents.
-fn is_bootloader(b: &mut Bench<'_>) -> Result<(), Stop> {
+pub(super) fn is_bootloader(b: &mut Bench<'_>) -> Result<(), Stop> {
     if b.value(0x1000, 0, 4)? != BOOTLOADER {
         return skipped("1000h is not 10000000h: no bootloader, or its program runs");
     }
@@ -219,24 +223,35 @@ fn block(number: u32, address: u32) -> Vec<u8> {
     bytes
 }
 
-/// Downloads a block in segments. The device may refuse it before the last one.
+/// Downloads a block, which the device has to refuse with this code, perhaps before the last segment.
 fn send_block(b: &mut Bench<'_>, block: &[u8], code: u32) -> Result<(), Stop> {
-    b.takes(request(0x21, 0x1F50, 1, (block.len() as u32).to_le_bytes()), 0x60)?;
-    let count = block.len().div_ceil(7);
-    for (number, part) in block.chunks(7).enumerate() {
+    match download(b, 1, block)? {
+        Some(given) if given == code => Ok(()),
+        Some(given) => failed(format!("abort {given:08X}h in place of {code:08X}h")),
+        None => failed("the block was accepted"),
+    }
+}
+
+/// Downloads bytes to 1F50h of a program in segments; the abort code if the device refuses them.
+pub(super) fn download(b: &mut Bench<'_>, program: u8, bytes: &[u8]) -> Result<Option<u32>, Stop> {
+    let initiate = request(0x21, 0x1F50, program, (bytes.len() as u32).to_le_bytes());
+    let count = bytes.len().div_ceil(7);
+    let segments = bytes.chunks(7).enumerate().map(|(number, part)| {
         let toggle = (number as u8 & 1) << 4;
         let mut data = [0; 8];
         data[0] = toggle | (7 - part.len() as u8) << 1 | u8::from(number + 1 == count);
         data[1..=part.len()].copy_from_slice(part);
+        (data, 0x20 | toggle)
+    });
+    for (data, command) in std::iter::once((initiate, 0x60)).chain(segments) {
         let answer = b.ask(data)?;
         match abort_of(&answer) {
-            Some(given) if given == code => return Ok(()),
-            Some(given) => return failed(format!("abort {given:08X}h in place of {code:08X}h")),
-            None if answer[0] == 0x20 | toggle => {}
-            None => return failed(format!("segment {number}: {:02X}h", answer[0])),
+            Some(code) => return Ok(Some(code)),
+            None if answer[0] == command => {}
+            None => return failed(format!("{:02X}h in place of {command:02X}h", answer[0])),
         }
     }
-    failed("the block was accepted")
+    Ok(None)
 }
 
 /// Block transfer is optional.

@@ -217,6 +217,13 @@ pub enum Error {
         /// The end of its trial.
         end: TrialEnd,
     },
+    /// Nothing has answered since the new bootloader was started on trial.
+    SilentOnTrial {
+        /// The device.
+        node: NodeId,
+        /// How long the tool has waited.
+        waited: Duration,
+    },
     /// The new bootloader runs on trial, and cannot be confirmed: it is built without renewal.
     Unconfirmable {
         /// The device.
@@ -405,6 +412,7 @@ impl Error {
             | Self::FellSilent { .. }
             | Self::TrialFailed { .. }
             | Self::RenewalFailed { .. }
+            | Self::SilentOnTrial { .. }
             | Self::FirstFailed { .. }
             | Self::Unconfirmable { .. }
             | Self::OtherIdentity { .. } => 0x6000_0014,
@@ -578,6 +586,11 @@ impl fmt::Display for Error {
             Self::RenewalFailed { node, end } => {
                 write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
             }
+            Self::SilentOnTrial { node, waited } => write!(
+                f,
+                "the new bootloader of node {node} was started on trial, and nothing has answered for {} s",
+                waited.as_secs()
+            ),
             Self::Unconfirmable { node } => write!(
                 f,
                 "the new bootloader of node {node} cannot be confirmed: it is built without renewal; a reset brings \

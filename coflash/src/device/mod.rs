@@ -3,6 +3,7 @@
 
 pub mod access;
 pub mod debugger;
+pub mod delivery;
 mod device_type;
 pub mod diagnose;
 mod dialect;
@@ -27,6 +28,7 @@ pub mod state;
 mod timing;
 pub mod value;
 
+pub use self::delivery::{delivery, Delivery};
 pub use self::device_type::DeviceType;
 pub use self::dialect::Dialect;
 pub use self::doing::{Doing, LssDoing};

@@ -54,9 +54,10 @@ impl OptionBytes {
         self.has(16 + sector) == self.protects_from_reading()
     }
 
-    /// The protected sectors of the first bank.
-    fn protected(self) -> Vec<u8> {
-        (0..12).filter(|sector| self.protects(*sector)).collect()
+    /// The protected sectors of the first bank: bit *n* for sector *n*.
+    #[must_use]
+    pub fn protected(self) -> u32 {
+        (0..12).filter(|sector| self.protects(*sector)).fold(0, |mask, sector| mask | 1 << sector)
     }
 
     const fn has(self, bit: u8) -> bool {
@@ -112,10 +113,12 @@ impl fmt::Display for OptionBytes {
             Some(level) => write!(f, "brown-out reset level {level}")?,
             None => f.write_str("brown-out reset off")?,
         }
-        match (self.protected().as_slice(), self.protects_from_reading()) {
-            ([], _) => f.write_str(", no sector protected")?,
-            (sectors, false) => write!(f, ", write-protected: {}", list(sectors))?,
-            (sectors, true) => write!(f, ", protected against reading and writing: {}", list(sectors))?,
+        match (self.protected(), self.protects_from_reading()) {
+            (0, _) => f.write_str(", no sector protected")?,
+            (sectors, false) => write!(f, ", write-protected: {}", sector_list(sectors))?,
+            (sectors, true) => {
+                write!(f, ", protected against reading and writing: {}", sector_list(sectors))?
+            }
         }
         write!(f, ", read-out protection level {}", self.read_out_level())?;
         if self.starts_watchdog() {
@@ -128,10 +131,15 @@ impl fmt::Display for OptionBytes {
     }
 }
 
-/// Sectors as a list.
-fn list(sectors: &[u8]) -> String {
-    let numbers: Vec<_> = sectors.iter().map(u8::to_string).collect();
-    format!("sectors {}", numbers.join(", "))
+/// The sectors of a mask, bit *n* for sector *n*, as a list.
+#[must_use]
+pub fn sector_list(mask: u32) -> String {
+    let sectors: Vec<_> = (0..32).filter(|sector| mask >> sector & 1 != 0).map(|n| n.to_string()).collect();
+    match sectors.as_slice() {
+        [] => "no sector".to_string(),
+        [one] => format!("sector {one}"),
+        sectors => format!("sectors {}", sectors.join(", ")),
+    }
 }
 
 #[cfg(test)]
@@ -155,7 +163,7 @@ mod tests {
             ),
             (
                 0x8001_AAFD,
-                "brown-out reset off, protected against reading and writing: sectors 0, read-out protection level 0, \
+                "brown-out reset off, protected against reading and writing: sector 0, read-out protection level 0, \
                  start from bank 2 (8001AAFDh)",
             ),
         ] {

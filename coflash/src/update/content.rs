@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use canopen::program::FlashError;
 
+use super::new_bootloader::NewBootloader;
 use super::options::Target;
-use super::renew::NewBootloader;
 use crate::device::error::flash_error_number;
 use crate::file::sealed::{Refusal, SealedFile};
 use crate::file::{judge, BlockFile};

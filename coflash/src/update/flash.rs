@@ -8,14 +8,14 @@ use super::aftermath::look;
 use super::content::{Content, Program};
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
-use super::event::{Done, Event, Note, Phase, Report, Warning};
+use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
 use super::reach::reach;
 use super::renew;
-use super::running::{telling_silence, RunningUpdate};
+use super::running::{give_back, telling_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
-use crate::device::{flying_master, Dialect, Error, Session};
+use crate::device::{Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
 use crate::file::BlockFile;
 
@@ -84,13 +84,7 @@ fn flash_content(
             Err(error) => look(session, error, &update, original, options.program, file.program_crcs()),
         };
         if let Some(taken) = update.mastership.take() {
-            // The result of the update remains, even if this fails.
-            if let Ok(master) = flying_master::give_back(session, taken) {
-                update.tell(match master {
-                    Some(master) => Note::MasterBack { node: master.node }.into(),
-                    None => Warning::MasterMissing.into(),
-                });
-            }
+            give_back(session, taken, &mut |event| update.tell(event));
         }
         update.tell(Event::Done(Box::new(Done::new(left, &result))));
         (result, session.node(), session.transfers())

@@ -14,6 +14,7 @@ mod flash;
 pub mod job;
 mod judge;
 pub mod many;
+mod new_bootloader;
 mod options;
 mod password;
 mod phase;
@@ -35,7 +36,8 @@ pub use self::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen}
 pub use self::event::{Event, Report};
 pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
+pub use self::new_bootloader::NewBootloader;
 pub use self::options::{FlashOptions, Target, JOINED_BLOCKS};
 pub use self::password::Password;
-pub use self::renew::{renew, NewBootloader};
+pub use self::renew::renew;
 pub use self::renewal::Renewal;

@@ -1,123 +1,35 @@
 //! The renewal of a device's bootloader: a new RAM image is staged, runs once on trial, and is confirmed;
 //! then the device installs it (docs/renewal.md).
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
-use canopen::Address;
-use seal::wire::BOOTLOADER;
-use shared_abi::ram_image::Version;
+use canopen::{Address, NodeId};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 use super::aftermath::look;
 use super::catch::knock;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
+use super::dialect;
 use super::event::{Done, Event, Note, Phase, Report, Retry};
 use super::judge::{judge, Judgement};
-use super::options::{FlashOptions, Target};
+use super::new_bootloader::NewBootloader;
+use super::options::FlashOptions;
 use super::renewal::Renewal;
-use super::running::{telling_silence, RunningUpdate};
-use super::steps::{check_target, enter_bootloader, execute, identification, running_program, start};
+use super::running::{give_back, telling_silence, RunningUpdate};
+use super::steps::{check_target, enter_bootloader, execute, identification, running_program, CALL_BACK};
 use crate::device::access::{security_of, told_challenge};
 use crate::device::error::told;
+use crate::device::flying_master::Mastership;
 use crate::device::renewal::{bootloader, progress, Bootloader};
-use crate::device::{Dialect, Doing, Error, Session};
-use crate::file::ram_image::{Fault, RamImage};
-use crate::file::read::{read, Firmware, Format};
-use crate::file::sealed::SealedFile;
+use crate::device::{recognise, Dialect, Doing, Error, Session};
 
 /// A device leaves its bootloader within this time after the answer to START.
 const LEAVES_WITHIN: Duration = Duration::from_millis(200);
-/// The old bootloader is back within this time: an image that nobody reaches, for example with another
-/// bit rate, ends after 60 s (`renewal_s` of the product); the watchdog ends one that hangs earlier.
+/// The old bootloader is usually back within this time: an image that nobody reaches, for example with
+/// another bit rate, ends after 60 s; the watchdog ends one that hangs earlier. A product may have another
+/// time (`renewal_s`), and no object has it: the user gives a longer one.
 const TRIAL_ENDS_WITHIN: Duration = Duration::from_secs(75);
-
-/// A new bootloader.
-#[derive(Clone, Debug)]
-pub enum NewBootloader {
-    /// A RAM image.
-    Plain(Arc<RamImage>),
-    /// A sealed one.
-    Sealed(Arc<SealedFile>),
-}
-
-impl NewBootloader {
-    /// The bootloader in a file of this format; `None` for any other file, also for one that cannot be read.
-    ///
-    /// # Errors
-    /// A [`Fault`] of its RAM image.
-    pub fn in_file(bytes: &[u8], format: Option<Format>) -> Result<Option<Self>, Fault> {
-        if format == Some(Format::Sealed) {
-            return Ok(Self::of_sealed(bytes));
-        }
-        read(bytes, format, Some(0)).map_or(Ok(None), |firmware| Self::of(&firmware))
-    }
-
-    /// The bootloader in firmware that was read; `None` for a program.
-    ///
-    /// # Errors
-    /// A [`Fault`] of its RAM image.
-    pub fn of(firmware: &Firmware) -> Result<Option<Self>, Fault> {
-        let Some(image) = RamImage::of(firmware) else { return Ok(None) };
-        image.check()?;
-        Ok(Some(Self::Plain(Arc::new(image))))
-    }
-
-    /// The bootloader in a sealed image; `None` for a program, and for a file that is no sealed image.
-    #[must_use]
-    pub fn of_sealed(bytes: &[u8]) -> Option<Self> {
-        let file = SealedFile::parse(bytes.to_vec()).ok()?;
-        (file.head().program() == BOOTLOADER).then(|| Self::Sealed(Arc::new(file)))
-    }
-
-    /// The value of 1F56h of a device with this bootloader. That of a sealed image is not known before it is
-    /// opened; its manifest has the CRC of what is written.
-    #[must_use]
-    pub fn crc(&self) -> u32 {
-        match self {
-            Self::Plain(image) => image.header().crc,
-            Self::Sealed(file) => file.head().crc(),
-        }
-    }
-
-    /// Size of header and image in bytes.
-    #[must_use]
-    pub fn size(&self) -> u32 {
-        match self {
-            Self::Plain(image) => image.header().total(),
-            Self::Sealed(file) => file.head().size(),
-        }
-    }
-
-    /// The device that it is for.
-    #[must_use]
-    pub fn target(&self) -> Target {
-        match self {
-            Self::Plain(image) => {
-                Target { vendor_id: image.header().vendor, product_code: image.header().product }
-            }
-            Self::Sealed(file) => Target::of_sealed(file),
-        }
-    }
-
-    /// The bytes for 1F50h.
-    fn bytes(&self) -> &[u8] {
-        match self {
-            Self::Plain(image) => image.bytes(),
-            Self::Sealed(file) => file.bytes(),
-        }
-    }
-
-    /// Its version.
-    #[must_use]
-    pub fn version(&self) -> Version {
-        match self {
-            Self::Plain(image) => Version(image.header().version),
-            Self::Sealed(file) => Version(file.head().version()),
-        }
-    }
-}
 
 /// Renews the bootloader of a device; the program stays, and is started again if it ran before.
 ///
@@ -126,14 +38,22 @@ impl NewBootloader {
 ///
 /// # Errors
 /// [`Error::NotRenewable`] for a device whose bootloader cannot be renewed, [`Error::RenewalFailed`] for
-/// one whose new bootloader did not come up, and the errors of [`flash`](super::flash()).
+/// one whose new bootloader did not come up, [`Error::SilentOnTrial`] for one that does not answer on trial
+/// and whose old bootloader is not back within 75 s or [`Timing::boot`](crate::device::Timing::boot),
+/// whichever is longer, and the errors of [`flash`](super::flash()).
 pub fn renew(
     session: &mut Session<'_>,
     new: &NewBootloader,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
-    telling_silence(session, tell, |session, tell| procedure(session, new, options, tell))
+    let (result, node) = telling_silence(session, tell, |session, tell| {
+        let result = procedure(session, new, options, tell);
+        (result, session.node())
+    });
+    // The session may have followed a lift to its bootloader.
+    session.talk_to(node);
+    result
 }
 
 /// [`renew`] as an update of a device: with [`Event::Done`] at the end.
@@ -195,15 +115,22 @@ fn procedure(
         check_target(session, target)?;
         tell(Note::TargetRight(target).into());
     }
-    let program = running_program(session, 1)?;
+    let program = running_program(session, CALL_BACK)?;
     let ran = session.device_type()?.is_some_and(|running| !running.is_bootloader());
-    enter_bootloader(session, tell)?;
-    let result = in_bootloader(session, new, options, tell);
-    // A program that ran before runs again, whatever became of the renewal.
-    let again = program.filter(|_| ran && options.start).map(|number| {
+    let mut way = Way { original: session.node(), dialect: Dialect::Block, mastership: None, options };
+    let entered = way.enter(session, tell);
+    let is_entered = entered.is_ok();
+    let result = entered.and_then(|()| in_bootloader(session, new, &way, tell));
+    // A program that ran before runs again, whatever became of the renewal. Nobody hears its start in a
+    // device that is silent; the next power-on starts it there.
+    let is_silent = matches!(result, Err(Error::SilentOnTrial { .. }));
+    let again = program.filter(|_| ran && options.start && is_entered && !is_silent).map(|number| {
         tell(Phase::Starting.into());
-        start(session, number)
+        dialect::of(way.dialect).start(session, way.original, number)
     });
+    if let Some(taken) = way.mastership.take() {
+        give_back(session, taken, tell);
+    }
     let renewal = result?;
     let running = again.transpose()?;
     if let Some(running) = running {
@@ -212,13 +139,53 @@ fn procedure(
     Ok(Renewal { running, took: session.now().saturating_sub(began), ..renewal })
 }
 
+/// The way into the bootloader, and what it wants there.
+struct Way<'o> {
+    /// The node at the start of the renewal: a lift's bootloader has another one.
+    original: NodeId,
+    /// The dialect of the bootloader.
+    dialect: Dialect,
+    /// The NMT mastership, while the tool holds it.
+    mastership: Option<Mastership>,
+    options: &'o FlashOptions,
+}
+
+impl Way<'_> {
+    /// Makes the bootloader run. A lift gets its password for that, and the tool the NMT mastership.
+    fn enter(&mut self, session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+        let running = session.find()?;
+        let found = match self.options.dialect {
+            Some(dialect) => dialect,
+            None => recognise(session, running, CALL_BACK)?,
+        };
+        if found == Dialect::Lift {
+            tell(Event::Found(running));
+            let mut update = RunningUpdate::new(tell);
+            let entered = dialect::of(found).enter(session, running, self.options, &mut update);
+            self.mastership = update.mastership.take();
+            self.dialect = entered?;
+            return Ok(());
+        }
+        enter_bootloader(session, tell)?;
+        let running = session.device_type()?;
+        let its = running.and_then(|running| Dialect::of_bootloader(running, session.node()));
+        self.dialect = its.unwrap_or(found);
+        Ok(())
+    }
+
+    /// Writes the password of the bootloader, if it has one: also after each reset.
+    fn unlock(&self, session: &mut Session<'_>, number: u8) -> Result<(), Error> {
+        dialect::of(self.dialect).unlock(session, self.options, number).map(drop)
+    }
+}
+
 fn in_bootloader(
     session: &mut Session<'_>,
     new: &NewBootloader,
-    options: &FlashOptions,
+    way: &Way<'_>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Renewal, Error> {
-    let node = session.node();
+    let (node, options) = (session.node(), way.options);
     let old = bootloader(session)?.ok_or(Error::NotRenewable { node })?;
     if let (NewBootloader::Plain(_), Some(challenge)) = (new, told_challenge(session)?) {
         if challenge.is_sealed() {
@@ -227,7 +194,7 @@ fn in_bootloader(
         }
     }
     let number = old.number;
-    let running = settled(session, old)?;
+    let running = settled(session, old, way)?;
     let (from, to) = (old.version, new.version());
     let (mut repeats, mut transfer) = (0, Duration::ZERO);
     let unchanged =
@@ -239,7 +206,7 @@ fn in_bootloader(
     }
     tell(Phase::Renewing { number, from: from.0, to: to.0 }.into());
     if !(is_same && is_open) {
-        leave_trial(session, number, running, tell)?;
+        leave_trial(session, number, running, way, tell)?;
         let began = session.now();
         repeats = stage(session, number, new, options, tell)?;
         transfer = session.now().saturating_sub(began);
@@ -251,11 +218,11 @@ fn in_bootloader(
         try_it(session, number)?;
     }
     tell(Phase::OnTrial.into());
-    if let Err(error) = install(session, number) {
+    if let Err(error) = way.unlock(session, number).and_then(|()| install(session, number)) {
         let is_refusal = matches!(error, Error::Failed { .. } | Error::Refused { .. });
         // A bootloader that is not confirmed need not wait for its end. The reason stays the result.
         match progress(session) {
-            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, tell)),
+            Ok(Some(running)) if is_refusal => drop(leave_trial(session, number, running, way, tell)),
             _ => {}
         }
         return Err(error);
@@ -273,8 +240,10 @@ fn in_bootloader(
 }
 
 /// Waits for an installation that goes on, and ends one that was broken off; what the device reports then.
-fn settled(session: &mut Session<'_>, old: Bootloader) -> Result<Progress, Error> {
+/// From then on it is unlocked.
+fn settled(session: &mut Session<'_>, old: Bootloader, way: &Way<'_>) -> Result<Progress, Error> {
     session.await_idle(old.number, Doing::Installation)?;
+    way.unlock(session, old.number)?;
     let known =
         progress(session)?.unwrap_or_else(|| old.running.map(|running| running.progress).unwrap_or_default());
     if known.state != State::Confirmed {
@@ -291,11 +260,12 @@ fn is_same(session: &mut Session<'_>, new: &NewBootloader, number: u8) -> Result
     Ok(identification(session, number)? == image.header().crc)
 }
 
-/// Ends a trial, whose image takes no other one.
+/// Ends a trial, whose image takes no other one. The one that comes back is unlocked.
 fn leave_trial(
     session: &mut Session<'_>,
     number: u8,
     running: Progress,
+    way: &Way<'_>,
     tell: &mut dyn FnMut(Event),
 ) -> Result<(), Error> {
     match running {
@@ -303,22 +273,39 @@ fn leave_trial(
         Progress { origin: Origin::Trial, state: State::Staged | State::None, .. } => {
             match session.command(number, ProgramControl::ClrSignature) {
                 // One that wants a password, for example. Any reset ends its trial.
-                Err(Error::Refused { .. }) => restart(session, tell),
+                Err(Error::Refused { .. }) => restart(session, number, way, tell),
                 Err(error) => Err(error),
-                Ok(()) => await_other_image(session).map(drop),
+                Ok(()) => {
+                    let limit = session.timing().boot;
+                    let other = await_other_image(session, limit)?;
+                    let node = session.node();
+                    other.ok_or(Error::NoAnswer { node, doing: Doing::Restart })?;
+                    way.unlock(session, number)
+                }
             }
         }
         // It is installed: the next start loads it from home.
-        Progress { origin: Origin::Trial, state: State::Installed, .. } => restart(session, tell),
+        Progress { origin: Origin::Trial, state: State::Installed, .. } => {
+            restart(session, number, way, tell)
+        }
         _ => Ok(()),
     }
 }
 
 /// Restarts the device, and brings it into its bootloader again.
-fn restart(session: &mut Session<'_>, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
+fn restart(
+    session: &mut Session<'_>,
+    number: u8,
+    way: &Way<'_>,
+    tell: &mut dyn FnMut(Event),
+) -> Result<(), Error> {
     session.reset_node()?;
     session.wait(LEAVES_WITHIN)?;
-    enter_bootloader(session, tell)
+    session.talk_to(way.original);
+    let options = FlashOptions { mastership: false, ..*way.options };
+    let mut again = Way { options: &options, mastership: None, ..*way };
+    again.enter(session, tell)?;
+    again.unlock(session, number)
 }
 
 /// Downloads the image into staging; returns the number of repetitions.
@@ -372,23 +359,25 @@ fn try_it(session: &mut Session<'_>, number: u8) -> Result<(), Error> {
         Ok(()) | Err(Error::NoAnswer { .. } | Error::Protocol { .. }) => {}
         Err(error) => return Err(error),
     }
-    let progress = await_other_image(session)?;
+    let (node, limit) = (session.node(), TRIAL_ENDS_WITHIN.max(session.timing().boot));
+    let progress = await_other_image(session, limit)?.ok_or(Error::SilentOnTrial { node, waited: limit })?;
     if progress.origin == Origin::Trial {
         return Ok(());
     }
-    Err(Error::RenewalFailed { node: session.node(), end: progress.trial_end })
+    Err(Error::RenewalFailed { node, end: progress.trial_end })
 }
 
-/// Waits for the bootloader that comes up after a reset; what it reports.
-fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
+/// Waits for the bootloader that comes up after a reset; what it reports, `None` if no bootloader answers
+/// within `limit`.
+fn await_other_image(session: &mut Session<'_>, limit: Duration) -> Result<Option<Progress>, Error> {
     // The old one still answers for a moment.
     session.wait(LEAVES_WITHIN)?;
-    let (began, limit) = (session.now(), TRIAL_ENDS_WITHIN.max(session.timing().boot));
+    let began = session.now();
     loop {
         let pause = session.timing().sdo;
         match session.device_type()? {
             Some(running) if running.is_bootloader() => match told(progress(session))? {
-                Some(Some(progress)) => return Ok(progress),
+                Some(Some(progress)) => return Ok(Some(progress)),
                 // A state of a later version.
                 Some(None) => return Err(Error::Unconfirmable { node: session.node() }),
                 None => {
@@ -397,9 +386,7 @@ fn await_other_image(session: &mut Session<'_>) -> Result<Progress, Error> {
                     return Err(Error::Unconfirmable { node: session.node() });
                 }
             },
-            _ if session.now() >= began + limit => {
-                return Err(Error::NoAnswer { node: session.node(), doing: Doing::Restart });
-            }
+            _ if session.now() >= began + limit => return Ok(None),
             _ => session.note_silence(began, limit, Doing::Restart),
         }
         session.await_boot_up(pause)?;

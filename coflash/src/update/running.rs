@@ -3,8 +3,8 @@
 use std::cell::RefCell;
 
 use super::device_after::DeviceState;
-use super::event::{Event, Warning};
-use crate::device::flying_master::Mastership;
+use super::event::{Event, Note, Warning};
+use crate::device::flying_master::{self, Mastership};
 use crate::device::session::Silence;
 use crate::device::Session;
 
@@ -22,6 +22,16 @@ pub(super) fn telling_silence<R>(
     let mut tell = |event| (tell.borrow_mut())(event);
     let (node, timing) = (session.node(), *session.timing());
     work(&mut session.with(node, timing).tell_silence(&silence), &mut tell)
+}
+
+/// Gives the NMT mastership back. The result of the update remains, even if this fails.
+pub(super) fn give_back(session: &mut Session<'_>, taken: Mastership, tell: &mut dyn FnMut(Event)) {
+    if let Ok(master) = flying_master::give_back(session, taken) {
+        tell(match master {
+            Some(master) => Note::MasterBack { node: master.node }.into(),
+            None => Warning::MasterMissing.into(),
+        });
+    }
 }
 
 /// A running update.

@@ -17,6 +17,16 @@ fn regions_of_the_bootloader_and_its_programs() {
     assert_eq!((LAYOUT.program(0), LAYOUT.program(2)), (None, None));
 }
 
+/// The sectors of RM0090 table 5 and RM0390 table 4: 16 KiB each up to sector 3, then 64 KiB.
+#[test]
+fn the_write_protection_covers_the_bootloader_and_leaves_what_a_renewal_writes() {
+    for (layout, renewal, mask) in
+        [(&LAYOUT, false, 0b1_0001), (&LAYOUT, true, 0b0_0001), (&nucleo_f446re::LAYOUT, false, 0b0_0011)]
+    {
+        assert_eq!(layout.protected_sectors(renewal), mask, "{}, {renewal}", layout.board);
+    }
+}
+
 #[test]
 fn boards_have_names() {
     assert_eq!(by_name("nucleo-f446re").map(|layout| layout.chip.chip), Some("stm32f446re"));

@@ -85,6 +85,11 @@ impl Error {
                                            bit rate, and run the command again; a reset that nobody asked for has its cause \
                                            in coflash info"
                 .to_string(),
+            Self::SilentOnTrial { .. } => "nothing is lost: the old bootloader comes back by itself at the end of the trial \
+                                           (renewal_s of the product, 60 s if it has no other), or at once when the device \
+                                           is switched off and on; for a product with a longer time give that time and 15 s \
+                                           more, in ms, as --boot-timeout"
+                .to_string(),
             Self::WrongTarget { what, .. } => failure_advice(what.error()).to_string(),
             Self::SealedOnly { .. } => "seal the program with a key that a root of the device has certified (coflash seal), and \
                                         flash the sealed image"

@@ -2,7 +2,7 @@
 
 use seal::key_block::SIZE;
 use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
-use shared_abi::ram_image::{Header, MAGIC};
+use shared_abi::ram_image::{feature, Header, MAGIC};
 
 use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
@@ -90,6 +90,14 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     Ok(pieces.in_order())
 }
 
+/// The sectors that belong under write protection in a device with this bootloader, as
+/// [`Layout::protected_sectors`] has them.
+#[must_use]
+pub fn protected_sectors(bootloader: &Image, layout: &Layout) -> u32 {
+    let features = layout.home.and_then(|home| bootloader.bytes(home.base + Header::FEATURES));
+    layout.protected_sectors(features.is_some_and(|word| u32::from_le_bytes(word) & feature::RENEWAL != 0))
+}
+
 #[cfg(test)]
 mod tests {
     use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -124,6 +132,16 @@ mod tests {
             assert_eq!(provision(&resident(none, 0x400)), Err(ProvisionFault::Open));
         }
         assert_eq!(provision(&resident(b"CBS1", 0x400)[..0x1F]), Err(ProvisionFault::Open), "cut off");
+    }
+
+    /// The word at offset 28 of the header has a bit for renewal, which writes the home of the RAM image.
+    #[test]
+    fn the_write_protection_follows_the_header_of_the_ram_image() {
+        for (word, mask) in [(0, 0b1_0001), (1, 0b1_0001), (2, 0b0_0001), (3, 0b0_0001)] {
+            let mut ram_image = [&RAM_IMAGE[..], &[0; 52]].concat();
+            ram_image[28] = word;
+            assert_eq!(protected_sectors(&image(&[(HOME, &ram_image)]), &LAYOUT), mask, "{word}");
+        }
     }
 
     #[test]

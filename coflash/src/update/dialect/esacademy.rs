@@ -46,11 +46,36 @@ impl Procedure for EsAcademy {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
         let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
-        let prepare =
-            |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| unlock(session, options, update);
+        let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
+            if self.unlock(session, options, options.program)? {
+                update.tell(Note::Unlocked.into());
+            }
+            Ok(())
+        };
         let crcs = file.program_crcs();
         let whole = Whole { content: &content, crcs, prepare: &prepare, status };
         whole::download(session, &whole, options, update)
+    }
+
+    /// The password is optional; without it, the download alone must be sufficient. That of a program
+    /// erases it.
+    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, number: u8) -> Result<bool, Error> {
+        let node = session.node();
+        let password = match options.unlock {
+            None => PASSWORD,
+            Some(password) => password.number().ok_or(Error::NotInDialect {
+                dialect: Dialect::EsAcademy,
+                what: "the password is a number of 32 bits: 0x and up to 8 digits, or 4 characters",
+            })?,
+        };
+        let at = Address::new(program::ENABLE_FLASH, number);
+        // The device erases before it answers.
+        let mut patient = session.with(node, session.timing().erasing());
+        match patient.write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {}) {
+            Ok(()) => Ok(true),
+            Err(Error::Refused { code: AbortCode::NO_OBJECT, .. }) => Ok(false),
+            Err(error) => Err(error),
+        }
     }
 
     fn start(&self, session: &mut Session<'_>, _: NodeId, number: u8) -> Result<DeviceType, Error> {
@@ -61,33 +86,6 @@ impl Procedure for EsAcademy {
         reset_program(session, number)?;
         arrived(session, number)
     }
-}
-
-/// Writes the password, which erases the program. It is optional; without it, the download alone
-/// must be sufficient.
-fn unlock(
-    session: &mut Session<'_>,
-    options: &FlashOptions,
-    update: &mut RunningUpdate<'_>,
-) -> Result<(), Error> {
-    let node = session.node();
-    let password = match options.unlock {
-        None => PASSWORD,
-        Some(password) => password.number().ok_or(Error::NotInDialect {
-            dialect: Dialect::EsAcademy,
-            what: "the password is a number of 32 bits: 0x and up to 8 digits, or 4 characters",
-        })?,
-    };
-    let at = Address::new(program::ENABLE_FLASH, options.program);
-    // The device erases before it answers.
-    let patient = session.timing().erasing();
-    let written = session.with(node, patient).write(at, &password.to_le_bytes(), Doing::Unlock, &mut |_| {});
-    match written {
-        Ok(()) => update.tell(Note::Unlocked.into()),
-        Err(Error::Refused { code: AbortCode::NO_OBJECT, .. }) => {}
-        Err(error) => return Err(error),
-    }
-    Ok(())
 }
 
 /// The result of the download, from 1F57h if the device has it, otherwise from 1001h.

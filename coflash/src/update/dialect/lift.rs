@@ -78,6 +78,11 @@ impl Procedure for Lift {
         whole::download(session, &whole, options, update)
     }
 
+    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, _: u8) -> Result<bool, Error> {
+        let password = options.unlock.ok_or(Error::NoPassword { node: session.node() })?;
+        unlock(session, password).map(|()| true)
+    }
+
     fn start(&self, session: &mut Session<'_>, original: NodeId, number: u8) -> Result<DeviceType, Error> {
         reset_program(session, LIFT_PROGRAM)?;
         if original == lift_node() {

@@ -39,6 +39,16 @@ pub(in crate::update) trait Procedure {
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error>;
 
+    /// Writes the password for the bootloader's own program number, in a dialect with passwords; whether
+    /// there was one to write. A locked device needs it again after each reset.
+    ///
+    /// # Errors
+    /// [`Error::NoPassword`], and [`Error::Refused`] for a wrong password.
+    fn unlock(&self, session: &mut Session<'_>, options: &FlashOptions, number: u8) -> Result<bool, Error> {
+        let _ = (session, options, number);
+        Ok(false)
+    }
+
     /// Step 15: starts the program; afterwards the session talks to the program's node. `original`
     /// is the node at the start of the update.
     ///

@@ -572,6 +572,10 @@ fn a_bootloader_gets_its_keys() {
     let image = ihex::read(&room.bytes("production.hex")).unwrap();
     let block: [u8; 256] = image.bytes(LAYOUT.key_block().base).unwrap();
     assert_eq!(image.byte_count(), 992 + 16 + 256);
+    // The sectors of RM0090 table 5 at 08000000h and 08010000h.
+    let words =
+        "option bytes         write protection (nWRP) of sectors 0, 4 and of no others, SPRMOD 0, BFB2 0";
+    assert!(done.out.contains(words), "{}", done.out);
     assert_eq!(block[..16], *b"CBKB\x01\0\0\0\x07\0\0\0\x02\0\0\0");
     let public = PublicKey::from_pem(&String::from_utf8(room.bytes("root.pub")).unwrap()).unwrap();
     assert_eq!(block[20..52], public.bytes());
@@ -926,7 +930,8 @@ fn a_device_is_compared_with_a_sealed_image() {
     let (done, fake) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()), &[]);
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
-    assert!(done.out.contains("and does not run it") && !done.out.contains("not reported"), "{}", done.out);
+    assert!(done.out.contains("and does not run it"), "{}", done.out);
+    assert!(done.out.ends_with("not reported 2007h/6, 2007h/1\n"), "{}", done.out);
     assert!(fake.writes().is_empty());
 
     // An application does not report all values, and the command says so.
@@ -934,7 +939,8 @@ fn a_device_is_compared_with_a_sealed_image() {
     assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
     let value: Value = serde_json::from_str(&done.out).unwrap();
     assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
-    assert_eq!(value["untold"], serde_json::json!(["1018h/3", "2002h/1", "2003h/1"]));
+    let untold = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
+    assert_eq!(value["untold"], untold);
 
     // Each difference is named, and each alone is enough.
     let number = |index: u16, sub: u8, value: u32| ((index, sub), value.to_le_bytes().to_vec());
@@ -980,6 +986,63 @@ fn a_device_is_compared_with_a_sealed_image() {
     let forgotten = forgotten.but(event(3, [7, 0x1_0002, 1, 1]));
     let (done, _) = compared(BOOTLOADER, forgotten, &[]);
     assert!(done.exit == 0 && done.out.contains("not reported 2003h/1"), "{}{}", done.out, done.err);
+
+    // Nor may it be in the middle of a renewal, or have option bytes that no product has.
+    let byte = |sub: u8, value: u8| ((0x2007, sub), vec![value]);
+    let state = |bytes: [u8; 4]| ((0x2007, 9), bytes.to_vec());
+    let factory = number(0x2007, 6, 0x0FFF_AAED);
+    let renewable = || Told::sealed(&program).but(revision.clone()).but(byte(1, 2)).but(factory.clone());
+    for (bytes, fault, words) in [
+        // State, origin, end of the last trial and its detail (docs/renewal.md).
+        ([1, 0, 0, 0], "staged", "another bootloader waits for its trial: coflash flash with its file"),
+        ([1, 0, 1, 0], "staged", "on trial it was not confirmed in time: coflash flash with a good one"),
+        ([1, 0, 4, 3], "staged", "on trial it could not be loaded: its CRC is wrong"),
+        ([1, 1, 0, 0], "on_trial", "a bootloader runs on trial: coflash flash with its file confirms it"),
+        ([0, 1, 0, 0], "on_trial", "a bootloader runs on trial"),
+        ([2, 0, 0, 0], "confirmed", "is confirmed and not installed"),
+        ([2, 2, 0, 0], "confirmed", "completes the renewal"),
+        ([3, 3, 0, 0], "damaged", "is damaged, and the spare runs, which repairs it: switch the device off"),
+    ] {
+        let (done, fake) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
+        assert!(done.out.contains("holds program 1 of"), "{}", done.out);
+        assert_eq!((done.exit, done.out.matches("  not ready ").count()), (6, 1), "{bytes:?}: {}", done.out);
+        assert!(done.out.contains(words), "{words}: {}", done.out);
+        assert!(done.err.contains("node 5 is not ready"), "{}", done.err);
+        assert!(fake.writes().is_empty());
+        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &["--json"]);
+        let value: Value = serde_json::from_str(&done.out).unwrap();
+        let expected = serde_json::json!([true, false, [fault]]);
+        assert_eq!(serde_json::json!([value["same"], value["ready"], value["faults"]]), expected);
+    }
+    // At rest: nothing was ever renewed; installed, and loaded from home or, until the next reset, from
+    // staging; a trial that failed, and whose image a program has replaced.
+    for bytes in [[0; 4], [3, 0, 0, 0], [3, 1, 0, 0], [3, 2, 0, 0], [0, 0, 1, 0]] {
+        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
+        assert_eq!(done.exit, 0, "{bytes:?}: {}{}", done.out, done.err);
+    }
+    // RM0090 section 3.9.10: SPRMOD is bit 31 of FLASH_OPTCR, BFB2 bit 4, nWRP bits 16 to 27.
+    for (option_bytes, fault) in [(0x8001_AAED, "read_protection"), (0x0FFE_AAFD, "second_bank")] {
+        let told = renewable().but(state([0; 4])).but(number(0x2007, 6, option_bytes));
+        let (done, _) = compared(BOOTLOADER, told, &["--json"]);
+        let value: Value = serde_json::from_str(&done.out).unwrap();
+        assert_eq!((done.exit, &value["faults"]), (6, &serde_json::json!([fault])));
+    }
+    // The protection that it has, and the one that belongs to its product.
+    for (number_of_its_own, wanted) in [(2, "it needs sector 0 and no others"), (0, "(0 and 4 on the boards")]
+    {
+        let told = renewable().but(byte(1, number_of_its_own)).but(state([0; 4]));
+        let (done, _) = compared(BOOTLOADER, told.but(number(0x2007, 6, 0x0FEE_AAED)), &[]);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let line = "  protection   the device has sectors 0, 4; ";
+        assert!(done.out.contains(line) && done.out.contains(wanted), "{}", done.out);
+    }
+    // A state of a later version is none that is known to be good.
+    let (done, _) = compared(BOOTLOADER, renewable().but(state([4, 0, 0, 0])), &[]);
+    assert!(done.exit == 0 && done.out.contains("not reported 2007h/9"), "{}{}", done.out, done.err);
+    // A difference comes first: the device may be another one.
+    let other = renewable().but(state([1, 1, 0, 0])).but(number(0x1F56, 1, 1));
+    let (done, _) = compared(BOOTLOADER, other, &[]);
+    assert!(done.exit == 3 && done.out.contains("  not ready "), "{}{}", done.out, done.err);
 
     // A bad file is refused before a device is asked. For a missing device there is another code.
     let other = room.path("release.pub");

@@ -70,6 +70,8 @@ pub enum Deed {
     Nothing,
     /// It restarts with this node-ID and this device type.
     Restart(u8, u32),
+    /// The same, with this time in place of the usual one.
+    RestartIn(Duration, u8, u32),
 }
 
 /// The end of a program that the fake has started.
@@ -303,8 +305,12 @@ impl Fake {
     }
 
     fn restart_into(&mut self, next: Option<u32>) {
+        self.restart_within(self.restart_time, next);
+    }
+
+    fn restart_within(&mut self, time: Duration, next: Option<u32>) {
         self.leaves_at = Some(self.now + self.leave_time);
-        self.restart = Some((self.now + self.leave_time + self.restart_time, next));
+        self.restart = Some((self.now + self.leave_time + time, next));
     }
 
     /// A frame of a block download (CiA 301, 7.2.4.3.9 to 11), if one is under way; says whether
@@ -506,10 +512,13 @@ impl Fake {
                 Err(code) => self.abort(at, code),
                 Ok(deed) => {
                     self.answer(answer);
-                    if let Deed::Restart(node, next) = deed {
-                        self.next_node = node;
-                        self.restart_into(Some(next));
-                    }
+                    let (time, node, next) = match deed {
+                        Deed::Nothing => return,
+                        Deed::Restart(node, next) => (self.restart_time, node, next),
+                        Deed::RestartIn(time, node, next) => (time, node, next),
+                    };
+                    self.next_node = node;
+                    self.restart_within(time, Some(next));
                 }
             }
             return;

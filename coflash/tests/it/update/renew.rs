@@ -68,6 +68,8 @@ enum Trial {
     Without,
     /// The old one is back, with these bytes in 2007h/9.
     Ends([u8; 2]),
+    /// Nobody hears it, and the old one is back after this time, with these bytes in 2007h/9.
+    Deaf(Duration, [u8; 2]),
 }
 
 /// A device whose bootloader can be renewed.
@@ -143,6 +145,10 @@ impl Board {
             0x01 if self.state == STAGED && self.origin != TRIAL => match self.trial {
                 Trial::Works | Trial::Without => self.restart(TRIAL, [0; 2]),
                 Trial::Ends(end) => self.restart(HOME, end),
+                Trial::Deaf(time, end) => {
+                    self.end = end;
+                    Deed::RestartIn(time, self.node, BOOTLOADER)
+                }
             },
             0x83 if on_trial || self.state == CONFIRMED => {
                 self.busy = 3;
@@ -310,17 +316,39 @@ fn the_end_of_a_trial_is_told_in_words() {
 /// An image that nobody reaches ends after a minute; the tool waits for the old one, and says so.
 #[test]
 fn a_deaf_image_is_waited_for() {
-    let (mut fake, _) = device(BOOTLOADER, |board| board.trial = Trial::Ends([1, 0]));
-    fake.restart_time = Duration::from_secs(61);
+    let (mut fake, _) =
+        device(BOOTLOADER, |board| board.trial = Trial::Deaf(Duration::from_secs(61), [1, 0]));
     let (result, events) = run(&mut fake);
     assert!(matches!(result, Err(Error::RenewalFailed { .. })), "{result:?}");
     assert!(events.iter().any(|event| matches!(event, Event::Warning(Warning::Silent { .. }))), "{events:?}");
+}
 
-    let (mut fake, _) = device(BOOTLOADER, |_| {});
-    fake.restart_time = Duration::from_secs(1000);
+/// A product may have a longer time, up to an hour, and no object has it: the tool ends its wait, and says
+/// how the device gets its old bootloader back. With the longer time it waits.
+#[test]
+fn a_trial_of_a_longer_time_than_usual_is_no_endless_wait() {
+    let minutes = Duration::from_secs(600);
+    let deaf = || device(APPLICATION, |board| board.trial = Trial::Deaf(minutes, [1, 0])).0;
+    let mut fake = deaf();
     let began = fake.now;
-    assert!(matches!(run(&mut fake).0, Err(Error::NoAnswer { .. })));
-    assert!(fake.now - began < Duration::from_secs(80));
+    let (result, events) = run(&mut fake);
+    let error = result.unwrap_err();
+    assert!(fake.now - began < Duration::from_secs(90));
+    let words = "the new bootloader of node 5 was started on trial, and nothing has answered for 75 s";
+    assert_eq!(error.to_string(), words);
+    assert_eq!(error.number(), 0x6000_0014);
+    for words in ["nothing is lost", "switched off and on", "--boot-timeout"] {
+        assert!(error.advice().contains(words), "{}", error.advice());
+    }
+    assert!(!events.iter().any(|event| matches!(event, Event::Phase(Phase::Starting))), "{events:?}");
+    assert_eq!(fake.count("command 01"), 0, "nobody hears it");
+
+    let mut fake = deaf();
+    let timing = Timing::default().boot(Duration::from_secs(615));
+    let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), timing);
+    let result = renew(&mut session, &new(), &FlashOptions::default(), &mut |_| {});
+    assert!(matches!(result, Err(Error::RenewalFailed { .. })), "{result:?}");
+    assert_eq!(fake.running, Some(APPLICATION), "the program runs again");
 }
 
 /// A refusal of the device, before it erases anything: its words and what to do.
