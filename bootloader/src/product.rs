@@ -63,6 +63,9 @@ pub struct Product {
     pub rescue_window_ms: u16,
     /// The same for a confirmed program.
     pub rescue_window_confirmed_ms: u16,
+    /// Whether two resets by the NRST pin within half a second keep the device in the bootloader: an entry
+    /// without a pin of its own. A program then starts half a second later after such a reset.
+    pub two_resets: bool,
     /// Node-IDs with which programs may be started (`BLCOP_MIN_NODEID`, `BLCOP_MAX_NODEID`).
     pub node_ids: RangeInclusive<u8>,
     /// Bit rates that the device may be set to, as indices of CiA 305 table 1: 0 for 1 Mbit/s to 8
@@ -170,6 +173,7 @@ impl Product {
         max_crash_resets: 3,
         rescue_window_ms: 300,
         rescue_window_confirmed_ms: 0,
+        two_resets: false,
         node_ids: 1..=127,
         bit_rates: 0..=8,
         node_source: NodeSource::Stored,

@@ -89,6 +89,25 @@ pub fn cleared_systick(mut systick: cortex_m::peripheral::SYST) -> cortex_m::per
     systick
 }
 
+/// Waits `ms` milliseconds with the system timer, while the core runs at `core` Hz. Afterwards the timer is off, as
+/// after a reset.
+#[cfg(target_arch = "arm")]
+pub fn pause(core: u32, ms: u32) {
+    // SAFETY: only the boot stage runs, which uses the timer for nothing else.
+    let mut timer = cleared_systick(unsafe { cortex_m::Peripherals::steal() }.SYST);
+    timer.set_clock_source(cortex_m::peripheral::syst::SystClkSource::Core);
+    timer.set_reload(core / 1000 - 1);
+    timer.enable_counter();
+    for _ in 0..ms {
+        while !timer.has_wrapped() {
+            // A hundredth of a millisecond or less: the timer need not be asked more often.
+            cortex_m::asm::delay(1000);
+        }
+    }
+    // SAFETY: the value after a reset (PM0214 section 4.5.1).
+    unsafe { timer.csr.write(0) };
+}
+
 /// The count of the system timer, which runs with the clock of the core.
 #[cfg(target_arch = "arm")]
 #[must_use]

@@ -17,12 +17,55 @@ use crate::program::{Invalid, VerifiedProgram};
 pub struct Circumstances {
     /// The request from the warm-start cell, which has been consumed.
     pub request: Option<BootRequest>,
-    /// The entry strap asks for the bootloader.
-    pub strap: bool,
+    /// What at the board asks for the bootloader ([`entry`]), if anything does.
+    pub entry: Option<Reason>,
     /// [`Policy::crash_resets`].
     pub crash_resets: u32,
     /// Node-ID of the device; a value outside 1 to 127 means that it has none.
     pub node_id: u8,
+}
+
+/// A reset by the NRST pin, for a product that two of them keep in the bootloader.
+///
+/// After the first one the boot stage waits before it starts a program. It then marks the warm-start
+/// cell ([`WarmStart::MARKED`](shared_abi::warm_start::WarmStart::MARKED)) for a while: a reset in this time is the
+/// second one. A power-on, a watchdog or a request is none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PinReset {
+    /// Another reset, or a product without this choice.
+    #[default]
+    None,
+    /// The first one.
+    First,
+    /// The second one.
+    Second,
+}
+
+impl PinReset {
+    /// After a reset by the pin, the time until the mark is set, in ms: a push-button bounces.
+    pub const BOUNCE_MS: u32 = 20;
+    /// After a reset by the pin, the time until the mark is removed and a program may start, in ms.
+    pub const WITHIN_MS: u32 = 500;
+
+    /// From the cause of a reset, and what the warm-start cell had.
+    #[must_use]
+    pub const fn of(cause: ResetCause, request: Option<BootRequest>, is_marked: bool) -> Self {
+        match (cause, request, is_marked) {
+            (ResetCause::Pin, None, false) => Self::First,
+            (ResetCause::Pin, None, true) => Self::Second,
+            _ => Self::None,
+        }
+    }
+}
+
+/// What at the board asks for the bootloader: the entry strap, or two resets by the pin.
+#[must_use]
+pub const fn entry(strap: bool, pin_reset: PinReset) -> Option<Reason> {
+    match (strap, pin_reset) {
+        (true, _) => Some(Reason::Strap),
+        (false, PinReset::Second) => Some(Reason::TwoResets),
+        (false, PinReset::None | PinReset::First) => None,
+    }
 }
 
 /// The product's configuration of the decision.
@@ -125,8 +168,8 @@ pub fn decide(
         Some(BootRequest::Renewal(_)) => return stay(Reason::Renewal),
         _ => {}
     }
-    if circumstances.strap {
-        return stay(Reason::Strap);
+    if let Some(reason) = circumstances.entry {
+        return stay(reason);
     }
     // A request is new: its sender knows about earlier crashes.
     let (number, trial, is_requested) = match circumstances.request {

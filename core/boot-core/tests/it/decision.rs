@@ -1,7 +1,7 @@
 //! The boot decision: the promised order of its checks.
 
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, Policy};
+use boot_core::decision::{decide, entry, fallback, BootDecision, Circumstances, PinReset, Policy};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
@@ -12,7 +12,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
 use shared_abi::warm_start::{BootRequest, Owed};
 
-const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
+const QUIET: Circumstances = Circumstances { request: None, entry: None, crash_resets: 0, node_id: 5 };
 
 fn policy() -> Policy {
     Policy {
@@ -88,11 +88,12 @@ fn what_asks_for_the_bootloader_wins() {
     let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });
     assert_eq!(stay(request(BootRequest::Stay), policy()), Reason::Requested);
     assert_eq!(stay(request(owed), policy()), Reason::Requested);
-    assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), Reason::Strap);
-    assert_eq!(
-        stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),
-        Reason::Strap
-    );
+    for reason in [Reason::Strap, Reason::TwoResets] {
+        let entry = Circumstances { entry: Some(reason), crash_resets: 3, ..QUIET };
+        assert_eq!(stay(entry, policy()), reason);
+        let request = Some(BootRequest::Start(1));
+        assert_eq!(stay(Circumstances { request, ..entry }, policy()), reason);
+    }
     assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), Reason::CrashLoop);
     assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), Reason::NoAutostart);
     for node_id in [0, 101, 127, 255] {
@@ -206,6 +207,33 @@ fn resets_in_a_row_are_counted_until_somebody_asks() {
     ] {
         assert_eq!(policy.crash_resets(2, Software, Some(request)), after, "{request:?}");
     }
+}
+
+/// Only resets by the pin alone count: a request, or any other reset, begins anew. One of them decides
+/// nothing.
+#[test]
+fn two_resets_by_the_pin_in_a_row_keep_the_device_in_the_bootloader() {
+    use ResetCause::{
+        BrownOut, IndependentWatchdog, LowPower, Pin, PowerOn, Software, Standby, Unknown, WindowWatchdog,
+    };
+    assert_eq!(PinReset::of(Pin, None, false), PinReset::First);
+    assert_eq!(PinReset::of(Pin, None, true), PinReset::Second);
+    for is_marked in [false, true] {
+        assert_eq!(PinReset::of(Pin, Some(BootRequest::Start(1)), is_marked), PinReset::None);
+        for cause in
+            [PowerOn, BrownOut, Standby, Software, IndependentWatchdog, WindowWatchdog, LowPower, Unknown]
+        {
+            assert_eq!(PinReset::of(cause, None, is_marked), PinReset::None, "{cause:?}");
+        }
+    }
+    assert_eq!(entry(false, PinReset::Second), Some(Reason::TwoResets));
+    for pin_reset in [PinReset::None, PinReset::First, PinReset::Second] {
+        assert_eq!(entry(true, pin_reset), Some(Reason::Strap));
+    }
+    assert_eq!((entry(false, PinReset::None), entry(false, PinReset::First)), (None, None));
+    // A power-on sets the flag of the pin, too.
+    assert_eq!(ResetCause::from_flags(0x0C00_0000, false), PowerOn);
+    assert_eq!(ResetCause::from_flags(0x0400_0000, false), Pin);
 }
 
 /// A program that starts by itself is held back, as long as its confirmation says; one that was
