@@ -24,6 +24,7 @@
 //! | `watchdog.rs` | the independent watchdog |
 //! | [`voltage`] | what follows from the supply: how wide the flash is programmed, and when it is left alone |
 //! | [`supply`] | the voltage detector |
+//! | `rom.rs` | the loader in the ROM of the chip |
 //! | `low_power.rs` | the wake-up from Standby, the clocks of the sleep mode |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
@@ -53,6 +54,8 @@ mod pll;
 mod port;
 #[cfg(any(feature = "uart", not(target_arch = "arm")))]
 pub mod ring;
+#[cfg(target_arch = "arm")]
+pub mod rom;
 #[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
 #[cfg(target_arch = "arm")]

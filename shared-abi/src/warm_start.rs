@@ -85,6 +85,10 @@ pub enum BootRequest {
     /// A step in the trial of a new RAM image ([`crate::renewal`]). The bootloader writes this request
     /// itself.
     Renewal(TrialStep) = 13,
+    /// Leave for the loader in the ROM of the chip ([`VectorTable::of_rom`](crate::vectors::VectorTable::of_rom)). The
+    /// bootloader writes this request itself, in a product that permits it; another one starts as after a
+    /// power-on.
+    RomLoader = 14,
 }
 
 /// A step in the trial of a new RAM image.
@@ -162,8 +166,8 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal; 0 none, which may have
-    /// the mark.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the ROM; 0
+    /// none, which may have the mark.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
@@ -203,6 +207,7 @@ impl WarmStart {
                 (12, u32::from_le_bytes([node_id, bit_rate, 0, 0]))
             }
             BootRequest::Renewal(step) => (13, step as u32),
+            BootRequest::RomLoader => (14, 0),
         };
         Self::encode(request, argument)
     }
@@ -238,6 +243,7 @@ impl WarmStart {
             (11, 1..=254) => BootRequest::Invalidate(program),
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
             (13, ..=0xFF) => BootRequest::Renewal(TrialStep::from_number(program)?),
+            (14, 0) => BootRequest::RomLoader,
             _ => return None,
         })
     }
@@ -336,6 +342,7 @@ mod tests {
             BootRequest::Renewal(TrialStep::Try),
             BootRequest::Renewal(TrialStep::Late),
             BootRequest::Renewal(TrialStep::GivenUp),
+            BootRequest::RomLoader,
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -448,7 +455,8 @@ mod tests {
             (13, 0),
             (13, 4),
             (13, 0x0101),
-            (14, 0),
+            (14, 1),
+            (15, 0),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

@@ -16,6 +16,7 @@ use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::renewal::{word, Origin, TrialEnd};
+use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Owed, TrialStep};
 
 use crate::caches::Caches;
@@ -66,6 +67,14 @@ pub unsafe extern "C" fn stage() -> ! {
     let request = cell.take();
     let pin_reset =
         if PRODUCT.two_resets { PinReset::of(reset_cause, request, is_marked) } else { PinReset::None };
+    if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && reset_cause == ResetCause::Software {
+        if let Some(vectors) = VectorTable::of_rom(bsp::rom::words(), LAYOUT.chip.sram) {
+            bsp::low_power::release(&rcc);
+            bsp::rom::map(&rcc);
+            // SAFETY: since the reset no interrupt was enabled and no bus master started.
+            unsafe { vectors.jump() }
+        }
+    }
     let entry = entry(bsp::entry_strap(), pin_reset);
 
     // CRCs need speed, but no exact clock. The crystal would take time to start.
