@@ -103,7 +103,7 @@ pub fn pause(core: u32, ms: u32) {
     timer.enable_counter();
     for _ in 0..ms {
         while !timer.has_wrapped() {
-            // A hundredth of a millisecond or less: the timer need not be asked more often.
+            // A fraction of a millisecond: the timer need not be asked more often.
             cortex_m::asm::delay(1000);
         }
     }

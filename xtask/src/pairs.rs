@@ -30,9 +30,6 @@ const FIELDS: [(&str, &[&str]); 43] = [
     ("autostart", &["Some(1)", "None"]),
     ("rescue_window_ms", &["300", "0"]),
     ("rescue_window_confirmed_ms", &["0", "100"]),
-    // The compact map has no room for these two in the largest product.
-    ("two_resets", &["false", "LAYOUT.home.is_some()"]),
-    ("rom_loader", &["false", "LAYOUT.home.is_some()"]),
     ("node_ids", &["1..=127", "2..=100"]),
     ("bit_rates", &["0..=8", "2..=6"]),
     ("node_source", &["NodeSource::Stored", "NodeSource::Constant", SWITCHES]),
@@ -70,6 +67,9 @@ const FIELDS: [(&str, &[&str]); 43] = [
     ("bootloader_counter", &["0", "3"]),
     ("bootloader_revisions", &["0", "1"]),
     (SEALED, &["false", "true"]),
+    // The compact map has no room for these two in the largest product.
+    ("two_resets", &["false", "LAYOUT.home.is_some()"]),
+    ("rom_loader", &["false", "LAYOUT.home.is_some()"]),
 ];
 
 /// Sealed images: a feature, and no field of a product. A board with the compact map has the other

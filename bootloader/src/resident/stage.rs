@@ -7,7 +7,7 @@
 
 use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
-use boot_core::decision::{decide, entry, fallback, BootDecision, Circumstances, PinReset};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
 use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
@@ -65,8 +65,6 @@ pub unsafe extern "C" fn stage() -> ! {
     let mut cell = product::warm_start_cell();
     let is_marked = PRODUCT.two_resets && cell.is_marked();
     let request = cell.take();
-    let pin_reset =
-        if PRODUCT.two_resets { PinReset::of(reset_cause, request, is_marked) } else { PinReset::None };
     if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && reset_cause == ResetCause::Software {
         if let Some(vectors) = VectorTable::of_rom(bsp::rom::words(), LAYOUT.chip.sram) {
             bsp::low_power::release(&rcc);
@@ -75,7 +73,7 @@ pub unsafe extern "C" fn stage() -> ! {
             unsafe { vectors.jump() }
         }
     }
-    let entry = entry(bsp::entry_strap(), pin_reset);
+    let strap = bsp::entry_strap();
 
     // CRCs need speed, but no exact clock. The crystal would take time to start.
     Source::Internal.speed_up(&rcc);
@@ -98,7 +96,7 @@ pub unsafe extern "C" fn stage() -> ! {
     let decide = |circumstances: &Circumstances| {
         decide(circumstances, &DECISION, |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number))
     };
-    let mut circumstances = Circumstances { request, entry, crash_resets, node_id };
+    let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
     let mut trial_end = TrialEnd::None;
     if PRODUCT.renewal {
         trial_end = renewal::trial_end(&flash, &parameters, request, reset_cause);
@@ -108,13 +106,17 @@ pub unsafe extern "C" fn stage() -> ! {
         }
     }
     let mut decision = decide(&circumstances);
-    if PRODUCT.two_resets && pin_reset == PinReset::First && !matches!(decision, BootDecision::Stay { .. }) {
-        // A watchdog of the option bytes has its longest time.
-        let core = Source::Internal.tree().sysclk();
-        bsp::pause(core, PinReset::BOUNCE_MS);
-        cell.mark();
-        bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
-        cell.clear();
+    if PRODUCT.two_resets {
+        let pin_reset = PinReset::of(reset_cause, request, is_marked);
+        decision = pin_reset.change(decision);
+        if pin_reset == PinReset::First && !matches!(decision, BootDecision::Stay { .. }) {
+            // A watchdog of the option bytes has its longest time.
+            let core = Source::Internal.tree().sysclk();
+            bsp::pause(core, PinReset::BOUNCE_MS);
+            cell.mark();
+            bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
+            cell.clear();
+        }
     }
     if !matches!(decision, BootDecision::Start { .. }) {
         // SAFETY: only the stack uses the RAM.
@@ -144,7 +146,7 @@ pub unsafe extern "C" fn stage() -> ! {
         }
         // There is no bootloader to stay in, neither for the entry strap nor for the reset pin or a rescue
         // window: the program with autostart is resumed at once, or the next that may start.
-        circumstances.entry = None;
+        circumstances.strap = false;
         for turn in 1..=PROGRAMS {
             let number = fallback(PRODUCT.autostart, PROGRAMS, turn);
             circumstances.request = Some(BootRequest::Resume(number));

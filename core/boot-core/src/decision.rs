@@ -17,8 +17,8 @@ use crate::program::{Invalid, VerifiedProgram};
 pub struct Circumstances {
     /// The request from the warm-start cell, which has been consumed.
     pub request: Option<BootRequest>,
-    /// What at the board asks for the bootloader ([`entry`]), if anything does.
-    pub entry: Option<Reason>,
+    /// The entry strap asks for the bootloader.
+    pub strap: bool,
     /// [`Policy::crash_resets`].
     pub crash_resets: u32,
     /// Node-ID of the device; a value outside 1 to 127 means that it has none.
@@ -56,15 +56,16 @@ impl PinReset {
             _ => Self::None,
         }
     }
-}
 
-/// What at the board asks for the bootloader: the entry strap, or two resets by the pin.
-#[must_use]
-pub const fn entry(strap: bool, pin_reset: PinReset) -> Option<Reason> {
-    match (strap, pin_reset) {
-        (true, _) => Some(Reason::Strap),
-        (false, PinReset::Second) => Some(Reason::TwoResets),
-        (false, PinReset::None | PinReset::First) => None,
+    /// What becomes of a decision after this reset: no program starts after the second one.
+    #[must_use]
+    pub const fn change(self, decision: BootDecision) -> BootDecision {
+        match (self, decision) {
+            (Self::Second, BootDecision::Start { .. } | BootDecision::Hold { .. }) => {
+                BootDecision::Stay { reason: Reason::TwoResets, refused: 0 }
+            }
+            _ => decision,
+        }
     }
 }
 
@@ -168,8 +169,8 @@ pub fn decide(
         Some(BootRequest::Renewal(_)) => return stay(Reason::Renewal),
         _ => {}
     }
-    if let Some(reason) = circumstances.entry {
-        return stay(reason);
+    if circumstances.strap {
+        return stay(Reason::Strap);
     }
     // A request is new: its sender knows about earlier crashes.
     let (number, trial, is_requested) = match circumstances.request {

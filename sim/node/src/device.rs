@@ -215,7 +215,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let node = NodeParameters::load(&journal, &flash, node, supports);
         let circumstances = Circumstances {
             request,
-            entry: strap.then_some(Reason::Strap),
+            strap,
             crash_resets: 0,
             node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
         };

@@ -174,7 +174,7 @@ impl Device {
         let node = NodeParameters::load(&parameters, &self.flash, BOARD_NODE, |_| true);
         let circumstances = Circumstances {
             request: None,
-            entry: None,
+            strap: false,
             crash_resets: 0,
             node_id: node.id.map_or(255, NodeId::get),
         };

@@ -1,7 +1,7 @@
 //! The boot decision: the promised order of its checks.
 
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, entry, fallback, BootDecision, Circumstances, PinReset, Policy};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset, Policy};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
@@ -12,7 +12,7 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
 use shared_abi::warm_start::{BootRequest, Owed};
 
-const QUIET: Circumstances = Circumstances { request: None, entry: None, crash_resets: 0, node_id: 5 };
+const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
 
 fn policy() -> Policy {
     Policy {
@@ -88,12 +88,11 @@ fn what_asks_for_the_bootloader_wins() {
     let owed = BootRequest::Owed(Owed { program: 1, value: 3, node_id: 5 });
     assert_eq!(stay(request(BootRequest::Stay), policy()), Reason::Requested);
     assert_eq!(stay(request(owed), policy()), Reason::Requested);
-    for reason in [Reason::Strap, Reason::TwoResets] {
-        let entry = Circumstances { entry: Some(reason), crash_resets: 3, ..QUIET };
-        assert_eq!(stay(entry, policy()), reason);
-        let request = Some(BootRequest::Start(1));
-        assert_eq!(stay(Circumstances { request, ..entry }, policy()), reason);
-    }
+    assert_eq!(stay(Circumstances { strap: true, ..QUIET }, policy()), Reason::Strap);
+    assert_eq!(
+        stay(Circumstances { strap: true, ..request(BootRequest::Start(1)) }, policy()),
+        Reason::Strap
+    );
     assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), Reason::CrashLoop);
     assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), Reason::NoAutostart);
     for node_id in [0, 101, 127, 255] {
@@ -226,11 +225,17 @@ fn two_resets_by_the_pin_in_a_row_keep_the_device_in_the_bootloader() {
             assert_eq!(PinReset::of(cause, None, is_marked), PinReset::None, "{cause:?}");
         }
     }
-    assert_eq!(entry(false, PinReset::Second), Some(Reason::TwoResets));
-    for pin_reset in [PinReset::None, PinReset::First, PinReset::Second] {
-        assert_eq!(entry(true, pin_reset), Some(Reason::Strap));
+    // After the second one no program starts, at once or after the rescue window.
+    let starts = decide(&QUIET, &policy(), |_| signed());
+    let held = decide(&QUIET, &Policy { rescue_window_ms: 300, ..policy() }, |_| signed());
+    let stays = BootDecision::Stay { reason: Reason::NoProgram, refused: 1 };
+    for decision in [starts, held] {
+        assert_eq!(PinReset::None.change(decision), decision);
+        assert_eq!(PinReset::First.change(decision), decision);
+        let twice = BootDecision::Stay { reason: Reason::TwoResets, refused: 0 };
+        assert_eq!(PinReset::Second.change(decision), twice);
     }
-    assert_eq!((entry(false, PinReset::None), entry(false, PinReset::First)), (None, None));
+    assert_eq!(PinReset::Second.change(stays), stays, "it stays for a reason of its own");
     // A power-on sets the flag of the pin, too.
     assert_eq!(ResetCause::from_flags(0x0C00_0000, false), PowerOn);
     assert_eq!(ResetCause::from_flags(0x0400_0000, false), Pin);
