@@ -32,8 +32,9 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 pub const SEALED: bool = cfg!(feature = "sealed");
 
 /// The abilities of the resident part, which the RAM image needs.
-pub const FEATURES: u32 =
-    if SEALED { feature::SEALED } else { 0 } | if PRODUCT.renewal { feature::RENEWAL } else { 0 };
+pub const FEATURES: u32 = if SEALED { feature::SEALED } else { 0 }
+    | if PRODUCT.renewal { feature::RENEWAL } else { 0 }
+    | if PRODUCT.rom_loader { feature::ROM_LOADER } else { 0 };
 
 /// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
 /// (DS8626 table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
@@ -63,6 +64,12 @@ pub struct Product {
     pub rescue_window_ms: u16,
     /// The same for a confirmed program.
     pub rescue_window_confirmed_ms: u16,
+    /// Whether two resets by the NRST pin within half a second keep the device in the bootloader: an entry
+    /// without a pin of its own. A program then starts half a second later after such a reset.
+    pub two_resets: bool,
+    /// Whether a command over CAN (2008h) starts the loader in the ROM of the chip, ST's own. Who may write a
+    /// program may then do anything with the device: not with the feature `sealed`.
+    pub rom_loader: bool,
     /// Node-IDs with which programs may be started (`BLCOP_MIN_NODEID`, `BLCOP_MAX_NODEID`).
     pub node_ids: RangeInclusive<u8>,
     /// Bit rates that the device may be set to, as indices of CiA 305 table 1: 0 for 1 Mbit/s to 8
@@ -170,6 +177,8 @@ impl Product {
         max_crash_resets: 3,
         rescue_window_ms: 300,
         rescue_window_confirmed_ms: 0,
+        two_resets: false,
+        rom_loader: false,
         node_ids: 1..=127,
         bit_rates: 0..=8,
         node_source: NodeSource::Stored,
@@ -228,6 +237,10 @@ impl Product {
         assert!(
             self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),
             "product: a device without lss cannot wait for it: crystal_failure must be RunFromHsi"
+        );
+        assert!(
+            !(SEALED && self.rom_loader),
+            "product: rom_loader would write any program into a device that takes sealed images"
         );
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
@@ -341,6 +354,7 @@ impl Product {
             resume: self.resume,
             read_back: self.reads_back(),
             bootloader: self.bootloader_number(),
+            rom_loader: self.rom_loader,
             ..self.profile.extras
         }
     }
@@ -428,7 +442,8 @@ pub const FACTS: Facts = Facts {
     node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
     bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
         | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
-    abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 },
+    abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 }
+        | if PRODUCT.rom_loader { Facts::ROM_LOADER } else { 0 },
 };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.

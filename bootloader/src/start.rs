@@ -34,7 +34,9 @@ const _: () = {
     assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
     assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
     assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other bit_rates");
-    assert!(facts.abilities == FACTS.abilities, "product: `resident` has another renewal");
+    let differs = facts.abilities ^ FACTS.abilities;
+    assert!(differs & Facts::ROM_LOADER == 0, "product: `resident` has another rom_loader");
+    assert!(differs == 0, "product: `resident` has another renewal");
 };
 
 #[repr(C, align(4))]

@@ -24,6 +24,7 @@
 //! | `watchdog.rs` | the independent watchdog |
 //! | [`voltage`] | what follows from the supply: how wide the flash is programmed, and when it is left alone |
 //! | [`supply`] | the voltage detector |
+//! | `rom.rs` | the loader in the ROM of the chip |
 //! | `low_power.rs` | the wake-up from Standby, the clocks of the sleep mode |
 //! | `debugger.rs`, `memory.rs` | the debugger interface, 1025h, to the chip's memory (feature `debugger`) |
 //! | `monitor.rs` | stops the program at a breakpoint while the bus goes on (feature `monitor`) |
@@ -53,6 +54,8 @@ mod pll;
 mod port;
 #[cfg(any(feature = "uart", not(target_arch = "arm")))]
 pub mod ring;
+#[cfg(target_arch = "arm")]
+pub mod rom;
 #[cfg(any(feature = "virtual-can", not(target_arch = "arm")))]
 pub mod slcan;
 #[cfg(target_arch = "arm")]
@@ -87,6 +90,25 @@ pub use stm32f4xx_hal::pac;
 pub fn cleared_systick(mut systick: cortex_m::peripheral::SYST) -> cortex_m::peripheral::SYST {
     systick.clear_current();
     systick
+}
+
+/// Waits `ms` milliseconds with the system timer, while the core runs at `core` Hz. Afterwards the timer is off, as
+/// after a reset.
+#[cfg(target_arch = "arm")]
+pub fn pause(core: u32, ms: u32) {
+    // SAFETY: only the boot stage runs, which uses the timer for nothing else.
+    let mut timer = cleared_systick(unsafe { cortex_m::Peripherals::steal() }.SYST);
+    timer.set_clock_source(cortex_m::peripheral::syst::SystClkSource::Core);
+    timer.set_reload(core / 1000 - 1);
+    timer.enable_counter();
+    for _ in 0..ms {
+        while !timer.has_wrapped() {
+            // A fraction of a millisecond: the timer need not be asked more often.
+            cortex_m::asm::delay(1000);
+        }
+    }
+    // SAFETY: the value after a reset (PM0214 section 4.5.1).
+    unsafe { timer.csr.write(0) };
 }
 
 /// The count of the system timer, which runs with the clock of the core.

@@ -45,11 +45,13 @@ pub enum Reason {
     Forbidden = 11,
     /// The RAM image is on trial, or its trial has just ended ([`crate::renewal`]).
     Renewal = 12,
+    /// The NRST pin has reset the device twice within half a second.
+    TwoResets = 13,
 }
 
 impl Reason {
     /// All reasons, in the order of their numbers.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::Requested,
         Self::Strap,
         Self::CrashLoop,
@@ -63,6 +65,7 @@ impl Reason {
         Self::Vectors,
         Self::Forbidden,
         Self::Renewal,
+        Self::TwoResets,
     ];
 
     /// The reason with this number; `None` for a number from a later version.
@@ -217,7 +220,7 @@ mod tests {
         for (number, reason) in (0..).zip(Reason::ALL) {
             assert_eq!((reason as u8, Reason::from_byte(number)), (number, Some(reason)));
         }
-        assert_eq!(Reason::from_byte(13), None);
+        assert_eq!(Reason::from_byte(14), None);
     }
 
     #[test]

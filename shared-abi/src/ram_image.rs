@@ -27,6 +27,8 @@ pub mod feature {
     /// The bootloader can be renewed: an image that takes part in a trial ends by itself, and installs itself.
     /// One without this runs from home alone.
     pub const RENEWAL: u32 = 2;
+    /// The device leaves for the loader in the ROM of the chip on request.
+    pub const ROM_LOADER: u32 = 4;
 }
 
 /// What a device has for a RAM image.

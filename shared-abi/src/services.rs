@@ -63,13 +63,16 @@ pub struct Facts {
     /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1; bit 9:
     /// the device may find it out.
     pub bit_rates: u16,
-    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS).
+    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS) and
+    /// [`ROM_LOADER`](Self::ROM_LOADER).
     pub abilities: u16,
 }
 
 impl Facts {
     /// In [`abilities`](Self::abilities): it loads a RAM image from staging, too ([`crate::renewal`]).
     pub const RENEWS: u16 = 1;
+    /// In [`abilities`](Self::abilities): it leaves for the loader in the ROM of the chip on request.
+    pub const ROM_LOADER: u16 = 2;
     /// Its size in bytes.
     pub const SIZE: u16 = size_of::<Self>() as u16;
 

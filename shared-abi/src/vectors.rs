@@ -1,7 +1,7 @@
 //! Vector tables: the judge of their first two words, the proof that a table was checked, and the
 //! jump to it. Device and host tool judge by the same rules.
 
-use crate::geometry::{Region, CORE_VECTORS_SIZE};
+use crate::geometry::{Region, CORE_VECTORS_SIZE, SYSTEM_MEMORY};
 use crate::layout::Layout;
 
 /// Why a vector table is refused.
@@ -132,6 +132,19 @@ impl VectorTable {
         }
     }
 
+    /// Checks the first two words of the loader in the ROM of the chip, [`SYSTEM_MEMORY`]: the stack is in the SRAM, and
+    /// the first instruction in the ROM. How long its table is, no manual says.
+    #[must_use]
+    pub const fn of_rom(words: [u32; 2], sram: Region) -> Option<Self> {
+        let [initial_sp, reset] = words;
+        let is_stack = initial_sp.is_multiple_of(4) && is_stack_in(&sram, initial_sp);
+        if is_stack && SYSTEM_MEMORY.contains(reset & !1, 2) && reset & 1 == 1 {
+            Some(Self { address: SYSTEM_MEMORY.base, initial_sp, reset })
+        } else {
+            None
+        }
+    }
+
     /// Whether a word may be the first one of a table: a pointer to the end of a stack in RAM.
     #[must_use]
     pub fn is_stack_pointer(word: u32, layout: &Layout) -> bool {
@@ -233,6 +246,30 @@ mod tests {
         // An image that ends in its own table has no code.
         let short = Region::new(0x0802_0000, 4);
         assert_eq!(Memory::ANY.judge([0x2001_0000, 0x0802_0001], short), Err(VectorFault::ResetVector));
+    }
+
+    #[test]
+    fn the_rom_is_entered_only_at_an_instruction_of_the_rom() {
+        let sram = LAYOUT.chip.sram;
+        let table = VectorTable::of_rom([0x2000_2D44, 0x1FFF_0189], sram).unwrap();
+        assert_eq!(
+            (table.address(), table.initial_sp(), table.reset()),
+            (0x1FFF_0000, 0x2000_2D44, 0x1FFF_0189)
+        );
+        // The end of the SRAM, and of the ROM.
+        assert!(VectorTable::of_rom([0x2002_0000, 0x1FFF_77FF], sram).is_some());
+        for words in [
+            [u32::MAX, u32::MAX],
+            [0, 0],
+            [0x2000_2D42, 0x1FFF_0189],
+            [0x2000_0000, 0x1FFF_0189],
+            [0x2002_0004, 0x1FFF_0189],
+            [0x2000_2D40, 0x1FFF_0188],
+            [0x2000_2D40, 0x1FFF_7801],
+            [0x2000_2D40, 0x0800_0189],
+        ] {
+            assert_eq!(VectorTable::of_rom(words, sram), None, "{words:08X?}");
+        }
     }
 
     #[test]

@@ -85,6 +85,10 @@ pub enum BootRequest {
     /// A step in the trial of a new RAM image ([`crate::renewal`]). The bootloader writes this request
     /// itself.
     Renewal(TrialStep) = 13,
+    /// Leave for the loader in the ROM of the chip ([`VectorTable::of_rom`](crate::vectors::VectorTable::of_rom)). The
+    /// bootloader writes this request itself, in a product that permits it; another one starts as after a
+    /// power-on.
+    RomLoader = 14,
 }
 
 /// A step in the trial of a new RAM image.
@@ -162,12 +166,14 @@ pub struct WarmStart {
     /// [`MAGIC`].
     pub magic: u32,
     /// 1 stay, 2 trial, 3 start, 4 fault, 5 as after a power-on, 6 resume, 7 owed, 8 damaged,
-    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal.
+    /// 9 fresh, 10 confirm, 11 invalidate, 12 store node parameters, 13 renewal, 14 loader in the ROM; 0
+    /// none, which may have the mark.
     pub request: u32,
     /// The program number (1 to 254) for a trial, start, resume, fresh start, confirm or invalidate
     /// request; the number of a [`Damage`]; for an owed answer, the program number in bits 0 to 7,
     /// the value in bits 8 to 15 and the node-ID in bits 16 to 22; for node parameters, the node-ID
-    /// in bits 0 to 7 and the bit rate in bits 8 to 15; the number of a [`TrialStep`]; otherwise 0.
+    /// in bits 0 to 7 and the bit rate in bits 8 to 15; the number of a [`TrialStep`]; 1 for the mark;
+    /// otherwise 0.
     pub argument: u32,
     /// [`check_word`] of the three words before.
     pub check: u32,
@@ -176,6 +182,9 @@ pub struct WarmStart {
 impl WarmStart {
     /// A cell without a request.
     pub const EMPTY: Self = Self { magic: 0, request: 0, argument: 0, check: 0 };
+    /// A cell with the mark, which is no request: the NRST pin has reset the device, and the time in which a
+    /// second such reset keeps it in the bootloader is not over.
+    pub const MARKED: Self = Self::encode(0, 1);
 
     /// The cell with this request.
     #[must_use]
@@ -198,6 +207,7 @@ impl WarmStart {
                 (12, u32::from_le_bytes([node_id, bit_rate, 0, 0]))
             }
             BootRequest::Renewal(step) => (13, step as u32),
+            BootRequest::RomLoader => (14, 0),
         };
         Self::encode(request, argument)
     }
@@ -233,6 +243,7 @@ impl WarmStart {
             (11, 1..=254) => BootRequest::Invalidate(program),
             (12, ..=0xFFFF) => BootRequest::StoreNode(StoredNode { node_id: program, bit_rate: value }),
             (13, ..=0xFF) => BootRequest::Renewal(TrialStep::from_number(program)?),
+            (14, 0) => BootRequest::RomLoader,
             _ => return None,
         })
     }
@@ -258,11 +269,28 @@ impl Cell {
         // SAFETY: the caller of `at` guarantees the address; volatile, because another image wrote
         // the cell.
         let found = unsafe { self.0.read_volatile() };
-        self.write(WarmStart::EMPTY);
+        self.clear();
         found.request()
     }
 
-    /// Writes a request for the bootloader. The write is complete when this returns, so a reset may
+    /// Whether the cell has the [mark](WarmStart::MARKED). [`take`](Self::take) removes it.
+    #[must_use]
+    pub fn is_marked(&self) -> bool {
+        // SAFETY: as in `take`.
+        unsafe { self.0.read_volatile() == WarmStart::MARKED }
+    }
+
+    /// Sets the [mark](WarmStart::MARKED), in place of a request.
+    pub fn mark(&mut self) {
+        self.write(WarmStart::MARKED);
+    }
+
+    /// Empties the cell: there is neither a request nor the mark.
+    pub fn clear(&mut self) {
+        self.write(WarmStart::EMPTY);
+    }
+
+    /// Writes a request for the bootloader, in place of the mark. The write is complete when this returns, so a reset may
     /// follow at once.
     pub fn put(&mut self, request: BootRequest) {
         self.write(WarmStart::new(request));
@@ -314,6 +342,7 @@ mod tests {
             BootRequest::Renewal(TrialStep::Try),
             BootRequest::Renewal(TrialStep::Late),
             BootRequest::Renewal(TrialStep::GivenUp),
+            BootRequest::RomLoader,
         ];
         for request in requests {
             let mut ram = WarmStart::EMPTY;
@@ -332,6 +361,47 @@ mod tests {
             [(0, 0), (10_000, 10_000), (1_000_000, 1_000_000), (1_275_000, 1_275_000), (9_999, 5_000)]
         {
             assert_eq!(StoredNode::new(1, given).bits_per_second(), kept);
+        }
+    }
+
+    /// A reader without the mark sees a request that it does not know. Every request replaces the mark, a *try*
+    /// and a confirmation among them, and it is gone when the cell was read.
+    #[test]
+    fn the_mark_is_no_request_and_ends_with_the_next_use_of_the_cell() {
+        let marked = WarmStart { magic: MAGIC, request: 0, argument: 1, check: check_word(&[MAGIC, 0, 1]) };
+        let mut ram = WarmStart::EMPTY;
+        let at = &raw mut ram;
+        // SAFETY: `ram` belongs to this test and outlives the cell.
+        let mut cell = unsafe { Cell::at(at) };
+        assert!(!cell.is_marked());
+        cell.mark();
+        // SAFETY: as above.
+        assert_eq!(unsafe { at.read_volatile() }, marked, "the value is frozen");
+        assert!(cell.is_marked(), "to look at it changes nothing");
+        assert!(cell.is_marked());
+        assert_eq!((cell.take(), cell.is_marked()), (None, false));
+        cell.mark();
+        cell.clear();
+        assert!(!cell.is_marked());
+        for request in [BootRequest::Renewal(TrialStep::Try), BootRequest::Confirm(1), BootRequest::Start(1)]
+        {
+            cell.mark();
+            cell.put(request);
+            assert!(!cell.is_marked());
+            assert_eq!(cell.take(), Some(request));
+        }
+        for bit in 0..32 {
+            let flip = 1 << bit;
+            for damaged in [
+                WarmStart { magic: MAGIC ^ flip, ..marked },
+                WarmStart { request: flip, ..marked },
+                WarmStart { argument: 1 ^ flip, ..marked },
+                WarmStart { check: marked.check ^ flip, ..marked },
+            ] {
+                // SAFETY: as above.
+                unsafe { at.write_volatile(damaged) };
+                assert!(!cell.is_marked(), "{damaged:?}");
+            }
         }
     }
 
@@ -367,6 +437,7 @@ mod tests {
             (3, 0),
             (3, 256),
             (0, 0),
+            (0, 1),
             (4, 1),
             (5, 1),
             (6, 0),
@@ -384,7 +455,8 @@ mod tests {
             (13, 0),
             (13, 4),
             (13, 0x0101),
-            (14, 0),
+            (14, 1),
+            (15, 0),
         ] {
             let check = check_word(&[MAGIC, request, argument]);
             let cell = WarmStart { magic: MAGIC, request, argument, check };

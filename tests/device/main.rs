@@ -29,3 +29,4 @@ mod supply;
 mod uart;
 mod virtual_can;
 mod watchdog;
+mod ways_in;

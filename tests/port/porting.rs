@@ -199,6 +199,7 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
         (format!("{include}, crc: CrcKind::Crc16"), "product: `resident` has another crc"),
         (format!("{include}, bit_rates: 0..=7"), "product: `resident` has other bit_rates"),
         (format!("{include}, node_ids: 1..=126"), "product: `resident` has other node_ids"),
+        (format!("{include}, rom_loader: true"), "product: `resident` has another rom_loader"),
     ] {
         let refused = product(&choices);
         assert!(!refused.status.success() && text(&refused).contains(says), "{says}: {}", text(&refused));
@@ -206,6 +207,19 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
     let built = product("heartbeat_ms: 2000");
     assert!(built.status.success(), "{}", text(&built));
     assert!(resident("later") != released, "a fresh one has changed");
+}
+
+/// The loader in the ROM writes any program.
+#[test]
+fn a_sealed_product_with_the_rom_loader_is_not_built() {
+    let copy = Copy::new();
+    let text_of =
+        "use super::*;\n\npub const PRODUCT: Product = Product { rom_loader: true, ..Product::DEFAULT };\n";
+    fs::write(copy.root.join("bootloader/products/open.rs"), text_of).expect("it can be written");
+    let refused =
+        copy.cargo(&["run", "-q", "-p", "xtask", "--", "build", "bootloader-sealed", "--product", "open"]);
+    let says = "product: rom_loader would write any program into a device that takes sealed images";
+    assert!(!refused.status.success() && text(&refused).contains(says), "{}", text(&refused));
 }
 
 /// RM0090 table 7: below 2.7 V the flash is programmed by half-words, below 2.1 V by bytes; table 10: the wait

@@ -68,6 +68,8 @@ pub const VARIANTS: &[Variant] = table![
     product("bootloader-switches", "switches"),
     // Programs start with the watchdog.
     product("bootloader-watchdog", "watchdog"),
+    // Ways into a bootloader without an entry strap.
+    product("bootloader-ways-in", "ways-in"),
     // They log their work, each one in another way (`cargo xtask emulate --log=WAY`).
     bootloader("bootloader-log-rtt", "log-rtt"),
     bootloader("bootloader-log-defmt", "log-defmt"),

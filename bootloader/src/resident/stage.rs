@@ -7,7 +7,7 @@
 
 use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
 use boot_core::program::verify;
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
@@ -16,6 +16,7 @@ use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::renewal::{word, Origin, TrialEnd};
+use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Owed, TrialStep};
 
 use crate::caches::Caches;
@@ -62,7 +63,16 @@ pub unsafe extern "C" fn stage() -> ! {
     }
 
     let mut cell = product::warm_start_cell();
+    let is_marked = PRODUCT.two_resets && cell.is_marked();
     let request = cell.take();
+    if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && reset_cause == ResetCause::Software {
+        if let Some(vectors) = VectorTable::of_rom(bsp::rom::words(), LAYOUT.chip.sram) {
+            bsp::low_power::release(&rcc);
+            bsp::rom::map(&rcc);
+            // SAFETY: since the reset no interrupt was enabled and no bus master started.
+            unsafe { vectors.jump() }
+        }
+    }
     let strap = bsp::entry_strap();
 
     // CRCs need speed, but no exact clock. The crystal would take time to start.
@@ -96,6 +106,18 @@ pub unsafe extern "C" fn stage() -> ! {
         }
     }
     let mut decision = decide(&circumstances);
+    if PRODUCT.two_resets {
+        let pin_reset = PinReset::of(reset_cause, request, is_marked);
+        decision = pin_reset.change(decision);
+        if pin_reset == PinReset::First && !matches!(decision, BootDecision::Stay { .. }) {
+            // A watchdog of the option bytes has its longest time.
+            let core = Source::Internal.tree().sysclk();
+            bsp::pause(core, PinReset::BOUNCE_MS);
+            cell.mark();
+            bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
+            cell.clear();
+        }
+    }
     if !matches!(decision, BootDecision::Start { .. }) {
         // SAFETY: only the stack uses the RAM.
         match unsafe { renewal::load(&flash, &parameters, request, &mut trial_end) } {
@@ -122,8 +144,8 @@ pub unsafe extern "C" fn stage() -> ! {
             }
             Err(damage) => cell.put(BootRequest::Damaged(damage)),
         }
-        // There is no bootloader to stay in, neither for the entry strap nor for a rescue window: the
-        // program with autostart is resumed at once, or the next that may start.
+        // There is no bootloader to stay in, neither for the entry strap nor for the reset pin or a rescue
+        // window: the program with autostart is resumed at once, or the next that may start.
         circumstances.strap = false;
         for turn in 1..=PROGRAMS {
             let number = fallback(PRODUCT.autostart, PROGRAMS, turn);

@@ -13,9 +13,9 @@ use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
     control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH,
     FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION,
-    PROGRAM_VERSION, RENEWAL_ENTRIES, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES,
-    STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK,
-    UNLOCK_ENTRIES,
+    PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE, SEALED_ENTRIES,
+    SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG,
+    STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
@@ -47,6 +47,8 @@ pub struct Extras {
     pub resume: bool,
     /// The program number of the bootloader itself, if it can be renewed.
     pub bootloader: Option<u8>,
+    /// Whether 2008h exists, which starts the loader in the ROM of the chip.
+    pub rom_loader: bool,
 }
 
 impl Extras {
@@ -58,6 +60,7 @@ impl Extras {
         second_server: true,
         resume: true,
         bootloader: None,
+        rom_loader: false,
     };
 
     /// Whether an object takes a password.
@@ -97,6 +100,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     } else {
         table
     };
+    let table = if extras.rom_loader { table.with(&ROM_LOADER_ENTRIES) } else { table };
     let table = if extras.sealed { table.with(&SEALED_ENTRIES) } else { table };
     match extras.password {
         PasswordObject::None => table,
@@ -127,7 +131,8 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
         + numbers.entries()
         + control_count(numbers)
         + STATE_ENTRIES.len()
-        + renewal;
+        + renewal
+        + if extras.rom_loader { ROM_LOADER_ENTRIES.len() } else { 0 };
     always + password + sealed + second_server + resume
 }
 
@@ -144,6 +149,7 @@ pub trait Choices {
         second_server: true,
         resume: true,
         bootloader: None,
+        rom_loader: true,
     };
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
@@ -451,6 +457,13 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             }
             (SECOND_SERVER, &[a, b, c, d]) if C::EXTRAS.second_server => {
                 self.second_server.write(at.sub, u32::from_le_bytes([a, b, c, d]))
+            }
+            (ROM_LOADER, &[a, b, c, d]) if C::EXTRAS.rom_loader => {
+                // A wrong signature: as of 1010h and 1011h (CiA 301 clause 7.5.2.13).
+                if u32::from_le_bytes([a, b, c, d]) != ROM_LOADER_SIGNATURE {
+                    return Err(AbortCode::STORE);
+                }
+                self.download.leave_for_rom_loader(&self.flash)
             }
             (PROGRAM_CONTROL, &[value]) => self.command(at.sub, ProgramControl::try_from(value)?),
             (ENABLE_FLASH | UNLOCK, password) if C::EXTRAS.has_password() => {

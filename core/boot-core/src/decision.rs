@@ -25,6 +25,50 @@ pub struct Circumstances {
     pub node_id: u8,
 }
 
+/// A reset by the NRST pin, for a product that two of them keep in the bootloader.
+///
+/// After the first one the boot stage waits before it starts a program. It then marks the warm-start
+/// cell ([`WarmStart::MARKED`](shared_abi::warm_start::WarmStart::MARKED)) for a while: a reset in this time is the
+/// second one. A power-on, a watchdog or a request is none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PinReset {
+    /// Another reset, or a product without this choice.
+    #[default]
+    None,
+    /// The first one.
+    First,
+    /// The second one.
+    Second,
+}
+
+impl PinReset {
+    /// After a reset by the pin, the time until the mark is set, in ms: a push-button bounces.
+    pub const BOUNCE_MS: u32 = 20;
+    /// After a reset by the pin, the time until the mark is removed and a program may start, in ms.
+    pub const WITHIN_MS: u32 = 500;
+
+    /// From the cause of a reset, and what the warm-start cell had.
+    #[must_use]
+    pub const fn of(cause: ResetCause, request: Option<BootRequest>, is_marked: bool) -> Self {
+        match (cause, request, is_marked) {
+            (ResetCause::Pin, None, false) => Self::First,
+            (ResetCause::Pin, None, true) => Self::Second,
+            _ => Self::None,
+        }
+    }
+
+    /// What becomes of a decision after this reset: no program starts after the second one.
+    #[must_use]
+    pub const fn change(self, decision: BootDecision) -> BootDecision {
+        match (self, decision) {
+            (Self::Second, BootDecision::Start { .. } | BootDecision::Hold { .. }) => {
+                BootDecision::Stay { reason: Reason::TwoResets, refused: 0 }
+            }
+            _ => decision,
+        }
+    }
+}
+
 /// The product's configuration of the decision.
 #[derive(Clone, Debug)]
 pub struct Policy {

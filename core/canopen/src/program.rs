@@ -257,6 +257,16 @@ pub const RENEWAL_ENTRIES: [Entry; 2] = [
     Entry::sub(DEVICE_STATE, STATE_RENEWAL, "State of a renewal", DataType::Unsigned32, Access::Ro),
 ];
 
+/// The command that starts the loader in the ROM of the chip, an object of coboot: it takes
+/// [`ROM_LOADER_SIGNATURE`] alone.
+pub const ROM_LOADER: u16 = 0x2008;
+/// The value that [`ROM_LOADER`] takes: "roml" read as little-endian bytes. A signature, as 1010h and 1011h have one,
+/// so that a client that writes every object does not start the loader.
+pub const ROM_LOADER_SIGNATURE: u32 = u32::from_le_bytes(*b"roml");
+/// The object's entry in the bootloader of a product with this command.
+pub const ROM_LOADER_ENTRIES: [Entry; 1] =
+    [Entry::var(ROM_LOADER, "Start of the ROM loader", DataType::Unsigned32, Access::Wo)];
+
 /// The value of [`PROGRAM_REGION`] for a program with flash from `base` on and a size of `size`
 /// bytes.
 #[must_use]

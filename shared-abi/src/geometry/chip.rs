@@ -98,6 +98,10 @@ pub struct Geometry {
 const KIB: u32 = 1024;
 
 /// Number of the core's vectors, which precede those of the interrupts: the initial stack pointer,
+/// The system memory, a ROM with a loader of ST: the same on every chip (RM0090 section 3.4, RM0390, RM0402 and
+/// RM0430 section 3.3).
+pub const SYSTEM_MEMORY: Region = Region::new(0x1FFF_0000, 30 * 1024);
+
 /// Reset and the other exceptions (ARMv7-M B1.5.3).
 pub const CORE_VECTORS: u32 = 16;
 /// Size of these vectors in bytes.

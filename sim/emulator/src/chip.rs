@@ -1,7 +1,7 @@
 //! Everything of the chip except the instruction set: memories, peripherals, clocks, and the
 //! address map.
 
-use shared_abi::geometry::{Geometry, Region};
+use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bus::node::Pins;
 use crate::bxcan::{self, BxCan};
@@ -34,8 +34,8 @@ use crate::variant::{self, Variant};
 
 /// Where flash (or whatever the boot pins choose) shows up for the reset vector.
 pub const BOOT_ALIAS: u32 = 0;
-/// Page of the system memory that holds the unique ID and the flash size.
-pub const SYSTEM_PAGE: Region = Region::new(0x1FFF_7000, PAGE);
+/// The pages of the system memory, and behind it of the unique ID and the flash size.
+pub const SYSTEM: Region = Region::new(SYSTEM_MEMORY.base, 8 * PAGE);
 const UNIQUE_ID: u32 = 0x1FFF_7A10;
 const FLASH_SIZE: u32 = 0x1FFF_7A22;
 /// Page of the option bytes.
@@ -140,6 +140,7 @@ const BLOCKS: [(u32, Block, ClockEnable); 42] = [
 /// Every block of the F4 occupies this much.
 const BLOCK_SIZE: u32 = 0x400;
 const RCC_CFGR: u32 = 0x4002_3808;
+const SYSCFG_MEMRMP: u32 = 0x4001_3800;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
 const UNMODELLED: [(u32, &str); 20] = [
@@ -232,7 +233,8 @@ pub struct Chip {
     pub sram: HostMemory,
     /// Core-coupled memory.
     pub ccm: HostMemory,
-    /// The page with unique ID and flash size.
+    /// The pages with system memory, unique ID and flash size. ST's loader is not there: the system memory is
+    /// empty, unless a test puts a program there.
     pub system: HostMemory,
     /// The page with the option bytes.
     pub options: HostMemory,
@@ -254,9 +256,9 @@ impl Chip {
     /// The chip without power.
     #[must_use]
     pub fn new(geometry: &'static Geometry, options: &Options) -> Self {
-        let mut system = HostMemory::new(SYSTEM_PAGE.size, 0xFF);
+        let mut system = HostMemory::new(SYSTEM.size, 0xFF);
         let place = |memory: &mut HostMemory, address: u32, bytes: &[u8]| {
-            let at = (address - SYSTEM_PAGE.base) as usize;
+            let at = (address - SYSTEM.base) as usize;
             memory.bytes_mut()[at..at + bytes.len()].copy_from_slice(bytes);
         };
         for (i, word) in (0..).zip(options.unique_id) {
@@ -314,6 +316,13 @@ impl Chip {
             is_halved: false,
             lines: Vec::new(),
         }
+    }
+
+    /// The memory at an address from 0 on, and its address there: flash, or the system memory.
+    #[must_use]
+    pub fn behind_alias(&self, address: u32) -> Option<u32> {
+        let memory = if self.syscfg.maps_system_memory() { SYSTEM_MEMORY } else { self.geometry.flash };
+        (address < memory.size).then_some(memory.base + address)
     }
 
     /// The virtual time.
@@ -759,6 +768,11 @@ impl Chip {
         };
         if let Err(unmodelled) = result {
             self.complain(Access::Write, address, size, value, unmodelled);
+        }
+        if address & !3 == SYSCFG_MEMRMP {
+            // Other memory may be at address 0 from now on.
+            self.slice.flush_tlb = true;
+            self.slice.leave = true;
         }
         if self.flash.take_bus_error() {
             self.slice.bus_error = Some(address);

@@ -21,12 +21,13 @@ mod traps;
 
 use std::collections::{HashMap, HashSet};
 
+use shared_abi::geometry::SYSTEM_MEMORY;
 use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Prot, TlbEntry, TlbType};
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
     counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE,
-    SRAM_ALIAS, SYSTEM_PAGE,
+    SRAM_ALIAS, SYSTEM,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
@@ -223,7 +224,7 @@ impl Cpu {
             (flash_base, pointer(&chip.flash.array), Prot::READ | Prot::EXEC),
             (sram_base, pointer(&chip.sram), Prot::ALL),
             (ccm_base, pointer(&chip.ccm), Prot::READ | Prot::WRITE),
-            (SYSTEM_PAGE.base, pointer(&chip.system), Prot::READ),
+            (SYSTEM.base, pointer(&chip.system), Prot::READ | Prot::EXEC),
             (OPTION_PAGE.base, pointer(&chip.options), Prot::READ),
         ];
         let with_ccm = chip.geometry.ccm.size > 0;
@@ -312,7 +313,7 @@ impl Cpu {
                 |uc, kind, address, size, value| on_unmapped(uc, kind, address as u32, size, value as u32),
             )?;
         }
-        for region in [geometry.flash, SYSTEM_PAGE, OPTION_PAGE] {
+        for region in [geometry.flash, SYSTEM, OPTION_PAGE] {
             self.uc.add_mem_hook(
                 HookType::MEM_WRITE_PROT,
                 region.base.into(),
@@ -520,13 +521,12 @@ impl Cpu {
     /// The memory block of `address`, with the offset in it. Only plain memory, no peripherals.
     fn memory(chip: &Chip, address: u32) -> Option<(&HostMemory, usize)> {
         let geometry = chip.geometry;
-        let flash_alias = shared_abi::geometry::Region::new(BOOT_ALIAS, geometry.flash.size);
+        let address = chip.behind_alias(address).unwrap_or(address);
         for (region, memory) in [
             (geometry.sram, &chip.sram),
             (geometry.flash, &chip.flash.array),
-            (flash_alias, &chip.flash.array),
             (geometry.ccm, &chip.ccm),
-            (SYSTEM_PAGE, &chip.system),
+            (SYSTEM, &chip.system),
             (OPTION_PAGE, &chip.options),
         ] {
             if region.contains(address, 1) {
@@ -1438,7 +1438,7 @@ fn count_instructions(chip: &Chip, address: u32, size: u32) -> Block {
 }
 
 fn is_flash(chip: &Chip, address: u32) -> bool {
-    address < chip.geometry.flash.size || chip.geometry.flash.contains(address, 1)
+    chip.geometry.flash.contains(chip.behind_alias(address).unwrap_or(address), 1)
 }
 
 fn is_flash_busy(chip: &mut Chip) -> bool {
@@ -1461,8 +1461,11 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
     if !state.notes.asked.insert(address) {
         state.notes.asked_again += 1;
     }
+    let paddr = chip.behind_alias(address).unwrap_or(address);
+    if SYSTEM_MEMORY.contains(paddr, 1) {
+        return entry(paddr, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ | Prot::EXEC });
+    }
     if is_flash(chip, address) {
-        let paddr = if address < geometry.flash.size { geometry.flash.base + address } else { address };
         return match kind {
             // A separate entry that allows only writes; the hook of stores carries out the store.
             MemType::WRITE => entry(paddr, Prot::WRITE),

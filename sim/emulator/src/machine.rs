@@ -5,7 +5,7 @@ pub mod image;
 
 use std::collections::BTreeSet;
 
-use shared_abi::geometry::{Geometry, Region};
+use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bxcan::BxCan;
 use crate::chip::Chip;
@@ -138,6 +138,20 @@ impl Machine {
         let changed = chip.flash.take_changed();
         let base = chip.geometry.flash.base;
         chip.slice.stale.extend(changed.into_iter().map(|(offset, len)| (base + offset, len)));
+        Ok(())
+    }
+
+    /// Puts a program into the system memory, in place of ST's loader, which is not there. It is at 1FFF_0000h.
+    ///
+    /// # Errors
+    /// [`Error::Address`] where it is too long.
+    pub fn load_rom(&mut self, bytes: &[u8]) -> Result<(), Error> {
+        let Region { base: address, size } = SYSTEM_MEMORY;
+        if bytes.len() > size as usize {
+            return Err(Error::Address { address, len: bytes.len(), wanted: "system memory" });
+        }
+        self.cpu.chip_mut().system.bytes_mut()[..bytes.len()].copy_from_slice(bytes);
+        self.cpu.forget_translations();
         Ok(())
     }
 

@@ -101,6 +101,22 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(())
     }
 
+    /// 2008h: the device leaves for the loader in the ROM of the chip. It can erase everything, so what keeps
+    /// a client from a download keeps it from this command: a password, or the product.
+    ///
+    /// # Errors
+    /// The abort for the client: the command is not permitted now, the device is busy, or its option bytes
+    /// leave the loader no use.
+    pub(crate) fn leave_for_rom_loader<F: Flash>(&mut self, flash: &F) -> Result<(), AbortCode> {
+        let is_locked = self.programs.iter().any(|program| program.locked);
+        let is_busy = self.boot_request.is_some() || self.programmer.has_work();
+        if is_locked || is_busy || !(self.policy.allowed)() || !rom_loader_runs(flash.option_bytes()) {
+            return Err(AbortCode::DEVICE_STATE);
+        }
+        self.boot_request = Some(BootRequest::RomLoader);
+        Ok(())
+    }
+
     /// The program has returned the device to the bootloader: it no longer needs a rescue window.
     pub fn confirm(&mut self, program: u8) {
         let Some(record) = self.program(program).and_then(|state| state.record) else { return };
@@ -164,6 +180,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         Ok(())
     }
+}
+
+/// Whether the loader in the ROM runs on a chip with these option bytes, as `FLASH_OPTCR` has them. It feeds no
+/// watchdog, so it would be ended by one that runs after each reset (WDG_SW is 0); read-out protection of level 2
+/// switches it off (AN2606). 0 is a device without a chip.
+const fn rom_loader_runs(option_bytes: u32) -> bool {
+    const WDG_SW: u32 = 1 << 5;
+    const RDP_LEVEL_2: u32 = 0xCC;
+    option_bytes & WDG_SW != 0 && option_bytes >> 8 & 0xFF != RDP_LEVEL_2
 }
 
 /// The request that starts a program; a program without the release is started on trial.

@@ -1,7 +1,7 @@
 //! The boot decision: the promised order of its checks.
 
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, Policy};
+use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset, Policy};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
@@ -206,6 +206,39 @@ fn resets_in_a_row_are_counted_until_somebody_asks() {
     ] {
         assert_eq!(policy.crash_resets(2, Software, Some(request)), after, "{request:?}");
     }
+}
+
+/// Only resets by the pin alone count: a request, or any other reset, begins anew. One of them decides
+/// nothing.
+#[test]
+fn two_resets_by_the_pin_in_a_row_keep_the_device_in_the_bootloader() {
+    use ResetCause::{
+        BrownOut, IndependentWatchdog, LowPower, Pin, PowerOn, Software, Standby, Unknown, WindowWatchdog,
+    };
+    assert_eq!(PinReset::of(Pin, None, false), PinReset::First);
+    assert_eq!(PinReset::of(Pin, None, true), PinReset::Second);
+    for is_marked in [false, true] {
+        assert_eq!(PinReset::of(Pin, Some(BootRequest::Start(1)), is_marked), PinReset::None);
+        for cause in
+            [PowerOn, BrownOut, Standby, Software, IndependentWatchdog, WindowWatchdog, LowPower, Unknown]
+        {
+            assert_eq!(PinReset::of(cause, None, is_marked), PinReset::None, "{cause:?}");
+        }
+    }
+    // After the second one no program starts, at once or after the rescue window.
+    let starts = decide(&QUIET, &policy(), |_| signed());
+    let held = decide(&QUIET, &Policy { rescue_window_ms: 300, ..policy() }, |_| signed());
+    let stays = BootDecision::Stay { reason: Reason::NoProgram, refused: 1 };
+    for decision in [starts, held] {
+        assert_eq!(PinReset::None.change(decision), decision);
+        assert_eq!(PinReset::First.change(decision), decision);
+        let twice = BootDecision::Stay { reason: Reason::TwoResets, refused: 0 };
+        assert_eq!(PinReset::Second.change(decision), twice);
+    }
+    assert_eq!(PinReset::Second.change(stays), stays, "it stays for a reason of its own");
+    // A power-on sets the flag of the pin, too.
+    assert_eq!(ResetCause::from_flags(0x0C00_0000, false), PowerOn);
+    assert_eq!(ResetCause::from_flags(0x0400_0000, false), Pin);
 }
 
 /// A program that starts by itself is held back, as long as its confirmation says; one that was

@@ -14,5 +14,6 @@ mod parameters;
 mod protection;
 mod renewal;
 mod resume;
+mod rom_loader;
 mod streams;
 mod supply;

@@ -566,6 +566,7 @@ fn what_a_product_does_without_is_not_there() {
     for index in [0x7F50, 0x6005, 0x2002] {
         assert!(least.write(Address::new(index, 1), &[0; 4]).is_err(), "{index:04X}h");
     }
+    assert_eq!(least.write(Address::new(0x2008, 0), b"roml"), Err(AbortCode(0x0601_0000)));
     assert!(least.upload_start(Address::new(0x1F50, 1)).is_err());
     assert!(least.upload_data(Address::new(0x1F50, 1), 0, &mut [0; 7]).is_err());
 

@@ -13,6 +13,12 @@ pub struct Syscfg {
 }
 
 impl Syscfg {
+    /// Whether the system memory is at address 0, in place of the flash (section 9.2.1).
+    #[must_use]
+    pub fn maps_system_memory(&self) -> bool {
+        self.memrmp == 1
+    }
+
     /// The port whose pin an EXTI line from 0 to 15 follows; 0 is port A (section 9.2.3).
     #[must_use]
     pub fn port_of(&self, line: u8) -> usize {
@@ -38,9 +44,11 @@ impl Peripheral for Syscfg {
 
     fn write(&mut self, offset: u32, value: u32, _now: Time) -> Result<(), Unmodelled> {
         match offset {
-            0x00 if value & 3 == 0 => self.memrmp = 0,
+            0x00 if value & 7 < 2 => self.memrmp = value & 1,
             0x00 => {
-                return Err(Unmodelled("memory remap (SYSCFG_MEMRMP): flash stays at address 0".into()));
+                return Err(Unmodelled(
+                    "memory remap (SYSCFG_MEMRMP) to RAM or external memory: address 0 stays as it is".into(),
+                ));
             }
             0x04 => self.pmc = value & 1 << 23,
             0x08..=0x14 => self.exticr[(offset as usize - 8) / 4] = value & 0xFFFF,

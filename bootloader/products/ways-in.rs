@@ -1,0 +1,6 @@
+//! For the tests: a board without an entry strap has other ways into a bootloader.
+
+use super::*;
+
+/// The choices of this product.
+pub const PRODUCT: Product = Product { two_resets: true, rom_loader: true, ..Product::DEFAULT };
