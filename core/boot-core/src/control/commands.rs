@@ -145,11 +145,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// # Errors
     /// As [`unlock`](Self::unlock).
     pub(crate) fn unlock_all(&mut self) -> Result<(), AbortCode> {
-        (1..=self.layout.programs.len() as u8).try_for_each(|program| self.unlock(program, false))?;
-        if P::RENEWS {
-            self.unlock(BOOTLOADER, false)?;
-        }
-        Ok(())
+        let last = PROGRAMS as u8;
+        (1..=last).try_for_each(|place| {
+            self.unlock(if P::RENEWS && place == last { BOOTLOADER } else { place }, false)
+        })
     }
 
     /// A correct password arrived: from now on 1F50h accepts data, as after CLEAR. With `at_once`,
