@@ -2,7 +2,7 @@
 
 use coboot_tests::firmware;
 use coboot_tests::powercut::board::{operations, prove, run, scenarios, Effort, Point};
-use emulator::machine::Operation;
+use emulator::machine::{Cut, Operation};
 
 #[test]
 fn no_cut_of_the_sample_bricks_the_board_or_starts_half_a_program() {
@@ -76,4 +76,40 @@ fn a_point_of_the_board_is_written_and_read() {
     ] {
         assert!(wrong.parse::<Point>().is_err(), "{wrong}");
     }
+}
+
+/// The same in a renewal: home is erased before the record says that staging is confirmed.
+#[test]
+fn a_cut_shows_a_home_that_is_erased_too_early() {
+    let scenario = scenarios().find(|scenario| scenario.name == "renewal").unwrap();
+    let mut story = scenario.story().unwrap();
+    let sound = operations(&story).unwrap();
+    let board = firmware::board();
+    let home = board.home.unwrap();
+    let is_erase = |operation: &Operation| match operation {
+        Operation::Erase { sectors } => sectors.iter().any(|sector| sector.region.base == home.base),
+        _ => false,
+    };
+    let erase = sound.iter().position(is_erase).unwrap();
+    // Since the last word of staging there were the records alone.
+    let staged = sound[..erase].iter().rposition(|operation| match operation {
+        Operation::Program { offset, .. } => {
+            board.staging.unwrap().contains(board.chip.flash.base + offset, 4)
+        }
+        _ => false,
+    });
+    let from = staged.unwrap() + 1;
+    for operation in &sound[..from] {
+        story.start.apply(operation, board.chip, Cut::After);
+    }
+    let effort = Effort { cut: (usize::MAX / 2, 1), recovered: (0, usize::MAX), cut_again: (0, usize::MAX) };
+    let told = |operations: &[Operation]| {
+        let report = prove("renewal", &story, operations, effort);
+        report.told.into_iter().map(|(_, what)| what).collect::<Vec<_>>()
+    };
+    let mut records = sound[from..=erase].to_vec();
+    assert_eq!(told(&records), Vec::<String>::new());
+    records.rotate_right(1);
+    let told = told(&records);
+    assert!(told.iter().any(|what| what.contains("bootloader does not answer")), "{told:?}");
 }
