@@ -17,7 +17,7 @@ use shared_abi::boot_report::{BootReport, Reason, Words};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
 use shared_abi::renewal::{word, Origin, TrialEnd};
 use shared_abi::vectors::VectorTable;
-use shared_abi::warm_start::{BootRequest, Owed, TrialStep};
+use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
@@ -66,12 +66,8 @@ pub unsafe extern "C" fn stage() -> ! {
     let is_marked = PRODUCT.two_resets && cell.is_marked();
     let request = cell.take();
     if PRODUCT.rom_loader && request == Some(BootRequest::RomLoader) && reset_cause == ResetCause::Software {
-        if let Some(vectors) = VectorTable::of_rom(bsp::rom::words(), LAYOUT.chip.sram) {
-            bsp::low_power::release(&rcc);
-            bsp::rom::map(&rcc);
-            // SAFETY: since the reset no interrupt was enabled and no bus master started.
-            unsafe { vectors.jump() }
-        }
+        // SAFETY: since the reset no interrupt was enabled and no bus master started.
+        unsafe { enter_rom(&rcc) };
     }
     let strap = bsp::entry_strap();
 
@@ -110,12 +106,7 @@ pub unsafe extern "C" fn stage() -> ! {
         let pin_reset = PinReset::of(reset_cause, request, is_marked);
         decision = pin_reset.change(decision);
         if pin_reset == PinReset::First && !matches!(decision, BootDecision::Stay { .. }) {
-            // A watchdog of the option bytes has its longest time.
-            let core = Source::Internal.tree().sysclk();
-            bsp::pause(core, PinReset::BOUNCE_MS);
-            cell.mark();
-            bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
-            cell.clear();
+            await_second_reset(&mut cell);
         }
     }
     if !matches!(decision, BootDecision::Start { .. }) {
@@ -195,6 +186,28 @@ pub unsafe extern "C" fn stage() -> ! {
         handoff.write(LAYOUT.handoff.base as *mut Handoff);
         program.vectors().jump()
     }
+}
+
+/// Enters the loader in the ROM of the chip. Returns if there is none.
+///
+/// # Safety
+/// No interrupt may be enabled, and no bus master started.
+unsafe fn enter_rom(rcc: &pac::RCC) {
+    let Some(vectors) = VectorTable::of_rom(bsp::rom::words(), LAYOUT.chip.sram) else { return };
+    bsp::low_power::release(rcc);
+    bsp::rom::map(rcc);
+    // SAFETY: the caller guarantees it.
+    unsafe { vectors.jump() }
+}
+
+/// Marks the first reset by the pin, and gives the second one its time. A watchdog of the option bytes does not bite
+/// meanwhile: it has its longest time.
+fn await_second_reset(cell: &mut Cell) {
+    let core = Source::Internal.tree().sysclk();
+    bsp::pause(core, PinReset::BOUNCE_MS);
+    cell.mark();
+    bsp::pause(core, PinReset::WITHIN_MS - PinReset::BOUNCE_MS);
+    cell.clear();
 }
 
 /// Why the RAM image runs, and what is left for it.
