@@ -20,8 +20,8 @@ program that would start, or a stored value that is gone.
 
 On the model of the flash it cuts every operation; of the real firmware it cuts a sample.
 
-  --full             every operation of an update with the real firmware, and a twentieth of those of
-                     the other scenarios; with a twentieth on the board of each other chip, and on the
+  --full             every operation of an update and of a renewal with the real firmware, and a
+                     twentieth of those of the other scenarios; with a twentieth on the board of each other chip, and on the
                      one with two programs
   --every-way        every way also for the second cut on the model; takes an hour
   --json             prints the counts as JSON, an object for each board

@@ -24,7 +24,7 @@ pub struct Delivery {
     pub option_bytes: Option<OptionBytes>,
     /// The reasons against its delivery.
     pub faults: Vec<Fault>,
-    /// The objects that it does not report. An application has none of them.
+    /// The objects that it does not report. An application has the number of its bootloader alone.
     pub untold: Vec<Address>,
 }
 

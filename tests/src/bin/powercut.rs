@@ -132,8 +132,9 @@ fn main() -> ExitCode {
         );
     }
     for scenario in board::scenarios().filter(|scenario| wish.has(scenario.name)) {
-        // Every operation once; the other scenarios share most of them.
-        let effort = match (wish.full && scenario.name == "update", wish.full || wish.twentieth) {
+        // Every operation once; the other scenarios share most of those of an update.
+        let has_its_own = matches!(scenario.name, "update" | "renewal");
+        let effort = match (wish.full && has_its_own, wish.full || wish.twentieth) {
             (true, _) => Effort::FULL,
             (_, true) => Effort::TWENTIETH,
             _ => Effort::SAMPLE,
