@@ -313,7 +313,9 @@ mod app {
             bootloader.is_finishing()
         });
         if let Some((program, window_ms)) = *held {
-            if now.has_reached(Instant::from_millis(window_ms.into())) {
+            // An installation that a cut has left is completed first.
+            let installs = PRODUCT.renewal && finishing;
+            if now.has_reached(Instant::from_millis(window_ms.into())) && !installs {
                 // The program starts even if no other node acknowledges the boot-up.
                 *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };

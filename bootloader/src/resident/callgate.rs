@@ -11,9 +11,9 @@ use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
-use boot_core::renewal::{header, identification};
+use boot_core::renewal::{header, identification, Places};
 use boot_core::store::record::Seal;
-use boot_core::store::{Key, NodeParameters, ProgramRecord, Value};
+use boot_core::store::{Key, NodeParameters, ProgramRecord, RenewalRecord, Value};
 use bsp::{pac, LAYOUT};
 use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
@@ -152,14 +152,16 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     keep(&mut parameters, flash, Key::NODE, node.value())
 }
 
-/// The RAM image at home as a program: what 1F56h and 2005h of it read.
-fn own_info(flash: &ResidentFlash) -> ProgramArgs {
-    let home = crate::ram_image::home();
-    let header = header(flash, home);
+/// The RAM image as a program: what 1F56h and 2005h of it read. As long as home is partly written, it is the one in
+/// staging.
+fn own_info(flash: &ResidentFlash, record: Option<RenewalRecord>) -> ProgramArgs {
+    let places = Places::of(LAYOUT).and_then(|places| places.order(flash, record, false)[0]);
+    let place = places.map_or(crate::ram_image::home(), |(place, _)| place);
+    let header = header(flash, place);
     ProgramArgs {
         number: BOOTLOADER.into(),
         size: header.total(),
-        crc: identification(flash, home, &header),
+        crc: identification(flash, place, &header),
         version: header.version,
         flags: PROGRAM_INSTALLED,
     }
@@ -170,7 +172,7 @@ fn own_info(flash: &ResidentFlash) -> ProgramArgs {
 fn program(selector: Selector, flash: &mut ResidentFlash, args: &mut ProgramArgs) -> Result<(), Status> {
     let number = u8::try_from(args.number).map_err(|_| Status::BadArgument)?;
     if PRODUCT.renewal && number == BOOTLOADER && selector == Selector::ProgramInfo {
-        *args = own_info(flash);
+        *args = own_info(flash, RenewalRecord::load(&product::parameters(flash), flash));
         return Ok(());
     }
     LAYOUT.program(number).ok_or(Status::BadArgument)?;

@@ -47,8 +47,12 @@ pub unsafe fn load(
     Err(damage)
 }
 
-/// The report of the RAM image that ran before this reset; `None` if a program ran, or the RAM was lost.
-pub fn last_report() -> Option<BootReport> {
+/// The report of the RAM image that ran before this reset; `None` if a program ran, or the power failed: a short
+/// dip may leave the RAM as it was.
+pub fn last_report(cause: ResetCause) -> Option<BootReport> {
+    if matches!(cause, ResetCause::PowerOn | ResetCause::BrownOut) {
+        return None;
+    }
     // SAFETY: the layout's handoff region, checked to be RAM of that size outside every image; nothing else
     // runs.
     BootReport::parse(unsafe { &(LAYOUT.handoff.base as *const Words).read_volatile() })
@@ -63,10 +67,8 @@ pub fn trial_end(
 ) -> TrialEnd {
     let ran_on_trial = || {
         let record = RenewalRecord::load(parameters, flash);
-        let is_confirmed =
-            record.is_some_and(|record| matches!(record.state, State::Confirmed | State::Installed));
-        let last = last_report().map(|report| of_word(report.renewal).0);
-        last == Some(Origin::Trial) && !is_confirmed
+        let last = last_report(cause).map(|report| of_word(report.renewal).0);
+        last == Some(Origin::Trial) && record.is_some_and(|record| record.state == State::Staged)
     };
     match request {
         Some(BootRequest::Renewal(TrialStep::Late)) => TrialEnd::Late,

@@ -79,7 +79,8 @@ pub unsafe extern "C" fn stage() -> ! {
     }
     let mut parameters = product::parameters(&flash);
     // A reset that ends the RAM image is no crash of a program.
-    let crash_resets = if PRODUCT.renewal && request.is_none() && renewal::last_report().is_some() {
+    let crash_resets = if PRODUCT.renewal && request.is_none() && renewal::last_report(reset_cause).is_some()
+    {
         storing::crash_count(&parameters, &flash)
     } else {
         count_crash_resets(&mut parameters, &mut flash, reset_cause, request)

@@ -28,16 +28,26 @@ pub(crate) fn judge(sent: Result<(), Error>, status: Option<(FlashError, u16)>, 
                 Err(Error::Refused { code, .. }) => Some(code),
                 _ => None,
             };
-            (repeatable(error), Error::Failed { doing, error, detail, code })
+            // Data that broke off are not in the expected form.
+            let broken = sent.as_ref().err().and_then(broken).filter(|_| error == FlashError::Format);
+            (repeatable(error).or(broken), Error::Failed { doing, error, detail, code })
         }
-        (Err(error @ Error::Refused { code, .. }), None) => {
-            let broken =
-                matches!(code, AbortCode::TOGGLE | AbortCode::TIMEOUT | AbortCode::COMMAND | AbortCode::CRC);
-            (broken.then_some(RepeatReason::Broken(code)), error)
-        }
+        (Err(error @ Error::Refused { .. }), None) => (broken(&error), error),
         (Err(error), None) => (Some(RepeatReason::NoAnswer), error),
     };
     Judgement::Bad { why, error }
+}
+
+/// The reason for a repetition, if the transfer broke off.
+fn broken(error: &Error) -> Option<RepeatReason> {
+    match error {
+        Error::NoAnswer { .. } => Some(RepeatReason::NoAnswer),
+        Error::Refused { code, .. } => {
+            let codes = [AbortCode::TOGGLE, AbortCode::TIMEOUT, AbortCode::COMMAND, AbortCode::CRC];
+            codes.contains(code).then_some(RepeatReason::Broken(*code))
+        }
+        _ => None,
+    }
 }
 
 /// The reason for a repetition, if it can help against this error.

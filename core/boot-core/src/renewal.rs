@@ -20,12 +20,19 @@ pub(crate) struct Known {
     pub version: u32,
     /// 1F56h of the running image.
     pub identification: u32,
+    /// It was confirmed since its start; its record may have gone since then.
+    pub confirmed: bool,
 }
 
 impl Known {
     /// Of a device without renewal.
-    pub(crate) const NOTHING: Self =
-        Self { origin: Origin::Home, trial_end: TrialEnd::None, version: 0, identification: 0 };
+    pub(crate) const NOTHING: Self = Self {
+        origin: Origin::Home,
+        trial_end: TrialEnd::None,
+        version: 0,
+        identification: 0,
+        confirmed: false,
+    };
 }
 
 /// The two places of a RAM image.

@@ -322,7 +322,7 @@ impl Chip {
     #[must_use]
     pub fn behind_alias(&self, address: u32) -> Option<u32> {
         let memory = if self.syscfg.maps_system_memory() { SYSTEM_MEMORY } else { self.geometry.flash };
-        (address < memory.size).then_some(memory.base + address)
+        (address < memory.size).then(|| memory.base + address)
     }
 
     /// The virtual time.

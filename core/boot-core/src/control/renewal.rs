@@ -9,7 +9,7 @@ use shared_abi::ram_image::Host;
 use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use super::{find, Downloader, Failure};
+use super::{find, Downloader, Failure, Program};
 use crate::flash::Flash;
 use crate::program::Expected;
 use crate::programmer::Renewing;
@@ -64,7 +64,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let running = if origin == Origin::Home { places.home } else { places.staging };
         let header = header(flash, running);
         let identification = identification(flash, running, &header);
-        self.renewal = Some(Known { origin, trial_end, version: header.version, identification });
+        self.renewal =
+            Some(Known { origin, trial_end, version: header.version, identification, confirmed: false });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
             state.identification = identification;
@@ -109,7 +110,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(crate) fn watch_trial(&mut self, now: Instant) {
         let Some(policy) = self.policy.renewal else { return };
         let ends = u32::from(policy.confirm_within_s) * 1000;
-        if self.is_on_trial() && self.boot_request.is_none() && now.has_reached(Instant::from_millis(ends)) {
+        let is_over = now.has_reached(Instant::from_millis(ends)) && !self.programmer.is_installing();
+        if self.is_on_trial() && self.boot_request.is_none() && is_over {
             self.boot_request = Some(BootRequest::Renewal(TrialStep::Late));
         }
     }
@@ -122,7 +124,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let is = self.renewal_state();
         let on_trial = self.is_on_trial();
         let busy = self.boot_request.is_some() || self.programmer.has_work();
-        let loads = self.transfer.is_some() || self.programmer.program().is_some();
+        let is_open = |program: &Program| matches!(program.session, Session::Open { .. });
+        let loads = self.transfer.is_some() || self.programs.iter().any(is_open);
         let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else {
             return Err(AbortCode::NO_SUB_INDEX);
         };
@@ -168,6 +171,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn image_stored<F: Flash>(&mut self, flash: &F) {
         let record = self.image_record(flash);
         self.set_record(record);
+        if let (Some(known), Some(State::Confirmed | State::Installed)) =
+            (&mut self.renewal, record.map(|record| record.state))
+        {
+            known.confirmed = true;
+        }
         if record.is_none() {
             // Nothing is staged any more.
             let identification = self.known().identification;
@@ -250,8 +258,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// Whether the running image is on trial, and not confirmed.
     fn is_on_trial(&self) -> bool {
-        let is_confirmed = matches!(self.renewal_state(), State::Confirmed | State::Installed);
-        self.known().origin == Origin::Trial && !is_confirmed
+        let known = self.known();
+        let is_confirmed =
+            known.confirmed || matches!(self.renewal_state(), State::Confirmed | State::Installed);
+        known.origin == Origin::Trial && !is_confirmed
     }
 
     /// A download of a new image begins: a download of the last program that has reached staging does not
@@ -259,7 +269,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     pub(super) fn drop_partial(&mut self, staging: Region) {
         let last = self.layout.programs.len() as u8;
         let Some(state) = find::<P>(&mut self.programs, last) else { return };
-        if state.partial.start() > staging.base {
+        if state.partial.start() > staging.base || matches!(state.session, Session::Open { .. }) {
             state.partial = Partial::NONE;
             self.programmer.void(last);
         }

@@ -274,7 +274,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Whether a RAM image is being installed.
-    fn is_installing(&self) -> bool {
+    pub(crate) fn is_installing(&self) -> bool {
         P::RENEWS && self.install.is_some()
     }
 
@@ -510,8 +510,11 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                     Err(error) => {
                         self.stop_installing();
                         // If the record cannot be removed, its data must not be changed.
-                        if self.program() == Some(program) {
+                        let mut program = program;
+                        if let Some(of) = self.program().filter(|of| change == Change::Void || *of == program)
+                        {
                             self.abort();
+                            program = of;
                         }
                         Some(Event::Failed { program, error, erasing: false })
                     }

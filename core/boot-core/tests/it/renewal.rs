@@ -562,6 +562,107 @@ fn a_trial_without_its_image_ends_too() {
     assert_eq!(node.0.take_boot_request(), Some(BootRequest::Renewal(TrialStep::Late)));
 }
 
+/// An image that was installed is on trial no more, whatever becomes of its record.
+#[test]
+fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+    let mut node = board.start();
+    assert_eq!((node.command(N, CONFIRM), node.progress().state), (0, State::Installed));
+    assert_eq!(node.command(1, CLEAR), 0);
+    for block in block_file_at(&program_of(0x3400), PROGRAM.base, 200) {
+        node.send(1, &block).unwrap();
+    }
+    assert_eq!(node.progress().state, State::None);
+    node.0.set_time(Instant::from_millis(200_000));
+    assert_eq!((node.command(N, CLEAR), node.0.take_boot_request()), (0, None));
+}
+
+/// 83h in the last millisecond counts, also if its store takes longer.
+#[test]
+fn a_confirmation_just_in_time_is_not_thrown_away() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    for steps in [0, 1, 4, 12, 40] {
+        let mut board = Board::new(&old);
+        board.start().stage(&new);
+        board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+        let mut node = board.start();
+        node.0.set_time(Instant::from_millis(59_999));
+        node.try_command(N, CONFIRM).unwrap();
+        for _ in 0..steps {
+            node.0.step();
+        }
+        node.0.set_time(Instant::from_millis(60_000));
+        node.settle();
+        assert_eq!(node.0.take_boot_request(), None, "{steps}");
+        assert_eq!(node.progress().state, State::Installed, "{steps}");
+    }
+}
+
+/// A program's download that is complete is no reason to refuse a trial; one that is open is.
+#[test]
+fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    board.off();
+    let mut node = board.start();
+    assert_eq!(node.command(1, CLEAR), 0);
+    let file = block_file_at(&program_of(0x1000), PROGRAM.base, 200);
+    let (last, first) = file.split_last().unwrap();
+    for block in first {
+        node.send(1, block).unwrap();
+    }
+    assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE));
+    assert_eq!(node.word(0x1F57), BUSY);
+    node.send(1, last).unwrap();
+    assert_eq!(node.command(N, START), 0);
+    assert_eq!(node.0.take_boot_request(), Some(BootRequest::Renewal(TrialStep::Try)));
+}
+
+/// The record of staging cannot be removed, and a program has to leave its flash alone: the error is the program's.
+#[test]
+fn a_program_whose_way_into_staging_cannot_be_stored_is_told() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.start().stage(&new);
+    board.off();
+    let mut node = board.start();
+    assert_eq!(node.command(1, CLEAR), 0);
+    let file = block_file_at(&program_of(0x3400), PROGRAM.base, 200);
+    let reaches = (STAGING.base - PROGRAM.base) as usize / 200;
+    for block in &file[..reaches] {
+        node.send(1, block).unwrap();
+    }
+    // Both sectors of the journal.
+    node.0.flash().protected = vec![1, 2];
+    for block in &file[reaches..reaches + 3] {
+        let _ = node.push(1, block);
+        node.settle();
+    }
+    assert_ne!(u32::from_le_bytes(node.read(0x1F57, 1)) >> 1 & 0x7F, 0, "an error of the program");
+    assert!(node.has_staged(&new) && node.progress().state == State::Staged);
+}
+
+/// A download of the program that has passed the start of staging does not go on over a new image.
+#[test]
+fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    let mut node = board.start();
+    assert_eq!(node.command(1, CLEAR), 0);
+    let file = block_file_at(&program_of(0x3700), PROGRAM.base, 200);
+    for block in &file[..file.len() - 5] {
+        node.send(1, block).unwrap();
+    }
+    node.stage(&new);
+    board.off();
+    let mut node = board.start();
+    assert_eq!((node.read::<8>(0x2006, 1), node.progress().state), ([0; 8], State::Staged));
+}
+
 /// The last program and staging share a sector.
 #[test]
 fn a_program_that_reaches_into_staging_takes_it() {
