@@ -256,6 +256,10 @@ impl ProgramControl {
             _ => return Err(Abort::LENGTH_TOO_HIGH),
         };
         let command = Command::from_value(value).ok_or(Abort::INVALID_VALUE)?;
+        if command == Command::Stop && Some(sub) == self.bootloader {
+            // It does not run.
+            return Ok(Answer::Send);
+        }
         let Self { fresh, armed, .. } = *self;
         let standing = Standing { fresh, armed, can_hand_over: answers.is_some() };
         match react(command, sub == self.program, standing)? {
@@ -434,6 +438,8 @@ mod tests {
             for value in [1, 2, 0x83, 0x84] {
                 assert_eq!(control.write(number, &[value], 0, &mut Renewable), Err(STATE), "{value}");
             }
+            assert_eq!(control.write(number, &[0], 0, &mut Renewable), Ok(Answer::Send), "it is stopped");
+            assert_eq!(request_behind(&mut control), Next::Serve);
             let owed = Owed { program: number, value: 3, node_id: 5 };
             assert_eq!(control.write(number, &[3], 0, &mut Renewable), Ok(Answer::Withhold(owed)));
             // It confirms no program: that is another sub-index.

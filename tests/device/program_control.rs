@@ -536,6 +536,9 @@ fn the_bootloader_is_a_program_of_the_application_too() {
                 "{image}: {refused:?}"
             );
         }
+        // It is stopped: a tool may write back what it has read.
+        session.command(number, ProgramControl::Stop).unwrap();
+        assert_eq!(session.read(at(PROGRAM_CONTROL)).unwrap(), [0], "{image}");
         // The bootloader acknowledges CLEAR in the application's place, and changes nothing.
         session.command(number, ProgramControl::Clear).unwrap();
         assert!(bench.is_bootloader(NODE), "{image}");

@@ -150,14 +150,15 @@ fn a_second_program_is_written_to_a_running_device() {
         let read = |bench: &mut Bench, index: u8, sub: u8| {
             bench.ask(0x601, &[0x40, index, 0x1F, sub, 0, 0, 0, 0], 0x581).expect("an answer")
         };
-        // 1F51h: number of programs, running, absent; no third one (06090011h).
-        assert_eq!(read(&mut bench, 0x51, 0), [0x4F, 0x51, 0x1F, 0, 2, 0, 0, 0]);
+        // 1F51h: running, absent; the third one is the bootloader, and there is no fourth one (06090011h).
+        assert_eq!(read(&mut bench, 0x51, 0), [0x4F, 0x51, 0x1F, 0, 3, 0, 0, 0]);
         assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 1, 0, 0, 0]);
         assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 3, 0, 0, 0]);
-        assert_eq!(read(&mut bench, 0x51, 3), [0x80, 0x51, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+        assert_eq!(read(&mut bench, 0x51, 3), [0x4F, 0x51, 0x1F, 3, 0, 0, 0, 0]);
+        assert_eq!(read(&mut bench, 0x51, 4), [0x80, 0x51, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
         for index in [0x56, 0x57] {
-            assert_eq!(read(&mut bench, index, 0), [0x4F, index, 0x1F, 0, 2, 0, 0, 0]);
-            assert_eq!(read(&mut bench, index, 3), [0x80, index, 0x1F, 3, 0x11, 0, 0x09, 0x06]);
+            assert_eq!(read(&mut bench, index, 0), [0x4F, index, 0x1F, 0, 3, 0, 0, 0]);
+            assert_eq!(read(&mut bench, index, 4), [0x80, index, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
         }
         assert_eq!(identification(&mut bench, 1), one.program_crc(), "{first}");
         assert_eq!(identification(&mut bench, 2), 0, "{first}");

@@ -131,6 +131,9 @@ uint32_t coboot_program_write(struct coboot_program *program, uint16_t index, ui
         return COBOOT_ABORT_READ_ONLY;
     }
     const bool own = sub == program->number;
+    if (value == STOP && sub == program->bootloader) {
+        return COBOOT_ABORT_NONE; /* It does not run. */
+    }
     switch (value) {
     case START_BOOTLOADER:
         return own && program->fresh ? confirm(program, now_ms) : leave(program, COBOOT_REQUEST_STAY, 0, now_ms);
