@@ -166,7 +166,7 @@ fn a_second_program_is_written_to_a_running_device() {
         // commands for it, are left to the bootloader (08000022h). A program that does not exist
         // has its own code.
         for (sub, value, code) in
-            [(2, 1, 0x0800_0022_u32), (2, 2, 0x0800_0022), (2, 0x83, 0x0800_0022), (3, 3, 0x0609_0011)]
+            [(2, 1, 0x0800_0022_u32), (2, 2, 0x0800_0022), (2, 0x83, 0x0800_0022), (4, 3, 0x0609_0011)]
         {
             let answer = bench.ask(0x601, &[0x2F, 0x51, 0x1F, sub, value, 0, 0, 0], 0x581).unwrap();
             let expected = [&[0x80, 0x51, 0x1F, sub][..], &code.to_le_bytes()].concat();
