@@ -2,7 +2,8 @@
 //! on trial, and is installed at home after its confirmation (docs/renewal.md).
 
 use canopen::program::{
-    FlashError, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, STATE_BOOTLOADER, STATE_RENEWAL,
+    FlashError, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, PROGRAM_VERSION, STATE_BOOTLOADER,
+    STATE_RENEWAL,
 };
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
@@ -178,6 +179,64 @@ fn the_image_may_differ_in_every_address() {
     assert!(!bench.is_bootloader(NODE));
     call_back(&mut bench);
     assert_eq!(bench.session().read_number(watchdog).unwrap(), 1000);
+}
+
+/// RAM outlives a short dip of the supply. It is a power-on all the same: the program starts.
+#[test]
+fn a_short_dip_of_the_supply_in_a_trial_is_a_power_on() {
+    let mut bench = board();
+    stage(&mut bench, &version(firmware::BOOTLOADER, NEW));
+    start(&mut bench);
+    bench.machine().set_supply(0, Span(0));
+    bench.run_ms(1);
+    bench.machine().set_supply(3_300, Span(0));
+    bench.run_ms(500);
+    let resets: Vec<_> = bench.events().into_iter().map(|(_, stop)| stop).collect();
+    assert!(resets.contains(&Stop::Reset(emulator::machine::ResetCause::PowerOn)), "{resets:?}");
+    assert!(!bench.is_bootloader(NODE), "the program starts");
+}
+
+/// The power fails while home is written, with a program that has a rescue window: the window does not end the
+/// installation, and until it is done the callgate says what the device runs.
+#[test]
+fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() {
+    let new = version(firmware::BOOTLOADER, NEW);
+    let blocks = firmware::blocks(firmware::APP_V1);
+    let at = |index| Address::new(index, number());
+    for confirmed in [true, false] {
+        let mut bench = Bench::new();
+        bench.power_on();
+        bench.await_boot_up(100);
+        stage(&mut bench, &new);
+        start(&mut bench);
+        // On trial, so that nobody has called this program back.
+        let stays = FlashOptions::default().trial_run(false).start(false);
+        flash(&mut bench.session(), &blocks, &stays, &mut |_| {}).unwrap();
+        if confirmed {
+            bench.confirm_program();
+            call_back(&mut bench);
+            start(&mut bench);
+        }
+        let when = Cut::After;
+        bench.machine().cut_power_at(Some(FlashCut { operation: 2_000, when }));
+        let _ = bench.session().command(number(), ProgramControl::SetSignature);
+        bench.run_ms(3_000);
+        bench.machine().cut_power_at(None);
+        let whole = cells(&mut bench, home(new.len())) == new;
+        assert!(!whole, "the cut came too late");
+        power_cycle(&mut bench);
+        if confirmed {
+            assert!(!bench.is_bootloader(NODE));
+            assert_eq!(bench.session().read_number(at(PROGRAM_ID)).unwrap(), crc_of(&new));
+            assert_eq!(bench.session().read_number(at(PROGRAM_VERSION)).unwrap(), NEW);
+            call_back(&mut bench);
+            bench.session().await_idle(number(), Doing::Installation).unwrap();
+        } else {
+            bench.run_ms(10_000);
+            assert!(!bench.is_bootloader(NODE), "the program starts in the end");
+        }
+        assert_eq!(cells(&mut bench, home(new.len())), new, "confirmed: {confirmed}");
+    }
 }
 
 /// Images that are deaf, hang, fault or reset: the old bootloader answers, says why, and keeps its home.

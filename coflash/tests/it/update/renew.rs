@@ -370,6 +370,10 @@ fn a_refusal_says_what_to_do() {
     let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((NOT_NOW, 0x86)));
     assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
     assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"]);
+    // A transfer that broke off (05040000h: time-out) leaves data that are not in the expected form.
+    let (mut fake, log) = device(BOOTLOADER, |board| board.refuses = Some((0x0504_0000, 0x04)));
+    assert!(run_with(&mut fake, &FlashOptions::default().repeats(1)).0.is_err());
+    assert_eq!(written(&log), ["03", "320 bytes", "03", "320 bytes"]);
 }
 
 #[test]

@@ -170,6 +170,21 @@ impl Board {
         board
     }
 
+    /// A device that was switched on after an image was staged.
+    fn with_staged(old: &[u8], new: &[u8]) -> Self {
+        let mut board = Self::new(old);
+        board.start().stage(new);
+        board.off();
+        board
+    }
+
+    /// A device that runs this image on trial at its next start.
+    fn on_trial(old: &[u8], new: &[u8]) -> Self {
+        let mut board = Self::with_staged(old, new);
+        board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+        board
+    }
+
     fn install_program(&mut self, size: usize) {
         let mut node = self.start();
         node.command(1, CLEAR);
@@ -545,9 +560,7 @@ fn a_damaged_image_is_not_staged() {
 #[test]
 fn a_trial_without_its_image_ends_too() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
-    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+    let mut board = Board::on_trial(&old, &new);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     for block in block_file_at(&program_of(0x3400), PROGRAM.base, 200) {
@@ -566,9 +579,7 @@ fn a_trial_without_its_image_ends_too() {
 #[test]
 fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
-    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+    let mut board = Board::on_trial(&old, &new);
     let mut node = board.start();
     assert_eq!((node.command(N, CONFIRM), node.progress().state), (0, State::Installed));
     assert_eq!(node.command(1, CLEAR), 0);
@@ -585,9 +596,7 @@ fn a_program_that_takes_the_spare_does_not_end_the_image_that_was_installed() {
 fn a_confirmation_just_in_time_is_not_thrown_away() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
     for steps in [0, 1, 4, 12, 40] {
-        let mut board = Board::new(&old);
-        board.start().stage(&new);
-        board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+        let mut board = Board::on_trial(&old, &new);
         let mut node = board.start();
         node.0.set_time(Instant::from_millis(59_999));
         node.try_command(N, CONFIRM).unwrap();
@@ -605,9 +614,7 @@ fn a_confirmation_just_in_time_is_not_thrown_away() {
 #[test]
 fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
-    board.off();
+    let mut board = Board::with_staged(&old, &new);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x1000), PROGRAM.base, 200);
@@ -626,9 +633,7 @@ fn a_complete_download_of_a_program_does_not_keep_a_trial_away() {
 #[test]
 fn a_program_whose_way_into_staging_cannot_be_stored_is_told() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
-    board.off();
+    let mut board = Board::with_staged(&old, &new);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
     let file = block_file_at(&program_of(0x3400), PROGRAM.base, 200);
@@ -1002,9 +1007,7 @@ fn a_hostile_master_never_takes_the_last_bootloader() {
 #[test]
 fn a_confirmed_image_is_kept_until_it_is_installed() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.start().stage(&new);
-    board.leave(Some(BootRequest::Renewal(TrialStep::Try)));
+    let mut board = Board::on_trial(&old, &new);
     let mut node = board.start();
     // The installation fails: home cannot be erased.
     node.0.flash().protected = vec![4];
