@@ -276,7 +276,7 @@ mod app {
             return;
         }
         let status = can.lock(line::status);
-        let finishing = bootloader.lock(|bootloader| {
+        let (finishing, installing) = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             debugger.with(bootloader, |device| {
                 slave.observe(status, now, device);
@@ -310,12 +310,11 @@ mod app {
                 let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);
                 *pending_reset = PendingReset { wanted: true, request, at: ends.then_some(now) };
             }
-            bootloader.is_finishing()
+            (bootloader.is_finishing(), bootloader.is_installing())
         });
         if let Some((program, window_ms)) = *held {
             // An installation that a cut has left is completed first.
-            let installs = PRODUCT.renewal && finishing;
-            if now.has_reached(Instant::from_millis(window_ms.into())) && !installs {
+            if now.has_reached(Instant::from_millis(window_ms.into())) && !installing {
                 // The program starts even if no other node acknowledges the boot-up.
                 *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };

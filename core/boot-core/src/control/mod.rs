@@ -275,6 +275,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         self.programmer.finishing().is_some() || self.programmer.is_storing()
     }
 
+    /// Whether a RAM image is being installed at home, or home is being repaired.
+    #[must_use]
+    pub fn is_installing(&self) -> bool {
+        self.programmer.is_installing()
+    }
+
     /// Stores node-ID and bit rate in the background.
     ///
     /// # Errors
