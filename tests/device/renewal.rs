@@ -203,7 +203,8 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
     let new = version(firmware::BOOTLOADER, NEW);
     let blocks = firmware::blocks(firmware::APP_V1);
     let at = |index| Address::new(index, number());
-    for confirmed in [true, false] {
+    let mut lacks_header = false;
+    for (confirmed, operation) in [(true, 7), (true, 8), (true, 2_000), (false, 2_000)] {
         let mut bench = if confirmed { board() } else { Bench::new() };
         if !confirmed {
             bench.power_on();
@@ -219,12 +220,13 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
             bench.session().await_idle(1, Doing::Program).unwrap();
         }
         let when = Cut::After;
-        bench.machine().cut_power_at(Some(FlashCut { operation: 2_000, when }));
+        bench.machine().cut_power_at(Some(FlashCut { operation, when }));
         let _ = bench.session().command(number(), ProgramControl::SetSignature);
         bench.run_ms(3_000);
         bench.machine().cut_power_at(None);
-        let is_whole = cells(&mut bench, home(new.len())) == new;
-        assert!(!is_whole, "the cut came too late");
+        let left = cells(&mut bench, home(new.len()));
+        assert!(left != new, "the cut came too late");
+        lacks_header |= left[4..8] == [0xFF; 4];
         power_cycle(&mut bench);
         if confirmed {
             assert!(!bench.is_bootloader(NODE));
@@ -239,6 +241,7 @@ fn an_installation_that_a_cut_has_left_is_completed_before_the_program_starts() 
         let is_whole = cells(&mut bench, home(new.len())) == new;
         assert!(is_whole, "confirmed: {confirmed}");
     }
+    assert!(lacks_header, "no cut came directly after the erase");
 }
 
 /// Images that are deaf, hang, fault or reset: the old bootloader answers, says why, and keeps its home.

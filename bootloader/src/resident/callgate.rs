@@ -11,7 +11,7 @@ use core::ffi::c_void;
 
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
-use boot_core::renewal::{header, identification, Places};
+use boot_core::renewal::{check, header, identification, Places};
 use boot_core::store::record::Seal;
 use boot_core::store::{Key, NodeParameters, ProgramRecord, RenewalRecord, Value};
 use bsp::{pac, LAYOUT};
@@ -26,6 +26,7 @@ use shared_abi::warm_start::BootRequest;
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
 use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
+use crate::ram_image::{home, HOST};
 use crate::storing::{crash_count, store};
 
 /// The entry of all services: it checks the argument structure, takes the flash once, calls the
@@ -153,10 +154,12 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
 }
 
 /// The RAM image as a program: what 1F56h and 2005h of it read. As long as home is partly written, it is the one in
-/// staging.
+/// staging. An image for the bench has no CRC to judge it by: it is only ever at home.
 fn own_info(flash: &ResidentFlash, record: Option<RenewalRecord>) -> ProgramArgs {
-    let places = Places::of(LAYOUT).and_then(|places| places.order(flash, record, false)[0]);
-    let place = places.map_or(crate::ram_image::home(), |(place, _)| place);
+    let order = Places::of(LAYOUT).map_or([None; 2], |places| places.order(flash, record, false));
+    let is_good = |place: &Region| check(flash, *place, LAYOUT, HOST).is_ok();
+    let good = order.into_iter().flatten().map(|(place, _)| place).find(is_good);
+    let place = good.unwrap_or_else(home);
     let header = header(flash, place);
     ProgramArgs {
         number: BOOTLOADER.into(),

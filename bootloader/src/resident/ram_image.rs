@@ -11,7 +11,7 @@ use crate::flash::ResidentFlash;
 use crate::product::{BOARD_IDENTITY, FEATURES, SEALED};
 
 /// What this resident part has for an image.
-const HOST: Host = Host { board: BOARD_IDENTITY, services: SERVICES_VERSION, features: FEATURES };
+pub const HOST: Host = Host { board: BOARD_IDENTITY, services: SERVICES_VERSION, features: FEATURES };
 
 extern "C" {
     /// The image's header: the linker script of the resident part has its address.
