@@ -7,7 +7,7 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
-use coboot_tests::{call_back, firmware};
+use coboot_tests::{call_back, firmware, renewal};
 use coflash::device::{Doing, Session, Timing};
 use coflash::file::convert::{self, blocks_of, Options};
 use coflash::file::read::read;
@@ -296,6 +296,11 @@ fn every_service_works_on_the_stack_alone() {
         assert_eq!(run(&mut bench, PROGRAM_INFO, [1; 5]).1[4], 0b01);
         assert_eq!(run(&mut bench, CONFIRM, [1, 6, 7, 8, 9]), (OK, [1, 6, 7, 8, 9]));
         assert_eq!(run(&mut bench, PROGRAM_INFO, [1; 5]).1, info);
+        if layout.staging.is_some() {
+            let (status, words) = run(&mut bench, PROGRAM_INFO, [255; 5]);
+            let crc = renewal::crc_of(&renewal::image_of(firmware::BOOTLOADER));
+            assert_eq!((status, words[0], words[2], words[4]), (OK, 255, crc, 0b01));
+        }
         assert_eq!(run(&mut bench, STORE_NODE, [9, 250_000, 3, 4, 5]), (OK, [9, 250_000, 3, 4, 5]));
         assert_eq!(run(&mut bench, READ_NODE, [0; 5]).1[..2], [9, 250_000]);
         assert_eq!(run(&mut bench, STORE_NODE, [1, 125_000, 3, 4, 5]).0, OK);
