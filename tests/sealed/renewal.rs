@@ -1,10 +1,11 @@
 //! The bootloader of a sealed device is renewed: by a genuine image that is newer, and by no other.
 
-use canopen::program::ProgramControl;
+use canopen::program::{FlashError, ProgramControl};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{
-    cells, confirm, identification, image_of, number, progress, running, start, with_crc,
+    cells, confirm, crc_of, identification, image_of, number, progress, running, start,
+    status as refusal, with_crc,
 };
 use coboot_tests::sealed_board::{board, key, release, root, sealer, status, write_to, COUNTER};
 use coflash::device::Transfers;
@@ -101,6 +102,55 @@ fn a_newer_genuine_bootloader_is_installed_and_an_older_one_never() {
     assert_eq!(send(&mut bench, &second), status::OK);
     assert_eq!(bench.machine().take_flash_log(), [], "the same image writes nothing");
     assert_eq!(send(&mut bench, &sealed(3, 0x0003_0000)), status::OK);
+}
+
+/// A device with this image at home, and a newer one in staging, which nobody has tried.
+fn device_with_staged(home: &[u8], newer: &[u8]) -> Bench {
+    let mut bench = device();
+    assert_eq!(send(&mut bench, home), status::OK);
+    start(&mut bench);
+    confirm(&mut bench);
+    power_cycle(&mut bench);
+    assert_eq!(send(&mut bench, newer), status::OK);
+    assert_eq!(progress(&mut bench).state, State::Staged);
+    bench
+}
+
+/// SEALED: the counter is raised with the confirmation, never before the trial. A probe writes an older
+/// bootloader, whose own counter says nothing; what is stored is that of the last confirmed one.
+#[test]
+fn an_image_that_was_only_staged_raises_no_counter() {
+    let (second, third) = (sealed(2, 0x0002_0000), sealed(3, 0x0003_0000));
+    let mut bench = device_with_staged(&second, &sealed(4, 0x0004_0000));
+    bench.power_off();
+    let home = firmware::board().home.unwrap().base;
+    bench.machine().load_bin(home, &image(0, 0x0000_9000)).unwrap();
+    bench.power_on();
+    bench.await_boot_up(100);
+    assert_eq!((running(&mut bench), progress(&mut bench).state), (0x0000_9000, State::None));
+    assert_eq!(send(&mut bench, &sealed(1, 0x0001_0000)), status::ROLLBACK);
+    assert_eq!(send(&mut bench, &second), status::OK);
+    assert_eq!(send(&mut bench, &third), status::OK);
+}
+
+/// A master that sends the image at home wants no other one: a start would try the one in staging.
+#[test]
+fn the_image_at_home_sent_again_gives_up_the_one_in_staging() {
+    let (second, third) = (sealed(2, 0x0002_0000), sealed(3, 0x0003_0000));
+    let mut bench = device_with_staged(&second, &third);
+    let staging = Region::new(firmware::board().staging.unwrap().base, 1024);
+    let before = cells(&mut bench, staging);
+    assert_ne!(identification(&mut bench), crc_of(&image(2, 0x0002_0000)));
+    // The staged one again keeps it.
+    assert_eq!(send(&mut bench, &third), status::OK);
+    assert_eq!(progress(&mut bench).state, State::Staged);
+    assert_eq!(send(&mut bench, &second), status::OK);
+    assert_eq!((progress(&mut bench).state, cells(&mut bench, staging)), (State::None, before));
+    assert_eq!(identification(&mut bench), crc_of(&image(2, 0x0002_0000)));
+    bench.session().command(number(), ProgramControl::Start).unwrap();
+    bench.run_ms(500);
+    assert_eq!(progress(&mut bench).origin, Origin::Home);
+    assert_eq!(refusal(&mut bench).error, Some(FlashError::NoValidProgram));
 }
 
 /// Each is refused before staging is touched.

@@ -62,7 +62,7 @@ struct Program {
     session: Session,
     /// The download that was cut off or is going on, as stored; a copy for the same reason.
     partial: Partial,
-    /// The version in the last control block.
+    /// The version in the last control block; of the bootloader itself, that of the image in 1F56h.
     version: u32,
     /// The last complete transfer was a raw image or Intel HEX, and no command followed.
     streamed: bool,
@@ -228,7 +228,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     /// 2005h: the version of the program in flash, 0 if unknown.
     #[must_use]
     pub fn version(&self, program: u8) -> u32 {
-        self.program(program).and_then(|state| state.record).map_or(0, |record| record.version)
+        let Some(state) = self.program(program) else { return 0 };
+        match state.record {
+            Some(record) => record.version,
+            None if P::RENEWS && program == BOOTLOADER => state.version,
+            None => 0,
+        }
     }
 
     /// 2006h: the download that can go on, as the CRC of its control block and the address up to
@@ -349,6 +354,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 self.image_stored(flash);
                 if ends {
                     self.end(BOOTLOADER, Ok(()));
+                } else if self.programmer.program() == Some(BOOTLOADER) {
+                    self.drop_partial();
                 }
             }
             Some(Event::Written { program: BOOTLOADER, expected, crc }) if P::RENEWS => {

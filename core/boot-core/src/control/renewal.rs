@@ -68,8 +68,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             Some(Known { origin, trial_end, version: header.version, identification, confirmed: false });
         if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
             state.region = places.home;
-            state.identification = identification;
         }
+        self.show_image(identification, header.version);
         let services = self.parameters.services();
         self.programmer.renewing = Some(Renewing { layout: self.layout, policy, services, record: None });
         let record = self.image_record(flash);
@@ -178,11 +178,15 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         if record.is_none() {
             // Nothing is staged any more.
-            let identification = self.known().identification;
-            if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
-                state.identification = identification;
-            }
+            let Known { identification, version, .. } = self.known();
+            self.show_image(identification, version);
         }
+    }
+
+    /// The image in 1F56h/n and 2005h/n: the one that was staged in this run, otherwise the running one.
+    fn show_image(&mut self, identification: u32, version: u32) {
+        let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) else { return };
+        (state.identification, state.version) = (identification, version);
     }
 
     /// Checks a complete image in staging; its record.
@@ -201,9 +205,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if expected.size < image.total() {
             return Err(FlashError::NoValidProgram);
         }
-        if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
-            state.identification = image.crc;
-        }
+        self.show_image(image.crc, image.version);
         let home = header(flash, places.home).crc;
         Ok(RenewalRecord { state: State::Staged, size: image.total(), crc: image.crc, home })
     }
@@ -264,9 +266,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         known.origin == Origin::Trial && !is_confirmed
     }
 
-    /// A download of a new image begins: a download of the last program that has reached staging does not
-    /// go on after it.
-    pub(super) fn drop_partial(&mut self, staging: Region) {
+    /// The flash of staging is about to be erased for a new image: a download of the last program that has
+    /// reached it does not go on afterwards.
+    pub(super) fn drop_partial(&mut self) {
+        let Some(Places { staging, .. }) = Places::of(self.layout) else { return };
         let last = self.layout.programs.len() as u8;
         let Some(state) = find::<P>(&mut self.programs, last) else { return };
         if state.partial.start() > staging.base || matches!(state.session, Session::Open { .. }) {

@@ -161,12 +161,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             let Host { board, services, features } = self.host();
             Requirements { board, services, features }
         });
-        if let (Some(staging), Some(_)) = (staging, findings.begins) {
-            self.drop_partial(staging);
-        }
         let Some(state) = find::<P>(&mut self.programs, program) else { return };
         if let Some(begin) = findings.begins {
-            state.version = begin.version;
+            // A RAM image has its version in its header.
+            if staging.is_none() {
+                state.version = begin.version;
+            }
             let mut next = 1;
             let goes_on = P::RESUMES && state.partial.is_same(begin.partial);
             // A sequence of blocks that begins again continues over the existing pieces.

@@ -15,12 +15,20 @@ use crate::store::Value;
 /// The number of bytes that one step hashes or decrypts.
 const STEP: usize = 1024;
 
+/// An image that is in the device already.
+#[derive(Clone, Copy)]
+pub(super) struct Same {
+    /// Its place.
+    pub place: Region,
+    /// The record to store, as it was read: after a power cut it may read differently the next time.
+    pub record: Value,
+}
+
 /// The device's decision about an image.
 #[derive(Clone, Copy)]
 pub(super) struct Acceptance {
-    /// `Some`: the same image is already installed, with this record; the new one is checked and
-    /// discarded.
-    pub same: Option<Value>,
+    /// `Some`: the new one is checked and discarded.
+    pub same: Option<Same>,
     /// The new counter.
     pub counter: Value,
 }
@@ -181,7 +189,8 @@ impl Content {
                 None => return Ok(false),
             },
             Phase::Image(hashing) => {
-                let image = Region::new(region.base, head.size());
+                let place = self.acceptance.same.map_or(region, |same| same.place);
+                let image = Region::new(place.base, head.size());
                 let Some(hash) = hashing.step(flash, image, &mut buffers.hash) else { return Ok(false) };
                 if hash[..HASH] != *head.image_hash() {
                     return Err(Fault::Signature);

@@ -9,12 +9,13 @@ use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 
 use super::buffers::{start, Buffers};
-use super::content::{Acceptance, Content};
+use super::content::{Acceptance, Content, Same};
 use crate::flash::Flash;
 use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
 use crate::queue::{Piece, Queue};
 use crate::renewal::header;
+use crate::resume::Partial;
 use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord, Value};
 
 // `seal` depends on nothing, so it has the number, too.
@@ -69,8 +70,7 @@ pub(crate) enum Progress {
     Waits,
     /// The next step.
     Works,
-    /// The flash contains it. `same`: it was already installed before, with this record as it was
-    /// read at that time. After a power cut it may read differently the next time.
+    /// The flash contains it. `same`: it was already installed before, and this is the record to store.
     Installed { same: Option<Value> },
 }
 
@@ -98,7 +98,13 @@ impl Image {
             Stage::Head { .. } => Progress::Waits,
             Stage::Content(content) if content.waits() => Progress::Waits,
             Stage::Certificate(_) | Stage::Manifest(_) | Stage::Content(_) => Progress::Works,
-            Stage::Installed(installed) => Progress::Installed { same: installed.acceptance.same },
+            Stage::Installed(installed) => {
+                let same = match installed.acceptance.same {
+                    Some(same) => Some(same.record),
+                    None => None,
+                };
+                Progress::Installed { same }
+            }
         }
     }
 
@@ -198,19 +204,20 @@ impl Place {
                 flash.read(block + at as u32, &mut keys[at..at + 4]);
             }
         }
-        let (mut counter, epoch) = floor(flash, parameters, self.layout, policy.counter, program);
+        let (mut stored, epoch) = floor(flash, parameters, self.layout, policy.counter, program);
         if let Some(lowered) = self.lowered_counter {
-            counter = counter.min(lowered);
+            stored = stored.min(lowered);
         }
         let head = Head(&buffers.head);
         let same = match self.home {
             Some(home) => self.same_image(head, flash, parameters, home),
             None => self.same_program(head, flash, parameters),
         };
-        if let (Some(home), None, None) = (self.home, same, self.lowered_counter) {
+        let counter = match (self.home, same, self.lowered_counter) {
             // Two genuine images cannot be exchanged for ever.
-            counter = counter.max(header(flash, home).counter.saturating_add(1));
-        }
+            (Some(home), None, None) => stored.max(header(flash, home).counter.saturating_add(1)),
+            _ => stored,
+        };
         let needs = seal::judge::judge(
             head,
             &seal::judge::Device {
@@ -228,7 +235,7 @@ impl Place {
             },
         )?;
         let with_confirmation = policy.counter_with_confirmation || self.home.is_some();
-        let floor = if with_confirmation { counter.min(head.counter()) } else { head.counter() };
+        let floor = if with_confirmation { stored.min(head.counter()) } else { head.counter() };
         let acceptance = Acceptance { same, counter: [floor, needs.epoch, head.counter(), 0] };
         let judged = Judged { acceptance, recipient: needs.recipient };
         let root = &keys[needs.root + 4..][..32];
@@ -246,36 +253,38 @@ impl Place {
         }
     }
 
-    /// The record of the program, if it is this one already.
+    /// The program, if it is this one already.
     fn same_program<F: Flash>(
         &self,
         head: Head<'_>,
         flash: &F,
         parameters: &impl Parameters,
-    ) -> Option<Value> {
+    ) -> Option<Same> {
         let record = ProgramRecord::load(parameters, flash, self.program)?;
         let [_, _, installed, _] = parameters.get(flash, Key::counter(self.program)).unwrap_or([0; 4]);
         let is_same = record.seal.is_some()
             && (record.size, record.crc, record.version) == (head.size(), head.crc(), head.version())
             && installed == head.counter();
-        is_same.then(|| record.value())
+        is_same.then(|| Same { place: self.region, record: record.value() })
     }
 
-    /// The stored record of staging, if the new RAM image is there already, or at home.
+    /// The RAM image in staging or at home, if it is this one already. If it is at home, the record of
+    /// another one in staging is removed: a start would try that one.
     fn same_image<F: Flash>(
         &self,
         head: Head<'_>,
         flash: &F,
         parameters: &impl Parameters,
         home: Region,
-    ) -> Option<Value> {
-        let value = parameters.get(flash, Key::program(self.program)).unwrap_or([0; 4]);
-        let staged = RenewalRecord::from_value(value).is_some().then_some(self.region);
-        let is_same = |place: Region| {
+    ) -> Option<Same> {
+        let staged = parameters.get(flash, Key::program(self.program));
+        let staged = staged.filter(|value| RenewalRecord::from_value(*value).is_some());
+        let staged = staged.map(|record| Same { place: self.region, record });
+        let home = Same { place: home, record: ProgramRecord::none(false, Partial::NONE) };
+        [staged, Some(home)].into_iter().flatten().find(|Same { place, .. }| {
             let size = head.size();
             size <= place.size && flash.crc32(0, Region::new(place.base, size)) == head.crc()
-        };
-        [Some(home), staged].into_iter().flatten().any(is_same).then_some(value)
+        })
     }
 
     /// The other one of two programs, if it is the dictionary.

@@ -396,7 +396,8 @@ impl<C: Choices> Node<'_, C> {
 
 #[test]
 fn an_image_is_staged_tried_confirmed_and_installed() {
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let newer = Header { version: 0x0001_0003, ..SOUND };
+    let (old, new) = (image(0x200, 1), image_of(newer, 0x300, 2, true));
     let mut board = Board::new(&old);
     let program = board.flash.cells(PROGRAM)[..0x1000].to_vec();
     let mut node = board.start();
@@ -406,10 +407,11 @@ fn an_image_is_staged_tried_confirmed_and_installed() {
     assert_eq!(node.read::<8>(0x2004, N).to_vec(), places);
     assert_eq!(node.read::<8>(0x2007, 8).to_vec(), [0x0001_0002, 1_u32].map(u32::to_le_bytes).concat());
     assert_eq!((node.progress(), node.word(0x1F56)), (Progress::default(), crc_of(&old)));
+    assert_eq!(node.word(0x2005), SOUND.version);
     assert_eq!(node.command(N, START), NO_VALID_PROGRAM, "nothing is staged");
     assert_eq!(node.command(N, CONFIRM), 0, "and nothing to confirm");
     node.stage(&new);
-    assert_eq!(node.word(0x1F56), crc_of(&new));
+    assert_eq!((node.word(0x1F56), node.word(0x2005)), (crc_of(&new), newer.version));
     assert_eq!(node.command(N, CONFIRM), 0, "before its trial this changes nothing");
     assert_eq!(node.progress(), Progress { state: State::Staged, ..Progress::default() });
     assert_eq!(node.command(N, START), 0);
@@ -419,6 +421,7 @@ fn an_image_is_staged_tried_confirmed_and_installed() {
     let mut node = board.start();
     let trial = Progress { state: State::Staged, origin: Origin::Trial, ..Progress::default() };
     assert_eq!((node.progress(), node.word(0x1F56)), (trial, crc_of(&new)));
+    assert_eq!(node.word(0x2005), newer.version);
     assert_eq!(node.try_command(N, START), Err(AbortCode::DEVICE_STATE), "one trial at a time");
     assert_eq!(node.command(N, CONFIRM), 0);
     assert_eq!(node.progress().state, State::Installed);
@@ -658,10 +661,21 @@ fn an_open_download_that_reaches_into_staging_is_dropped_with_the_new_image() {
     let mut board = Board::new(&old);
     let mut node = board.start();
     assert_eq!(node.command(1, CLEAR), 0);
-    let file = block_file_at(&program_of(0x3700), PROGRAM.base, 200);
+    let mut file = block_file_at(&program_of(0x3700), PROGRAM.base, 200);
+    // With a size: it could go on.
+    file[0] = bench::block(0, 0, &[0x3700_u32, 0, 0].map(u32::to_le_bytes).concat());
     for block in &file[..file.len() - 5] {
         node.send(1, block).unwrap();
     }
+    // An image that is refused takes nothing from it.
+    let wrong = image_of(Header { board: !BOARD, ..SOUND }, 0x280, 3, true);
+    let _ = node.send(N, &wrong);
+    assert_eq!(node.word(0x1F57), FORMAT);
+    board.off();
+    let mut node = board.start();
+    let partial: [u8; 8] = node.read(0x2006, 1);
+    let end = u32::from_le_bytes(partial[4..].try_into().unwrap());
+    assert!(end > STAGING.base, "{end:08X}h is before staging: the next download would not be dropped");
     node.stage(&new);
     board.off();
     let mut node = board.start();
