@@ -4,7 +4,7 @@ use super::*;
 
 /// The choices of this product.
 pub const PRODUCT: Product = Product {
-    autostart: None,
+    autostart: Autostart::List(&[]),
     rescue_window_ms: 0,
     auto_bit_rate: false,
     boot_up_emergency: false,

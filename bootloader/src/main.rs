@@ -58,6 +58,8 @@ mod app {
     use bsp::{line, pac, CanPort, IDENTITY, LAYOUT};
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
+    use core::ops::RangeInclusive;
+
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
     use shared_abi::services::{StoreState, STORE_STATE_WORDS};
@@ -107,6 +109,7 @@ mod app {
             Some(ms) => ms,
             None => 0,
         },
+        autostart: product::AUTOSTART,
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };
@@ -123,6 +126,7 @@ mod app {
     impl Choices for Chosen {
         const EXTRAS: Extras = EXTRAS;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
+        const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;
     }
 
     #[shared]

@@ -8,10 +8,11 @@
 use core::ops::RangeInclusive;
 
 use boot_core::bootloader::Extras;
+use boot_core::canopen::program::AUTOSTART_FUNCTION;
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::control::{Erase, Policy, Renewal, Verdict};
 use boot_core::crc::CrcKind;
-use boot_core::decision;
+use boot_core::decision::{self, Autostart};
 use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
@@ -52,9 +53,11 @@ pub enum CrystalFailure {
 pub struct Product {
     /// The dialect of the product, where dialects contradict each other (docs/dialects.md).
     pub profile: Profile,
-    /// The program that starts by itself after a reset, 1 to the number of programs; `None` for a
-    /// device that waits for 1F51h = 1 (`BLCOP_USE_AUTOSTART_APP`, `BLCOP_APP_START_INDEX`).
-    pub autostart: Option<u8>,
+    /// The programs that start by themselves after a reset, the preferred one first: the device starts the
+    /// first one that is valid, released and allowed. An empty list for a device that waits for 1F51h = 1
+    /// (`BLCOP_USE_AUTOSTART_APP`). Programs count from 1, as sub-indices do: the manual's
+    /// `BLCOP_APP_START_INDEX` = 0 is program 1 here.
+    pub autostart: Autostart,
     /// The number of unrequested resets of the application in a row after which the device stays in
     /// the bootloader; at least 1.
     pub max_crash_resets: u32,
@@ -173,7 +176,7 @@ impl Product {
     /// A product with no choice of its own.
     pub const DEFAULT: Self = Self {
         profile: Profile::STANDARD,
-        autostart: Some(1),
+        autostart: Autostart::InOrder,
         max_crash_resets: 3,
         rescue_window_ms: 300,
         rescue_window_confirmed_ms: 0,
@@ -220,12 +223,28 @@ impl Product {
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
     /// message of the broken rule.
     pub const fn checked(self) -> Self {
-        let programs = LAYOUT.programs.len();
-        if let Some(number) = self.autostart {
-            assert!(
-                number >= 1 && number as usize <= programs,
-                "product: autostart names a program that the layout has not"
-            );
+        if let Autostart::List(list) = self.autostart {
+            let mut at = 0;
+            while at < list.len() {
+                assert!(
+                    list[at] != 0,
+                    "product: autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1"
+                );
+                assert!(
+                    list[at] as usize <= LAYOUT.programs.len(),
+                    "product: autostart names a program that the layout has not"
+                );
+                assert!(
+                    !matches!(self.profile.download.data, Some(data) if data == list[at]),
+                    "product: autostart names the profile's data, which are no program"
+                );
+                let mut other = 0;
+                while other < at {
+                    assert!(list[other] != list[at], "product: autostart names a program twice");
+                    other += 1;
+                }
+                at += 1;
+            }
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(
@@ -249,7 +268,7 @@ impl Product {
             self.rescue_window_confirmed_ms
         };
         assert!(
-            window == 0 || self.autostart.is_some(),
+            window == 0 || self.autostart.is_on(),
             "product: a rescue window needs autostart: without it no program starts by itself"
         );
         assert!(
@@ -303,15 +322,6 @@ impl Product {
             "product: renewal needs watchdog_ms: it ends the trial of a bootloader that hangs"
         );
         assert!(self.renewal_s >= 1 && self.renewal_s <= 3600, "product: renewal_s must be 1 to 3600");
-        if let Some(data) = self.profile.download.data {
-            assert!(
-                match self.autostart {
-                    Some(number) => number != data,
-                    None => true,
-                },
-                "product: autostart names the profile's data, which are no program"
-            );
-        }
         assert!(
             self.profile.download.locked != self.profile.password.is_empty(),
             "product: a profile that locks 1F50h needs a password, and only such a profile has one"
@@ -390,6 +400,7 @@ impl Product {
     pub const fn decision(&self) -> decision::Policy {
         decision::Policy {
             autostart: self.autostart,
+            programs: &PROGRAMS,
             max_crash_resets: self.max_crash_resets,
             node_ids: *self.node_ids.start()..=*self.node_ids.end(),
             rescue_window_ms: self.rescue_window_ms,
@@ -415,6 +426,39 @@ pub enum NodeSource {
     Function(fn() -> (u8, u8)),
 }
 
+/// The numbers of the programs, without the profile's data.
+pub const PROGRAMS: [u8; LAYOUT.programs.len() - HAS_DATA as usize] = {
+    let mut numbers = [0; LAYOUT.programs.len() - HAS_DATA as usize];
+    let (mut number, mut count) = (1, 0);
+    while count < numbers.len() {
+        if !matches!(PRODUCT.profile.download.data, Some(data) if data == number) {
+            numbers[count] = number;
+            count += 1;
+        }
+        number += 1;
+    }
+    numbers
+};
+/// Whether the profile's data are in the layout.
+const HAS_DATA: bool =
+    matches!(PRODUCT.profile.download.data, Some(data) if data as usize <= LAYOUT.programs.len());
+
+/// The programs that start by themselves, as 2007h/11 shows them: the first one in the lower byte, then the
+/// second one; [`AUTOSTART_FUNCTION`] if a function of the product says it.
+pub const AUTOSTART: u16 = match PRODUCT.autostart {
+    Autostart::InOrder => first_two(&PROGRAMS),
+    Autostart::List(list) => first_two(list),
+    Autostart::Function(_) => AUTOSTART_FUNCTION,
+};
+
+const fn first_two(list: &[u8]) -> u16 {
+    match list {
+        [] => 0,
+        [only] => *only as u16,
+        [first, second, ..] => u16::from_le_bytes([*first, *second]),
+    }
+}
+
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
 
@@ -431,10 +475,7 @@ const RENEWAL: Renewal = Renewal {
 pub const FACTS: Facts = Facts {
     board: BOARD_IDENTITY,
     size: Facts::SIZE,
-    autostart: match PRODUCT.autostart {
-        Some(number) => number as u16,
-        None => 0,
-    },
+    autostart: AUTOSTART,
     crc_bits: match PRODUCT.crc {
         CrcKind::Crc32 => 32,
         CrcKind::Crc16 => 16,

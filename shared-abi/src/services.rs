@@ -54,7 +54,8 @@ pub struct Facts {
     pub board: u32,
     /// Bytes of this record.
     pub size: u16,
-    /// The program that starts by itself; 0 for none.
+    /// The programs that start by themselves, the first one in bits 0 to 7, the second one in bits 8 to 15;
+    /// 0 for none, FFh if a function of the product says it.
     pub autostart: u16,
     /// Bits of the CRC of programs: 32 or 16.
     pub crc_bits: u16,

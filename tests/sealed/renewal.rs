@@ -4,8 +4,8 @@ use canopen::program::{FlashError, ProgramControl};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{
-    cells, confirm, crc_of, identification, image_of, number, progress, running, start,
-    status as refusal, with_crc,
+    cells, confirm, crc_of, identification, image_of, number, progress, running, start, status as refusal,
+    with_crc,
 };
 use coboot_tests::sealed_board::{board, key, release, root, sealer, status, write_to, COUNTER};
 use coflash::device::Transfers;

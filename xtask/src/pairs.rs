@@ -27,7 +27,7 @@ of each.
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
 const FIELDS: [(&str, &[&str]); 43] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
-    ("autostart", &["Some(1)", "None"]),
+    ("autostart", &["Autostart::InOrder", "Autostart::List(&[])", "Autostart::Function(|| &[1])"]),
     ("rescue_window_ms", &["300", "0"]),
     ("rescue_window_confirmed_ms", &["0", "100"]),
     ("node_ids", &["1..=127", "2..=100"]),

@@ -145,8 +145,8 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     }
     let id = match u8::try_from(args.node_id) {
         Ok(NO_NODE_ID) => None,
-        Ok(id) => Some(NodeId::new(id).ok_or(Status::BadArgument)?),
-        Err(_) => return Err(Status::BadArgument),
+        Ok(id) if PRODUCT.node_ids.contains(&id) => NodeId::new(id),
+        _ => return Err(Status::BadArgument),
     };
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };

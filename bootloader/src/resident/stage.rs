@@ -8,7 +8,7 @@
 use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
-use boot_core::program::verify;
+use boot_core::program::{verify, Invalid};
 use boot_core::store::Key;
 use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
@@ -27,14 +27,12 @@ use crate::{renewal, storing};
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
 /// the warm-start cell in this time.
 const RESET_PERIOD_MS: u32 = 100;
-/// Programs of the layout.
-const PROGRAMS: u8 = LAYOUT.programs.len() as u8;
 
 /// Decides between a program and the bootloader, and starts it: a program in flash, or the RAM image
 /// with a report ([`BootReport`]) of what is left for it.
 ///
 /// A damaged RAM image does not run. The warm-start cell records the damage, and a program starts:
-/// the one with autostart, or the next that may. If there is none, the chip resets again and again.
+/// the first with autostart that may, or another one. If there is none, the chip resets again and again.
 ///
 /// # Safety
 /// Nothing else may run yet.
@@ -91,7 +89,10 @@ pub unsafe extern "C" fn stage() -> ! {
     let node = product::node_parameters(&parameters, &flash);
     let node_id = node.id.map_or(NO_NODE_ID, NodeId::get);
     let decide = |circumstances: &Circumstances| {
-        decide(circumstances, &DECISION, |number| verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number))
+        decide(circumstances, &DECISION, |number| match PRODUCT.profile.download.data {
+            Some(data) if data == number => Err(Invalid::NoSuchProgram),
+            _ => verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number),
+        })
     };
     let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
     let mut trial_end = TrialEnd::None;
@@ -137,18 +138,13 @@ pub unsafe extern "C" fn stage() -> ! {
             Err(damage) => cell.put(BootRequest::Damaged(damage)),
         }
         // There is no bootloader to stay in, neither for the entry strap nor for the reset pin or a rescue
-        // window: the program with autostart is resumed at once, or the next that may start.
+        // window: the first program with autostart that may start is resumed at once, or another one.
         circumstances.strap = false;
-        for turn in 1..=PROGRAMS {
-            let number = fallback(PRODUCT.autostart, PROGRAMS, turn);
+        fallback(&DECISION, |number| {
             circumstances.request = Some(BootRequest::Resume(number));
-            if PRODUCT.profile.download.data != Some(number) {
-                decision = decide(&circumstances);
-            }
-            if matches!(decision, BootDecision::Start { .. }) {
-                break;
-            }
-        }
+            decision = decide(&circumstances);
+            matches!(decision, BootDecision::Start { .. })
+        });
     }
 
     let has_watchdog = flash.starts_watchdog();

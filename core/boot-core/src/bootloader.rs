@@ -1,6 +1,7 @@
 //! The bootloader as a CANopen device: its object dictionary and the download.
 
 use core::marker::PhantomData;
+use core::ops::RangeInclusive;
 use core::task::Poll;
 
 use canopen::bit_rate::BitRate;
@@ -14,7 +15,7 @@ use canopen::program::{
     control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH,
     FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION,
     PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE, SEALED_ENTRIES,
-    SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG,
+    SECOND_SERVER, SOFTWARE_VERSION, STATE_AUTOSTART, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG,
     STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
@@ -153,6 +154,8 @@ pub trait Choices {
     };
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
+    /// The node-IDs that the device takes: with another one no program starts.
+    const NODE_IDS: RangeInclusive<u8> = 1..=127;
 }
 
 /// A bootloader with everything.
@@ -183,6 +186,8 @@ pub struct Config {
     /// 2007h/10: the time in ms within which a program must feed the independent watchdog; 0 if the
     /// bootloader does not start it.
     pub program_watchdog_ms: u16,
+    /// 2007h/11: the programs that start by themselves.
+    pub autostart: u16,
     /// How programs are downloaded.
     pub download: Policy,
     /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
@@ -432,6 +437,9 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             DEVICE_STATE if at.sub == STATE_PROGRAM_WATCHDOG => {
                 return put(buf, &self.config.program_watchdog_ms.to_le_bytes());
             }
+            DEVICE_STATE if at.sub == STATE_AUTOSTART => {
+                return put(buf, &self.config.autostart.to_le_bytes());
+            }
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
             DEVICE_STATE if P::RENEWS && at.sub == STATE_VERSIONS => {
                 return put(buf, &self.download.versions());
@@ -545,6 +553,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
 {
     fn supports(&mut self, rate: BitRate) -> bool {
         (self.config.supports)(rate)
+    }
+
+    fn takes(&mut self, id: NodeId) -> bool {
+        C::NODE_IDS.contains(&id.get())
     }
 
     fn store(&mut self, id: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {

@@ -69,11 +69,42 @@ impl PinReset {
     }
 }
 
+/// The programs that start by themselves after a reset: the first one that is valid and may start.
+#[derive(Clone, Copy, Debug)]
+pub enum Autostart {
+    /// Each program of the layout, the lowest number first.
+    InOrder,
+    /// These, in this order. With an empty list the device waits for a command.
+    List(&'static [u8]),
+    /// The list that a function returns, for instance one that reads a switch. It runs in the boot stage,
+    /// before any peripheral is set up, and must leave the peripherals that it uses as after a reset.
+    Function(fn() -> &'static [u8]),
+}
+
+impl Autostart {
+    /// Whether a program can start by itself.
+    #[must_use]
+    pub const fn is_on(self) -> bool {
+        !matches!(self, Self::List([]))
+    }
+
+    /// The programs in the order in which they are tried; `programs`: those of the layout.
+    fn order(self, programs: &'static [u8]) -> &'static [u8] {
+        match self {
+            Self::InOrder => programs,
+            Self::List(list) => list,
+            Self::Function(list) => list(),
+        }
+    }
+}
+
 /// The product's configuration of the decision.
 #[derive(Clone, Debug)]
 pub struct Policy {
-    /// The program that starts by itself after a reset, if any.
-    pub autostart: Option<u8>,
+    /// The programs that start by themselves after a reset.
+    pub autostart: Autostart,
+    /// The numbers of the programs of the layout, the lowest first; without those that are data.
+    pub programs: &'static [u8],
     /// After this many consecutive crash resets, the device stays in the bootloader.
     pub max_crash_resets: u32,
     /// The node-IDs with which a program may start.
@@ -143,24 +174,24 @@ pub enum BootDecision {
     },
 }
 
-/// The program that is tried in this turn (1 to `programs`, at most 127) when there is no bootloader to
-/// stay in: the one with autostart first, then the next ones.
-#[must_use]
-pub const fn fallback(autostart: Option<u8>, programs: u8, turn: u8) -> u8 {
-    let first = match autostart {
-        Some(number) => number,
-        None => 1,
-    };
-    (first - 1 + turn - 1) % programs + 1
+/// Tries programs until one starts, when there is no bootloader to stay in: those with autostart first,
+/// then all.
+pub fn fallback(policy: &Policy, mut starts: impl FnMut(u8) -> bool) {
+    // With one program both are the same.
+    let is_choice = policy.programs.len() > 1;
+    let first = policy.autostart.order(policy.programs);
+    let _ = is_choice && first.iter().any(|number| starts(*number))
+        || policy.programs.iter().any(|number| starts(*number));
 }
 
-/// Makes the decision. `verify` checks a program completely and is called at most once.
+/// Makes the decision. `verify` checks a program completely; it is called once for each program that is
+/// tried.
 pub fn decide(
     circumstances: &Circumstances,
     policy: &Policy,
-    verify: impl FnOnce(u8) -> Result<VerifiedProgram, Invalid>,
+    verify: impl Fn(u8) -> Result<VerifiedProgram, Invalid>,
 ) -> BootDecision {
-    use BootDecision::{Hold, Start, Stay};
+    use BootDecision::Stay;
 
     let stay = |reason| Stay { reason, refused: 0 };
     match circumstances.request {
@@ -172,17 +203,54 @@ pub fn decide(
     if circumstances.strap {
         return stay(Reason::Strap);
     }
+    let by_itself = |number| Candidate { number, trial: false, is_requested: false };
+    let requested = |number, trial| Candidate { number, trial, is_requested: true };
+    let mut others: &[u8] = &[];
     // A request is new: its sender knows about earlier crashes.
-    let (number, trial, is_requested) = match circumstances.request {
-        Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => (number, true, true),
-        Some(BootRequest::Start(number)) => (number, false, true),
-        Some(BootRequest::Resume(number) | BootRequest::Confirm(number)) => (number, false, false),
+    let candidate = match circumstances.request {
+        Some(BootRequest::Trial(number) | BootRequest::Fresh(number)) => requested(number, true),
+        Some(BootRequest::Start(number)) => requested(number, false),
+        Some(BootRequest::Resume(number) | BootRequest::Confirm(number)) => by_itself(number),
         _ if circumstances.crash_resets >= policy.max_crash_resets => return stay(Reason::CrashLoop),
-        _ => match policy.autostart {
-            Some(number) => (number, false, false),
-            None => return stay(Reason::NoAutostart),
+        _ => match policy.autostart.order(policy.programs) {
+            [first, rest @ ..] => {
+                others = rest;
+                by_itself(*first)
+            }
+            [] => return stay(Reason::NoAutostart),
         },
     };
+    let mut decision = start(circumstances, policy, candidate, &verify);
+    for number in others {
+        let (Stay { reason, .. }, true) = (decision, policy.programs.len() > 1) else { break };
+        let other = start(circumstances, policy, by_itself(*number), &verify);
+        // The reason to stay is that of the first program that is there.
+        if reason == Reason::NoProgram || !matches!(other, Stay { .. }) {
+            decision = other;
+        }
+    }
+    decision
+}
+
+/// A program that may be started.
+struct Candidate {
+    number: u8,
+    /// Also without a release.
+    trial: bool,
+    /// A client has requested it.
+    is_requested: bool,
+}
+
+/// Decides about the start of one program.
+fn start(
+    circumstances: &Circumstances,
+    policy: &Policy,
+    candidate: Candidate,
+    verify: impl Fn(u8) -> Result<VerifiedProgram, Invalid>,
+) -> BootDecision {
+    use BootDecision::{Hold, Start, Stay};
+
+    let Candidate { number, trial, is_requested } = candidate;
     let refuse = |reason| Stay { reason, refused: if is_requested { number } else { 0 } };
     if !policy.node_ids.contains(&circumstances.node_id) {
         return refuse(Reason::NodeId);

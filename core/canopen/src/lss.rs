@@ -49,6 +49,11 @@ pub trait LssDevice {
     /// bit rate by listening.
     fn supports(&mut self, rate: BitRate) -> bool;
 
+    /// Whether the device takes this node-ID.
+    fn takes(&mut self, _id: NodeId) -> bool {
+        true
+    }
+
     /// Stores node-ID and bit rate for the next start. `None` as node-ID stores "no node-ID" (FFh);
     /// `None` as bit rate leaves the stored value unchanged. A device that needs time returns
     /// `Pending`, and [`stored`](Self::stored) is called then.
@@ -287,11 +292,12 @@ impl Lss {
             (IDENTIFY_NON_CONFIGURED, _) => return self.is_unconfigured().then_some((NON_CONFIGURED, 0)),
             (FASTSCAN, State::Waiting) => return self.fastscan(bytes).then_some((IDENTIFIED, 0)),
             (CONFIGURE_NODE_ID, State::Configuration) => {
-                let known = NodeId::new(a).is_some() || a == UNCONFIGURED;
-                if known {
-                    self.pending = NodeId::new(a);
+                let id = NodeId::new(a);
+                let is_taken = id.map_or(a == UNCONFIGURED, |id| device.takes(id));
+                if is_taken {
+                    self.pending = id;
                 }
-                u32::from(!known)
+                u32::from(!is_taken)
             }
             (CONFIGURE_BIT_TIMING, State::Configuration) => {
                 let rate = BitRate::from_index(b).filter(|rate| a == 0 && device.supports(*rate));

@@ -179,6 +179,12 @@ pub const STATE_RENEWAL: u8 = 9;
 /// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
 /// watchdog, which the bootloader starts; 0 if it does not.
 pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
+/// Sub-index of [`DEVICE_STATE`]: the programs that start by themselves after a reset, the preferred one in
+/// bits 0 to 7, the next one in bits 8 to 15; 0 for none, [`AUTOSTART_FUNCTION`] if the product decides.
+pub const STATE_AUTOSTART: u8 = 11;
+/// The value of [`STATE_AUTOSTART`] of a device whose product decides at each start.
+pub const AUTOSTART_FUNCTION: u16 = 0xFF;
+
 /// The source of a device's clock ([`STATE_CLOCK`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
@@ -205,8 +211,8 @@ pub enum Supply {
 pub const SUPPLY_DETAIL: u8 = 1;
 
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 9] = [
-    Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_WATCHDOG),
+pub const STATE_ENTRIES: [Entry; 10] = [
+    Entry::record(DEVICE_STATE, "Device state", STATE_AUTOSTART),
     Entry::sub(
         DEVICE_STATE,
         STATE_BOOTLOADER,
@@ -236,6 +242,13 @@ pub const STATE_ENTRIES: [Entry; 9] = [
         DEVICE_STATE,
         STATE_PROGRAM_WATCHDOG,
         "Watchdog of a program",
+        DataType::Unsigned16,
+        Access::Const,
+    ),
+    Entry::sub(
+        DEVICE_STATE,
+        STATE_AUTOSTART,
+        "Programs that start by themselves",
         DataType::Unsigned16,
         Access::Const,
     ),

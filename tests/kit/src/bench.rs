@@ -40,6 +40,7 @@ pub const CONFIG: Config = Config {
     boot_up_emergency: false,
     lss_store: true,
     program_watchdog_ms: 0,
+    autostart: 1,
     download: Policy::DEFAULT,
     password: b"",
 };

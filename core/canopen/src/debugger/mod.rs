@@ -397,6 +397,10 @@ impl<D: LssDevice, M> LssDevice for Debugged<'_, D, M> {
         self.device.supports(rate)
     }
 
+    fn takes(&mut self, id: NodeId) -> bool {
+        self.device.takes(id)
+    }
+
     fn store(&mut self, node: Option<NodeId>, rate: Option<BitRate>) -> Poll<Result<(), StoreError>> {
         self.device.store(node, rate)
     }
