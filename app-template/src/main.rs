@@ -50,6 +50,7 @@ mod app {
     use bsp::clock::Source;
     use bsp::{line, pac, CanPort, BIT_RATE, LAYOUT, NODE_ID};
     use canopen::node::{self, NmtPolicy};
+    use canopen::sdo::server::Config as SdoConfig;
     use canopen::slave::{self, Slave};
     use canopen::{BitRate, Frame, Instant, NodeId};
     use coboot_app::{Bootloader, Defaults, Exit, Next, Start};
@@ -112,6 +113,11 @@ mod app {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,
                 nmt: NmtPolicy::Follow,
+                sdo: SdoConfig {
+                    request_base: start.sdo().request,
+                    response_base: start.sdo().response,
+                    ..SdoConfig::DEFAULT
+                },
                 ..node::Config::default()
             },
             ..slave::Config::default()

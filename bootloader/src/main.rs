@@ -46,7 +46,7 @@ mod app {
     use boot_core::canopen::lss;
     use boot_core::canopen::node::{self, NmtPolicy};
     use boot_core::canopen::od::Entry;
-    use boot_core::canopen::program::ClockSource;
+    use boot_core::canopen::program::{ClockSource, ProgramStart};
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
@@ -56,9 +56,9 @@ mod app {
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
     use bsp::{line, pac, CanPort, IDENTITY, LAYOUT};
+    use core::ops::RangeInclusive;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
-    use core::ops::RangeInclusive;
 
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
@@ -104,12 +104,6 @@ mod app {
         layout: LAYOUT,
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
-        lss_store: PRODUCT.lss_store,
-        program_watchdog_ms: match PRODUCT.program_watchdog_ms {
-            Some(ms) => ms,
-            None => 0,
-        },
-        autostart: product::AUTOSTART,
         download: PRODUCT.download(),
         password: PRODUCT.profile.password,
     };
@@ -126,7 +120,9 @@ mod app {
     impl Choices for Chosen {
         const EXTRAS: Extras = EXTRAS;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
+        const LSS_STORE: bool = PRODUCT.lss_store;
         const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;
+        const PROGRAM_START: ProgramStart = product::PROGRAM_START;
     }
 
     #[shared]

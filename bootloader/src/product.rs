@@ -8,7 +8,7 @@
 use core::ops::RangeInclusive;
 
 use boot_core::bootloader::Extras;
-use boot_core::canopen::program::AUTOSTART_FUNCTION;
+use boot_core::canopen::program::ProgramStart;
 use boot_core::canopen::{BitRate, NodeId};
 use boot_core::control::{Erase, Policy, Renewal, Verdict};
 use boot_core::crc::CrcKind;
@@ -443,19 +443,24 @@ pub const PROGRAMS: [u8; LAYOUT.programs.len() - HAS_DATA as usize] = {
 const HAS_DATA: bool =
     matches!(PRODUCT.profile.download.data, Some(data) if data as usize <= LAYOUT.programs.len());
 
-/// The programs that start by themselves, as 2007h/11 shows them: the first one in the lower byte, then the
-/// second one; [`AUTOSTART_FUNCTION`] if a function of the product says it.
-pub const AUTOSTART: u16 = match PRODUCT.autostart {
-    Autostart::InOrder => first_two(&PROGRAMS),
-    Autostart::List(list) => first_two(list),
-    Autostart::Function(_) => AUTOSTART_FUNCTION,
+/// 2007h/10.
+pub const PROGRAM_START: ProgramStart = ProgramStart {
+    watchdog_ms: match PRODUCT.program_watchdog_ms {
+        Some(ms) => ms,
+        None => 0,
+    },
+    by_itself: match PRODUCT.autostart {
+        Autostart::InOrder => first_two(&PROGRAMS),
+        Autostart::List(list) => first_two(list),
+        Autostart::Function(_) => [ProgramStart::DECIDED, 0],
+    },
 };
 
-const fn first_two(list: &[u8]) -> u16 {
+const fn first_two(list: &[u8]) -> [u8; 2] {
     match list {
-        [] => 0,
-        [only] => *only as u16,
-        [first, second, ..] => u16::from_le_bytes([*first, *second]),
+        [] => [0; 2],
+        [only] => [*only, 0],
+        [first, second, ..] => [*first, *second],
     }
 }
 
@@ -475,7 +480,7 @@ const RENEWAL: Renewal = Renewal {
 pub const FACTS: Facts = Facts {
     board: BOARD_IDENTITY,
     size: Facts::SIZE,
-    autostart: AUTOSTART,
+    autostart: u16::from_le_bytes(PROGRAM_START.by_itself),
     crc_bits: match PRODUCT.crc {
         CrcKind::Crc32 => 32,
         CrcKind::Crc16 => 16,
@@ -485,6 +490,8 @@ pub const FACTS: Facts = Facts {
         | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
     abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 }
         | if PRODUCT.rom_loader { Facts::ROM_LOADER } else { 0 },
+    sdo_request_base: PRODUCT.sdo_request_base,
+    sdo_response_base: PRODUCT.sdo_response_base,
 };
 
 /// Version of the bootloader: major in the upper half, minor in the lower.

@@ -34,6 +34,11 @@ const _: () = {
     assert!(facts.crc_bits == FACTS.crc_bits, "product: `resident` has another crc");
     assert!(facts.node_ids == FACTS.node_ids, "product: `resident` has other node_ids");
     assert!(facts.bit_rates == FACTS.bit_rates, "product: `resident` has other bit_rates");
+    assert!(
+        facts.sdo_request_base == FACTS.sdo_request_base
+            && facts.sdo_response_base == FACTS.sdo_response_base,
+        "product: `resident` has another sdo_request_base or sdo_response_base"
+    );
     let differs = facts.abilities ^ FACTS.abilities;
     assert!(differs & Facts::ROM_LOADER == 0, "product: `resident` has another rom_loader");
     assert!(differs == 0, "product: `resident` has another renewal");

@@ -19,6 +19,7 @@
 
 use shared_abi::callgate::{CallgateError, ProgramArgs, PROGRAM_INSTALLED};
 use shared_abi::geometry::Region;
+use shared_abi::handoff::SdoBases;
 use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::{BootRequest, Owed};
@@ -79,6 +80,7 @@ pub struct ProgramControl {
     node_id: Option<u8>,
     /// The node-ID with which the bootloader can answer in this program's place.
     bootloader_node: Option<u8>,
+    sdo: SdoBases,
     departure: Departure<BootRequest>,
 }
 
@@ -98,6 +100,7 @@ impl ProgramControl {
             promised: None,
             node_id: start.node_id,
             bootloader_node: start.bootloader_node(),
+            sdo: start.sdo(),
             departure: Departure::Staying,
         }
     }
@@ -108,6 +111,12 @@ impl ProgramControl {
     #[must_use]
     pub const fn answering_itself(self) -> Self {
         Self { bootloader_node: None, ..self }
+    }
+
+    /// The bases of the COB-IDs of SDO.
+    #[must_use]
+    pub const fn sdo(&self) -> SdoBases {
+        self.sdo
     }
 
     /// The program that runs, 1 to 254.
@@ -381,6 +390,7 @@ mod tests {
             bootloader_version: 0,
             serial_number: 0,
             bootloader_number: Some(bootloader_number),
+            sdo: SdoBases::PREDEFINED,
         }
     }
 

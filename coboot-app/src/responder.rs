@@ -203,7 +203,7 @@ impl Responder {
     /// The identifiers to let through: NMT and the SDO requests of this node.
     #[must_use]
     pub const fn identifiers(&self) -> [u16; 2] {
-        [0, 0x600 + self.node_id as u16]
+        [0, self.control.sdo().request + self.node_id as u16]
     }
 
     /// Program control, to confirm this program with
@@ -230,10 +230,10 @@ impl Responder {
                 None
             }
             (id, &[a, b, c, d, e, f, g, h])
-                if id == 0x600 + u16::from(self.node_id) && self.nmt != Nmt::Stopped =>
+                if id == self.control.sdo().request + u16::from(self.node_id) && self.nmt != Nmt::Stopped =>
             {
                 let bytes = self.request([a, b, c, d, e, f, g, h], now, services)?;
-                Some(Frame { id: 0x580 + u16::from(self.node_id), len: 8, bytes })
+                Some(Frame { id: self.control.sdo().response + u16::from(self.node_id), len: 8, bytes })
             }
             _ => None,
         }

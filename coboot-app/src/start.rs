@@ -1,6 +1,6 @@
 //! How the program was started.
 
-use shared_abi::handoff::{BootInfo, Handoff};
+use shared_abi::handoff::{BootInfo, Handoff, SdoBases};
 use shared_abi::layout::Layout;
 
 /// The values to use when no bootloader has started the program (but a debugger, for example).
@@ -75,6 +75,16 @@ impl Start {
         }
     }
 
+    /// The bases of the COB-IDs of SDO: a client of the bootloader goes on with the program by the same ones.
+    /// Those of the predefined connection set if no bootloader started the program.
+    #[must_use]
+    pub const fn sdo(&self) -> SdoBases {
+        match self.told {
+            Some(told) => told.sdo,
+            None => SdoBases::PREDEFINED,
+        }
+    }
+
     /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
     /// this program's place. `None` where it has to find the bit rate out first.
     #[must_use]
@@ -103,6 +113,7 @@ mod tests {
         bootloader_version: 0x0001_0000,
         serial_number: 9,
         bootloader_number: None,
+        sdo: SdoBases { request: 0x680, response: 0x480 },
     };
 
     #[test]
@@ -114,6 +125,8 @@ mod tests {
         let start = Start::new(None, DEFAULTS);
         assert_eq!((start.node_id, start.bit_rate, start.serial_number), (Some(32), 125_000, 7));
         assert_eq!((start.program, start.fresh, start.told), (1, false, None));
+        assert_eq!(start.sdo(), SdoBases { request: 0x600, response: 0x580 });
+        assert_eq!(Start::new(Some(TOLD), DEFAULTS).sdo(), TOLD.sdo);
     }
 
     #[test]

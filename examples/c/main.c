@@ -93,7 +93,7 @@ static void nmt(const struct can_frame *frame)
 
 static void handle(const struct can_frame *frame)
 {
-    struct can_frame answer = { (uint16_t)(0x580 + program.node_id), 8, { 0 } };
+    struct can_frame answer = { (uint16_t)(program.sdo_response_base + program.node_id), 8, { 0 } };
 
     if (frame->id == 0) {
         nmt(frame);
@@ -125,7 +125,7 @@ static void send_heartbeat(void)
 
 static void start_can(uint32_t clock)
 {
-    const uint16_t requests = (uint16_t)(0x600 + program.node_id);
+    const uint16_t requests = (uint16_t)(program.sdo_request_base + program.node_id);
 
     if (!can_start(clock, program.bit_rate, 0, requests)) {
         /* The bootloader will start with another bit rate. */

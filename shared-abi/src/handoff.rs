@@ -18,7 +18,8 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 /// | 1 | |
 /// | 2 | [`Handoff::flags`] |
 /// | 3 | [`Handoff::bootloader_number`] |
-pub const VERSION: u16 = 3;
+/// | 4 | [`Handoff::sdo_request_base`], [`Handoff::sdo_response_base`] |
+pub const VERSION: u16 = 4;
 /// The oldest version that a reader accepts.
 pub const OLDEST: u16 = 1;
 
@@ -122,6 +123,34 @@ pub struct BootInfo {
     /// The sub-index of the bootloader itself in 1F51h, 1F56h and 1F57h; `None` if it cannot be renewed
     /// over CAN.
     pub bootloader_number: Option<u8>,
+    /// The bases of the COB-IDs of SDO.
+    pub sdo: SdoBases,
+}
+
+/// The bases of the COB-IDs of SDO, to which the node-ID is added; 80h to 780h.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SdoBases {
+    /// Of requests to the device.
+    pub request: u16,
+    /// Of its answers.
+    pub response: u16,
+}
+
+impl SdoBases {
+    /// Those of the predefined connection set (CiA 301 table 69).
+    pub const PREDEFINED: Self = Self { request: 0x600, response: 0x580 };
+
+    /// From the two words of the record.
+    const fn of_record(request: u16, response: u16) -> Self {
+        match (request, response) {
+            (0x80..=0x780, 0x80..=0x780) => Self { request, response },
+            _ => Self::PREDEFINED,
+        }
+    }
+
+    const fn is_predefined(self) -> bool {
+        self.request == Self::PREDEFINED.request && self.response == Self::PREDEFINED.response
+    }
 }
 
 /// The handoff in RAM: 48 bytes, little-endian.
@@ -152,8 +181,13 @@ pub struct Handoff {
     pub flags: u32,
     /// The sub-index of the bootloader itself, 0 for none. Since version 3.
     pub bootloader_number: u32,
+    /// The base of the COB-ID of SDO requests; 0 for those of the predefined connection set. Since version
+    /// 4.
+    pub sdo_request_base: u16,
+    /// The base of the COB-ID of SDO answers, in the same way. Since version 4.
+    pub sdo_response_base: u16,
     /// 0; later versions may define these words.
-    pub reserved: [u32; 3],
+    pub reserved: [u32; 2],
     /// [`check_word`] of the eleven words before.
     pub check: u32,
 }
@@ -174,6 +208,9 @@ impl Handoff {
             Some(number) => number as u32,
             None => 0,
         };
+        if !info.sdo.is_predefined() {
+            words[8] = info.sdo.request as u32 | (info.sdo.response as u32) << 16;
+        }
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and every bit pattern is a valid `Handoff`.
         unsafe { core::mem::transmute(words) }
@@ -199,6 +236,7 @@ impl Handoff {
             bootloader_version: self.bootloader_version,
             serial_number: self.serial_number,
             bootloader_number: u8::try_from(self.bootloader_number).ok().filter(|number| *number != 0),
+            sdo: SdoBases::of_record(self.sdo_request_base, self.sdo_response_base),
         })
     }
 
@@ -276,15 +314,19 @@ mod tests {
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
         bootloader_number: Some(2),
+        sdo: SdoBases { request: 0x680, response: 0x480 },
     };
 
     #[test]
     fn tells_what_it_was_told() {
         assert_eq!(Handoff::new(&INFO).info(), Some(INFO));
+        let predefined = BootInfo { sdo: SdoBases::PREDEFINED, ..INFO };
+        assert_eq!(Handoff::new(&predefined).info(), Some(predefined));
+        assert_eq!(Handoff::new(&predefined).sdo_request_base, 0, "as before version 4");
     }
 
-    /// A bootloader of version 1 does not set this flag, and no number; a newer bootloader may set unknown
-    /// bits, and a number that none can be.
+    /// A bootloader of version 1 does not set this flag, no number and no COB-IDs; a newer bootloader may set
+    /// unknown bits, a number that none can be, and COB-IDs of other services.
     #[test]
     fn an_older_version_is_read_and_is_never_fresh() {
         let mut words = [0; WORDS];
@@ -292,11 +334,13 @@ mod tests {
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
         let old: Handoff = unsafe { core::mem::transmute(words) };
-        let expected = Some(BootInfo { fresh: false, bootloader_number: None, ..INFO });
+        let sdo = SdoBases::PREDEFINED;
+        let expected = Some(BootInfo { fresh: false, bootloader_number: None, sdo, ..INFO });
         assert_eq!(old.info(), expected);
-        words[1] = 0x0030_0004;
+        words[1] = 0x0030_0005;
         words[6] = 0xFFFF_FFFE;
         words[7] = 0x0102;
+        words[8] = 0x0480_0000;
         words[WORDS - 1] = check_of(&words);
         // SAFETY: as above.
         let newer: Handoff = unsafe { core::mem::transmute(words) };
@@ -310,7 +354,8 @@ mod tests {
         assert_eq!(Handoff { trial: 0, ..good }.info(), None);
         assert_eq!(Handoff { flags: 0, ..good }.info(), None);
         assert_eq!(Handoff { bootloader_number: 3, ..good }.info(), None);
-        assert_eq!(Handoff { reserved: [0, 0, 1], ..good }.info(), None);
+        assert_eq!(Handoff { sdo_response_base: 0x580, ..good }.info(), None);
+        assert_eq!(Handoff { reserved: [0, 1], ..good }.info(), None);
         assert_eq!(Handoff { check: !good.check, ..good }.info(), None);
         let unusable = Handoff::new(&BootInfo { node_id: 0, ..INFO });
         assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");

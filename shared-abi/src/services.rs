@@ -67,6 +67,10 @@ pub struct Facts {
     /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS) and
     /// [`ROM_LOADER`](Self::ROM_LOADER).
     pub abilities: u16,
+    /// The bases of the COB-IDs of SDO requests, and of answers, which programs get with the handoff.
+    pub sdo_request_base: u16,
+    /// See [`sdo_request_base`](Self::sdo_request_base).
+    pub sdo_response_base: u16,
 }
 
 impl Facts {
@@ -87,11 +91,12 @@ impl Facts {
         let Some(version) = word(bytes, table.wrapping_sub(base)) else { return None };
         let Some(at) = word(bytes, table.wrapping_sub(base).wrapping_add(FACTS)) else { return None };
         let at = at.wrapping_sub(base);
-        let (Some(board), Some(first), Some(second), Some(third)) = (
+        let (Some(board), Some(first), Some(second), Some(third), Some(fourth)) = (
             word(bytes, at),
             word(bytes, at.wrapping_add(4)),
             word(bytes, at.wrapping_add(8)),
             word(bytes, at.wrapping_add(12)),
+            word(bytes, at.wrapping_add(16)),
         ) else {
             return None;
         };
@@ -103,6 +108,8 @@ impl Facts {
             node_ids: (second >> 16) as u16,
             bit_rates: third as u16,
             abilities: (third >> 16) as u16,
+            sdo_request_base: fourth as u16,
+            sdo_response_base: (fourth >> 16) as u16,
         };
         if facts.size < Self::SIZE {
             return None;
@@ -206,7 +213,7 @@ const _: () = {
     assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
     assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
     assert!(offset_of!(Services, facts) == 8 + 7 * POINTER);
-    assert!(offset_of!(Facts, bit_rates) == 12 && size_of::<Facts>() == 16);
+    assert!(offset_of!(Facts, bit_rates) == 12 && size_of::<Facts>() == 20);
     assert!(size_of::<StoreState>() == 128);
 };
 
@@ -227,12 +234,14 @@ mod tests {
     fn facts_are_read_from_the_bytes_of_a_resident_part() {
         let facts = Facts {
             board: 0x1234_5678,
-            size: 16,
+            size: 20,
             autostart: 2,
             crc_bits: 16,
             node_ids: 0x7F01,
             bit_rates: 0x1FF,
             abilities: 0x8001,
+            sdo_request_base: 0x680,
+            sdo_response_base: 0x480,
         };
         // Its services are at 20h, version 3, and the facts at 60h.
         let mut bytes = [0; 0x80];
@@ -240,15 +249,16 @@ mod tests {
             (0x20, 3),
             (0x44, 0x0800_0060),
             (0x60, 0x1234_5678),
-            (0x64, 0x0002_0010),
+            (0x64, 0x0002_0014),
             (0x68, 0x7F01_0010),
             (0x6C, 0x8001_01FF),
+            (0x70, 0x0480_0680),
         ] {
             bytes[at..at + 4].copy_from_slice(&u32::to_le_bytes(word));
         }
         let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
         assert_eq!(read(&bytes), Some((3, facts)));
-        for (at, word) in [(0x44, 0x0800_0074_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_000F)] {
+        for (at, word) in [(0x44, 0x0800_0070_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_0013)] {
             let mut wrong = bytes;
             wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());
             assert_eq!(read(&wrong), None, "{word:#x} at {at:#x}");

@@ -24,9 +24,9 @@ static void print(const void *record, size_t len)
 int main(void)
 {
     static const unsigned char handoff[48] = {
-        'C', 'B', 'H', 'O', 3, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
+        'C', 'B', 'H', 'O', 4, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 1, 0, 0, 0,
-        2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xEA, 0xBC, 0xF3, 0x12,
+        2, 0, 0, 0, 0x80, 6, 0x80, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0x07, 0xB7, 0x24, 0xCA,
     };
     /* Of a bootloader that knew no flags. */
     static const unsigned char older[48] = {
@@ -48,8 +48,10 @@ int main(void)
     struct coboot_handoff record;
     memcpy(&record, older, sizeof record);
     printf("%d%d%u ", coboot_handoff_is_sound(&record), coboot_is_fresh(&record), coboot_bootloader_number(&record));
+    printf("%x/%x ", coboot_sdo_request_base(&record), coboot_sdo_response_base(&record));
     memcpy(&record, handoff, sizeof record);
     printf("%d%u ", coboot_is_fresh(&record), coboot_bootloader_number(&record));
+    printf("%x/%x ", coboot_sdo_request_base(&record), coboot_sdo_response_base(&record));
     printf("%d %u %u %u %u\n", coboot_handoff_is_sound(&record), record.node_id, (unsigned)record.bit_rate,
            (unsigned)(record.reset_cause == COBOOT_RESET_SOFTWARE), record.trial);
     unsigned sound = 0;
@@ -114,7 +116,7 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
         434257310200000001000000CD5920E5\n\
         434257310300000001000000F981E052\n\
         434257310700000002037F00A57F86CC\n\
-        100 12 1 5 125000 1 1\n\
+        100 600/580 12 680/480 1 5 125000 1 1\n\
         0\n\
         00\n\
         0110211\n";

@@ -4,7 +4,7 @@ use std::mem::{align_of, offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args};
 use shared_abi::geometry::Region;
-use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
+use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
 use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
 /// The bytes of a structure in RAM. (The host is little-endian, like the chip.)
@@ -56,7 +56,9 @@ fn handoff_byte_for_byte() {
         (offset_of!(Handoff, serial_number), 20),
         (offset_of!(Handoff, flags), 24),
         (offset_of!(Handoff, bootloader_number), 28),
-        (offset_of!(Handoff, reserved), 32),
+        (offset_of!(Handoff, sdo_request_base), 32),
+        (offset_of!(Handoff, sdo_response_base), 34),
+        (offset_of!(Handoff, reserved), 36),
         (offset_of!(Handoff, check), 44),
     ];
     for (actual, expected) in offsets {
@@ -72,14 +74,15 @@ fn handoff_byte_for_byte() {
         bootloader_version: 0x0001_0002,
         serial_number: 0xDEAD_BEEF,
         bootloader_number: Some(2),
+        sdo: SdoBases { request: 0x680, response: 0x480 },
     });
     #[rustfmt::skip]
     let expected = [
-        b'C', b'B', b'H', b'O', 3, 0, 48, 0,
+        b'C', b'B', b'H', b'O', 4, 0, 48, 0,
         5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        1, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0,
-        0xEA, 0xBC, 0xF3, 0x12,
+        1, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0, 0, 0, 0, 0, 0, 0, 0,
+        0x07, 0xB7, 0x24, 0xCA,
     ];
     assert_eq!(bytes(&handoff), expected);
 }

@@ -118,6 +118,8 @@ fn of_rust() -> BTreeMap<String, i64> {
         serial_number,
         flags,
         bootloader_number,
+        sdo_request_base,
+        sdo_response_base,
         reserved,
         check
     ));

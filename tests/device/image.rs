@@ -135,13 +135,15 @@ fn the_resident_part_has_its_facts() {
         let resident = Parts::of(image).resident;
         let (version, facts) =
             Facts::of_resident(&resident, board.bootloader.base, board.callgate() + OFFSET).unwrap();
-        assert_eq!((version, facts.size, facts.board), (1, 16, identity), "{image}");
-        [facts.autostart, facts.crc_bits, facts.node_ids, facts.bit_rates]
+        assert_eq!((version, facts.size, facts.board), (1, 20, identity), "{image}");
+        let sdo = [facts.sdo_request_base, facts.sdo_response_base];
+        ([facts.autostart, facts.crc_bits, facts.node_ids, facts.bit_rates], sdo)
     };
-    assert_eq!(facts(firmware::BOOTLOADER), [1, 32, 0x7F01, 0x3FF]);
-    assert_eq!(facts(firmware::BOOTLOADER_LEAST), [0, 32, 0x7F01, 0x1FF]);
-    assert_eq!(facts(firmware::BOOTLOADER_CRC_16), [1, 16, 0x7F01, 0x3FF]);
-    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), [1, 32, 0x6402, 0x27C]);
+    let predefined = [0x600, 0x580];
+    assert_eq!(facts(firmware::BOOTLOADER), ([1, 32, 0x7F01, 0x3FF], predefined));
+    assert_eq!(facts(firmware::BOOTLOADER_LEAST), ([0, 32, 0x7F01, 0x1FF], predefined));
+    assert_eq!(facts(firmware::BOOTLOADER_CRC_16), ([1, 16, 0x7F01, 0x3FF], predefined));
+    assert_eq!(facts(firmware::BOOTLOADER_SWITCHES), ([1, 32, 0x6402, 0x27C], [0x680, 0x480]));
 }
 
 /// The flash contains the 16 vectors of the core; the RAM image begins with all vectors.

@@ -87,6 +87,24 @@ fn lss_starts_in_configuration_and_stores_nothing() {
     assert_eq!(answer[..2], [0x17, 1]);
 }
 
+/// A program gets the COB-IDs with the handoff: trial, start and call back go by the same ones.
+#[test]
+fn an_update_keeps_the_cob_ids_of_the_product() {
+    let mut bench = switched_on(42, BitRate::K500);
+    bench.machine().set_pin('C', 0, Some(true));
+    let node = canopen::NodeId::new(42).unwrap();
+    for program in [firmware::APP_V1, firmware::APP_V2, firmware::APP_C] {
+        let file = firmware::blocks(program);
+        let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
+        let mut session = Session::new(&mut ids, node, Timing::default());
+        let report = flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+        assert!(!report.running.unwrap().is_bootloader(), "{program}");
+        drop(session);
+        // By the predefined ones nobody answers.
+        assert_eq!(bench.ask(0x62A, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x5AA), None, "{program}");
+    }
+}
+
 /// A released program only starts while PC0 is high; CLEAR of this product erases at once.
 #[test]
 fn a_pin_says_whether_a_program_is_valid() {

@@ -199,6 +199,11 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
         (format!("{include}, crc: CrcKind::Crc16"), "product: `resident` has another crc"),
         (format!("{include}, bit_rates: 0..=7"), "product: `resident` has other bit_rates"),
         (format!("{include}, node_ids: 1..=126"), "product: `resident` has other node_ids"),
+        (
+            format!("{include}, autostart: Autostart::List(&[]), rescue_window_ms: 0"),
+            "product: `resident` has another autostart",
+        ),
+        (format!("{include}, sdo_request_base: 0x680"), "product: `resident` has another sdo_request_base"),
         (format!("{include}, rom_loader: true"), "product: `resident` has another rom_loader"),
     ] {
         let refused = product(&choices);
@@ -606,7 +611,7 @@ const MISTAKES: &[Mistake] = &[
     },
     // Choices that contradict each other, or the layout, which has only one program.
     product(
-        "Product { autostart: Some(2), ..Product::DEFAULT }",
+        "Product { autostart: Autostart::List(&[2]), ..Product::DEFAULT }",
         "product: autostart names a program that the layout has not",
     ),
     product(
@@ -614,7 +619,15 @@ const MISTAKES: &[Mistake] = &[
         "product: max_crash_resets must be 1 or more",
     ),
     product(
-        "Product { autostart: None, ..Product::DEFAULT }",
+        "Product { autostart: Autostart::List(&[0]), ..Product::DEFAULT }",
+        "product: autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1",
+    ),
+    product(
+        "Product { autostart: Autostart::List(&[1, 1]), ..Product::DEFAULT }",
+        "product: autostart names a program twice",
+    ),
+    product(
+        "Product { autostart: Autostart::List(&[]), ..Product::DEFAULT }",
         "product: a rescue window needs autostart: without it no program starts by itself",
     ),
     product(

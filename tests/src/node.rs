@@ -39,8 +39,6 @@ static CONFIG: bootloader::Config = bootloader::Config {
     layout: &LAYOUT,
     supports: coboot_node::supports,
     boot_up_emergency: true,
-    lss_store: true,
-    program_watchdog_ms: 0,
     download: Profile::STANDARD.download,
     password: &[],
 };

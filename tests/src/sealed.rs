@@ -84,8 +84,6 @@ const fn config(
         layout,
         supports: |_| true,
         boot_up_emergency: false,
-        lss_store: true,
-        program_watchdog_ms: 0,
         download: Policy {
             identity: Some((VENDOR_ID, PRODUCT_CODE)),
             seal: SealPolicy { data: profile.download.data, ..seal },

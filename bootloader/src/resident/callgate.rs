@@ -143,13 +143,10 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
         };
         return Ok(());
     }
-    let id = match u8::try_from(args.node_id) {
-        Ok(NO_NODE_ID) => None,
-        Ok(id) if PRODUCT.node_ids.contains(&id) => NodeId::new(id),
-        _ => return Err(Status::BadArgument),
-    };
+    let is_allowed = |id: &u8| PRODUCT.node_ids.contains(id) || *id == NO_NODE_ID;
+    let id = u8::try_from(args.node_id).ok().filter(is_allowed).ok_or(Status::BadArgument)?;
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
-    let node = NodeParameters { id, bit_rate: bit_rate.ok_or(Status::BadArgument)? };
+    let node = NodeParameters { id: NodeId::new(id), bit_rate: bit_rate.ok_or(Status::BadArgument)? };
     keep(&mut parameters, flash, Key::NODE, node.value())
 }
 

@@ -14,7 +14,7 @@ use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
 use shared_abi::boot_report::{BootReport, Reason, Words};
-use shared_abi::handoff::{BootInfo, Handoff, ResetCause};
+use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
 use shared_abi::renewal::{word, Origin, TrialEnd};
 use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
@@ -167,6 +167,7 @@ pub unsafe extern "C" fn stage() -> ! {
         bootloader_version: product::VERSION,
         serial_number: bsp::serial_number(),
         bootloader_number: PRODUCT.bootloader_number(),
+        sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
     });
     if SEALED && program.locks_flash() {
         // SAFETY: only this code runs, and it writes the flash no more.

@@ -4,8 +4,6 @@
 use canopen::program::ProgramState;
 use clap::Args;
 use coflash::device::info::{program_info, ProgramInfo};
-use coflash::device::read_state::read_state;
-use coflash::device::state::BootloaderState;
 use coflash::device::Session;
 use coflash::update::event::{Event, Phase};
 use coflash::update::steps::{
@@ -13,7 +11,6 @@ use coflash::update::steps::{
 };
 use coflash::Error;
 use serde_json::{json, Value};
-use shared_abi::boot_report::Reason;
 
 use super::catch::{self, Limit};
 use super::context::Context;
@@ -160,8 +157,7 @@ impl Release {
             // the command.
             tell(Event::Found(session.find()?));
             release(session, number, tell)?;
-            let words = format!("program {number} is released for autostart{}", autostart_words(session)?);
-            Ok((words, json!({})))
+            Ok((format!("program {number} is released for autostart"), json!({})))
         })
     }
 }
@@ -172,7 +168,7 @@ impl Withdraw {
             tell(Event::Found(session.find()?));
             withdraw(session, number)?;
             let words = format!(
-                "program {number} is no longer released for autostart: the device stays in the bootloader"
+                "program {number} is no longer released for autostart: it does not start by itself"
             );
             Ok((words, json!({})))
         })
@@ -205,13 +201,6 @@ impl Status {
 fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
     let info = program_info(session, number)?;
     Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))
-}
-
-/// What the device says of programs that start by themselves.
-fn autostart_words(session: &mut Session<'_>) -> Result<&'static str, Error> {
-    let is_off = |state: BootloaderState| state.reason == Reason::NoAutostart as u8;
-    let state = read_state(session)?;
-    Ok(if state.is_some_and(is_off) { "; no program starts by itself on this product" } else { "" })
 }
 
 fn info_words(info: &ProgramInfo) -> String {

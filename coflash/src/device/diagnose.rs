@@ -85,6 +85,12 @@ impl fmt::Display for Diagnosis {
     }
 }
 
+/// What a node needs that is heard and does not answer. The tool does not look for the COB-IDs: a request on
+/// one of a PDO would be a command to a machine.
+const OTHER_IDS: &str = "another tool may be using it, it needs a longer --sdo-timeout, or SDO has other \
+                         COB-IDs there: give --sdo-request and --sdo-response as its product has them \
+                         (sdo_request_base, sdo_response_base)";
+
 impl Diagnosis {
     /// The conclusion from the frames that were heard.
     fn traffic(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -96,14 +102,12 @@ impl Diagnosis {
             ),
             Some(Some(state)) => write!(
                 f,
-                "node {node} sends heartbeats ({}) but does not answer: another tool may be using it, or it \
-                 needs a longer --sdo-timeout",
+                "node {node} sends heartbeats ({}) but does not answer: {OTHER_IDS}",
                 state_words(*state)
             ),
             Some(None) => write!(
                 f,
-                "node {node} sends frames but does not answer: another tool may be using it, or it needs a longer \
-                 --sdo-timeout"
+                "node {node} sends frames but does not answer: {OTHER_IDS}"
             ),
             None if heard.is_empty() => write!(
                 f,

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use canopen::program::{
-    DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_OPTION_BYTES, STATE_PROGRAM_RESET,
-    STATE_PROGRAM_WATCHDOG, STATE_REASON, STATE_SUPPLY,
+    ProgramStart, DEVICE_STATE, STATE_CLOCK, STATE_CRASH_RESETS, STATE_OPTION_BYTES, STATE_PROGRAM_RESET,
+    STATE_PROGRAM_START, STATE_REASON, STATE_SUPPLY,
 };
 use canopen::Address;
 
@@ -34,13 +34,38 @@ pub(crate) fn state_after_failure(session: &mut Session<'_>) -> Option<Bootloade
     read_state(session).ok().flatten()
 }
 
-/// 2007h/10: the time within which a program must feed the watchdog that the bootloader starts; `None` if
-/// there is no such watchdog, or the device does not say.
+/// 2007h/10: how the bootloader starts programs; `None` if the device does not say.
+///
+/// # Errors
+/// Those of a [read](Session::read).
+pub fn program_start(session: &mut Session<'_>) -> Result<Option<ProgramStart>, Error> {
+    let word = told(session.read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)))?;
+    Ok(word.map(ProgramStart::of_word))
+}
+
+/// What a device says of a program that was released for autostart, in words; `None` if the program starts
+/// by itself, or the device does not say.
+pub(crate) fn autostart_words(start: ProgramStart, number: u8) -> Option<String> {
+    match start.by_itself {
+        [first, _] if first == number => None,
+        [ProgramStart::DECIDED, _] => {
+            Some("the device decides at each start which program starts by itself".into())
+        }
+        [0, _] => Some("no program starts by itself on this product".into()),
+        [first, second] if second == number => Some(format!("it starts by itself if program {first} cannot")),
+        [first, 0] => Some(format!("it does not start by itself: program {first} does")),
+        [first, second] => {
+            Some(format!("it does not start by itself: program {first} does, or program {second}"))
+        }
+    }
+}
+
+/// The time within which a program must feed the watchdog that the bootloader starts; `None` if there is no
+/// such watchdog, or the device does not say.
 ///
 /// # Errors
 /// Those of a [read](Session::read).
 pub fn program_watchdog(session: &mut Session<'_>) -> Result<Option<Duration>, Error> {
-    let at = Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG);
-    let ms = told(session.read_number(at))?.filter(|ms| *ms > 0);
-    Ok(ms.map(|ms| Duration::from_millis(ms.into())))
+    let ms = program_start(session)?.map_or(0, |start| start.watchdog_ms);
+    Ok((ms > 0).then(|| Duration::from_millis(ms.into())))
 }

@@ -106,7 +106,7 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
             tell(Event::Found(session.find()?));
             steps::withdraw(session, number)?;
             format!(
-                "program {number} is no longer released: the device stays in the bootloader after a reset"
+                "program {number} is no longer released: it does not start by itself"
             )
         }
         Step::Start => {

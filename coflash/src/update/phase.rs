@@ -136,6 +136,13 @@ pub enum Note {
         #[serde(rename = "master", serialize_with = "json::node")]
         node: NodeId,
     },
+    /// What the device says of the program that was released for autostart.
+    Autostart {
+        /// The program's number.
+        number: u8,
+        /// It in words.
+        says: String,
+    },
 }
 
 /// A problem that may make the update, or a later step, fail.
@@ -243,6 +250,7 @@ impl fmt::Display for Note {
             Self::MasterBack { node } => {
                 write!(f, "NMT mastership given back: node {node} is the master")
             }
+            Self::Autostart { number, says } => write!(f, "program {number}: {says}"),
         }
     }
 }

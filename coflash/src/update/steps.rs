@@ -8,9 +8,9 @@ use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
 use super::options::Target;
-use super::phase::PUT_OFF;
+use super::phase::{Note, PUT_OFF};
 use crate::device::error::{absent, told, Error, Mismatch};
-use crate::device::read_state::state_after_failure;
+use crate::device::read_state::{autostart_words, program_start, state_after_failure};
 use crate::device::{DeviceType, Doing, Session, Timing};
 
 /// How many times an application is called back. A program that was started directly after its
@@ -206,6 +206,9 @@ pub fn erase_at_once(session: &mut Session<'_>, number: u8) -> Result<(), Error>
 pub fn release(session: &mut Session<'_>, number: u8, tell: &mut dyn FnMut(Event)) -> Result<(), Error> {
     execute(session, number, ProgramControl::SetSignature)?;
     tell(Phase::Released.into());
+    if let Some(says) = program_start(session)?.and_then(|start| autostart_words(start, number)) {
+        tell(Note::Autostart { number, says }.into());
+    }
     Ok(())
 }
 

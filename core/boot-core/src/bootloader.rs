@@ -12,10 +12,10 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, ClockSource, FlashError, Numbers, ProgramControl, Supply, DEVICE_STATE, ENABLE_FLASH,
-    FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION,
-    PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE, SEALED_ENTRIES,
-    SECOND_SERVER, SOFTWARE_VERSION, STATE_AUTOSTART, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_WATCHDOG,
+    control_count, ClockSource, FlashError, Numbers, ProgramControl, ProgramStart, Supply, DEVICE_STATE,
+    ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL,
+    PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE,
+    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_START,
     STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
@@ -154,8 +154,12 @@ pub trait Choices {
     };
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
+    /// Whether layer setting services may store node-ID and bit rate.
+    const LSS_STORE: bool = true;
     /// The node-IDs that the device takes: with another one no program starts.
     const NODE_IDS: RangeInclusive<u8> = 1..=127;
+    /// 2007h/10.
+    const PROGRAM_START: ProgramStart = ProgramStart::NONE;
 }
 
 /// A bootloader with everything.
@@ -181,13 +185,6 @@ pub struct Config {
     /// its data are "BOOT" and the reason why the device stayed
     /// ([`Reason`]).
     pub boot_up_emergency: bool,
-    /// Whether layer setting services may store node-ID and bit rate.
-    pub lss_store: bool,
-    /// 2007h/10: the time in ms within which a program must feed the independent watchdog; 0 if the
-    /// bootloader does not start it.
-    pub program_watchdog_ms: u16,
-    /// 2007h/11: the programs that start by themselves.
-    pub autostart: u16,
     /// How programs are downloaded.
     pub download: Policy,
     /// The password that unlocks 1F50h if [`Policy::locked`] is set; the client writes it to the
@@ -434,12 +431,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
             PROGRAM_CONTROL => return put(buf, &[self.download.control(program) as u8]),
             PROGRAM_REGION => return put(buf, &self.download.region(program)),
             PROGRAM_PARTIAL if P::RESUMES => return put(buf, &self.download.partial(at.sub)),
-            DEVICE_STATE if at.sub == STATE_PROGRAM_WATCHDOG => {
-                return put(buf, &self.config.program_watchdog_ms.to_le_bytes());
-            }
-            DEVICE_STATE if at.sub == STATE_AUTOSTART => {
-                return put(buf, &self.config.autostart.to_le_bytes());
-            }
+            DEVICE_STATE if at.sub == STATE_PROGRAM_START => const { C::PROGRAM_START.to_word() },
             DEVICE_STATE if at.sub == STATE_OPTION_BYTES => self.flash.option_bytes(),
             DEVICE_STATE if P::RENEWS && at.sub == STATE_VERSIONS => {
                 return put(buf, &self.download.versions());
@@ -563,7 +555,7 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
         if !self.download.rights().permits(right::STORE) {
             return Poll::Ready(Err(StoreError::Failed));
         }
-        if !self.config.lss_store {
+        if !C::LSS_STORE {
             return Poll::Ready(Err(StoreError::Unsupported));
         }
         let node = NodeParameters { id, bit_rate: rate.unwrap_or(self.node.bit_rate) };

@@ -176,14 +176,41 @@ pub const STATE_VERSIONS: u8 = 8;
 /// In [`DEVICE_STATE`]: the state of a renewal of the bootloader (`shared_abi::renewal::Progress`). Only
 /// with renewal.
 pub const STATE_RENEWAL: u8 = 9;
-/// In [`DEVICE_STATE`]: the time in milliseconds within which a program must feed the independent
-/// watchdog, which the bootloader starts; 0 if it does not.
-pub const STATE_PROGRAM_WATCHDOG: u8 = 10;
-/// Sub-index of [`DEVICE_STATE`]: the programs that start by themselves after a reset, the preferred one in
-/// bits 0 to 7, the next one in bits 8 to 15; 0 for none, [`AUTOSTART_FUNCTION`] if the product decides.
-pub const STATE_AUTOSTART: u8 = 11;
-/// The value of [`STATE_AUTOSTART`] of a device whose product decides at each start.
-pub const AUTOSTART_FUNCTION: u16 = 0xFF;
+/// In [`DEVICE_STATE`]: the [`ProgramStart`].
+pub const STATE_PROGRAM_START: u8 = 10;
+
+/// How the bootloader starts programs ([`STATE_PROGRAM_START`]).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ProgramStart {
+    /// The time in milliseconds within which a program must feed the independent watchdog, which the
+    /// bootloader starts; 0 if it does not. Bits 0 to 15.
+    pub watchdog_ms: u16,
+    /// The programs that start by themselves after a reset, the preferred one first; 0 for none. Bits 16 to
+    /// 23, and 24 to 31.
+    pub by_itself: [u8; 2],
+}
+
+impl ProgramStart {
+    /// Without a watchdog; no program starts by itself.
+    pub const NONE: Self = Self { watchdog_ms: 0, by_itself: [0; 2] };
+    /// In place of the preferred program, if the product decides at each start.
+    pub const DECIDED: u8 = 0xFF;
+
+    /// The word of the object.
+    #[must_use]
+    pub const fn to_word(self) -> u32 {
+        let [first, second] = self.by_itself;
+        let [low, high] = self.watchdog_ms.to_le_bytes();
+        u32::from_le_bytes([low, high, first, second])
+    }
+
+    /// From the word of the object.
+    #[must_use]
+    pub const fn of_word(word: u32) -> Self {
+        let [low, high, first, second] = word.to_le_bytes();
+        Self { watchdog_ms: u16::from_le_bytes([low, high]), by_itself: [first, second] }
+    }
+}
 
 /// The source of a device's clock ([`STATE_CLOCK`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -211,8 +238,8 @@ pub enum Supply {
 pub const SUPPLY_DETAIL: u8 = 1;
 
 /// The entries of [`DEVICE_STATE`].
-pub const STATE_ENTRIES: [Entry; 10] = [
-    Entry::record(DEVICE_STATE, "Device state", STATE_AUTOSTART),
+pub const STATE_ENTRIES: [Entry; 9] = [
+    Entry::record(DEVICE_STATE, "Device state", STATE_PROGRAM_START),
     Entry::sub(
         DEVICE_STATE,
         STATE_BOOTLOADER,
@@ -238,20 +265,7 @@ pub const STATE_ENTRIES: [Entry; 10] = [
     Entry::sub(DEVICE_STATE, STATE_CLOCK, "Source of the clock", DataType::Unsigned8, Access::Ro),
     Entry::sub(DEVICE_STATE, STATE_OPTION_BYTES, "Option bytes", DataType::Unsigned32, Access::Ro),
     Entry::sub(DEVICE_STATE, STATE_SUPPLY, "Supply", DataType::Unsigned8, Access::Ro),
-    Entry::sub(
-        DEVICE_STATE,
-        STATE_PROGRAM_WATCHDOG,
-        "Watchdog of a program",
-        DataType::Unsigned16,
-        Access::Const,
-    ),
-    Entry::sub(
-        DEVICE_STATE,
-        STATE_AUTOSTART,
-        "Programs that start by themselves",
-        DataType::Unsigned16,
-        Access::Const,
-    ),
+    Entry::sub(DEVICE_STATE, STATE_PROGRAM_START, "Start of programs", DataType::Unsigned32, Access::Const),
 ];
 
 /// The entries of [`DEVICE_STATE`] in an application.

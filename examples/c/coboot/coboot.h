@@ -133,7 +133,7 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 /* ---- The handoff: how the device came up ---- */
 
 #define COBOOT_HANDOFF_MAGIC UINT32_C(0x4F484243)
-#define COBOOT_HANDOFF_VERSION UINT32_C(0x3)
+#define COBOOT_HANDOFF_VERSION UINT32_C(0x4)
 #define COBOOT_HANDOFF_OLDEST UINT32_C(0x1)
 
 /* In `flags`, since version 2: the program was started right after its download in one go. */
@@ -163,7 +163,9 @@ struct coboot_handoff {
     uint32_t serial_number;
     uint32_t flags;
     uint32_t bootloader_number;
-    uint32_t reserved[3];
+    uint16_t sdo_request_base;
+    uint16_t sdo_response_base;
+    uint32_t reserved[2];
     uint32_t check;
 };
 COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
@@ -179,7 +181,9 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_version) == 16, 
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, serial_number) == 20, "coboot_handoff: serial_number");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, "coboot_handoff: flags");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_number) == 28, "coboot_handoff: bootloader_number");
-COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 32, "coboot_handoff: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, sdo_request_base) == 32, "coboot_handoff: sdo_request_base");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, sdo_response_base) == 34, "coboot_handoff: sdo_response_base");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 36, "coboot_handoff: reserved");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
 
 /* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */
@@ -203,6 +207,25 @@ static inline bool coboot_is_fresh(const struct coboot_handoff *handoff)
 static inline uint8_t coboot_bootloader_number(const struct coboot_handoff *handoff)
 {
     return handoff->bootloader_number <= UINT8_MAX ? (uint8_t)handoff->bootloader_number : 0;
+}
+
+/* The bases of the COB-IDs of SDO requests and answers, to which the node-ID is added: of a bootloader that knows none,
+ * those of the predefined connection set (CiA 301 table 69).
+ */
+static inline bool coboot_has_sdo_bases(const struct coboot_handoff *handoff)
+{
+    return handoff->sdo_request_base >= 0x80 && handoff->sdo_request_base <= 0x780
+        && handoff->sdo_response_base >= 0x80 && handoff->sdo_response_base <= 0x780;
+}
+
+static inline uint16_t coboot_sdo_request_base(const struct coboot_handoff *handoff)
+{
+    return coboot_has_sdo_bases(handoff) ? handoff->sdo_request_base : 0x600;
+}
+
+static inline uint16_t coboot_sdo_response_base(const struct coboot_handoff *handoff)
+{
+    return coboot_has_sdo_bases(handoff) ? handoff->sdo_response_base : 0x580;
 }
 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----

@@ -28,6 +28,8 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
     program->node_id = node_id;
     program->bit_rate = bit_rate;
     program->serial_number = 0;
+    program->sdo_request_base = 0x600;
+    program->sdo_response_base = 0x580;
     program->number = 1;
     program->bootloader = 0;
     program->fresh = false;
@@ -38,6 +40,8 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
         program->node_id = handoff.node_id;
         program->bit_rate = handoff.bit_rate;
         program->serial_number = handoff.serial_number;
+        program->sdo_request_base = coboot_sdo_request_base(&handoff);
+        program->sdo_response_base = coboot_sdo_response_base(&handoff);
         program->number = handoff.program;
         program->bootloader = coboot_bootloader_number(&handoff);
         program->fresh = coboot_is_fresh(&handoff);

@@ -45,6 +45,9 @@ struct coboot_program {
     uint8_t node_id;
     uint32_t bit_rate;
     uint32_t serial_number;
+    /* The bases of the COB-IDs of SDO requests and answers, to which the node-ID is added. */
+    uint16_t sdo_request_base;
+    uint16_t sdo_response_base;
     /* The number of the program in the device, from 1 on. */
     uint8_t number;
     /* Services of the bootloader, or a null pointer. */

@@ -81,7 +81,7 @@ mod app {
         let defaults = Defaults { node_id: Some(32), bit_rate: 125_000, serial_number: 0 };
         let start = Start::read(&LAYOUT, defaults);
         let bootloader = Bootloader::new(&LAYOUT);
-        let node = start.node_id.and_then(|node_id| Node::new(node_id, HEARTBEAT_MS));
+        let node = start.node_id.and_then(|node_id| Node::new(node_id, [start.sdo().request, start.sdo().response], HEARTBEAT_MS));
         let timing = BitTiming::new(rcc.clocks.pclk1().raw(), start.bit_rate);
         let (Some(node), Some(timing)) = (node, timing) else {
             // A node-ID or a bit rate that has to be found out first: the bootloader can.

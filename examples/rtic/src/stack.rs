@@ -55,20 +55,22 @@ enum State {
 /// A node.
 pub struct Node {
     id: u8,
+    /// The bases of the COB-IDs of SDO requests and answers.
+    sdo: [u16; 2],
     state: State,
     heartbeat_ms: u32,
     beaten: u32,
 }
 
 impl Node {
-    /// A node with this node-ID, 1 to 127, that has yet to send its boot-up.
-    pub fn new(id: u8, heartbeat_ms: u32) -> Option<Self> {
-        (1..=127).contains(&id).then_some(Self { id, state: State::BootUp, heartbeat_ms, beaten: 0 })
+    /// A node with this node-ID, 1 to 127, and these bases of SDO requests and answers, that has yet to send its boot-up.
+    pub fn new(id: u8, sdo: [u16; 2], heartbeat_ms: u32) -> Option<Self> {
+        (1..=127).contains(&id).then_some(Self { id, sdo, state: State::BootUp, heartbeat_ms, beaten: 0 })
     }
 
     /// The identifiers of what the node receives: NMT and its SDO requests.
     pub fn identifiers(&self) -> [u16; 2] {
-        [0, 0x600 + u16::from(self.id)]
+        [0, self.sdo[0] + u16::from(self.id)]
     }
 
     /// The boot-up or heartbeat that is to be sent.
@@ -97,9 +99,9 @@ impl Node {
                 };
                 None
             }
-            (id, data) if id == 0x600 + u16::from(self.id) && self.state != State::Stopped => {
+            (id, data) if id == self.sdo[0] + u16::from(self.id) && self.state != State::Stopped => {
                 let answer = answer(*<&[u8; 8]>::try_from(data).ok()?, objects)?;
-                Some(Event::Answer(0x580 + u16::from(self.id), answer))
+                Some(Event::Answer(self.sdo[1] + u16::from(self.id), answer))
             }
             _ => None,
         }

@@ -136,9 +136,6 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         layout: args.board,
         supports,
         boot_up_emergency: true,
-        lss_store: true,
-        program_watchdog_ms: 0,
-        autostart: 1,
         download: Policy {
             identity: Some((args.vendor_id, args.product_code)),
             crc: if args.crc16 { CrcKind::Crc16 } else { CrcKind::Crc32 },

@@ -49,8 +49,6 @@ static CONFIG: Config = Config {
     layout: &LAYOUT,
     supports: |_| true,
     boot_up_emergency: false,
-    lss_store: true,
-    program_watchdog_ms: 0,
     download: Policy::DEFAULT,
     password: b"",
 };

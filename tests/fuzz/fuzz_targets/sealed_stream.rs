@@ -65,8 +65,6 @@ static CONFIG: Config = Config {
     layout: &LAYOUT,
     supports: |_| true,
     boot_up_emergency: false,
-    lss_store: true,
-    program_watchdog_ms: 0,
     download: Policy {
         identity: Some((VENDOR_ID, PRODUCT_CODE)),
         seal: SealPolicy {

@@ -49,8 +49,6 @@ macro_rules! config {
             layout: &LAYOUT,
             supports: |_| true,
             boot_up_emergency: false,
-            lss_store: true,
-            program_watchdog_ms: 0,
             download: Policy { identity: Some((1, 2)), ..PROFILE.download },
             password: PROFILE.password,
         };

@@ -38,9 +38,6 @@ pub const CONFIG: Config = Config {
     layout: LAYOUT_REF,
     supports: |rate| rate != BitRate::K800,
     boot_up_emergency: false,
-    lss_store: true,
-    program_watchdog_ms: 0,
-    autostart: 1,
     download: Policy::DEFAULT,
     password: b"",
 };

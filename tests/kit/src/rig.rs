@@ -70,9 +70,6 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
         layout,
         supports: |_| true,
         boot_up_emergency: false,
-        lss_store: true,
-        program_watchdog_ms: 0,
-        autostart: 1,
         download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
         password: profile.password,
     }

@@ -86,8 +86,6 @@ impl Node {
             layout: &LAYOUT,
             supports: coboot_node::supports,
             boot_up_emergency: true,
-            lss_store: true,
-            program_watchdog_ms: 0,
             download: Policy { ..profile.download },
             password: profile.password,
         }));

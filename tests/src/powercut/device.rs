@@ -59,8 +59,6 @@ const CONFIG: Config = Config {
     node_id: None,
     password: b"",
     boot_up_emergency: false,
-    lss_store: true,
-    program_watchdog_ms: 0,
     download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..Policy::DEFAULT },
 };
 static SOUND: Config = CONFIG;

@@ -1,7 +1,9 @@
 //! The boot decision: the promised order of its checks.
 
+use std::cell::RefCell;
+
 use boot_core::crc::CrcKind;
-use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset, Policy};
+use boot_core::decision::{decide, fallback, Autostart, BootDecision, Circumstances, PinReset, Policy};
 use boot_core::flash::{run, Flash as _};
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
@@ -16,7 +18,8 @@ const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_
 
 fn policy() -> Policy {
     Policy {
-        autostart: Some(1),
+        autostart: Autostart::InOrder,
+        programs: &[1],
         max_crash_resets: 3,
         node_ids: 1..=100,
         rescue_window_ms: 0,
@@ -94,7 +97,7 @@ fn what_asks_for_the_bootloader_wins() {
         Reason::Strap
     );
     assert_eq!(stay(Circumstances { crash_resets: 3, ..QUIET }, policy()), Reason::CrashLoop);
-    assert_eq!(stay(QUIET, Policy { autostart: None, ..policy() }), Reason::NoAutostart);
+    assert_eq!(stay(QUIET, Policy { autostart: Autostart::List(&[]), ..policy() }), Reason::NoAutostart);
     for node_id in [0, 101, 127, 255] {
         assert_eq!(stay(Circumstances { node_id, ..QUIET }, policy()), Reason::NodeId);
     }
@@ -107,7 +110,7 @@ fn without_signature_a_program_starts_as_a_trial_alone() {
     let start = Circumstances { request: Some(BootRequest::Start(1)), ..QUIET };
     let refused = BootDecision::Stay { reason: Reason::Unsigned, refused: 1 };
     assert_eq!(decide(&start, &policy(), |_| unsigned()), refused);
-    let policy = Policy { autostart: None, ..policy() };
+    let policy = Policy { autostart: Autostart::List(&[]), ..policy() };
     for request in [BootRequest::Trial(1), BootRequest::Fresh(1)] {
         let trial = Circumstances { request: Some(request), crash_resets: 9, ..QUIET };
         let expected = BootDecision::Start { program: unsigned().unwrap(), trial: true };
@@ -341,16 +344,90 @@ fn a_start_that_is_refused_names_its_program() {
     assert_eq!(refused(None, with(|policy| policy.node_ids = 6..=100), signed), 0);
 }
 
-/// Without a bootloader to stay in, each program has its turn.
+/// Without a bootloader to stay in, each program has its turn, until one starts.
 #[test]
-fn the_program_with_autostart_is_tried_first_and_then_each_other_once() {
-    let order = |autostart, programs| {
-        (1..=programs).map(move |turn| fallback(autostart, programs, turn)).collect::<Vec<_>>()
+fn the_programs_with_autostart_are_tried_first_and_then_the_others() {
+    let order = |autostart, programs, starts: u8| {
+        let mut tried = Vec::new();
+        fallback(&Policy { autostart, programs, ..policy() }, |number| {
+            if !tried.contains(&number) {
+                tried.push(number);
+            }
+            number == starts
+        });
+        tried
     };
-    assert_eq!(order(Some(1), 1), [1]);
-    assert_eq!(order(None, 1), [1]);
-    assert_eq!(order(None, 2), [1, 2]);
-    assert_eq!(order(Some(2), 2), [2, 1]);
-    assert_eq!(order(Some(2), 3), [2, 3, 1]);
-    assert_eq!(fallback(Some(127), 127, 127), 126);
+    assert_eq!(order(Autostart::InOrder, &[1], 0), [1]);
+    assert_eq!(order(Autostart::List(&[]), &[1], 0), [1]);
+    assert_eq!(order(Autostart::List(&[]), &[1, 2], 0), [1, 2]);
+    assert_eq!(order(Autostart::List(&[2]), &[1, 2], 0), [2, 1]);
+    assert_eq!(order(Autostart::List(&[2]), &[1, 2, 3], 0), [2, 1, 3]);
+    assert_eq!(order(Autostart::List(&[2]), &[1, 2, 3], 1), [2, 1]);
+    assert_eq!(order(Autostart::Function(|| &[3, 2]), &[1, 2, 3], 2), [3, 2]);
+}
+
+/// The first program of the list that may start does, whatever is wrong with those before it; a request
+/// names one program, and no other one takes its place.
+#[test]
+fn of_several_programs_the_preferred_one_that_may_start_does() {
+    /// Two programs: what is wrong with each.
+    type Faults = [Option<Invalid>; 2];
+    const GOOD: Option<Invalid> = None;
+    const ABSENT: Option<Invalid> = Some(Invalid::Absent);
+    const DAMAGED: Option<Invalid> = Some(Invalid::Crc);
+    let decide_with = |autostart, circumstances: Circumstances, faults: Faults, start_allowed| {
+        let tried = RefCell::new(Vec::new());
+        let policy = Policy { autostart, programs: &[1, 2], start_allowed, ..policy() };
+        let decision = decide(&circumstances, &policy, |number| {
+            tried.borrow_mut().push(number);
+            match number {
+                1 | 2 => faults[usize::from(number) - 1].map_or_else(signed, Err),
+                _ => Err(Invalid::NoSuchProgram),
+            }
+        });
+        (decision, tried.into_inner())
+    };
+    let starts = |autostart, faults| {
+        let (decision, tried) = decide_with(autostart, QUIET, faults, |_| true);
+        matches!(decision, BootDecision::Start { trial: false, .. }).then(|| *tried.last().unwrap())
+    };
+    let listed = Autostart::List;
+    for (autostart, faults, expected) in [
+        (Autostart::InOrder, [GOOD, GOOD], Some(1)),
+        (Autostart::InOrder, [ABSENT, GOOD], Some(2)),
+        (Autostart::InOrder, [DAMAGED, GOOD], Some(2)),
+        (Autostart::InOrder, [ABSENT, ABSENT], None),
+        (listed(&[2, 1]), [GOOD, GOOD], Some(2)),
+        (listed(&[2, 1]), [GOOD, ABSENT], Some(1)),
+        (listed(&[1]), [ABSENT, GOOD], None),
+        (listed(&[]), [GOOD, GOOD], None),
+        (Autostart::Function(|| &[2]), [GOOD, GOOD], Some(2)),
+        // A function that names what there is not.
+        (Autostart::Function(|| &[7, 0, 1]), [GOOD, GOOD], Some(1)),
+        (Autostart::Function(|| &[]), [GOOD, GOOD], None),
+    ] {
+        assert_eq!(starts(autostart, faults), expected, "{autostart:?} {faults:?}");
+    }
+    // One that is not allowed now is passed over, too.
+    let (decision, tried) = decide_with(Autostart::InOrder, QUIET, [GOOD, GOOD], |number| number == 2);
+    assert!(matches!(decision, BootDecision::Start { .. }));
+    assert_eq!(tried, [1, 2]);
+    // The reason to stay is that of the first one that is there.
+    for (faults, expected) in [
+        ([ABSENT, ABSENT], Reason::NoProgram),
+        ([ABSENT, DAMAGED], Reason::Damaged),
+        ([DAMAGED, ABSENT], Reason::Damaged),
+        ([DAMAGED, Some(Invalid::Vectors(VectorFault::NotThumb))], Reason::Damaged),
+    ] {
+        let (decision, _) = decide_with(Autostart::InOrder, QUIET, faults, |_| true);
+        assert!(matches!(decision, BootDecision::Stay { reason, .. } if reason == expected), "{faults:?}");
+    }
+    for request in
+        [BootRequest::Start(1), BootRequest::Trial(1), BootRequest::Resume(1), BootRequest::Confirm(1)]
+    {
+        let requested = Circumstances { request: Some(request), ..QUIET };
+        let (decision, tried) = decide_with(Autostart::InOrder, requested, [ABSENT, GOOD], |_| true);
+        assert!(matches!(decision, BootDecision::Stay { .. }), "{request:?}");
+        assert_eq!(tried, [1], "{request:?}");
+    }
 }

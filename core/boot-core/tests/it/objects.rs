@@ -1,9 +1,10 @@
 //! What the objects say, and what the device does beside a download: each object of each program,
 //! emergencies, layer setting services, the second server, and commands in each other's way.
 
+use std::ops::RangeInclusive;
 use std::task::Poll;
 
-use boot_core::bootloader::Config;
+use boot_core::bootloader::{Bootloader, Choices, Config, Extras};
 use boot_core::control::{Policy, Step};
 use boot_core::flash::FlashFault;
 use boot_core::profile::Profile;
@@ -11,6 +12,7 @@ use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use canopen::line::LineEvent;
 use canopen::lss::{LssDevice, StoreError};
 use canopen::od::{Address, Objects};
+use canopen::program::ProgramStart;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, NodeId};
 use kit::bench::{Bench, CONFIG, CONTROL};
@@ -385,13 +387,36 @@ fn a_store_that_the_flash_refuses_is_told_and_the_old_values_stay() {
     assert_eq!(rig.node.stored(), Poll::Ready(Ok(())));
 }
 
+/// A product that stores nothing by layer setting services, and takes some node-IDs alone.
+struct Fixed;
+
+impl Choices for Fixed {
+    const LSS_STORE: bool = false;
+    const NODE_IDS: RangeInclusive<u8> = 2..=100;
+    const PROGRAM_START: ProgramStart = ProgramStart { watchdog_ms: 0x0403, by_itself: [2, 1] };
+}
+
 #[test]
 fn a_device_that_stores_nothing_says_so() {
     let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with_config(&mut flash, Config { lss_store: false, ..CONFIG }, 256);
-    assert_eq!(bench.node.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Unsupported)));
-    assert!(bench.node.supports(BitRate::K125) && !bench.node.supports(BitRate::K800));
+    let mut fixed = with_choices::<Fixed>(&mut flash);
+    assert_eq!(fixed.store(NodeId::new(9), None), Poll::Ready(Err(StoreError::Unsupported)));
+    assert!(fixed.supports(BitRate::K125) && !fixed.supports(BitRate::K800));
+    let taken = |id| fixed.takes(NodeId::new(id).unwrap());
+    assert_eq!([1, 2, 100, 101, 127].map(taken), [false, true, true, false, false]);
+    let mut word = [0; 4];
+    assert_eq!(fixed.read(Address::new(0x2007, 10), &mut word), Ok(4));
+    assert_eq!(word, [3, 4, 2, 1], "watchdog, then the programs that start by themselves");
+    drop(fixed);
     assert!(flash.touched.is_empty());
+}
+
+/// A bootloader of a product with these choices.
+fn with_choices<C: Choices>(flash: &mut ModelFlash) -> Bootloader<'static, &mut ModelFlash, Journal, 1, C> {
+    let parameters = Journal::open(flash, CONFIG.layout.parameters);
+    let (buffer, sealed) = leaked(256);
+    let node = kit::bench::node();
+    Bootloader::new(&CONFIG, 0, node, &BootReport::NONE, parameters, flash, buffer, sealed)
 }
 
 // --- emergencies, identity, the second server
@@ -487,9 +512,9 @@ fn the_state_of_the_device_is_what_the_boot_stage_reported() {
         assert_eq!(node.read(Address::new(0x2007, sub), &mut byte), Ok(1));
         assert_eq!(byte, [value], "2007h/{sub}");
     }
-    let mut word = [0xEE; 2];
-    assert_eq!(node.read(Address::new(0x2007, 10), &mut word), Ok(2));
-    assert_eq!(word, [0, 0]);
+    let mut word = [0xEE; 4];
+    assert_eq!(node.read(Address::new(0x2007, 10), &mut word), Ok(4));
+    assert_eq!(word, [0; 4]);
 }
 
 /// A START that came to nothing after the reset: 1F57h is 02h for that program. A damaged program is
@@ -545,7 +570,6 @@ fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_
 /// A product that does without them has no second server, and a request for a block upload is unknown.
 #[test]
 fn what_a_product_does_without_is_not_there() {
-    use boot_core::bootloader::{Bootloader, Choices, Extras};
     use canopen::sdo::server::{Config as ServerConfig, SdoServer};
     struct Least;
     impl Choices for Least {
@@ -553,11 +577,7 @@ fn what_a_product_does_without_is_not_there() {
         const BLOCK_UPLOAD: bool = false;
     }
     let mut flash = ModelFlash::new(&CHIP);
-    let parameters = Journal::open(&flash, CONFIG.layout.parameters);
-    let (buffer, sealed) = leaked(256);
-    let node = kit::bench::node();
-    let mut least: Bootloader<'_, _, _, 1, Least> =
-        Bootloader::new(&CONFIG, 0, node, &BootReport::NONE, parameters, &mut flash, buffer, sealed);
+    let mut least = with_choices::<Least>(&mut flash);
     let channel = least.second_server();
     assert!(least.write(Address::new(0x1201, 1), &0x0000_06A0_u32.to_le_bytes()).is_err());
     assert_eq!(least.second_server(), channel);

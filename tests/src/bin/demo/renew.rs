@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bsp::can::BitTiming;
-use canopen::program::{ProgramControl, DEVICE_STATE, STATE_PROGRAM_WATCHDOG};
+use canopen::program::{ProgramControl, ProgramStart, DEVICE_STATE, STATE_PROGRAM_START};
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
@@ -93,8 +93,9 @@ fn renewed(bench: &mut Bench, new: &NewBootloader) -> Outcome<()> {
 fn call_back(bench: &mut Bench) -> Outcome<()> {
     bench.session().command(1, ProgramControl::StartBootloader)?;
     bench.await_boot_up(1000);
-    let watchdog = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_WATCHDOG))?;
-    print_line(bench.time(), &format!("2007h/10 of the bootloader: {watchdog} ms"));
+    let start = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START))?;
+    let watchdog = ProgramStart::of_word(start).watchdog_ms;
+    print_line(bench.time(), &format!("watchdog of a program (2007h/10): {watchdog} ms"));
     introduce(bench)?;
     bench.session().command(1, ProgramControl::Start)?;
     bench.await_boot_up(1000);
