@@ -167,9 +167,8 @@ impl Withdraw {
         with(context, "withdraw", &self.program, |session, number, tell| {
             tell(Event::Found(session.find()?));
             withdraw(session, number)?;
-            let words = format!(
-                "program {number} is no longer released for autostart: it does not start by itself"
-            );
+            let words =
+                format!("program {number} is no longer released for autostart: it does not start by itself");
             Ok((words, json!({})))
         })
     }

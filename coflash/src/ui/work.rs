@@ -105,9 +105,7 @@ fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) ->
         Step::Withhold => {
             tell(Event::Found(session.find()?));
             steps::withdraw(session, number)?;
-            format!(
-                "program {number} is no longer released: it does not start by itself"
-            )
+            format!("program {number} is no longer released: it does not start by itself")
         }
         Step::Start => {
             let running = session.find()?;

@@ -13,7 +13,7 @@ use boot_core::canopen::od::Entry;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
-use boot_core::decision::{decide, BootDecision, Circumstances, Policy};
+use boot_core::decision::{decide, Autostart, BootDecision, Circumstances, Policy};
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use boot_core::store::NodeParameters;
@@ -34,7 +34,8 @@ const ANSWER_TO_RESET_MS: u32 = 15;
 const SAVE_AFTER: Duration = Duration::from_millis(250);
 /// The firmware's policy for the boot decision. Nothing can crash here.
 const POLICY: Policy = Policy {
-    autostart: Some(1),
+    autostart: Autostart::InOrder,
+    programs: &[1, 2],
     max_crash_resets: 3,
     node_ids: 1..=127,
     rescue_window_ms: 0,

@@ -11,7 +11,7 @@ use boot_core::canopen::{AbortCode, BitRate, NodeId};
 use boot_core::control::{Erase, Policy, Room, Step};
 use boot_core::crc::CrcKind;
 use boot_core::crc32;
-use boot_core::decision::{self, decide, BootDecision, Circumstances};
+use boot_core::decision::{self, decide, Autostart, BootDecision, Circumstances};
 use boot_core::flash::{run, Flash, FlashFault, Next, Operation};
 use boot_core::profile::Profile;
 use boot_core::program::verify;
@@ -93,7 +93,8 @@ static HASTY: Config = Config { download: Policy { erase: |_| Erase::AtOnce, ..C
 
 /// The boot decision of these tests: program 1 starts by itself, and there is no rescue window.
 pub const DECISION: decision::Policy = decision::Policy {
-    autostart: Some(1),
+    autostart: Autostart::List(&[1]),
+    programs: &[1, 2],
     max_crash_resets: 3,
     node_ids: 1..=127,
     rescue_window_ms: 0,
