@@ -63,24 +63,22 @@ enum Together {
 /// fails, the others continue.
 ///
 /// The options of BinaryBlockDownload and DotNetFlashtool are also accepted in their original
-/// spelling (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on).
+/// spelling (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on). As in
+/// DotNetFlashtool, -F, --node_id and --prog_no leave the trial out unless --chk_run is given.
 #[derive(Debug, Args)]
 pub(super) struct Flash {
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary, block file or sealed image.
-    #[arg(value_name = "FILE", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
+    #[arg(value_name = "FILE", conflicts_with = "legacy_file", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
     file: Option<PathBuf>,
 
-    /// The firmware file in DotNetFlashtool's spelling.
-    #[arg(short = 'F', value_name = "FILE", conflicts_with = "file", hide = true)]
-    legacy_file: Option<PathBuf>,
-
     /// The devices' node-IDs: 5, or a list with ranges like 1,5,9-12.
-    #[arg(long, short = 'N', aliases = ["node_id", "nodes"], default_value = "1", value_parser = nodes, value_name = "NODES")]
+    #[arg(long, short = 'N', alias = "nodes", default_value = "1", value_parser = nodes, value_name = "NODES",
+          conflicts_with = "node_id")]
     node: Vec<Vec<NodeId>>,
 
     /// A job file, which names the devices and their programs (see the manual), in place of FILE
     /// and --node.
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "vid"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "node_id", "vid"])]
     job: Option<PathBuf>,
 
     /// How many devices are updated at the same time.
@@ -96,7 +94,8 @@ pub(super) struct Flash {
     report: Option<PathBuf>,
 
     /// The program number: sub-index of 1F50h.
-    #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
+    #[arg(long, short = 'P', value_name = "1..254", value_parser = program_number, default_value = "1",
+          conflicts_with = "prog_no")]
     program: u8,
 
     #[command(flatten)]
@@ -115,7 +114,7 @@ pub(super) struct Flash {
     /// Release the program for autostart without a trial. By default, if the dialect has such a
     /// release, the program is started once, its identity (1018h) is compared with the
     /// bootloader's, and it is called back.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "chk_run")]
     no_trial: bool,
 
     /// Watch the program for this time after each start, in milliseconds; 0 does not watch. By default
@@ -123,10 +122,6 @@ pub(super) struct Flash {
     /// emergency 6000h or the bootloader ends the update: exit status 7.
     #[arg(long, value_parser = watch_time, value_name = "MS")]
     watch: Option<Duration>,
-
-    /// The trial in the manual's spelling; it is the default.
-    #[arg(long = "chk_run", hide = true)]
-    chk_run: bool,
 
     /// Search until the bootloader answers or Ctrl-C ends the search: the device may still be
     /// switched off, and an application that does not leave is called again and again.
@@ -199,12 +194,30 @@ impl Flash {
             Some(job) => self.devices_of_job(context, job)?,
             None => self.devices(context)?,
         };
+        if devices.iter().any(|device| self.leaves_trial_out(device)) {
+            context.out.say(
+                "no trial, as DotNetFlashtool makes none: the program is released before its first start \
+                 (--chk_run tries it first)",
+            );
+        }
         let bus = context.bus.clone().or_else(|| self.legacy.bus());
         let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
         match devices.as_slice() {
             [device] if self.job.is_none() => self.one(context, &mut link, device),
             devices => self.many(context, &mut link, devices),
         }
+    }
+
+    /// Whether the manual's words alone are the reason that this program gets no trial.
+    fn leaves_trial_out(&self, device: &Assignment) -> bool {
+        let has_trial = matches!(self.access.dialect(), None | Some(Dialect::Block));
+        let asked_for = self.no_trial || self.no_start || self.job.is_some();
+        self.legacy.makes_no_trial() && has_trial && !asked_for && !device.file.is_bootloader()
+    }
+
+    /// The program number, in either spelling.
+    fn number(&self) -> u8 {
+        self.legacy.program().unwrap_or(self.program)
     }
 
     /// The options for reading a file for the named dialect.
@@ -218,8 +231,8 @@ impl Flash {
     /// The devices of the command line, which all get the same program.
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
-        let image = self.file.as_deref().or(self.legacy_file.as_deref()).ok_or_else(unnamed)?;
-        let file = self.program(context, image, self.program, &self.source(), self.labels.label(image)?)?;
+        let image = self.file.as_deref().or(self.legacy.file()).ok_or_else(unnamed)?;
+        let file = self.program(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
         let options = self.options(&file, &Settings::default())?;
         match &file {
             Program::Blocks(file) => {
@@ -237,7 +250,7 @@ impl Flash {
         }
         let address = self.legacy.address();
         let mut nodes: Vec<NodeId> = Vec::new();
-        for node in self.node.iter().flatten() {
+        for node in self.legacy.nodes().unwrap_or(&self.node).iter().flatten() {
             if !nodes.contains(node) {
                 nodes.push(*node);
             }
@@ -266,7 +279,7 @@ impl Flash {
         for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
             let Entry { node, address, settings, .. } = entry;
             let image = settings.image.clone().unwrap_or_default();
-            let program = settings.program.unwrap_or(self.program);
+            let program = settings.program.unwrap_or(self.number());
             let same = known.iter().find(|(path, board, number, _)| {
                 (path, board, *number) == (&image, &settings.board, program)
             });
@@ -338,7 +351,9 @@ impl Flash {
         let advice = "convert it with --vid and --pid, or give these options here";
         let unnamed = || Failure::usage("the file does not name its target device", advice);
         let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
-        let trial = settings.trial_run.unwrap_or(!self.no_trial);
+        // A new bootloader is never installed without its trial, and DotNetFlashtool knows none.
+        let untried = self.legacy.makes_no_trial() && !file.is_bootloader();
+        let trial = settings.trial_run.unwrap_or(!(self.no_trial || untried));
         let start = settings.start.unwrap_or(!self.no_start);
         if file.is_bootloader() && !(trial && start) {
             let advice =
@@ -346,7 +361,7 @@ impl Flash {
             return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
         }
         Ok(FlashOptions::default()
-            .program(self.program)
+            .program(self.number())
             .repeats(self.block_repeats)
             .check_target(check_target)
             .trial_run(trial)

@@ -2,18 +2,36 @@
 //! They are accepted, so that a script works after only the program's name was changed.
 
 use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
 
+use canopen::NodeId;
 use clap::Args;
 use coflash::device::lss::LssAddress;
 
 use super::context::Context;
 use super::output::Failure;
-use super::values::number;
+use super::values::{nodes, number, program_number};
 
 /// The options that have no effect here, or have another spelling.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Options of the manual's tools")]
 pub(super) struct Legacy {
+    /// The firmware file in DotNetFlashtool's spelling.
+    #[arg(short = 'F', value_name = "FILE", hide = true)]
+    legacy_file: Option<PathBuf>,
+
+    /// The node-ID in its spelling.
+    #[arg(long = "node_id", value_name = "1..126", value_parser = nodes_of_its_devices, hide = true)]
+    node_id: Option<Vec<Vec<NodeId>>>,
+
+    /// The program number in its spelling.
+    #[arg(long = "prog_no", value_name = "1..254", value_parser = program_number, hide = true)]
+    prog_no: Option<u8>,
+
+    /// The trial, which its other words leave out.
+    #[arg(long = "chk_run", hide = true)]
+    chk_run: bool,
+
     /// The bit rate as an index (0 is 1 Mbit/s, 2 is 500, 3 is 250, 4 is 125 kbit/s), for adapters
     /// that set the bit rate; ? lists all indices.
     #[arg(short = 'B', alias = "br_idx", long = "bit-rate-index", value_name = "0..8", value_parser = index,
@@ -87,43 +105,58 @@ enum Interface {
 /// Table 13, in the order of the indices.
 const KILOBITS: [u32; 9] = [1000, 800, 500, 250, 125, 100, 50, 20, 10];
 
+/// Chapter 5.3: the tool's own node-ID.
+const ITS_OWN_NODE_ID: u8 = 127;
+
 /// CAN over a serial line (table 12).
 const VIRTUAL_CAN: u32 = 16;
 /// The bit rate of that line in the manual and in this tool.
 const SERIAL_BIT_RATE: u32 = 115_200;
 
-/// Table 12, shortened: the interface, and the URL for it in this tool.
-const INTERFACES: [(&str, &str); 16] = [
-    ("pcNetCAN (ISA), PhyCAN driver", "none"),
-    ("pcNetCAN (ISA), PCAN 1.x driver", "none"),
-    ("PEAK PCAN-Dongle, PCAN 1.x driver", "socketcan:can0"),
-    ("SYS TEC USB-CANmodul, USBCAN 4.x driver", "socketcan:can0"),
-    ("PEAK PCAN-PCI, PCAN-PCI driver", "socketcan:can0"),
-    ("reserved", ""),
-    ("pcNetCAN (ISA), PCAN 2.x driver", "none"),
-    ("PEAK PCAN-Dongle, PCAN 2.x driver", "socketcan:can0"),
-    ("PEAK PCAN-PCI, PCAN 2.x driver", "socketcan:can0"),
-    ("PEAK PCAN-Dongle, PCAN-Dongle driver", "socketcan:can0"),
-    ("PEAK PCAN-USB, PCAN-USB driver", "socketcan:can0"),
-    ("reserved", ""),
-    ("reserved", ""),
-    ("SYS TEC CAN-Ethernet gateway", "none"),
-    ("PEAK PCAN-USB, PCAN 2.x driver", "socketcan:can0"),
-    ("CAN over a serial line (VCAN)", "slcan:PORT"),
+/// Table 12, shortened: the interface, and the URL for it in this tool, on Linux with the kernel's
+/// driver and on Windows with the maker's library. PCAN-Basic has no plug-and-play channel for a
+/// dongle, and SYS TEC's library is not one of those that this tool loads.
+const INTERFACES: [(&str, &str, &str); 16] = [
+    ("pcNetCAN (ISA), PhyCAN driver", NONE, NONE),
+    ("pcNetCAN (ISA), PCAN 1.x driver", NONE, NONE),
+    ("PEAK PCAN-Dongle, PCAN 1.x driver", SOCKETCAN, NONE),
+    ("SYS TEC USB-CANmodul, USBCAN 4.x driver", SOCKETCAN, NONE),
+    ("PEAK PCAN-PCI, PCAN-PCI driver", SOCKETCAN, PCAN_PCI),
+    ("reserved", "", ""),
+    ("pcNetCAN (ISA), PCAN 2.x driver", NONE, NONE),
+    ("PEAK PCAN-Dongle, PCAN 2.x driver", SOCKETCAN, NONE),
+    ("PEAK PCAN-PCI, PCAN 2.x driver", SOCKETCAN, PCAN_PCI),
+    ("PEAK PCAN-Dongle, PCAN-Dongle driver", SOCKETCAN, NONE),
+    ("PEAK PCAN-USB, PCAN-USB driver", SOCKETCAN, PCAN_USB),
+    ("reserved", "", ""),
+    ("reserved", "", ""),
+    ("SYS TEC CAN-Ethernet gateway", NONE, NONE),
+    ("PEAK PCAN-USB, PCAN 2.x driver", SOCKETCAN, PCAN_USB),
+    ("CAN over a serial line (VCAN)", "slcan:PORT", "slcan:PORT"),
 ];
+
+const NONE: &str = "none";
+const SOCKETCAN: &str = "socketcan:can0";
+const PCAN_USB: &str = "peak:PCAN_USBBUS1@BITRATE";
+const PCAN_PCI: &str = "peak:PCAN_PCIBUS1@BITRATE";
 
 impl Legacy {
     /// The list that a question mark asks for. The command then does nothing else.
     pub(super) fn list(&self) -> Option<String> {
         let mut text = String::new();
         if self.vxd_type == Some(Interface::List) {
-            text.push_str("vxd_type  interface                                here, by --bus\n");
-            for (number, (name, url)) in (1..).zip(INTERFACES) {
-                let line = format!("{number:<8}  {name:<39}  {url}");
+            text.push_str(
+                "vxd_type  interface                                --bus on Linux  --bus on Windows\n",
+            );
+            for (number, (name, linux, windows)) in (1..).zip(INTERFACES) {
+                let line = format!("{number:<8}  {name:<39}  {linux:<14}  {windows}");
                 // Writing into memory does not fail.
                 let _ = writeln!(text, "{}", line.trim_end());
             }
-            text.push_str("socketcan: is Linux, with the kernel's driver for the interface\n");
+            text.push_str(
+                "none: use an adapter that coflash has (kvaser:, gs_usb:, slcan: and others); coflash adapters lists \
+                 those of this computer\n",
+            );
         }
         if matches!(self.index, Some(Index::List)) {
             text.push_str("br_idx  bit rate\n");
@@ -182,6 +215,34 @@ impl Legacy {
         })
     }
 
+    /// The firmware file.
+    pub(super) fn file(&self) -> Option<&Path> {
+        self.legacy_file.as_deref()
+    }
+
+    /// The node-IDs.
+    pub(super) fn nodes(&self) -> Option<&Vec<Vec<NodeId>>> {
+        self.node_id.as_ref()
+    }
+
+    /// The program number.
+    pub(super) fn program(&self) -> Option<u8> {
+        self.prog_no
+    }
+
+    /// Whether the call is one of DotNetFlashtool. BinaryBlockDownload's -P, -N and -B are this
+    /// tool's own options as well.
+    fn is_of_dot_net_flashtool(&self) -> bool {
+        self.legacy_file.is_some() || self.node_id.is_some() || self.prog_no.is_some()
+    }
+
+    /// Whether the words are those of DotNetFlashtool without `--chk_run`: it then releases a program
+    /// without a trial, because not every program may be started for a moment (manual L-1112d_10,
+    /// note at the end of the steps of a download in chapter 3).
+    pub(super) fn makes_no_trial(&self) -> bool {
+        self.is_of_dot_net_flashtool() && !self.chk_run
+    }
+
     /// The LSS address, if the user gave any part of it; the other parts have the manual's defaults
     /// (table 9).
     pub(super) fn address(&self) -> Option<LssAddress> {
@@ -205,8 +266,23 @@ impl Legacy {
         match (self.baudrate.filter(|_| of_bus), self.index) {
             (Some(kilobits), _) => Some(kilobits * 1000),
             (None, Some(Index::Rate(rate))) => Some(rate),
-            (None, Some(Index::List) | None) => None,
+            (None, Some(Index::List)) => None,
+            // Table 11: by default the index is 0.
+            (None, None) => (of_bus && self.is_of_dot_net_flashtool()).then_some(KILOBITS[0] * 1000),
         }
+    }
+}
+
+/// The node-IDs of devices to DotNetFlashtool (table 11), which takes 127 for itself.
+fn nodes_of_its_devices(text: &str) -> Result<Vec<NodeId>, String> {
+    let nodes = nodes(text)?;
+    match nodes.iter().any(|node| node.get() == ITS_OWN_NODE_ID) {
+        true => {
+            Err("node-IDs are 1 to 126, and 127 is DotNetFlashtool's own: for a device with node-ID 127 \
+                     give --node 127"
+                .to_string())
+        }
+        false => Ok(nodes),
     }
 }
 

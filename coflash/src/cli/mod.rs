@@ -277,7 +277,7 @@ fn early_output() -> Output {
 
 /// The words of the command line, in the order for the parser.
 fn words() -> Vec<OsString> {
-    words::ordered(std::env::args_os().collect(), &commands())
+    words::ordered(std::env::args_os().map(words::typed).collect(), &commands())
 }
 
 /// Parses the command line and the command's name, with defaults from the configuration file. Help
@@ -310,7 +310,7 @@ fn command_line() -> Result<(String, Cli), Failure> {
 
 /// Runs one line of the shell.
 fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
-    let words = std::iter::once("coflash".to_string()).chain(words).map(OsString::from);
+    let words = std::iter::once("coflash".to_string()).chain(words).map(OsString::from).map(words::typed);
     let words = words::ordered(words.collect(), &commands());
     let first = commands().ignore_errors(true).get_matches_from(&words);
     let read = configured(context.config.clone(), &first)?
@@ -323,7 +323,7 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
             context.out.say(error.to_string().trim_end());
             return Ok(());
         }
-        Err(error) => return Err(Failure::bare_usage(error.to_string())),
+        Err(error) => return Err(Failure::unreadable_line(&error)),
     };
     if matches!(cli.command, Command::Shell(_)) {
         return Err(Failure::usage("this is already the shell", "leave the word shell out"));

@@ -361,11 +361,12 @@ impl Failure {
     pub(super) fn unreadable_line(error: &clap::Error) -> Self {
         let of_node = error.get(ContextKind::InvalidArg).is_some_and(|name| {
             let ContextValue::String(name) = name else { return false };
-            name.split_whitespace().any(|word| matches!(word, "--node" | "--nodes"))
+            name.split_whitespace().any(|word| matches!(word, "--node" | "--nodes" | "--node_id"))
         });
         let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
-        let legacy = if of_node && wrong_value { legacy::INVALID_NODE_ID } else { legacy::INVALID_PARAMETER };
-        Self { legacy, ..Self::bare_usage(error.render().to_string()) }
+        let number = (of_node && wrong_value).then_some(legacy::INVALID_NODE_ID);
+        let legacy = number.unwrap_or(legacy::INVALID_PARAMETER);
+        Self { number, legacy, ..Self::bare_usage(error.render().to_string()) }
     }
 
     /// An error in a job file.
@@ -489,6 +490,10 @@ impl From<FileError> for Failure {
             Cause::Empty => "the file is empty: build the program again, or copy the file again",
             Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
             Cause::Foreign { advice, .. } => advice,
+            Cause::NotNamedFormat { found: Some(_), .. } => "leave -I out: the first bytes show the format",
+            Cause::NotNamedFormat { found: None, .. } => {
+                "name the right file, or leave -I out: without it the tool says what the file is"
+            }
             Cause::NoData => {
                 "name the linker's output: an object file, or one without loadable sections, has nothing for the flash"
             }

@@ -5,6 +5,17 @@ use std::ffi::OsString;
 
 use clap::{Arg, Command};
 
+/// A word as the parser expects it. The manual prints the dash of `–F` and `–I` as an en dash, and
+/// so does a command line that was copied from it.
+pub fn typed(word: OsString) -> OsString {
+    match word.to_str().and_then(|text| text.strip_prefix('\u{2013}')) {
+        Some(letter) if letter.len() == 1 && letter.as_bytes()[0].is_ascii_alphabetic() => {
+            format!("-{letter}").into()
+        }
+        _ => word,
+    }
+}
+
 /// Moves options from before their command to after it: `coflash --node 5 info` becomes
 /// `coflash info --node 5`. Unknown options stay in place, and the parser reports them.
 pub fn ordered(words: Vec<OsString>, root: &Command) -> Vec<OsString> {
@@ -127,6 +138,22 @@ mod tests {
         let words = ordered(words, &super::super::commands());
         let words: Vec<&str> = words.iter().skip(1).filter_map(|word| word.to_str()).collect();
         words.join(" ")
+    }
+
+    #[test]
+    fn a_printed_dash_is_that_of_an_option() {
+        for (word, typed) in [
+            ("\u{2013}F", "-F"),
+            // Neither an option of the manual nor a word of one character is touched.
+            ("\u{2013}Fa", "\u{2013}Fa"),
+            ("\u{2013}5", "\u{2013}5"),
+            ("\u{2013}", "\u{2013}"),
+            ("\u{2013}\u{e4}", "\u{2013}\u{e4}"),
+            ("a\u{2013}F", "a\u{2013}F"),
+            ("-F", "-F"),
+        ] {
+            assert_eq!(super::typed(word.into()), typed, "{word}");
+        }
     }
 
     #[test]

@@ -134,6 +134,14 @@ pub enum Cause {
         /// What to do.
         advice: &'static str,
     },
+    /// A file whose first bytes are not those of the format that the user named.
+    #[error("is no {named} file{}", .found.map_or(String::new(), |found| format!(", but {found}")))]
+    NotNamedFormat {
+        /// The format that the user named.
+        named: &'static str,
+        /// The format that the first bytes show.
+        found: Option<&'static str>,
+    },
     /// A text in another encoding than ASCII.
     #[error("{0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
     Encoding(Encoding),
@@ -338,6 +346,7 @@ impl Cause {
             | Self::TooLarge { .. }
             | Self::NotFirmware
             | Self::Foreign { .. }
+            | Self::NotNamedFormat { .. }
             | Self::Encoding(_)
             | Self::Sealed
             | Self::NoAddress

@@ -57,16 +57,23 @@ impl Format {
     }
 }
 
-impl fmt::Display for Format {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+impl Format {
+    /// Its name.
+    const fn name(self) -> &'static str {
+        match self {
             Self::IntelHex => "Intel HEX",
             Self::SRecord => "Motorola S-record",
             Self::Elf => "ELF",
             Self::BlockFile => "block file",
             Self::Sealed => "sealed image",
             Self::Raw => "raw binary",
-        })
+        }
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
     }
 }
 
@@ -121,17 +128,23 @@ fn read_telling(
     if bytes.is_empty() {
         return Err(Place::File.fault(Cause::Empty));
     }
-    let format = format.or_else(|| Format::detect(bytes));
+    let found = Format::detect(bytes);
+    let format = format.or(found);
     if matches!(format, None | Some(Format::IntelHex | Format::SRecord)) {
         if let Some(encoding) = encoding(bytes) {
             return Err(Place::File.fault(Cause::Encoding(encoding)));
         }
     }
-    let not_firmware = || match foreign::name(bytes) {
-        Some((what, advice)) => Cause::Foreign { what, advice },
-        None => Cause::NotFirmware,
+    let other = |otherwise| match foreign::name(bytes) {
+        Some((what, advice)) => Place::File.fault(Cause::Foreign { what, advice }),
+        None => Place::File.fault(otherwise),
     };
-    let format = format.ok_or_else(|| Place::File.fault(not_firmware()))?;
+    let format = format.ok_or_else(|| other(Cause::NotFirmware))?;
+    // A text with a damaged first line has another fault than a file that is none of the kind, so
+    // only the first character counts.
+    if matches!(format, Format::IntelHex | Format::SRecord) && found != Some(format) {
+        return Err(other(Cause::NotNamedFormat { named: format.name(), found: found.map(Format::name) }));
+    }
     let firmware = match format {
         Format::IntelHex => ihex::read(bytes).map(Firmware::Image),
         Format::SRecord => srec::read(bytes).map(Firmware::Image),

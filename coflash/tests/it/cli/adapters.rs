@@ -2,8 +2,8 @@
 
 use std::fs;
 use std::io::{Read, Write};
-use std::net::TcpListener;
-use std::thread;
+use std::net::{SocketAddr, TcpListener};
+use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use crate::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
@@ -60,8 +60,9 @@ fn check(fake: &Fake) {
     assert_eq!(fake.running, Some(APPLICATION));
 }
 
-#[test]
-fn slcan_over_tcp() {
+/// Serves `fake` through an SLCAN adapter on a TCP port. Gives its address, and at the end the device
+/// and the commands that the adapter got.
+pub fn serve_slcan(fake: Fake) -> (SocketAddr, JoinHandle<(Fake, Vec<String>)>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     let server = thread::spawn(move || {
@@ -69,9 +70,15 @@ fn slcan_over_tcp() {
         stream.set_nodelay(true).unwrap();
         stream.set_read_timeout(Some(Duration::from_millis(1))).unwrap();
         let mut said = Vec::new();
-        let fake = converse(stream, device(), |text, stream| slcan(text, stream, &mut said), slcan_text);
+        let fake = converse(stream, fake, |text, stream| slcan(text, stream, &mut said), slcan_text);
         (fake, said)
     });
+    (address, server)
+}
+
+#[test]
+fn slcan_over_tcp() {
+    let (address, server) = serve_slcan(device());
     flash(&format!("slcan:tcp://{address}@250k"));
     let (fake, said) = server.join().unwrap();
     check(&fake);

@@ -1,10 +1,13 @@
 //! The functions of the manual's tools (L-1112e_5, L-1112d_10), with their own options.
 
+use std::fs;
 use std::net::TcpListener;
 use std::time::Duration;
 
-use crate::fake::{Fake, Outcome, BOOTLOADER};
-use crate::tool::{coflash, data, folder, run, serve};
+use super::adapters::serve_slcan;
+use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
+use crate::tool::{coflash, data, folder, run, serve, Done};
+use crate::update::renew::image;
 
 /// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {
@@ -132,6 +135,19 @@ fn a_question_mark_lists_interfaces_and_bit_rates() {
     assert_eq!(lines.len(), 1 + 16 + 1, "{}", done.out);
     assert!(lines[4].starts_with("4 ") && lines[4].contains("SYS TEC USB-CANmodul"), "{}", lines[4]);
     assert!(lines[16].starts_with("16 ") && lines[16].ends_with("slcan:PORT"), "{}", lines[16]);
+    // What --bus is given on Windows: PCAN-Basic has names for plug-and-play adapters (PCANBasic.h),
+    // and this tool loads no library of SYS TEC.
+    assert!(lines[0].ends_with("--bus on Linux  --bus on Windows"), "{}", lines[0]);
+    for (number, linux, windows) in [
+        (4, "socketcan:can0", "none"),
+        (5, "socketcan:can0", "peak:PCAN_PCIBUS1@BITRATE"),
+        (10, "socketcan:can0", "none"),
+        (11, "socketcan:can0", "peak:PCAN_USBBUS1@BITRATE"),
+        (14, "none", "none"),
+    ] {
+        let words: Vec<&str> = lines[number].split_whitespace().rev().take(2).collect();
+        assert_eq!(words, [windows, linux], "{}", lines[number]);
+    }
     for spelling in ["-B", "--br_idx"] {
         let done = coflash(&["flash", spelling, "?"]);
         assert_eq!((done.exit, done.err.as_str()), (0, ""));
@@ -145,6 +161,185 @@ fn a_question_mark_lists_interfaces_and_bit_rates() {
     assert!(done.exit == 2 && done.err.contains("interfaces are 1 to 16"), "{}", done.err);
     let done = coflash(&["flash", "--vxd_type", "4"]);
     assert!(done.exit == 2 && done.err.contains("no firmware file is named"), "{}", done.err);
+}
+
+/// The words of a call of DotNetFlashtool, for `flash`, with the block file that it names.
+fn dot_net(file: &str, call: &str, bus: &str) -> Done {
+    let folder = folder("dot-net");
+    folder.file(file, &fs::read(data("plain-400.blk")).unwrap());
+    let mut command = crate::tool::command();
+    command.current_dir(&folder).args(["--bus", bus, "flash"]);
+    run(command.args(call.split_whitespace()))
+}
+
+const NO_TRIAL: &str =
+    "no trial, as DotNetFlashtool makes none: the program is released before its first start (--chk_run tries it first)\n";
+
+/// The examples of chapter 5.3, word by word and with the printed dashes, after the name of the
+/// program. The note on the last steps of a download (chapter 3) says that this tool starts no program
+/// for a moment; so the program is released (83h) and then started, once.
+#[test]
+fn the_examples_of_dotnetflashtool_word_by_word() {
+    for (file, call, node, program, ignored) in [
+        ("blcop_app.bin", "–F blcop_app.bin", 1, 1, 0),
+        ("blcop_app.bin", "–F blcop_app.bin --node_id 0x62 --baudrate 500 --device_no 5", 0x62, 1, 1),
+        ("blcop_app2.bin", "–F blcop_app2.bin --node_id 15 --br_idx 4 --device_no 255 --prog_no 2", 15, 2, 1),
+        (
+            "blcop_app.bin",
+            "–F blcop_app.bin --node_id 0xF --vxd_type 16 --baudrate 115200 --device_no 7",
+            15,
+            1,
+            2,
+        ),
+        (
+            "blcop_app.bin",
+            "–F blcop_app.bin --node_id 20 --vxd_type 14 --ip_addr 192.168.1.10 --ip_port 1234",
+            20,
+            1,
+            3,
+        ),
+    ] {
+        let (bus, server) = serve(quick(BOOTLOADER).at(node, program));
+        let done = dot_net(file, call, &bus);
+        assert_eq!(done.exit, 0, "{call}: {}", done.err);
+        assert_eq!(done.out.matches(NO_TRIAL).count(), 1, "{call}: {}", done.out);
+        assert_eq!(done.err.matches("is ignored").count(), ignored, "{call}: {}", done.err);
+        let fake = server.join().unwrap();
+        assert_eq!(fake.running, Some(APPLICATION), "{call}");
+        let commands: Vec<&str> = fake.writes().into_iter().filter(|entry| entry.starts_with("c")).collect();
+        assert_eq!(commands, ["command 03", "command 83", "command 01"], "{call}");
+    }
+}
+
+/// Chapter 5.2: BinaryBlockDownload makes the trial. Only what DotNetFlashtool alone has leaves it out.
+#[test]
+fn only_the_words_of_dotnetflashtool_leave_the_trial_out() {
+    for (call, trials) in [
+        ("blcop_app.bin -N 5", 1),
+        ("-P 1 -N 5 --timeout 500 blcop_app.bin", 1),
+        ("blcop_app.bin -N 5 --sdo_timeout 500 --chk_tgt 0 --device_no 255", 1),
+        ("-F blcop_app.bin --node_id 5 --chk_run", 1),
+        ("blcop_app.bin --node_id 5", 0),
+        ("blcop_app.bin -N 5 --prog_no 1", 0),
+        ("-F blcop_app.bin -N 5", 0),
+        ("blcop_app.bin -N 5 --no-trial", 0),
+    ] {
+        let (bus, server) = serve(quick(BOOTLOADER));
+        let done = dot_net("blcop_app.bin", call, &bus);
+        assert_eq!(done.exit, 0, "{call}: {}", done.err);
+        let fake = server.join().unwrap();
+        assert_eq!(fake.count("command 80"), trials, "{call}");
+        assert_eq!(fake.count("command 83"), 1, "{call}");
+        let said = trials == 0 && !call.contains("--no-trial");
+        assert_eq!(done.out.contains(NO_TRIAL), said, "{call}: {}", done.out);
+    }
+    // A program that is not started is not released either.
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let done = dot_net("blcop_app.bin", "-F blcop_app.bin --node_id 5 --no-start", &bus);
+    assert_eq!((done.exit, done.out.contains("no trial")), (0, false), "{}", done.err);
+    assert_eq!(server.join().unwrap().count("command 83"), 0);
+}
+
+/// DotNetFlashtool knows no new bootloaders, and without its trial none is installed: here its words
+/// change nothing, and the tool goes as far as the bus.
+#[test]
+fn its_words_leave_the_trial_of_a_bootloader_in() {
+    let folder = folder("dot-net-bootloader");
+    let file = folder.file("new.bin", &image(0x0000_0102));
+    let call = |words: &[&str]| coflash(&[&["--bus", "socketcand://127.0.0.1:1/x", "flash"], words].concat());
+    let done = call(&["-F", &file, "--node_id", "5"]);
+    assert_eq!(done.exit, 4, "{}", done.err);
+    assert!(done.out.contains("bootloader") && !done.out.contains("no trial"), "{}", done.out);
+    let done = call(&["--node", "5", "--no-trial", &file]);
+    assert!(done.exit == 2 && done.err.contains("--no-trial"), "{}", done.err);
+}
+
+#[test]
+fn words_that_contradict_each_other_are_refused() {
+    let file = data("plain-400.blk");
+    for (words, expected) in [
+        (&["-F", &file, &file][..], "cannot be used with"),
+        (&["-F", &file, "--node_id", "5", "--node", "5"], "cannot be used with"),
+        (&["-F", &file, "--prog_no", "1", "--program", "1"], "cannot be used with"),
+        (&["-F", &file, "--chk_run", "--no-trial"], "cannot be used with"),
+        (&["-F", "–I"], "a value is required"),
+        (&["-F", &file, "--prog_no", "0"], "programs are 1 to 254"),
+    ] {
+        let done = coflash(&[&["--bus", "socketcand://127.0.0.1:1/x", "flash"][..], words].concat());
+        assert!(done.exit == 2 && done.err.contains(expected), "{words:?}: {}", done.err);
+    }
+}
+
+/// Chapter 5.3: node-IDs are 1 to 126, and the tool itself has 127. `ERR_INVALID_NODEID` is
+/// 60000017h (L-1112e_5, table 5).
+#[test]
+fn a_wrong_node_id_has_the_manuals_number() {
+    let file = data("plain-400.blk");
+    for (words, expected) in [
+        (&["flash", "-F", &file, "--node_id", "0"][..], "node-IDs are 1 to 127"),
+        (&["flash", "-F", &file, "--node_id", "127"], "127 is DotNetFlashtool's own"),
+        (&["flash", "-F", &file, "--node_id", "120-127"], "127 is DotNetFlashtool's own"),
+        (&["flash", &file, "--node", "0"], "node-IDs are 1 to 127"),
+        (&["info", "--node", "0"], "node-IDs are 1 to 127"),
+        (&["info", "-N", "128"], "node-IDs are 1 to 127"),
+    ] {
+        let done = coflash(&[&["--json"][..], words].concat());
+        let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+        assert_eq!((done.exit, &json["error"]["number"]), (2, &"0x60000017".into()), "{words:?}: {json}");
+        assert!(json["error"]["what"].as_str().unwrap().contains(expected), "{words:?}: {json}");
+    }
+    // This tool has no node-ID of its own.
+    let (bus, server) = serve(quick(BOOTLOADER).at(127, 1));
+    let done = dot_net("blcop_app.bin", "-F blcop_app.bin --node 127", &bus);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+}
+
+/// Table 11: the default of --br_idx is 0, 1 Mbit/s (table 13), S8 of the CAN232 manual. An adapter
+/// that has a bit rate of its own keeps it for every other call.
+#[test]
+fn the_default_bit_rate_is_that_of_dotnetflashtool() {
+    for (call, url, rate) in [
+        ("-F blcop_app.bin --node_id 5", "", Some("S8")),
+        ("-F blcop_app.bin --node_id 5 --br_idx 4", "", Some("S4")),
+        ("-F blcop_app.bin --node_id 5", "@250k", Some("S5")),
+        ("-P 1 -N 5 blcop_app.bin", "", None),
+        ("-F blcop_app.bin --node_id 5 --vxd_type 16 --baudrate 115200", "", None),
+    ] {
+        let (address, server) = serve_slcan(quick(BOOTLOADER));
+        let done = dot_net("blcop_app.bin", call, &format!("slcan:tcp://{address}{url}"));
+        assert_eq!(done.exit, 0, "{call}: {}", done.err);
+        let (_, said) = server.join().unwrap();
+        assert_eq!(said.iter().find(|word| word.starts_with('S')).map(String::as_str), rate, "{call}");
+    }
+}
+
+/// `ERR_SREC_NO_VALID_S3` (L-1112e_5, table 5): the indicated file does not have the S3 format.
+#[test]
+fn a_file_that_is_not_of_the_named_format_is_error_21h() {
+    let folder = folder("named-format");
+    let zip = folder.file("app.s3", b"PK\x03\x04\x14\0\0\0\0\0\0\0");
+    let text = folder.file("text.s3", b"hello\n");
+    let damaged = folder.file("damaged.s3", b"S1040000AA52\nS9030000FC\n");
+    let hex = data("program.hex");
+    for (format, file, number, words) in [
+        ("S3", &hex, "0x60000021", "is no Motorola S-record file, but Intel HEX"),
+        ("ihex", &data("program.s3"), "0x60000021", "is no Intel HEX file, but Motorola S-record"),
+        ("S3", &data("program.bin"), "0x60000021", "is no Motorola S-record file"),
+        ("S9", &text, "0x60000021", "is no Motorola S-record file"),
+        ("S5", &zip, "0x60000021", "is not a firmware file but"),
+        // A file of the format with a damaged line has the number of its fault: ERR_SREC_CRC_ERROR.
+        ("S3", &damaged, "0x60000020", "the line is damaged"),
+    ] {
+        for command in ["convert", "flash"] {
+            let done = coflash(&["--json", command, file, "-I", format]);
+            let json: serde_json::Value = serde_json::from_str(&done.out).unwrap();
+            assert_eq!((done.exit, &json["error"]["number"]), (3, &number.into()), "{file}: {json}");
+            assert!(json["error"]["what"].as_str().unwrap().contains(words), "{file}: {json}");
+        }
+    }
+    let done = coflash(&["--legacy-exit-codes", "convert", &hex, "-I", "S3"]);
+    assert_eq!(done.exit, shown(0x6000_0021), "{}", done.err);
 }
 
 /// The manual's example with CAN over a serial line: its bit rate is 115200 bit/s.

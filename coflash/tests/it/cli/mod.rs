@@ -507,7 +507,11 @@ fn a_script_for_the_manuals_download_tools_works() {
         assert_eq!(done.err.contains("--vxd_type is ignored"), dot_net, "{}", done.err);
         let fake = server.join().unwrap();
         assert_eq!(fake.blocks.concat(), fs::read(&file).unwrap());
-        assert_eq!(fake.count("command 80"), 1, "a trial in both, asked for or not");
+        assert_eq!(
+            fake.count("command 80"),
+            1,
+            "BinaryBlockDownload makes a trial, the other one with --chk_run"
+        );
     }
     for (option, value, words) in [("--gateway_id", "3", "SDO gateway"), ("-B", "9", "0 (1 Mbit/s) to 8")] {
         let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", &file, option, value]);

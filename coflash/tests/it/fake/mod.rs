@@ -87,6 +87,8 @@ type Script<T> = Box<dyn FnMut(T) -> Outcome + Send>;
 
 pub struct Fake {
     pub node: u8,
+    /// Its program: the sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
+    pub program: u8,
     pub now: Duration,
     /// The device type of what runs; `None` while it restarts or is absent.
     pub running: Option<u32>,
@@ -174,6 +176,7 @@ impl Fake {
     pub fn new(running: u32) -> Self {
         Self {
             node: NODE,
+            program: 1,
             now: Duration::from_secs(1000),
             running: Some(running),
             restart: None,
@@ -218,6 +221,11 @@ impl Fake {
             maker: None,
             next_node: NODE,
         }
+    }
+
+    /// The same device with another node-ID, which it keeps, and with its program under another number.
+    pub fn at(self, node: u8, program: u8) -> Self {
+        Self { node, next_node: node, program, ..self }
     }
 
     /// The log without reads.
@@ -484,8 +492,8 @@ impl Fake {
             (0x1018, 1) => number(0x03F),
             (0x1018, 2) => number(1234),
             (0x1F51, 0) => Ok(vec![1]),
-            (0x1F51, 1) => Ok(vec![u8::from(self.running == Some(APPLICATION))]),
-            (0x1F56, 1) => {
+            (0x1F51, sub) if sub == self.program => Ok(vec![u8::from(self.running == Some(APPLICATION))]),
+            (0x1F56, sub) if sub == self.program => {
                 let last = self.blocks.last().filter(|block| block[0] == 0xFF);
                 let crc = last.map_or(0, |block| u32::from_le_bytes(block[16..20].try_into().unwrap()));
                 let application = self.crc_of_application.filter(|_| self.running == Some(APPLICATION));
@@ -497,8 +505,8 @@ impl Fake {
             (0x2007, 6) => self.chip.map(|(options, _)| options.to_le_bytes().to_vec()).ok_or(0x0602_0000),
             (0x2007, 7) => self.chip.map(|(_, supply)| vec![supply]).ok_or(0x0602_0000),
             (0x2007, 10) => self.watchdog_ms.map(|ms| ms.to_le_bytes().to_vec()).ok_or(0x0602_0000),
-            (0x1F57, 1) => number(if self.busy() { 1 } else { self.status }),
-            (0x1F50, 1) => self.readable.clone().ok_or(0x0601_0001),
+            (0x1F57, sub) if sub == self.program => number(if self.busy() { 1 } else { self.status }),
+            (0x1F50, sub) if sub == self.program => self.readable.clone().ok_or(0x0601_0001),
             (0x1018 | 0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),
             _ => Err(0x0602_0000),
         }
@@ -524,11 +532,11 @@ impl Fake {
             return;
         }
         let outcome = match at {
-            (0x1F51, 1) => {
+            (0x1F51, sub) if sub == self.program => {
                 self.log.push(format!("command {:02X}", data[0]));
                 (self.on_command)(data[0])
             }
-            (0x1F50, 1) => {
+            (0x1F50, sub) if sub == self.program => {
                 let number = u32::from_le_bytes(data[..4].try_into().unwrap());
                 self.log.push(format!("block {}", number as i32));
                 (self.on_block)(number)

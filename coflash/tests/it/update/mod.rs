@@ -8,6 +8,6 @@ mod many;
 mod master;
 mod mastership;
 mod procedure;
-mod renew;
+pub mod renew;
 mod search;
 mod watch;

@@ -39,7 +39,7 @@ const NEW: u32 = 0x0001_0003;
 const OLD_CRC: u32 = 0x1234_5678;
 
 /// A RAM image, typed from the table of its header; its CRC is that of the words after the CRC.
-fn image(version: u32) -> Vec<u8> {
+pub fn image(version: u32) -> Vec<u8> {
     let mut bytes = b"CBI2".to_vec();
     for word in [0, 64, 256, 0x2000_0000, 0x2001_FFC0, 1, 0, 7, 1, 2, 0, version, 0, 0, 0] {
         bytes.extend(u32::to_le_bytes(word));
