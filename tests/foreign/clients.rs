@@ -19,18 +19,18 @@ fn endpoint() -> Endpoint {
     Endpoint::new(bench)
 }
 
-fn text(output: &Output) -> String {
+pub fn text(output: &Output) -> String {
     format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
 }
 
 /// The python of `cargo xtask test`, with the pinned third-party packages.
-fn python() -> Command {
+pub fn python() -> Command {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
     Command::new(python)
 }
 
-fn script(name: &str) -> PathBuf {
+pub fn script(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("python").join(name)
 }
 
@@ -100,7 +100,7 @@ fn canopen_asyncio_updates_the_device_by_raw_images() {
 }
 
 /// The command line built by `cargo xtask test`.
-fn coflash() -> Command {
+pub fn coflash() -> Command {
     let coflash = env::var_os("COBOOT_COFLASH")
         .unwrap_or_else(|| panic!("COBOOT_COFLASH is not set: run the tests by `cargo xtask test`"));
     Command::new(coflash)

@@ -6,6 +6,8 @@ mod eds;
 mod examples;
 #[cfg(unix)]
 mod gdb_door;
+#[cfg(unix)]
+mod hosted;
 #[cfg(target_os = "linux")]
 mod pages;
 mod peers;

@@ -8,11 +8,13 @@ use coflash::file::board;
 use shared_abi::layout::{self, Layout};
 
 use crate::file_flash::Speed;
+use crate::run::Command;
 
 /// Bootloader nodes on a CAN bus of the host, each with a file in place of its flash.
 ///
 /// The nodes run the bootloader of the firmware and accept programs like it. They have no CPU for a
-/// program: after the start of a program a node is silent, or a stand-in answers. Ctrl-C cuts the
+/// program: after the start of a program a node is silent, or a stand-in answers, or a program of the
+/// host runs. Ctrl-C cuts the
 /// power: everything that a node has reported as stored is in its file.
 #[derive(Debug, Parser)]
 #[command(name = "coboot-node", version)]
@@ -86,6 +88,12 @@ pub struct Args {
     /// Answer in place of a started program the requests that a host sends to a running application
     #[arg(long)]
     pub stand_in: bool,
+
+    /// Start this program of the host in place of a downloaded program, and end it when the device
+    /// leaves the program: COMMAND gets the file with the downloaded bytes as its only argument.
+    /// Includes --stand-in. Whoever reaches the bus decides what COMMAND reads
+    #[arg(long, value_name = "COMMAND", value_parser = Command::find)]
+    pub run: Option<Command>,
 }
 
 /// The dialects of docs/dialects.md.

@@ -2,7 +2,8 @@
 //!
 //! A START leaves a request and resets the device, as on the chip, and so does everything else that
 //! ends the bootloader; the boot decision is then made again. If it selects a program, no CPU can
-//! run it: the device is silent from then on, or a [stand-in](crate::stand_in) answers.
+//! run it: the device is silent from then on, or a [stand-in](crate::stand_in) answers, alone or for a
+//! [process of the host](crate::run).
 
 use std::io;
 use std::time::Duration;
@@ -14,14 +15,16 @@ use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
 use boot_core::decision::{decide, Autostart, BootDecision, Circumstances, Policy};
+use boot_core::flash::Flash as _;
 use boot_core::program::verify;
-use boot_core::store::Journal;
-use boot_core::store::NodeParameters;
+use boot_core::store::{Journal, NodeParameters, ProgramRecord};
 use coboot_app::{Defaults, Next, Start};
 use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::handoff::ResetCause;
 use shared_abi::warm_start::{BootRequest, Owed};
 
 use crate::file_flash::FileFlash;
+use crate::run::{Command, Ending, Place, Process};
 use crate::stand_in::StandIn;
 use crate::supports;
 
@@ -32,7 +35,7 @@ pub const BUFFER: usize = 80 * 1024;
 const ANSWER_TO_RESET_MS: u32 = 15;
 /// The file is never older than this while the flash changes.
 const SAVE_AFTER: Duration = Duration::from_millis(250);
-/// The firmware's policy for the boot decision. Nothing can crash here.
+/// The firmware's policy for the boot decision.
 const POLICY: Policy = Policy {
     autostart: Autostart::InOrder,
     programs: &[1, 2],
@@ -79,6 +82,13 @@ pub enum Event {
         /// Its node-ID.
         node: Option<NodeId>,
     },
+    /// The process of a program has ended.
+    Ended {
+        /// The number of the program.
+        number: u8,
+        /// How.
+        ending: Ending,
+    },
     /// The running program or bootloader has a new node-ID from layer setting services.
     NodeId(NodeId),
 }
@@ -86,16 +96,28 @@ pub enum Event {
 /// A device with `PROGRAMS` programs.
 pub struct Device<'b, const PROGRAMS: usize> {
     setup: Setup,
+    /// What is started as its programs.
+    command: Option<&'b Command>,
+    /// How many times in a row a program has ended by itself.
+    crash_resets: u32,
     phase: Phase<'b, PROGRAMS>,
 }
 
 /// What runs between two resets.
 enum Phase<'b, const PROGRAMS: usize> {
     Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
-    StandIn(Box<Running<StandIn>>, &'b mut [u8]),
+    StandIn(Box<Running<StandIn>>, &'b mut [u8], Option<Hosted>),
     Silent(Idle<'b>),
     /// Only during the change from one to the other.
     None,
+}
+
+/// A program that runs as a process of the host.
+struct Hosted {
+    number: u8,
+    process: Process,
+    /// The stand-in leaves with this request; the process is being ended.
+    leaving: Option<BootRequest>,
 }
 
 /// The parts that the next bootloader needs.
@@ -128,7 +150,18 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     /// Switches a device on.
     #[must_use]
     pub fn new(setup: Setup, flash: FileFlash, buffer: &'b mut [u8]) -> (Self, Event) {
-        let mut device = Self { setup, phase: Phase::None };
+        Self::hosted(setup, None, flash, buffer)
+    }
+
+    /// Switches a device on whose programs are started by this command; the setup has a stand-in.
+    #[must_use]
+    pub fn hosted(
+        setup: Setup,
+        command: Option<&'b Command>,
+        flash: FileFlash,
+        buffer: &'b mut [u8],
+    ) -> (Self, Event) {
+        let mut device = Self { setup, command, crash_resets: 0, phase: Phase::None };
         let event = device.reset(Idle { flash, buffer }, None);
         (device, event)
     }
@@ -137,7 +170,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     pub fn flash(&mut self) -> Option<&mut FileFlash> {
         match &mut self.phase {
             Phase::Bootloader(running) => Some(running.device.flash()),
-            Phase::StandIn(running, _) => Some(running.device.flash()),
+            Phase::StandIn(running, ..) => Some(running.device.flash()),
             Phase::Silent(idle) => Some(&mut idle.flash),
             Phase::None => None,
         }
@@ -147,7 +180,9 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     pub fn handle(&mut self, frame: &Frame, now: Instant) {
         match &mut self.phase {
             Phase::Bootloader(running) => running.handle(frame, now),
-            Phase::StandIn(running, _) => running.handle_in_program(frame, now),
+            // A device that is about to reset accepts nothing.
+            Phase::StandIn(_, _, Some(Hosted { leaving: Some(_), .. })) => {}
+            Phase::StandIn(running, ..) => running.handle_in_program(frame, now),
             Phase::Silent(_) | Phase::None => {}
         }
     }
@@ -165,6 +200,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
     ) -> io::Result<bool> {
         let reset;
         let mut more = false;
+        let mut cause = ResetCause::Pin;
         match &mut self.phase {
             Phase::Bootloader(running) => {
                 running.device.set_time(now);
@@ -182,12 +218,24 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                 reset = running.exchange(now, !finishing, send);
                 running.tell_node_id(tell);
             }
-            Phase::StandIn(running, _) => {
+            Phase::StandIn(running, _, hosted) => {
                 let flash = running.device.flash();
                 if flash.is_urgent() {
                     flash.save()?;
                 }
-                reset = running.leave_or_exchange(now, send).map(Some);
+                reset = match hosted {
+                    None => running.leave_or_exchange(now, send).map(Some),
+                    Some(hosted) => {
+                        cause = ResetCause::Software;
+                        hosted.leaving = hosted.leaving.or_else(|| running.leave_or_exchange(now, send));
+                        let ending = hosted.process.look(hosted.leaving.is_some());
+                        if let Some(ending) = ending {
+                            tell(Event::Ended { number: hosted.number, ending });
+                        }
+                        // A process that ends by itself leaves no request: a crash.
+                        ending.map(|_| hosted.leaving)
+                    }
+                };
                 running.tell_node_id(tell);
             }
             Phase::Silent(_) | Phase::None => return Ok(false),
@@ -198,10 +246,11 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     let (flash, buffer) = running.device.into_parts();
                     Idle { flash, buffer }
                 }
-                Phase::StandIn(running, buffer) => Idle { flash: running.device.into_flash(), buffer },
+                Phase::StandIn(running, buffer, _) => Idle { flash: running.device.into_flash(), buffer },
                 Phase::Silent(idle) => idle,
                 Phase::None => return Ok(false),
             };
+            self.crash_resets = POLICY.crash_resets(self.crash_resets, cause, request);
             tell(self.reset(idle, request));
             more = true;
         }
@@ -217,7 +266,7 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
         let circumstances = Circumstances {
             request,
             strap,
-            crash_resets: 0,
+            crash_resets: self.crash_resets,
             node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
         };
         let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
@@ -229,7 +278,12 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                     BootDecision::Stay { reason, refused } => (reason, refused),
                     _ => (Reason::Rescue, 0),
                 };
-                let report = BootReport { reason: reason as u8, refused, ..BootReport::NONE };
+                let report = BootReport {
+                    reason: reason as u8,
+                    refused,
+                    crash_resets: self.crash_resets.min(u8::MAX.into()) as u8,
+                    ..BootReport::NONE
+                };
                 let device = Bootloader::new(
                     config,
                     serial_number,
@@ -269,16 +323,36 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
                         };
                         // A lift's bootloader is another node.
                         let hands_over = config.node_id.is_none();
+                        let hosted = self.command.map(|command| {
+                            let place = Place {
+                                serial_number,
+                                node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
+                                program: number,
+                            };
+                            let program = contents(&flash, &journal, config, number);
+                            let file = flash.path().with_extension(format!("program{number}"));
+                            let process = Process::start(command, &file, &program, place);
+                            Hosted { number, process, leaving: None }
+                        });
                         let device = StandIn::new(entries, says, &start, hands_over, flash, config.layout);
                         let address = device.lss_address();
                         let slave = slave(address, node, config.device.heartbeat_ms, NmtPolicy::Follow);
-                        Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer)
+                        Phase::StandIn(Box::new(Running::new(device, slave, node.id)), buffer, hosted)
                     }
                 };
                 Event::Program { number, trial, node: node.id }
             }
         }
     }
+}
+
+/// The bytes of a program, as they were downloaded.
+fn contents(flash: &FileFlash, journal: &Journal, config: &bootloader::Config, number: u8) -> Vec<u8> {
+    let record = ProgramRecord::load(journal, flash, number);
+    let (Some(record), Some(region)) = (record, config.layout.program(number)) else { return Vec::new() };
+    let mut bytes = vec![0; record.size.min(region.size) as usize];
+    flash.read(region.base, &mut bytes);
+    bytes
 }
 
 /// The request to the program, which the bootloader carries out after its boot-up message.

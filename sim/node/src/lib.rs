@@ -10,6 +10,7 @@
 //! | [`device`] | a device: boot decision, bootloader, and the replacement of a program |
 //! | [`stand_in`] | the replacement of a program: the objects that a host reads from a running
 //! application |
+//! | [`run`] | the program as a process of the host |
 //! | [`server`] | a separate bus for socketcand clients |
 //!
 //! `docs/node.md` describes the properties and limits of a node.
@@ -18,6 +19,7 @@
 pub mod args;
 pub mod device;
 pub mod file_flash;
+pub mod run;
 pub mod server;
 pub mod stand_in;
 

@@ -86,8 +86,8 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
     let mut buffers = vec![[0; BUFFER]; setups.len()];
     let mut devices = Vec::new();
     for ((setup, flash), buffer) in setups.into_iter().zip(flashes).zip(&mut buffers) {
-        let (device, event) = Device::<PROGRAMS>::new(setup, flash, buffer);
-        log_event(setup.serial_number, event);
+        let (device, event) = Device::<PROGRAMS>::hosted(setup, args.run.as_ref(), flash, buffer);
+        log_event(args, setup.serial_number, event);
         devices.push((setup.serial_number, device));
     }
     // The first pass is the boot-up: a request that is there already is answered after it.
@@ -107,7 +107,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
                 }
             };
             more |= device
-                .work(now, &mut send, &mut |event| log_event(*serial, event))
+                .work(now, &mut send, &mut |event| log_event(args, *serial, event))
                 .map_err(|error| format!("the file of serial number {serial} cannot be written: {error}"))?;
             sent?;
         }
@@ -144,7 +144,7 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
         password: profile.password,
     }));
     let stand_in: Option<&'static [Entry]> =
-        args.stand_in.then(|| &*Vec::leak(StandIn::entries(programs as u8)));
+        (args.stand_in || args.run.is_some()).then(|| &*Vec::leak(StandIn::entries(programs as u8)));
     let setup = |n: u8| -> Option<Setup> {
         let id = match args.unconfigured {
             true => None,
@@ -163,13 +163,17 @@ fn setups(args: &Args, programs: usize) -> Result<Vec<Setup>, Box<dyn Error>> {
 }
 
 /// Prints the result of a reset.
-fn log_event(serial: u32, event: Event) {
+fn log_event(args: &Args, serial: u32, event: Event) {
     let (node, what) = match event {
         Event::NodeId(node) => (Some(node), "node-ID set by LSS".to_owned()),
         Event::Bootloader { node, reason } => (node, format!("bootloader ({reason:?})")),
         Event::Program { number, trial, node } => {
             let trial = if trial { ", on trial" } else { "" };
-            (node, format!("would start program {number}{trial}"))
+            let starts = if args.run.is_some() { "starts" } else { "would start" };
+            (node, format!("{starts} program {number}{trial}"))
+        }
+        Event::Ended { number, ending } => {
+            return print_line(&format!("serial {serial}: program {number} {ending}"));
         }
     };
     let node = node.map_or("no node-ID".to_owned(), |node| format!("node {}", node.get()));

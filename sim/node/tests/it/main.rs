@@ -7,6 +7,8 @@ mod commands;
 mod conform;
 mod cut;
 mod cuts;
+#[cfg(unix)]
+mod hosted;
 mod nodes;
 mod pages;
 mod production_line;
