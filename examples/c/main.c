@@ -59,6 +59,34 @@ const struct object objects[] = {
     { 0 },
 };
 
+/* ---- Program control ---- */
+
+/* 1F51h = 80h: a master calls the bootloader in the place of the program `sub`.
+ *
+ * It only takes a note. coboot_program_proceed resets the chip when the answer is on the bus and some
+ * 10 ms have passed, so nothing has to wait here, as the manual's TgtStartBootloader does. The first
+ * 80h to a program that has just been downloaded and started confirms that program instead. An
+ * application that must not leave now, since its machine moves, returns COBOOT_ABORT_DEVICE_STATE
+ * first, and stays.
+ */
+static uint32_t start_bootloader(uint8_t sub)
+{
+    return coboot_program_write(&program, COBOOT_PROGRAM_CONTROL, sub, COBOOT_START_BOOTLOADER, board_now_ms());
+}
+
+/* The callback of a download to 1F51h, AppCbProgramCtrl of the SYS TEC manual (L-1112d_10, 4.5). It
+ * runs before the SDO answer is sent: COBOOT_ABORT_NONE gives the positive answer, any other value is
+ * the code of the abort.
+ */
+uint32_t app_cb_program_ctrl(uint8_t sub, uint32_t value)
+{
+    if (value == COBOOT_START_BOOTLOADER) {
+        return start_bootloader(sub);
+    }
+    /* The other commands: stop, start, reset and clear a program. */
+    return coboot_program_write(&program, COBOOT_PROGRAM_CONTROL, sub, value, board_now_ms());
+}
+
 /* ---- The node ---- */
 
 static void send_state(uint8_t state)

@@ -58,5 +58,8 @@ uint32_t object_write(uint16_t index, uint8_t sub, uint32_t value, size_t len)
     if (is_object) {
         return object->write(sub, value);
     }
+    if (index == COBOOT_PROGRAM_CONTROL) {
+        return app_cb_program_ctrl(sub, value);
+    }
     return coboot_program_write(&program, index, sub, value, board_now_ms());
 }

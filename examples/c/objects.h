@@ -27,11 +27,12 @@ struct object {
     uint32_t (*write)(uint8_t sub, uint32_t value);
 };
 
-/* The application defines these two: coboot's state of the program, with 1F51h, 1F56h and 1F57h;
- * and all other objects, the last one zeros.
+/* The application defines these three: coboot's state of the program, with 1F51h, 1F56h and 1F57h;
+ * all other objects, the last one zeros; and the callback of a download to 1F51h.
  */
 extern struct coboot_program program;
 extern const struct object objects[];
+uint32_t app_cb_program_ctrl(uint8_t sub, uint32_t value);
 /* Further objects from another file, the last one zeros. They are optional. */
 extern const struct object more_objects[] __attribute__((weak));
 

@@ -13,6 +13,13 @@ COBOOT_LABEL(VENDOR_ID, PRODUCT_CODE, VERSION);
 // What coboot knows of this program.
 coboot_program program;
 
+// The callback of a download to 1F51h, before it is answered: 80h calls the bootloader. A machine that moves refuses 80h by
+// COBOOT_ABORT_DEVICE_STATE, and stays in the program.
+uint32_t app_cb_program_ctrl(uint8_t sub, uint32_t value)
+{
+    return coboot_program_write(&program, COBOOT_PROGRAM_CONTROL, sub, value, board_now_ms());
+}
+
 namespace {
 
 // Without a bootloader, or where it leaves the bit rate to be found out, which this program cannot do.

@@ -28,6 +28,9 @@ extern "C" {
  */
 #define COBOOT_DEVICE_STATE 0x2007
 
+/* The value of 1F51h that calls the bootloader (SYS TEC manual L-1112d_10, table 2). */
+#define COBOOT_START_BOOTLOADER UINT32_C(0x80)
+
 /* SDO abort codes (CiA 301 table 22). */
 #define COBOOT_ABORT_NONE UINT32_C(0)
 #define COBOOT_ABORT_READ_ONLY UINT32_C(0x06010002)
