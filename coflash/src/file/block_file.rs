@@ -73,6 +73,12 @@ pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
 /// smaller; a larger file holds data for two memories.
 pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
 
+/// The size of the last block's data if size, CRC and block CRC are at the offsets that the manual of
+/// 2008 prints (L-1112e_5, 5.1: 28h, 2Ch and 30h). They leave 28 bytes for the field that the same table
+/// calls 32 bytes long; with 32 bytes it is [`LAST_SIZE_2008`]. Nobody here has a file of that tool, so
+/// both are read.
+const LAST_SIZE_AT_2008_OFFSETS: usize = 0x30 - HEADER_SIZE;
+
 /// The form of the last block.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LastBlock {
@@ -109,7 +115,7 @@ impl Block {
             flash_address: self.flash_address,
             size: match (self.number, self.data.len()) {
                 // The size field of the manual of 2008 does not include the reserved bytes.
-                (NUMBER_LAST, LAST_SIZE_2008) => LAST_SIZE as u32,
+                (NUMBER_LAST, LAST_SIZE_2008 | LAST_SIZE_AT_2008_OFFSETS) => LAST_SIZE as u32,
                 // A block is never larger than `MAX_DATA`.
                 (_, size) => size as u32,
             },
@@ -220,7 +226,7 @@ impl BlockFile {
             }
             offset += len;
             let data_len = block.data.len();
-            let last = is_last.then(|| Last::parse(&block.data));
+            let last = is_last.then(|| parse_last(&block.data));
             check_order(blocks.last(), &block, place)?;
             blocks.push(block);
             match last {
@@ -426,11 +432,11 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
         return Err(place.fault(Cause::BlockSize { number, size }));
     }
     let mut crc_at = HEADER_SIZE + size as usize;
-    let of_2008 = HEADER_SIZE + LAST_SIZE_2008;
     // The size field of the manual of 2008 does not include the reserved bytes. The last block ends
     // with the file.
-    if number == NUMBER_LAST && size as usize == LAST_SIZE && bytes.len() == of_2008 + CRC_SIZE {
-        crc_at = of_2008;
+    if number == NUMBER_LAST && size as usize == LAST_SIZE {
+        let of_2008 = [LAST_SIZE_2008, LAST_SIZE_AT_2008_OFFSETS].map(|size| HEADER_SIZE + size);
+        crc_at = of_2008.into_iter().find(|at| bytes.len() == at + CRC_SIZE).unwrap_or(crc_at);
     }
     let crc = bytes.get(crc_at..).and_then(|rest| rest.first_chunk::<CRC_SIZE>());
     let crc = crc.ok_or_else(|| cut_off("a block", crc_at + CRC_SIZE))?;
@@ -440,6 +446,14 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     }
     let data = bytes[HEADER_SIZE..crc_at].to_vec();
     Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
+}
+
+/// The data of the last block, in each of its forms; `None` for a wrong length.
+fn parse_last(data: &[u8]) -> Option<Last> {
+    match data.split_last_chunk::<LAST_SIZE>() {
+        Some((_, last)) if data.len() == LAST_SIZE_AT_2008_OFFSETS => Last::parse(last),
+        _ => Last::parse(data),
+    }
 }
 
 /// Checks that a program block has data, ends inside the address space and lies after the block

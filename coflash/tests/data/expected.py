@@ -32,7 +32,16 @@ def memory():
     return found
 
 
-def block_file(control, block_size, crc=zlib.crc32, offset=0):
+def last_of_2008(size, crc, reserved):
+    """The last block of the older manual (L-1112e_5, 5.1). Its table prints data size 8, a field of 32 reserved bytes,
+    and the offsets 28h, 2Ch and 30h for the size and CRC of the program and the CRC of the block. The offsets leave 28
+    bytes for the field; with 32 bytes everything after it is 4 bytes later. The data size counts neither."""
+    body = struct.pack("<III", 0xFFFFFFFF, 0, 8) + bytes(reserved) + struct.pack("<II", size, crc)
+    assert reserved == 32 or (body.find(struct.pack("<I", size), 12), len(body)) == (0x28, 0x30)
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def block_file(control, block_size, crc=zlib.crc32, offset=0, reserved=None):
     found = memory()
     flash = bytes(found.get(a, 0xFF) for a in range(START, max(found) + 1))
     assert flash == open("program.bin", "rb").read()
@@ -44,6 +53,8 @@ def block_file(control, block_size, crc=zlib.crc32, offset=0):
         last = max(a for a in found if a < address + block_size - 16)
         out += block(number, address + offset, flash[address - START:last + 1 - START], crc)
         number, address = number + 1, address + block_size - 16
+    if reserved is not None:
+        return out + last_of_2008(len(flash), crc(flash), reserved)
     return out + block(0xFFFFFFFF, 0, struct.pack("<II", len(flash), crc(flash)), crc)
 
 
@@ -53,3 +64,5 @@ open("release-110.blk", "wb").write(
     block_file(lambda size: struct.pack("<IIIIq", size, 0, 1234, 0x00640A01, 1420070400), 0x110))
 open("crc16-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, crc16))
 open("adjusted-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, offset=-0x08000000))
+open("last-2008-offsets-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, reserved=28))
+open("last-2008-reserved-400.blk", "wb").write(block_file(lambda size: bytes(8), 0x400, reserved=32))

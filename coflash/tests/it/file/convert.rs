@@ -67,6 +67,36 @@ fn the_last_block_of_2008_is_written_and_read() {
     assert!(BlockFile::parse(&damaged).is_err(), "its CRC runs over the reserved bytes");
 }
 
+/// The table of the manual of 2008 contradicts itself: a field of 32 reserved bytes, and offsets (28h, 2Ch,
+/// 30h) that leave 28. `tests/data/expected.py` writes a file for each from the table. Both are read for
+/// what they are, and sent as they are.
+#[test]
+fn the_last_block_of_2008_is_read_at_the_printed_offsets_and_after_32_bytes() {
+    let plain = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    for (file, last) in [(data!("last-2008-offsets-400.blk"), 52), (data!("last-2008-reserved-400.blk"), 56)]
+    {
+        let read = BlockFile::parse(file).unwrap();
+        assert_eq!((read.program_size(), read.program_crc()), (plain.program_size(), plain.program_crc()));
+        assert!(read.image() == plain.image() && read.emit() == file);
+        assert_eq!(read.blocks().last().unwrap().emit(), file[file.len() - last..]);
+        // A byte of the field more or less, and a damaged one.
+        let at = file.len() - 20;
+        for other in [[&file[..at], &file[at + 1..]].concat(), [&file[..at], &[0], &file[at..]].concat()] {
+            assert!(BlockFile::parse(&other).is_err(), "{}", other.len());
+        }
+        let mut damaged = file.to_vec();
+        damaged[at] ^= 1;
+        assert!(BlockFile::parse(&damaged).unwrap_err().to_string().contains("CRC of block"));
+        // The same with a data size that counts the field, as the device takes it, too.
+        let mut counts = file[..file.len() - 4].to_vec();
+        let size_at = file.len() - last + 8;
+        counts[size_at] = last as u8 - 16;
+        let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&counts[size_at - 8..]);
+        counts.extend(crc.to_le_bytes());
+        assert_eq!(BlockFile::parse(&counts).unwrap().program_crc(), plain.program_crc());
+    }
+}
+
 /// Polynomial 1021h in blocks and program, stored in 32 bits (manual, table 8); made with Python's
 /// `binascii.crc_hqx`.
 #[test]
