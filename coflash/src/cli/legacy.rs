@@ -108,6 +108,8 @@ const KILOBITS: [u32; 9] = [1000, 800, 500, 250, 125, 100, 50, 20, 10];
 /// Chapter 5.3: the tool's own node-ID.
 const ITS_OWN_NODE_ID: u8 = 127;
 
+/// The CAN-Ethernet gateway (table 12).
+const CAN_ETHERNET: u32 = 14;
 /// CAN over a serial line (table 12).
 const VIRTUAL_CAN: u32 = 16;
 /// The bit rate of that line in the manual and in this tool.
@@ -173,6 +175,14 @@ impl Legacy {
             let what = "an SDO gateway on the CAN bus (CiA 302-7) is not supported";
             let advice = "connect the adapter to the device's own network and leave --gateway_id and --network_id out, \
                           or reach it through a gateway with CiA 309-3: --bus cia309://HOST:PORT/NET";
+            return Err(Failure::usage(what, advice));
+        }
+        // Its device is at another place than any bus of this tool, so none may stand in for it.
+        if self.vxd_type == Some(Interface::Type(CAN_ETHERNET)) {
+            let what = "the SYS TEC CAN-Ethernet gateway (--vxd_type 14) is not supported: its protocol is not public";
+            let advice = "leave --vxd_type, --ip_addr and --ip_port out, and reach the same bus by --bus: \
+                          socketcand://HOST:PORT/can0 or slcan:tcp://HOST:PORT (a computer or an adapter at the bus), \
+                          or cia309://HOST:PORT/NET (a gateway with CiA 309-3)";
             return Err(Failure::usage(what, advice));
         }
         let serial = self.vxd_type == Some(Interface::Type(VIRTUAL_CAN));

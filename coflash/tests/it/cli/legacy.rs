@@ -176,7 +176,7 @@ const NO_TRIAL: &str =
     "no trial, as DotNetFlashtool makes none: the program is released before its first start (--chk_run tries it first)\n";
 
 /// The examples of chapter 5.3, word by word and with the printed dashes, after the name of the
-/// program. The note on the last steps of a download (chapter 3) says that this tool starts no program
+/// program; the last one is in a test of its own. The note on the last steps of a download (chapter 3) says that this tool starts no program
 /// for a moment; so the program is released (83h) and then started, once.
 #[test]
 fn the_examples_of_dotnetflashtool_word_by_word() {
@@ -190,13 +190,6 @@ fn the_examples_of_dotnetflashtool_word_by_word() {
             15,
             1,
             2,
-        ),
-        (
-            "blcop_app.bin",
-            "–F blcop_app.bin --node_id 20 --vxd_type 14 --ip_addr 192.168.1.10 --ip_port 1234",
-            20,
-            1,
-            3,
         ),
     ] {
         let (bus, server) = serve(quick(BOOTLOADER).at(node, program));
@@ -363,6 +356,28 @@ fn a_serial_line_has_115200_bits_a_second() {
         let done = coflash(&[&["--bus", "slcan:nowhere", "flash", "-F", &file][..], options].concat());
         assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);
     }
+}
+
+/// Table 12, interface 14, with the last example of chapter 5.3: the device is on the bus of that gateway. A
+/// bus that is known from somewhere else is another one, and nothing may be sent there.
+#[test]
+fn the_can_ethernet_gateway_stops_and_names_what_to_use() {
+    let example = "–F blcop_app.bin --node_id 20 --vxd_type 14 --ip_addr 192.168.1.10 --ip_port 1234";
+    let (bus, server) = serve(quick(BOOTLOADER));
+    let refused = |done: &Done| {
+        assert_eq!(done.exit, 2, "{}", done.err);
+        for words in ["--vxd_type 14", "--bus", "socketcand://", "slcan:tcp://", "cia309://"] {
+            assert!(done.err.contains(words), "{words}: {}", done.err);
+        }
+    };
+    refused(&dot_net("blcop_app.bin", example, &bus));
+    let file = data("plain-400.blk");
+    let words = ["flash", "-F", &file, "--node_id", "20", "--vxd_type", "14"];
+    refused(&coflash(&words));
+    refused(&run(crate::tool::command().args(words).env("COFLASH_BUS", &bus)));
+    // The bus was never opened: the first connection is this one.
+    assert_eq!(coflash(&["--bus", &bus, "release", "-N", "5"]).exit, 0);
+    assert_eq!(server.join().unwrap().count("command 83"), 1);
 }
 
 /// `FT_DEF_RETRY_TIMEOUT`: how many times a request without an answer is sent.
