@@ -1,7 +1,7 @@
 //! The choices that a product has. A product makes them in its file, `products/default.rs`.
 //!
 //! The resident part and the RAM image are both built from it. Names in brackets are those of the
-//! SYS TEC manual (L-1112d_10, chapter 4.6). If choices contradict each other, the build fails with
+//! SYS TEC manual (L-1112d_10, chapter 4.8). If choices contradict each other, the build fails with
 //! the names of the choices.
 #![allow(dead_code, reason = "each of the two programs uses some of it")]
 

@@ -9,7 +9,7 @@ use crc::{Crc, NoTable, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 static CRC32: Crc<u32, NoTable> = Crc::<u32, NoTable>::new(&CRC_32_ISO_HDLC);
 static CRC16: Crc<u16, NoTable> = Crc::<u16, NoTable>::new(&CRC_16_XMODEM);
 
-/// The CRC of the blocks and programs of a product (SYS TEC manual L-1112d_10, `BL_CRC`).
+/// The CRC of the blocks and programs of a product (SYS TEC manual L-1112d_10, `BLCOP_USE_CRC16`).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum CrcKind {
     /// CRC-32/ISO-HDLC.

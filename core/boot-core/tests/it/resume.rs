@@ -19,7 +19,7 @@ const CHUNK: usize = 64;
 /// A block file with an identity.
 fn named(image: &[u8]) -> Vec<Vec<u8>> {
     let mut file = block_file(image, CHUNK);
-    // Reserved word with the size, vendor-ID, product code (manual L-1112d_10, figure 13).
+    // Reserved word with the size, vendor-ID, product code (manual L-1112d_10, figure 11).
     let words: Vec<u8> = [image.len() as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
     file[0] = block(0, 0, &words);
     file
