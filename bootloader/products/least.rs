@@ -12,6 +12,7 @@ pub const PRODUCT: Product = Product {
     renewal: false,
     lss: false,
     crystal_failure: CrystalFailure::RunFromHsi,
+    block_download: false,
     block_upload: false,
     second_server: false,
     resume: false,

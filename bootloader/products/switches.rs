@@ -17,6 +17,8 @@ pub const PRODUCT: Product = Product {
     boot_up_emergency: false,
     sdo_request_base: 0x680,
     sdo_response_base: 0x480,
+    segments_per_sub_block: 20,
+    receive_queue: 8,
     lss_start_in_configuration: true,
     lss_announce: true,
     lss_store: false,

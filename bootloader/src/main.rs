@@ -75,7 +75,7 @@ mod app {
 
     /// Frames that can wait for the protocol task. The task has a higher priority than all work
     /// that takes long, so only few frames wait.
-    const RX_QUEUE: usize = 32;
+    const RX_QUEUE: usize = PRODUCT.receive_queue as usize;
     /// Period in which the protocol checks its deadlines, in ms.
     const TICK_MS: u32 = 2;
     /// Programs of the layout; each is a sub-index of 1F50h, 1F51h, 1F56h and 1F57h.
@@ -119,6 +119,7 @@ mod app {
 
     impl Choices for Chosen {
         const EXTRAS: Extras = EXTRAS;
+        const BLOCK_DOWNLOAD: bool = PRODUCT.block_download;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
         const LSS_STORE: bool = PRODUCT.lss_store;
         const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;
@@ -182,6 +183,7 @@ mod app {
                     unknown_request: PRODUCT.profile.unknown_request,
                     request_base: PRODUCT.sdo_request_base,
                     response_base: PRODUCT.sdo_response_base,
+                    blksize: PRODUCT.segments_per_sub_block,
                     ..SdoConfig::DEFAULT
                 },
             },

@@ -106,6 +106,14 @@ pub struct Product {
     pub lss_announce: bool,
     /// Whether LSS may store node-ID and bit rate.
     pub lss_store: bool,
+    /// Whether programs can be written by SDO block download. Without it the device answers 05040001h, and
+    /// a master goes on in segments, which takes two to three times as long (`SDO_BLOCKTRANSFER`).
+    pub block_download: bool,
+    /// The segments of a sub-block of a block download at most, 1 to 127; at low bit rates the device takes
+    /// fewer (`SDO_BLOCKSIZE_DOWNLOAD`).
+    pub segments_per_sub_block: u8,
+    /// Received frames that may wait for the protocol, 8 to 255 (`CDRV_MAX_RX_BUFF_ENTRIES_LOW`).
+    pub receive_queue: u8,
     /// Whether objects can be read by SDO block upload; on boards with the split map alone.
     pub block_upload: bool,
     /// Whether there is a second SDO server (1201h), by which one client writes a program to several
@@ -196,6 +204,9 @@ impl Product {
         lss_start_in_configuration: false,
         lss_announce: false,
         lss_store: true,
+        block_download: true,
+        segments_per_sub_block: 127,
+        receive_queue: 32,
         block_upload: LAYOUT.home.is_some(),
         second_server: LAYOUT.home.is_some(),
         resume: LAYOUT.home.is_some(),
@@ -261,6 +272,11 @@ impl Product {
             !(SEALED && self.rom_loader),
             "product: rom_loader would write any program into a device that takes sealed images"
         );
+        assert!(
+            self.segments_per_sub_block >= 1 && self.segments_per_sub_block <= 127,
+            "product: segments_per_sub_block must be 1 to 127"
+        );
+        assert!(self.receive_queue >= 8, "product: receive_queue must be 8 or more");
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
             self.rescue_window_ms

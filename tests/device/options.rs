@@ -87,6 +87,25 @@ fn lss_starts_in_configuration_and_stores_nothing() {
     assert_eq!(answer[..2], [0x17, 1]);
 }
 
+/// CiA 301 clause 7.2.4.3.9: the answer to an initiate (A4h: with CRC) has the segments of a sub-block; a
+/// device without block download knows no such request (05040001h), and a tool goes on in segments.
+#[test]
+fn block_download_has_the_products_sub_blocks_or_is_not_there() {
+    let initiate = [0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0];
+    let mut bench = switched_on(42, BitRate::K500);
+    let answer = bench.ask(0x6AA, &initiate, 0x4AA).unwrap();
+    assert_eq!(answer, [0xA4, 0x50, 0x1F, 1, 20, 0, 0, 0]);
+
+    let mut bench = Bench::of_image(firmware::BOOTLOADER_LEAST);
+    bench.power_on();
+    bench.await_boot_up(100);
+    let refused = bench.ask(0x601, &initiate, 0x581).unwrap();
+    assert_eq!((refused[0], refused[4..].to_vec()), (0x80, vec![0x01, 0, 0x04, 0x05]));
+    let file = firmware::blocks(firmware::APP_V1);
+    flash(&mut bench.session(), &file, &FlashOptions::default(), &mut |_| {}).unwrap();
+    assert!(!bench.session().device_type().unwrap().unwrap().is_bootloader());
+}
+
 /// A program gets the COB-IDs with the handoff: trial, start and call back go by the same ones.
 #[test]
 fn an_update_keeps_the_cob_ids_of_the_product() {
@@ -112,7 +131,10 @@ fn a_pin_says_whether_a_program_is_valid() {
     bench.machine().set_pin('C', 0, Some(true));
     let file = firmware::blocks(firmware::APP_V1);
     let node = canopen::NodeId::new(42).unwrap();
-    let request = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+    let in_bootloader = |bench: &mut Bench| {
+        let answer = bench.ask(0x6AA, &[0x40, 0x00, 0x10, 0, 0, 0, 0, 0], 0x4AA);
+        answer.unwrap() == [0x43, 0x00, 0x10, 0, 0x00, 0x00, 0x00, 0x10]
+    };
     {
         let mut ids = SdoIds::new(&mut bench, 0x680, 0x480);
         let mut session = Session::new(&mut ids, node, Timing::default());
@@ -125,11 +147,11 @@ fn a_pin_says_whether_a_program_is_valid() {
         bench.machine().set_pin('C', 0, Some(valid));
         bench.power_on();
         bench.run_ms(600);
-        bench.ask(0x6AA, &request, 0x4AA).is_some()
+        in_bootloader(bench)
     };
     assert!(restart(&mut bench, false), "low: the bootloader stays, without a rescue window");
     bench.run_ms(600);
-    assert!(bench.ask(0x6AA, &request, 0x4AA).is_some());
+    assert!(in_bootloader(&mut bench));
     assert!(!restart(&mut bench, true), "high: behind the rescue window the program runs");
     // The first CLEAR erases the whole program.
     bench.power_off();

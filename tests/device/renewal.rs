@@ -2,8 +2,8 @@
 //! on trial, and is installed at home after its confirmation (docs/renewal.md).
 
 use canopen::program::{
-    FlashError, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, PROGRAM_VERSION, STATE_BOOTLOADER,
-    STATE_RENEWAL,
+    FlashError, ProgramControl, ProgramStart, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, PROGRAM_VERSION,
+    STATE_BOOTLOADER, STATE_PROGRAM_START, STATE_RENEWAL,
 };
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
@@ -169,16 +169,19 @@ fn a_reset_after_the_confirmation_starts_the_program() {
 fn the_image_may_differ_in_every_address() {
     let mut bench = board();
     let other = image_of(firmware::BOOTLOADER_WATCHDOG);
-    let watchdog = Address::new(DEVICE_STATE, 10);
-    assert_eq!(bench.session().read_number(watchdog).unwrap(), 0);
+    let watchdog = |bench: &mut Bench| {
+        let word = bench.session().read_number(Address::new(DEVICE_STATE, STATE_PROGRAM_START)).unwrap();
+        ProgramStart::of_word(word).watchdog_ms
+    };
+    assert_eq!(watchdog(&mut bench), 0);
     stage(&mut bench, &other);
     start(&mut bench);
-    assert_eq!(bench.session().read_number(watchdog).unwrap(), 1000);
+    assert_eq!(watchdog(&mut bench), 1000);
     confirm(&mut bench);
     power_cycle(&mut bench);
     assert!(!bench.is_bootloader(NODE));
     call_back(&mut bench);
-    assert_eq!(bench.session().read_number(watchdog).unwrap(), 1000);
+    assert_eq!(watchdog(&mut bench), 1000);
 }
 
 /// RAM outlives a short dip of the supply. It is a power-on all the same: the program starts.

@@ -615,6 +615,11 @@ const MISTAKES: &[Mistake] = &[
         "product: autostart names a program that the layout has not",
     ),
     product(
+        "Product { segments_per_sub_block: 128, ..Product::DEFAULT }",
+        "product: segments_per_sub_block must be 1 to 127",
+    ),
+    product("Product { receive_queue: 7, ..Product::DEFAULT }", "product: receive_queue must be 8 or more"),
+    product(
         "Product { max_crash_resets: 0, ..Product::DEFAULT }",
         "product: max_crash_resets must be 1 or more",
     ),

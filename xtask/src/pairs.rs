@@ -25,7 +25,7 @@ of each.
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
-const FIELDS: [(&str, &[&str]); 43] = [
+const FIELDS: [(&str, &[&str]); 46] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Autostart::InOrder", "Autostart::List(&[])", "Autostart::Function(|| &[1])"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -44,6 +44,9 @@ const FIELDS: [(&str, &[&str]); 43] = [
     ("lss_start_in_configuration", &["false", "true"]),
     ("lss_announce", &["false", "true"]),
     ("lss_store", &["true", "false"]),
+    ("block_download", &["true", "false"]),
+    ("segments_per_sub_block", &["127", "1"]),
+    ("receive_queue", &["32", "8"]),
     ("block_upload", &["true", "false"]),
     ("identity_check", &["true", "false"]),
     ("check", &["|_, _| Verdict::Standard", "|_, _| Verdict::Accept"]),

@@ -152,6 +152,8 @@ pub trait Choices {
         bootloader: None,
         rom_loader: true,
     };
+    /// Whether objects can be written by SDO block download.
+    const BLOCK_DOWNLOAD: bool = true;
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
     /// Whether layer setting services may store node-ID and bit rate.
@@ -404,6 +406,10 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
 {
     fn has_second_server() -> bool {
         C::EXTRAS.second_server
+    }
+
+    fn has_block_download() -> bool {
+        C::BLOCK_DOWNLOAD
     }
 
     fn has_block_upload() -> bool {

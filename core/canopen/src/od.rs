@@ -354,6 +354,16 @@ pub trait Objects {
         false
     }
 
+    /// Whether objects can be written by block download. Without it, the compiler leaves out the code for
+    /// it, and its requests are unknown requests.
+    #[must_use]
+    fn has_block_download() -> bool
+    where
+        Self: Sized,
+    {
+        true
+    }
+
     /// Whether objects can be read by block upload. Without it, the compiler leaves out the code for it,
     /// and its requests are unknown requests.
     #[must_use]

@@ -504,7 +504,8 @@ impl Fake {
             }
             (0x2007, 6) => self.chip.map(|(options, _)| options.to_le_bytes().to_vec()).ok_or(0x0602_0000),
             (0x2007, 7) => self.chip.map(|(_, supply)| vec![supply]).ok_or(0x0602_0000),
-            (0x2007, 10) => self.watchdog_ms.map(|ms| ms.to_le_bytes().to_vec()).ok_or(0x0602_0000),
+            // Program 1 starts by itself.
+            (0x2007, 10) => self.watchdog_ms.map(|ms| [ms.to_le_bytes(), [1, 0]].concat()).ok_or(0x0602_0000),
             (0x1F57, sub) if sub == self.program => number(if self.busy() { 1 } else { self.status }),
             (0x1F50, sub) if sub == self.program => self.readable.clone().ok_or(0x0601_0001),
             (0x1018 | 0x1F50 | 0x1F51 | 0x1F56 | 0x1F57, _) => Err(0x0609_0011),

@@ -567,13 +567,14 @@ fn the_second_server_has_the_channel_that_it_is_told_until_the_communication_is_
     assert_ne!(bench.word(at(1)) & 0x8000_0000, 0, "the channel does not exist");
 }
 
-/// A product that does without them has no second server, and a request for a block upload is unknown.
+/// A product that does without them has no second server, and a request for a block transfer is unknown.
 #[test]
 fn what_a_product_does_without_is_not_there() {
     use canopen::sdo::server::{Config as ServerConfig, SdoServer};
     struct Least;
     impl Choices for Least {
         const EXTRAS: Extras = Extras { second_server: false, resume: false, ..Extras::STANDARD };
+        const BLOCK_DOWNLOAD: bool = false;
         const BLOCK_UPLOAD: bool = false;
     }
     let mut flash = ModelFlash::new(&CHIP);
@@ -594,10 +595,15 @@ fn what_a_product_does_without_is_not_there() {
     let node = NodeId::new(5).unwrap();
     let mut server = SdoServer::new(node, ServerConfig { unknown_request, ..ServerConfig::DEFAULT });
     let now = canopen::Instant::from_millis(0);
-    // CiA 301 section 7.2.4.3.13: initiate of 1008h, start, acknowledge, end.
-    for request in
-        [[0xA4, 0x08, 0x10, 0, 127, 0, 0, 0], [0xA3, 0, 0, 0, 0, 0, 0, 0], [0xA2, 1, 127, 0, 0, 0, 0, 0]]
-    {
+    // CiA 301 section 7.2.4.3.13: initiate of 1008h, start, acknowledge; section 7.2.4.3.9: initiate of
+    // 1F50h/1, end.
+    for request in [
+        [0xA4, 0x08, 0x10, 0, 127, 0, 0, 0],
+        [0xA3, 0, 0, 0, 0, 0, 0, 0],
+        [0xA2, 1, 127, 0, 0, 0, 0, 0],
+        [0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0],
+        [0xC1, 0, 0, 0, 0, 0, 0, 0],
+    ] {
         server.handle(&canopen::Frame::full(canopen::CobId::sdo_request(node), request), now, &mut least);
         let answer = server.poll(now, &mut least).unwrap();
         assert_eq!(answer.exactly::<8>(), Some(&[0x80, 0, 0, 0, 0, 0, 0, 8]), "{request:02X?}");

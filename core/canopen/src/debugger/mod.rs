@@ -296,6 +296,10 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
         D::has_second_server()
     }
 
+    fn has_block_download() -> bool {
+        D::has_block_download()
+    }
+
     fn has_block_upload() -> bool {
         D::has_block_upload()
     }

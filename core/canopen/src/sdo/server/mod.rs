@@ -381,8 +381,10 @@ impl SdoServer {
             ccs::DOWNLOAD_SEGMENT => self.download_segment(bytes, objects),
             ccs::INITIATE_UPLOAD => self.initiate_upload(bytes, objects),
             ccs::UPLOAD_SEGMENT => self.upload_segment(bytes, objects),
-            ccs::INITIATE_BLOCK_DOWNLOAD => self.initiate_block_download(bytes, objects),
-            ccs::END_BLOCK_DOWNLOAD => self.end_block_download(bytes, objects),
+            ccs::INITIATE_BLOCK_DOWNLOAD if O::has_block_download() => {
+                self.initiate_block_download(bytes, objects)
+            }
+            ccs::END_BLOCK_DOWNLOAD if O::has_block_download() => self.end_block_download(bytes, objects),
             fields::ABORT => {
                 self.reset(objects);
                 Ok(())
