@@ -26,6 +26,9 @@ const CONFIRMED: u32 = u32::from_le_bytes(*b"CNF1");
 const INSTALLED: u32 = u32::from_le_bytes(*b"INS1");
 
 impl RenewalRecord {
+    /// The stored form of "nothing is in staging".
+    pub(crate) const NONE: Value = [0; 4];
+
     /// Loads the record from the store; `None` if nothing is in staging.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F) -> Option<Self> {
         Self::from_value(parameters.get(flash, Key::program(BOOTLOADER))?)

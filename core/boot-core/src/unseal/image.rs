@@ -15,7 +15,6 @@ use crate::keys::{floor, is_sound};
 use crate::policy::SealPolicy;
 use crate::queue::{Piece, Queue};
 use crate::renewal::header;
-use crate::resume::Partial;
 use crate::store::{Key, Parameters, ProgramRecord, RenewalRecord, Value};
 
 // `seal` depends on nothing, so it has the number, too.
@@ -280,7 +279,7 @@ impl Place {
         let staged = parameters.get(flash, Key::program(self.program));
         let staged = staged.filter(|value| RenewalRecord::from_value(*value).is_some());
         let staged = staged.map(|record| Same { place: self.region, record });
-        let home = Same { place: home, record: ProgramRecord::none(false, Partial::NONE) };
+        let home = Same { place: home, record: RenewalRecord::NONE };
         [staged, Some(home)].into_iter().flatten().find(|Same { place, .. }| {
             let size = head.size();
             size <= place.size && flash.crc32(0, Region::new(place.base, size)) == head.crc()
