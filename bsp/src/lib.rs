@@ -15,6 +15,7 @@
 //! | `pll.rs` | the clock tree in the registers of the chip, and the regulator |
 //! | `drivers.rs` | the set-up that is the same for every board: clocks, pins, entry strap |
 //! | [`can`] | bxCAN: bit timing, filters, send, receive, errors |
+//! | [`can_driver`] | what bootloader and application want of a CAN controller |
 //! | `can_modes.rs` | bxCAN's operating modes, register by register |
 //! | `can_controllers.rs` | the use of CAN2 in place of CAN1 |
 //! | [`uart`] | a UART without waiting |
@@ -33,6 +34,7 @@
 pub mod can;
 #[cfg(target_arch = "arm")]
 pub mod can_controllers;
+pub mod can_driver;
 mod can_modes;
 pub mod clock;
 #[cfg(target_arch = "arm")]
@@ -50,7 +52,6 @@ mod memory;
 pub mod monitor;
 #[cfg(target_arch = "arm")]
 mod pll;
-#[cfg(target_arch = "arm")]
 mod port;
 #[cfg(any(feature = "uart", not(target_arch = "arm")))]
 pub mod ring;

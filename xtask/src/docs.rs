@@ -51,12 +51,12 @@ fn missing(quote: &[String], source: &str) -> Option<String> {
 
 #[test]
 fn the_guides_show_code_as_it_is() {
-    for document in ["docs/application.md", "docs/first-hour.md", "docs/porting.md", "docs/product.md"] {
-        let found = quotes(&files::ours(document).unwrap());
-        assert!(!found.is_empty(), "{document}: no quotes");
+    for name in "application can-driver first-hour flash-driver operating-system porting product".split(' ') {
+        let found = quotes(&files::ours(format!("docs/{name}.md")).unwrap());
+        assert!(!found.is_empty(), "{name}: no quotes");
         for Quote { file, lines } in found {
             let gone = missing(&lines, &files::ours(&file).unwrap());
-            assert_eq!(gone, None, "{document} quotes what {file} does not have: copy it from there");
+            assert_eq!(gone, None, "{name} quotes what {file} does not have: copy it from there");
         }
     }
 }

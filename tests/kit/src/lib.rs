@@ -12,6 +12,7 @@
 //! | `memory` | feature `debugger`: a device with the debugger interface, and its memory |
 //! | `model` | feature `boot`: a strict flash that loses power on demand |
 //! | `boot` | feature `boot`: the one way to make a bootloader |
+//! | `driver` | feature `boot`: the demonstration that proves a flash driver |
 //! | `bench` | feature `boot`: a bootloader on that flash, and the actions of a host |
 //! | `rig` | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
@@ -26,6 +27,8 @@ pub mod boot;
 #[cfg(feature = "bus")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod bus;
+#[cfg(feature = "boot")]
+pub mod driver;
 pub mod folder;
 #[cfg(feature = "hawkbit")]
 #[allow(missing_docs, reason = "names say it")]
