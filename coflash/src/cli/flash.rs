@@ -208,11 +208,16 @@ impl Flash {
         }
     }
 
-    /// Whether the manual's words alone are the reason that this program gets no trial.
+    /// Whether the manual's words leave the trial of this file out. DotNetFlashtool knows neither job
+    /// files nor new bootloaders, and a bootloader is never installed without its trial.
+    fn is_untried(&self, file: &Program) -> bool {
+        self.legacy.makes_no_trial() && self.job.is_none() && !file.is_bootloader()
+    }
+
+    /// Whether that alone is the reason that this program gets no trial.
     fn leaves_trial_out(&self, device: &Assignment) -> bool {
         let has_trial = matches!(self.access.dialect(), None | Some(Dialect::Block));
-        let asked_for = self.no_trial || self.no_start || self.job.is_some();
-        self.legacy.makes_no_trial() && has_trial && !asked_for && !device.file.is_bootloader()
+        self.is_untried(&device.file) && has_trial && !self.no_trial && !self.no_start
     }
 
     /// The program number, in either spelling.
@@ -351,9 +356,7 @@ impl Flash {
         let advice = "convert it with --vid and --pid, or give these options here";
         let unnamed = || Failure::usage("the file does not name its target device", advice);
         let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
-        // A new bootloader is never installed without its trial, and DotNetFlashtool knows none.
-        let untried = self.legacy.makes_no_trial() && !file.is_bootloader();
-        let trial = settings.trial_run.unwrap_or(!(self.no_trial || untried));
+        let trial = settings.trial_run.unwrap_or(!(self.no_trial || self.is_untried(file)));
         let start = settings.start.unwrap_or(!self.no_start);
         if file.is_bootloader() && !(trial && start) {
             let advice =
