@@ -273,6 +273,10 @@ impl Product {
             "product: rom_loader would write any program into a device that takes sealed images"
         );
         assert!(
+            self.block_download || !self.second_server,
+            "product: second_server needs block_download, by which a group gets its data"
+        );
+        assert!(
             self.segments_per_sub_block >= 1 && self.segments_per_sub_block <= 127,
             "product: segments_per_sub_block must be 1 to 127"
         );

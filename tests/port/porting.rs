@@ -615,6 +615,10 @@ const MISTAKES: &[Mistake] = &[
         "product: autostart names a program that the layout has not",
     ),
     product(
+        "Product { block_download: false, ..Product::DEFAULT }",
+        "product: second_server needs block_download, by which a group gets its data",
+    ),
+    product(
         "Product { segments_per_sub_block: 128, ..Product::DEFAULT }",
         "product: segments_per_sub_block must be 1 to 127",
     ),
