@@ -171,13 +171,17 @@ pub const LAST_SIZE: usize = 8;
 /// The size in the manual of 2008 (L-1112e_5, 5.1), with 32 reserved bytes at the beginning. The
 /// size in the block's header stays [`LAST_SIZE`].
 pub const LAST_SIZE_2008: usize = 32 + LAST_SIZE;
+/// The same if size, CRC and block CRC are at the offsets that this manual prints (28h, 2Ch and 30h): they
+/// leave 28 bytes for the field that its table calls 32 bytes long. Nobody here has a file of that tool, so
+/// both are taken.
+pub const LAST_SIZE_AT_2008_OFFSETS: usize = 0x30 - HEADER_SIZE;
 
 impl Last {
     /// Parses the data of the last block, with or without reserved bytes at the beginning; `None`
     /// for a wrong length.
     #[must_use]
     pub fn parse(data: &[u8]) -> Option<Self> {
-        if data.len() != LAST_SIZE && data.len() != LAST_SIZE_2008 {
+        if !matches!(data.len(), LAST_SIZE | LAST_SIZE_2008 | LAST_SIZE_AT_2008_OFFSETS) {
             return None;
         }
         let data: &[u8; LAST_SIZE] = data.last_chunk()?;

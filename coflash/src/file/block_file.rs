@@ -4,7 +4,8 @@ use std::fmt;
 
 use crc::{Crc, Table, CRC_16_XMODEM, CRC_32_ISO_HDLC};
 use shared_abi::block_file::{
-    Control, Header, Last, CRC_SIZE, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, NUMBER_CONTROL, NUMBER_LAST,
+    Control, Header, Last, CRC_SIZE, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, LAST_SIZE_AT_2008_OFFSETS,
+    NUMBER_CONTROL, NUMBER_LAST,
 };
 pub use shared_abi::block_file::{Identity, FRAMING, MAX_BLOCK_SIZE};
 
@@ -72,12 +73,6 @@ pub const MAX_DATA: usize = MAX_BLOCK_SIZE - FRAMING;
 /// The most bytes from a program's start to its last byte. The flash of any microcontroller is
 /// smaller; a larger file holds data for two memories.
 pub const MAX_PROGRAM_SIZE: u32 = 64 * 1024 * 1024;
-
-/// The size of the last block's data if size, CRC and block CRC are at the offsets that the manual of
-/// 2008 prints (L-1112e_5, 5.1: 28h, 2Ch and 30h). They leave 28 bytes for the field that the same table
-/// calls 32 bytes long; with 32 bytes it is [`LAST_SIZE_2008`]. Nobody here has a file of that tool, so
-/// both are read.
-const LAST_SIZE_AT_2008_OFFSETS: usize = 0x30 - HEADER_SIZE;
 
 /// The form of the last block.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -226,7 +221,7 @@ impl BlockFile {
             }
             offset += len;
             let data_len = block.data.len();
-            let last = is_last.then(|| parse_last(&block.data));
+            let last = is_last.then(|| Last::parse(&block.data));
             check_order(blocks.last(), &block, place)?;
             blocks.push(block);
             match last {
@@ -446,14 +441,6 @@ fn parse_block(bytes: &[u8], checksum: Checksum, place: Place) -> Result<(Block,
     }
     let data = bytes[HEADER_SIZE..crc_at].to_vec();
     Ok((Block { number, flash_address, data }, crc_at + CRC_SIZE))
-}
-
-/// The data of the last block, in each of its forms; `None` for a wrong length.
-fn parse_last(data: &[u8]) -> Option<Last> {
-    match data.split_last_chunk::<LAST_SIZE>() {
-        Some((_, last)) if data.len() == LAST_SIZE_AT_2008_OFFSETS => Last::parse(last),
-        _ => Last::parse(data),
-    }
 }
 
 /// Checks that a program block has data, ends inside the address space and lies after the block

@@ -9,8 +9,8 @@ use canopen::program::FlashError;
 use canopen::AbortCode;
 use seal::wire::MAGIC;
 use shared_abi::block_file::{
-    Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, MAX_BLOCK_SIZE, NUMBER_CONTROL,
-    NUMBER_LAST,
+    Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, LAST_SIZE_AT_2008_OFFSETS,
+    MAX_BLOCK_SIZE, NUMBER_CONTROL, NUMBER_LAST,
 };
 use shared_abi::geometry::Region;
 
@@ -187,12 +187,12 @@ impl BlockFile {
         match self.start.first_chunk() {
             Some(header) if self.len == HEADER_SIZE => {
                 self.header = Header::parse(header);
-                if self.header.number == NUMBER_LAST
-                    && self.header.size == LAST_SIZE as u32
-                    && self.announced == Some((FRAMING + LAST_SIZE_2008) as u32)
-                {
+                if self.header.number == NUMBER_LAST && self.header.size == LAST_SIZE as u32 {
                     // The size field of the manual of 2008 does not include the reserved bytes.
-                    self.header.size = LAST_SIZE_2008 as u32;
+                    let announced = self.announced.map_or(0, |size| size.saturating_sub(FRAMING as u32));
+                    if matches!(announced as usize, LAST_SIZE_2008 | LAST_SIZE_AT_2008_OFFSETS) {
+                        self.header.size = announced;
+                    }
                 }
                 judge_header(self.header, to)
             }
