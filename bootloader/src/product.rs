@@ -573,7 +573,7 @@ pub const fn supports(rate: BitRate) -> bool {
             let index = rate as u8;
             index >= *PRODUCT.bit_rates.start()
                 && index <= *PRODUCT.bit_rates.end()
-                && TIMINGS[index as usize].is_some()
+                && TIMINGS[index as usize] != 0
         }
     }
 }

@@ -114,7 +114,7 @@ impl<I: Controller> Port<I> {
     /// Sets bit timing and mode, and joins the bus with empty mailboxes.
     ///
     /// Joining takes 11 recessive bits on the bus. The controller waits for them by itself.
-    pub fn configure(&mut self, timing: BitTiming, mode: Mode) {
+    pub fn configure(&mut self, timing: u32, mode: Mode) {
         self.leave_bus();
         self.waiting = None;
         self.modes.set_bit_timing(timing, mode);

@@ -7,7 +7,6 @@ use core::marker::PhantomData;
 use core::mem::{transmute_copy, ManuallyDrop};
 
 use bxcan::{Can, Instance};
-use shared_abi::bit_timing::BitTiming;
 
 /// The controller's mode on the bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,9 +87,9 @@ impl<I: Instance> Modes<I> {
     }
 
     /// Sets the bit timing, in initialisation (section 32.7.7).
-    pub fn set_bit_timing(&mut self, timing: BitTiming, mode: Mode) {
+    pub fn set_bit_timing(&mut self, timing: u32, mode: Mode) {
         let silent = if mode == Mode::Silent { SILM } else { 0 };
-        self.write(BTR, timing.register() | silent);
+        self.write(BTR, timing | silent);
     }
 
     /// Drops the frames of the mailboxes. In initialisation no frame is on its way (section 32.7.1), and

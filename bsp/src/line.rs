@@ -11,10 +11,10 @@ use crate::can_driver::CanDriver;
 use crate::clock::Source;
 use crate::facts::{CAN_CLOCK, INTERNAL};
 
-/// The bit timing of the board's CAN controller for each bit rate; `None` if there is none.
-pub const TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(CAN_CLOCK, BitRate::TABLE);
+/// The bit timing of the board's CAN controller for each bit rate, as `CAN_BTR` has it; 0 if there is none.
+pub const TIMINGS: [u32; 9] = BitTiming::registers(CAN_CLOCK, BitRate::TABLE);
 /// The timings while the core runs from HSI.
-const INTERNAL_TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(INTERNAL.apb1_clock(), BitRate::TABLE);
+const INTERNAL_TIMINGS: [u32; 9] = BitTiming::registers(INTERNAL.apb1_clock(), BitRate::TABLE);
 
 /// Whether the board's CAN controller can run at this bit rate; true for a bit rate that must be
 /// detected.
@@ -22,19 +22,19 @@ const INTERNAL_TIMINGS: [Option<BitTiming>; 9] = BitTiming::table(INTERNAL.apb1_
 pub const fn supports(rate: BitRate) -> bool {
     match rate {
         BitRate::Auto => true,
-        rate => TIMINGS[rate as usize].is_some(),
+        rate => TIMINGS[rate as usize] != 0,
     }
 }
 
 /// The timing of a bit rate with this source of the clock. No other bit rate is requested than those
 /// that the controller [`supports`].
 #[inline(always)]
-pub(crate) fn timing(rate: BitRate, clock: Source) -> Option<&'static BitTiming> {
+pub(crate) fn timing(rate: BitRate, clock: Source) -> Option<u32> {
     let timings = match clock {
         Source::Crystal => &TIMINGS,
         Source::Internal => &INTERNAL_TIMINGS,
     };
-    timings.get(rate as usize)?.as_ref()
+    timings.get(rate as usize).copied().filter(|register| *register != 0)
 }
 
 /// Empties the controller's FIFO, which holds three frames in bxCAN. `take` returns whether there was

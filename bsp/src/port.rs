@@ -18,7 +18,7 @@ macro_rules! is_a_can_driver {
         $($of)* {
             fn set_bit_rate(&mut self, rate: BitRate, mode: Mode) {
                 if let Some(timing) = crate::line::timing(rate, self.clock()) {
-                    self.configure(*timing, mode);
+                    self.configure(timing, mode);
                 }
             }
 

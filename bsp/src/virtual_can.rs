@@ -6,7 +6,7 @@ use cortex_m::peripheral::NVIC;
 use embedded_can::{Frame, Id};
 use stm32f4xx_hal::pac::Interrupt;
 
-use crate::can::{BitTiming, Errors, Lost, Mode};
+use crate::can::{Errors, Lost, Mode};
 use crate::clock::Source;
 use crate::facts::UartController;
 use crate::identity::serial_number;
@@ -53,7 +53,7 @@ impl Port {
 
     /// Does nothing: a serial line has no bit timing, and no other node that a silent one could
     /// disturb.
-    pub fn configure(&mut self, _timing: BitTiming, _mode: Mode) {}
+    pub fn configure(&mut self, _timing: u32, _mode: Mode) {}
 
     /// A serial line has no bus-off.
     pub fn recover_from_bus_off(&mut self) {}

@@ -66,16 +66,19 @@ impl BitTiming {
         }
     }
 
-    /// The timings of several bit rates, worked out at compile time.
+    /// The [registers](Self::register) of several bit rates, worked out at compile time; 0, which is that of
+    /// no timing, where the clock cannot make one.
     #[must_use]
-    pub const fn table<const N: usize>(clock: u32, bit_rates: [u32; N]) -> [Option<Self>; N] {
-        let mut table = [None; N];
+    pub const fn registers<const N: usize>(clock: u32, bit_rates: [u32; N]) -> [u32; N] {
+        let mut registers = [0; N];
         let mut i = 0;
         while i < N {
-            table[i] = Self::new(clock, bit_rates[i]);
+            if let Some(timing) = Self::new(clock, bit_rates[i]) {
+                registers[i] = timing.register();
+            }
             i += 1;
         }
-        table
+        registers
     }
 
     /// The value of `CAN_BTR`.

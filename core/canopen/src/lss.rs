@@ -293,7 +293,7 @@ impl Lss {
             (FASTSCAN, State::Waiting) => return self.fastscan(bytes).then_some((IDENTIFIED, 0)),
             (CONFIGURE_NODE_ID, State::Configuration) => {
                 let id = NodeId::new(a);
-                let is_taken = id.map_or(a == UNCONFIGURED, |id| device.takes(id));
+                let is_taken = a == UNCONFIGURED || id.is_some_and(|id| device.takes(id));
                 if is_taken {
                     self.pending = id;
                 }

@@ -189,10 +189,11 @@ impl BlockFile {
                 self.header = Header::parse(header);
                 if self.header.number == NUMBER_LAST && self.header.size == LAST_SIZE as u32 {
                     // The size field of the manual of 2008 does not include the reserved bytes.
-                    let announced = self.announced.map_or(0, |size| size.saturating_sub(FRAMING as u32));
-                    if matches!(announced as usize, LAST_SIZE_2008 | LAST_SIZE_AT_2008_OFFSETS) {
-                        self.header.size = announced;
-                    }
+                    self.header.size = match self.announced {
+                        Some(OF_2008) => LAST_SIZE_2008 as u32,
+                        Some(AT_2008_OFFSETS) => LAST_SIZE_AT_2008_OFFSETS as u32,
+                        _ => LAST_SIZE as u32,
+                    };
                 }
                 judge_header(self.header, to)
             }
@@ -200,6 +201,10 @@ impl BlockFile {
         }
     }
 }
+
+/// The bytes of the last block in the two readings of the manual of 2008.
+const OF_2008: u32 = (FRAMING + LAST_SIZE_2008) as u32;
+const AT_2008_OFFSETS: u32 = (FRAMING + LAST_SIZE_AT_2008_OFFSETS) as u32;
 
 /// Whether a block holds data of the program.
 fn is_data(header: &Header) -> bool {

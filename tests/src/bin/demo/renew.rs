@@ -107,25 +107,13 @@ fn call_back(bench: &mut Bench) -> Outcome<()> {
 
 /// The image with another prescaler in the table of its bit rates, as if it were built for another crystal.
 fn with_wrong_bit_rate(mut image: Vec<u8>) -> Outcome<Vec<u8>> {
-    /// The bytes of an entry of the table.
-    const ENTRY: usize = 6;
-    let bytes = |timing: &BitTiming| {
-        let [low, high] = timing.prescaler.to_le_bytes();
-        [low, high, timing.segment_1, timing.segment_2]
-    };
-    let is_table = |at: &usize| {
-        let entries = bsp::line::TIMINGS.iter().zip((*at..).step_by(ENTRY));
-        entries
-            .filter_map(|(timing, at)| Some((bytes(timing.as_ref()?), at)))
-            .all(|(timing, at)| image.get(at..at + 4) == Some(&timing))
-    };
-    let table = (0..image.len()).find(is_table).ok_or("the table of the bit rates is elsewhere")?;
-    let own = bsp::line::TIMINGS
-        .iter()
-        .position(|timing| timing.is_some() && *timing == BitTiming::new(bsp::CAN_CLOCK, BIT_RATE))
-        .ok_or("the board cannot run at this bit rate")?;
-    let at = table + own * ENTRY;
-    let prescaler = u16::from_le_bytes([image[at], image[at + 1]]) * 2;
-    image[at..at + 2].copy_from_slice(&prescaler.to_le_bytes());
+    let table: Vec<u8> = bsp::line::TIMINGS.iter().flat_map(|timing| timing.to_le_bytes()).collect();
+    let at = image.windows(table.len()).position(|bytes| bytes == table);
+    let at = at.ok_or("the table of the bit rates is elsewhere")?;
+    let timing = BitTiming::new(bsp::CAN_CLOCK, BIT_RATE).ok_or("the board cannot run at this bit rate")?;
+    let own = bsp::line::TIMINGS.iter().position(|register| *register == timing.register());
+    let at = at + 4 * own.ok_or("the bit rate is none of CANopen")?;
+    let wrong = BitTiming { prescaler: 2 * timing.prescaler, ..timing };
+    image[at..at + 4].copy_from_slice(&wrong.register().to_le_bytes());
     Ok(with_crc(image))
 }
