@@ -59,7 +59,6 @@ mod app {
     use core::ops::RangeInclusive;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
-
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
     use shared_abi::services::{StoreState, STORE_STATE_WORDS};

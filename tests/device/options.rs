@@ -82,6 +82,11 @@ fn lss_starts_in_configuration_and_stores_nothing() {
     // 5Eh: inquire node-ID, without a selection.
     let answer = bench.ask(0x7E5, &[0x5E, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
     assert_eq!(answer[..2], [0x5E, 42]);
+    // 11h: configure node-ID; 1: outside the product's 2 to 100.
+    for (id, refused) in [(1, 1), (2, 0), (100, 0), (101, 1), (127, 1), (255, 0)] {
+        let answer = bench.ask(0x7E5, &[0x11, id, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
+        assert_eq!(answer[..2], [0x11, refused], "{id}");
+    }
     // 17h: store configuration; 1: storing is not supported.
     let answer = bench.ask(0x7E5, &[0x17, 0, 0, 0, 0, 0, 0, 0], 0x7E4).unwrap();
     assert_eq!(answer[..2], [0x17, 1]);
