@@ -69,3 +69,25 @@ pub fn program_watchdog(session: &mut Session<'_>) -> Result<Option<Duration>, E
     let ms = program_start(session)?.map_or(0, |start| start.watchdog_ms);
     Ok((ms > 0).then(|| Duration::from_millis(ms.into())))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 2007h/10, docs/protocol.md: the preferred program, then the next one; FFh if the product decides.
+    #[test]
+    fn a_program_that_does_not_start_first_is_told() {
+        let words = |by_itself, number| autostart_words(ProgramStart { watchdog_ms: 0, by_itself }, number);
+        assert_eq!([words([1, 0], 1), words([2, 1], 2)], [None, None]);
+        for (by_itself, number, expected) in [
+            ([0, 0], 1, "no program starts by itself"),
+            ([1, 2], 2, "if program 1 cannot"),
+            ([1, 0], 2, "it does not start by itself: program 1 does"),
+            ([1, 2], 3, "program 1 does, or program 2"),
+            ([0xFF, 0], 1, "the device decides"),
+        ] {
+            let words = words(by_itself, number).unwrap();
+            assert!(words.contains(expected), "{by_itself:?}, {number}: {words}");
+        }
+    }
+}

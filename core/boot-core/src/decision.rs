@@ -222,6 +222,7 @@ pub fn decide(
     };
     let mut decision = start(circumstances, policy, candidate, &verify);
     for number in others {
+        // A layout with one program has no other one: the compiler leaves the loop out.
         let (Stay { reason, .. }, true) = (decision, policy.programs.len() > 1) else { break };
         let other = start(circumstances, policy, by_itself(*number), &verify);
         // The reason to stay is that of the first program that is there.
