@@ -10,7 +10,7 @@ use core::ops::RangeInclusive;
 use boot_core::bootloader::Extras;
 use boot_core::canopen::program::ProgramStart;
 use boot_core::canopen::{BitRate, NodeId};
-use boot_core::control::{Erase, Policy, Renewal, Verdict};
+use boot_core::control::{AppInfo, Erase, Policy, Renewal, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::decision::{self, Autostart};
 use boot_core::flash::Flash;
@@ -19,7 +19,6 @@ use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
-use shared_abi::block_file;
 use shared_abi::ram_image::feature;
 use shared_abi::renewal;
 use shared_abi::services::Facts;
@@ -129,7 +128,7 @@ pub struct Product {
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
     /// The product's own check of block 0 and of the label in the image (`TgtProcessAppInfoData`).
-    pub check: fn(program: u8, control: &block_file::Control) -> Verdict,
+    pub check: fn(program: u8, info: &AppInfo<'_>) -> Verdict,
     /// Whether programs may be changed now.
     pub programming_allowed: fn() -> bool,
     /// The time of the erase for CLEAR of a program (`TgtCheckEraseApp`); `None` for the profile's.

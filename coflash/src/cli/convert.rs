@@ -195,13 +195,13 @@ impl Convert {
         if let Some(sealing) = sealing {
             return self.seal(context, &output, &done.file, &sealing);
         }
-        if let (true, Control::Dated { identity, version, .. }) = (of_image, done.file.control()) {
+        if let (true, Some(Control::Dated { identity, version, .. })) = (of_image, done.file.control()) {
             let Identity { vendor_id, product_code, .. } = identity;
             let output = output.display();
             context.out.say(format_args!(
                 "{output}: for vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {}, \
                  as its label says",
-                ProgramVersion(*version)
+                ProgramVersion(version)
             ));
         }
         self.tell(context, &output, &done);

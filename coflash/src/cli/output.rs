@@ -520,7 +520,6 @@ impl From<FileError> for Failure {
             | Cause::ProgramHeaderSize(_)
             | Cause::BlockCrc { .. }
             | Cause::BlockNumber { .. }
-            | Cause::ControlSize(_)
             | Cause::LastSize(_)
             | Cause::ProgramCrc { .. } => "copy the file again from where it was built, or build it again",
             // Their messages contain the advice.

@@ -128,7 +128,8 @@ impl Block {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BlockFile {
     blocks: Vec<Block>,
-    control: Control,
+    /// `None` for data of the product's own.
+    control: Option<Control>,
     last: Last,
     checksum: Checksum,
 }
@@ -161,7 +162,7 @@ impl BlockFile {
             LastBlock::Of2008 => LAST_SIZE_2008 - LAST_SIZE,
         };
         all.push(block(NUMBER_LAST, 0, [&vec![0; reserved][..], &last.emit()].concat()));
-        Self { blocks: all, control, last, checksum }
+        Self { blocks: all, control: Some(control), last, checksum }
     }
 
     /// The same program in blocks of up to `size` bytes, framing included: blocks without a gap
@@ -190,13 +191,15 @@ impl BlockFile {
         Self { blocks, ..self.clone() }
     }
 
-    /// Whether bytes begin like a block file: block 0 at address 0 with one of the valid lengths.
+    /// Whether bytes begin like a block file: block 0 at address 0, with one of the manual's lengths, or with
+    /// another one and block 1 after it.
     #[must_use]
     pub fn looks_like(bytes: &[u8]) -> bool {
-        bytes.first_chunk().is_some_and(|header| {
-            let Header { number, flash_address, size } = Header::parse(header);
-            number == NUMBER_CONTROL && flash_address == 0 && matches!(size, 8 | 12 | 24)
-        })
+        let Some(header) = bytes.first_chunk() else { return false };
+        let Header { number, flash_address, size } = Header::parse(header);
+        let next = bytes.get((size as usize).saturating_add(FRAMING)..).and_then(|rest| rest.first_chunk());
+        let is_followed = next.is_some_and(|number| u32::from_le_bytes(*number) == 1);
+        number == NUMBER_CONTROL && flash_address == 0 && (matches!(size, 8 | 12 | 24) || is_followed)
     }
 
     /// Parses a file and checks every number, size and CRC in it. The first block shows which CRC
@@ -237,9 +240,8 @@ impl BlockFile {
             let words = "there are more bytes after the last block: the file is damaged, or consists of several files";
             return Err(Place::Offset(offset).fault(Cause::Malformed(words)));
         }
-        let control = &blocks[0].data;
-        let control =
-            Control::parse(control).ok_or(Place::Offset(0).fault(Cause::ControlSize(control.len())))?;
+        // Of another length, it has a meaning for the check of the product alone.
+        let control = Control::parse(&blocks[0].data);
         let file = Self { blocks, control, last, checksum };
         if file.program_blocks().is_empty() {
             return Err(Place::File.fault(Cause::NoData));
@@ -316,10 +318,11 @@ impl BlockFile {
         }
     }
 
-    /// The contents of block 0.
+    /// The contents of block 0; `None` if it has a length that the manual does not define, because its data
+    /// are the product's own.
     #[must_use]
-    pub fn control(&self) -> &Control {
-        &self.control
+    pub fn control(&self) -> Option<Control> {
+        self.control
     }
 
     /// The values of 1F56h of a device with this program: its CRC by the checksum of the file, and by

@@ -300,9 +300,6 @@ pub enum Cause {
         /// The size of its data in bytes.
         size: u32,
     },
-    /// Block 0 has an unknown length.
-    #[error("block 0 has {0} data bytes; 8, 12 and 24 are known")]
-    ControlSize(usize),
     /// The last block has a wrong length.
     #[error("the last block has {0} data bytes and must have 8")]
     LastSize(usize),
@@ -365,7 +362,6 @@ impl Cause {
             | Self::ProgramHeaderSize(_)
             | Self::BlockNumber { .. }
             | Self::BlockSize { .. }
-            | Self::ControlSize(_)
             | Self::LastSize(_) => 0x6000_0022,
             Self::Overlap { .. } => 0x6000_0023,
             Self::NothingInside(_) => 0x6000_0024,

@@ -51,7 +51,7 @@ pub struct Blocks {
     /// The CRC of blocks and program.
     pub checksum: Checksum,
     /// The contents of block 0.
-    pub control: Control,
+    pub control: Option<Control>,
     /// The start of the program's region.
     pub program_start: u32,
     /// The size of the program in bytes from there on.
@@ -131,7 +131,7 @@ impl Blocks {
         Self {
             all: file.blocks().iter().map(line).collect(),
             checksum: file.checksum(),
-            control: *file.control(),
+            control: file.control(),
             program_start: file.program_start(),
             program_size: file.program_size(),
             program_crc: file.program_crc(),
@@ -142,8 +142,8 @@ impl Blocks {
     #[must_use]
     pub fn identity(&self) -> Option<&Identity> {
         match &self.control {
-            Control::Plain => None,
-            Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
+            None | Some(Control::Plain) => None,
+            Some(Control::Identity(identity) | Control::Dated { identity, .. }) => Some(identity),
         }
     }
 
@@ -151,8 +151,8 @@ impl Blocks {
     #[must_use]
     pub fn release(&self) -> Option<(ProgramVersion, u64)> {
         match self.control {
-            Control::Dated { version, date, .. } => Some((ProgramVersion(version), date)),
-            Control::Plain | Control::Identity(_) => None,
+            Some(Control::Dated { version, date, .. }) => Some((ProgramVersion(version), date)),
+            _ => None,
         }
     }
 }
@@ -206,6 +206,10 @@ impl fmt::Display for Inspection {
             writeln!(f, "  program      {program_size} bytes from {program_start:#010x} on, CRC {program_crc:0digits$X}h")?;
             if let Some(Identity { vendor_id, product_code, .. }) = blocks.identity() {
                 writeln!(f, "  for          vendor-ID {vendor_id:08X}h, product code {product_code:08X}h")?;
+            }
+            if blocks.control.is_none() {
+                let size = blocks.all.first().map_or(0, |block| block.size);
+                writeln!(f, "  block 0      {size} bytes of the product's own, for its own check")?;
             }
             if let Some((version, date)) = blocks.release() {
                 match date {

@@ -139,12 +139,12 @@ fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Load
 /// after the vectors.
 fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
     use shared_abi::block_file::Control;
-    match *file.control() {
-        Control::Identity(identity) => Some((identity.vendor_id, identity.product_code, None)),
-        Control::Dated { identity, version, .. } => {
+    match file.control() {
+        Some(Control::Identity(identity)) => Some((identity.vendor_id, identity.product_code, None)),
+        Some(Control::Dated { identity, version, .. }) => {
             Some((identity.vendor_id, identity.product_code, Some(ProgramVersion(version).to_string())))
         }
-        Control::Plain => {
+        None | Some(Control::Plain) => {
             let label = label::label_of(&file.image(), file.program_start())?;
             Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
         }

@@ -123,9 +123,9 @@ impl Target {
 
     /// The device that block 0 names.
     pub(super) fn of_control(file: &BlockFile) -> Option<Self> {
-        match *file.control() {
-            Control::Plain => None,
-            Control::Identity(identity) | Control::Dated { identity, .. } => {
+        match file.control() {
+            None | Some(Control::Plain) => None,
+            Some(Control::Identity(identity) | Control::Dated { identity, .. }) => {
                 Some(Self { vendor_id: identity.vendor_id, product_code: identity.product_code })
             }
         }

@@ -106,9 +106,14 @@ impl<'b> Queue<'b> {
             return false;
         }
         for (i, byte) in bytes.iter_mut().enumerate() {
-            *byte = self.byte(self.queued + PIECE_HEADER + offset + i);
+            *byte = self.open_byte(offset + i);
         }
         true
+    }
+
+    /// A data byte of the open piece.
+    pub(crate) fn open_byte(&self, offset: usize) -> u8 {
+        self.byte(self.queued + PIECE_HEADER + offset)
     }
 
     /// The address of the open piece.
@@ -214,6 +219,7 @@ mod tests {
             let mut bytes = [0; 2];
             assert!(queue.read_open(3, &mut bytes));
             assert_eq!((queue.open_address(), bytes), (address, [round, 99]));
+            assert_eq!(queue.open_byte(4), 99);
             assert!(!queue.read_open(5, &mut bytes), "there are 6");
             assert!(queue.is_empty(), "not before it is judged");
             assert_eq!(queue.first(), None);

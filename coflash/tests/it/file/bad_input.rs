@@ -184,6 +184,25 @@ fn a_damaged_block_file_is_named_with_its_offset() {
     assert!(error.starts_with("offset 0x35b: the last block gives 4001 bytes"), "{error}");
 }
 
+/// A block 0 of another length than the manual's has a meaning for the check of the product alone: it goes to
+/// the device as it is.
+#[test]
+fn block_0_may_hold_what_a_product_wants() {
+    let good = data!("plain-400.blk");
+    for size in [0_usize, 1, 7, 9, 13, 20, 25, 1000, 16_368] {
+        let data: Vec<u8> = (0..size).map(|n| n as u8 ^ 0x5A).collect();
+        let mut block = [0; 12].to_vec();
+        block[8..].copy_from_slice(&(size as u32).to_le_bytes());
+        block.extend(&data);
+        let crc = coflash::file::block_file::CRC.checksum(&block);
+        block.extend(crc.to_le_bytes());
+        // 24 bytes are block 0 of the good file.
+        let file = meaning(&[&block, &good[24..]].concat(), None).unwrap();
+        assert_eq!((file.control(), &file.blocks()[0].data), (None, &data), "{size} bytes");
+        assert_eq!(coflash::update::Target::of(&file), None, "{size} bytes name no device");
+    }
+}
+
 /// An ELF file for Arm (System V ABI, chapters 4 and 5) with so many load segments, each of which
 /// shows this many bytes from `offset` on.
 fn elf(segments: u16, len: usize, segment: impl Fn(u32) -> (u32, u32, u32)) -> Vec<u8> {

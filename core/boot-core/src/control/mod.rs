@@ -44,7 +44,7 @@ use crate::store::{Key, NodeParameters, Parameters, ProgramRecord};
 use crate::unseal::Outcome;
 use rights::Rights;
 
-pub use crate::policy::{Erase, Policy, Renewal, Verdict};
+pub use crate::policy::{AppInfo, Erase, Policy, Renewal, Verdict};
 pub use crate::programmer::Step;
 pub use sealed::{Room, Sealed};
 

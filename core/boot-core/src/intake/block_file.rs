@@ -16,7 +16,7 @@ use shared_abi::geometry::Region;
 
 use super::format::{Begin, Destination, Format, Recognition, SMALLEST_PROGRAM};
 use super::stream::judge_start;
-use crate::policy::Judge;
+use crate::policy::{AppInfo, Judge};
 use crate::program::Expected;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
@@ -31,8 +31,8 @@ pub(super) struct BlockFile {
     len: usize,
     /// The header; zeros until it has arrived.
     header: Header,
-    /// The first bytes: the header, and all data of the first and of the last block.
-    start: [u8; HEADER_SIZE + LAST_SIZE_2008],
+    /// The first bytes: the header. The data are in the queue.
+    start: [u8; HEADER_SIZE],
     /// The number of bytes that the client announced.
     announced: Option<u32>,
     /// The last four bytes after the data: the CRC in the block.
@@ -57,7 +57,7 @@ impl Format for BlockFile {
         Recognition::Yes(Self {
             len: 0,
             header: Header { number: 0, flash_address: 0, size: 0 },
-            start: [0; HEADER_SIZE + LAST_SIZE_2008],
+            start: [0; HEADER_SIZE],
             announced: None,
             told: 0,
             crc: 0,
@@ -111,15 +111,20 @@ impl Format for BlockFile {
             }
             to.queue.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
-        let fields = self.start[HEADER_SIZE..].get(..header.size as usize);
+        let mut fields = [0; LAST_SIZE_2008];
+        let fields = fields.get_mut(..header.size as usize).map(|fields| {
+            to.queue.read_open(0, fields);
+            &*fields
+        });
         match header.number {
             NUMBER_CONTROL => {
-                let control = fields.and_then(Control::parse).ok_or(malformed)?;
-                to.judge.check_identity(&control)?;
+                let control = fields.and_then(Control::parse);
+                to.judge.check_identity(&AppInfo::of_block(control, to.queue))?;
+                to.queue.discard();
                 let (size, version) = match control {
-                    Control::Plain => (0, 0),
-                    Control::Identity(identity) => (identity.app_size, 0),
-                    Control::Dated { identity, version, .. } => (identity.app_size, version),
+                    None | Some(Control::Plain) => (0, 0),
+                    Some(Control::Identity(identity)) => (identity.app_size, 0),
+                    Some(Control::Dated { identity, version, .. }) => (identity.app_size, version),
                 };
                 // A control block without a size is the same for too many programs.
                 let id = if size == 0 { 0 } else { self.crc };
@@ -136,6 +141,7 @@ impl Format for BlockFile {
             }
             NUMBER_LAST if to.judge.images.only_sealed().is_some() => {
                 // The manifest of the sealed image describes the program.
+                to.queue.discard();
                 to.findings.complete = Some(Expected { size: 0, crc: None });
             }
             _ if to.judge.images.only_sealed().is_some() => {
@@ -147,6 +153,7 @@ impl Format for BlockFile {
             }
             NUMBER_LAST => {
                 let last = fields.and_then(Last::parse).ok_or(malformed)?;
+                to.queue.discard();
                 if last.program_size < SMALLEST_PROGRAM {
                     return Err(malformed);
                 }
@@ -177,16 +184,14 @@ impl BlockFile {
             return Ok(());
         }
         self.crc = to.judge.policy.crc.resume(self.crc, &[byte]);
-        if let Some(place) = self.start.get_mut(at) {
-            *place = byte;
-        }
-        if at >= HEADER_SIZE {
-            let joins = !is_data(&self.header) || to.queue.push(self.header.flash_address, &[byte]);
+        let Some(place) = self.start.get_mut(at) else {
+            let joins = to.queue.push(self.header.flash_address, &[byte]);
             return if joins { Ok(()) } else { Err(TOO_LONG) };
-        }
-        match self.start.first_chunk() {
-            Some(header) if self.len == HEADER_SIZE => {
-                self.header = Header::parse(header);
+        };
+        *place = byte;
+        match self.len {
+            HEADER_SIZE => {
+                self.header = Header::parse(&self.start);
                 if self.header.number == NUMBER_LAST && self.header.size == LAST_SIZE as u32 {
                     // The size field of the manual of 2008 does not include the reserved bytes.
                     self.header.size = match self.announced {

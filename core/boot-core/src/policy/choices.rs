@@ -5,6 +5,7 @@ use shared_abi::block_file::Control;
 use shared_abi::ram_image::Host;
 
 use crate::crc::CrcKind;
+use crate::queue::Queue;
 use crate::session::Session;
 
 /// The time of the erase for CLEAR.
@@ -30,6 +31,35 @@ pub enum Verdict {
     Refuse(FlashError),
 }
 
+/// What the integrator's own check gets: the data of block 0, or those of the label in the image.
+#[derive(Clone, Copy)]
+pub struct AppInfo<'a> {
+    /// Identity, version and date. `None` if block 0 has a length that the manual does not define: its
+    /// data have a meaning for the integrator alone.
+    pub control: Option<Control>,
+    /// Where the data of block 0 are the open piece; `None` for a label.
+    block: Option<&'a Queue<'a>>,
+}
+
+impl<'a> AppInfo<'a> {
+    /// Block 0, whose data are the open piece of the queue.
+    pub(crate) const fn of_block(control: Option<Control>, block: &'a Queue<'a>) -> Self {
+        Self { control, block: Some(block) }
+    }
+
+    /// The label of an image.
+    pub(crate) const fn of_label(control: Control) -> Self {
+        Self { control: Some(control), block: None }
+    }
+
+    /// The data of block 0 as they were sent, 0 to 16 368 bytes; none for a label.
+    pub fn bytes(&self) -> impl ExactSizeIterator<Item = u8> + use<'a> {
+        let block = self.block;
+        let size = block.map_or(0, Queue::open_size);
+        (0..size).map(move |at| block.map_or(0, |block| block.open_byte(at)))
+    }
+}
+
 /// The product's choices about downloads.
 #[derive(Clone, Copy, Debug)]
 pub struct Policy {
@@ -37,9 +67,9 @@ pub struct Policy {
     /// a control block is any value, and 0 and 0 here take any program
     /// ([`fits`](shared_abi::block_file::fits)).
     pub identity: Option<(u32, u32)>,
-    /// The integrator's own check, with the contents of the control block (`TgtProcessAppInfoData`
-    /// of the manual).
-    pub check: fn(program: u8, control: &Control) -> Verdict,
+    /// The integrator's own check (`TgtProcessAppInfoData` of the manual). A block 0 of a length that the
+    /// manual does not define is refused unless this accepts it.
+    pub check: fn(program: u8, info: &AppInfo<'_>) -> Verdict,
     /// Whether programs may be changed now; if not, the status is `NO_ACCESS`.
     pub allowed: fn() -> bool,
     /// When CLEAR of a program erases (`TgtCheckEraseApp` of the manual).

@@ -8,7 +8,7 @@ use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::vectors::VectorTable;
 
-use super::choices::{Policy, Verdict};
+use super::choices::{AppInfo, Policy, Verdict};
 use crate::keys::Images;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
@@ -94,13 +94,17 @@ impl Judge<'_> {
             .map_err(|_| Refusal::unfit(FlashError::Format))
     }
 
-    /// Whether a program is for this device, from its control block.
-    pub(crate) fn check_identity(&self, control: &Control) -> Result<(), Refusal> {
-        let identity = match control {
-            Control::Plain => None,
-            Control::Identity(identity) | Control::Dated { identity, .. } => Some(identity),
+    /// Whether a program is for this device, from its control block or its label.
+    pub(crate) fn check_identity(&self, info: &AppInfo<'_>) -> Result<(), Refusal> {
+        let verdict = (self.policy.check)(self.program, info);
+        if verdict == Verdict::Standard && info.control.is_none() {
+            return Err(Refusal::unfit(FlashError::Format));
+        }
+        let identity = match &info.control {
+            None | Some(Control::Plain) => None,
+            Some(Control::Identity(identity) | Control::Dated { identity, .. }) => Some(identity),
         };
-        match ((self.policy.check)(self.program, control), identity, self.policy.identity) {
+        match (verdict, identity, self.policy.identity) {
             (Verdict::Refuse(error), ..) => Err(Refusal::unfit(error)),
             (Verdict::Standard, Some(told), Some(device)) => {
                 fits((told.vendor_id, told.product_code), device).map_err(|difference| {
@@ -122,7 +126,7 @@ impl Judge<'_> {
         };
         let Label { vendor_id, product_code, version, .. } = label;
         let identity = Identity { app_size: 0, vendor_id, product_code };
-        self.check_identity(&Control::Dated { identity, version, date: 0 })?;
+        self.check_identity(&AppInfo::of_label(Control::Dated { identity, version, date: 0 }))?;
         Ok(version)
     }
 }

@@ -3,5 +3,5 @@
 mod choices;
 mod judge;
 
-pub use choices::{Erase, Policy, Renewal, SealPolicy, Verdict};
+pub use choices::{AppInfo, Erase, Policy, Renewal, SealPolicy, Verdict};
 pub(crate) use judge::Judge;

@@ -1,6 +1,6 @@
 //! Program download by block file: every block and command, in and out of order, on a strict flash.
 
-use boot_core::control::{Downloader, Policy, Step, Verdict};
+use boot_core::control::{AppInfo, Downloader, Policy, Step, Verdict};
 use boot_core::crc::CrcKind;
 use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::{verify, Invalid};
@@ -482,14 +482,73 @@ fn control(app_size: u32, vendor_id: u32, product_code: u32) -> Vec<u8> {
     block(0, 0, &words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>())
 }
 
+/// The data of block 0 belong to the product, whatever their length is (manual, `TgtProcessAppInfoData`).
+#[test]
+fn a_products_own_check_gets_block_0_of_any_length_byte_for_byte() {
+    // The n-th byte of data of this length: 251 is no factor of the size of the ring, so that no two places
+    // of the ring look alike.
+    fn byte(len: usize, n: usize) -> u8 {
+        ((len + n) % 251) as u8
+    }
+    fn own(_: u8, info: &AppInfo<'_>) -> Verdict {
+        let len = info.bytes().len();
+        assert!(info.bytes().eq((0..len).map(|n| byte(len, n))), "{len} bytes");
+        assert_eq!(info.control.is_some(), matches!(len, 8 | 12 | 24), "{len} bytes");
+        match len % 3 {
+            0 => Verdict::Accept,
+            1 => Verdict::Refuse(FlashError::Unspecified),
+            _ => Verdict::Standard,
+        }
+    }
+    let policy = Policy { check: own, ..Policy::DEFAULT };
+    let (old, new) = (program(200, 0xA0), program(3000, 0xB0));
+    // 16 368 bytes are the most that a block can have. The larger ring has its end within some of the blocks.
+    for buffer in [16_384, 20_000] {
+        let mut flash = ModelFlash::new(&CHIP);
+        let mut bench = Bench::new(&mut flash);
+        bench.install(&old);
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        let mut bench = Bench::with_buffer(&mut flash, policy, buffer);
+        for len in (0..64).chain([100, 255, 256, 1000, 4096, 16_366, 16_367, 16_368]) {
+            let data: Vec<u8> = (0..len).map(|n| byte(len, n)).collect();
+            assert_eq!(bench.command(CLEAR), 0);
+            bench.node.flash().touched.clear();
+            let (answer, status) = match len % 3 {
+                0 => (Ok(()), 0),
+                1 => (Err(AbortCode(0x0800_0020)), 0x7E),
+                // Of the manual's lengths these two are judged by the standard.
+                _ if matches!(len, 8 | 12 | 24) => (Ok(()), 0),
+                _ => (Err(AbortCode(0x0800_0020)), 0x04),
+            };
+            assert_eq!(bench.block(&block(0, 0, &data)), (answer, status), "{len} bytes");
+            assert_eq!(bench.node.flash().touched, [], "nothing is lost with {len} bytes");
+            if answer.is_err() {
+                assert_eq!(bench.command(START), 0, "{len} bytes");
+                assert_eq!(bench.node.take_boot_request(), Some(BootRequest::Start(1)), "{len} bytes");
+                continue;
+            }
+            // The program comes after it, and the same ring holds its blocks.
+            block_file(&new, 700)[1..].iter().for_each(|block| bench.good(block));
+            assert_eq!(bench.command(SET_SIGNATURE), 0, "{len} bytes");
+        }
+    }
+    // One byte more is refused by its length, with the announcement of the transfer.
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with_buffer(&mut flash, policy, 20_000);
+    assert_eq!(bench.command(CLEAR), 0);
+    assert_eq!(bench.block(&block(0, 0, &[0; 16_369])).0, Err(AbortCode(0x0607_0012)));
+}
+
 /// A wrong file has no effect: the installed program stays and starts.
 #[test]
 fn a_file_for_another_product_is_refused_before_anything_is_lost() {
-    fn no_downgrade(program: u8, control: &Control) -> Verdict {
+    fn no_downgrade(program: u8, info: &AppInfo<'_>) -> Verdict {
         assert_eq!(program, 1);
-        match control {
-            Control::Identity(told) if told.app_size == 0xBAD => Verdict::Refuse(FlashError::Unspecified),
-            Control::Identity(told) if told.app_size == 0x600D => Verdict::Accept,
+        match info.control {
+            Some(Control::Identity(told)) if told.app_size == 0xBAD => {
+                Verdict::Refuse(FlashError::Unspecified)
+            }
+            Some(Control::Identity(told)) if told.app_size == 0x600D => Verdict::Accept,
             _ => Verdict::Standard,
         }
     }

@@ -2,7 +2,7 @@
 //! anything is lost if the label is in the first block, and never becomes valid if it is in a later
 //! one.
 
-use boot_core::control::{Policy, Verdict};
+use boot_core::control::{AppInfo, Policy, Verdict};
 use boot_core::store::{Journal, ProgramRecord};
 use canopen::program::FlashError;
 use canopen::AbortCode;
@@ -126,9 +126,9 @@ fn a_label_that_fits_is_taken_and_tells_the_version() {
 /// The product's own check also gets the label: block 0 cannot claim another version.
 #[test]
 fn a_products_own_check_sees_the_label() {
-    fn no_downgrade(_: u8, control: &Control) -> Verdict {
-        match control {
-            Control::Dated { version: 0..=7, .. } => Verdict::Refuse(FlashError::Unspecified),
+    fn no_downgrade(_: u8, info: &AppInfo<'_>) -> Verdict {
+        match info.control {
+            Some(Control::Dated { version: 0..=7, .. }) => Verdict::Refuse(FlashError::Unspecified),
             _ => Verdict::Standard,
         }
     }
