@@ -4,7 +4,7 @@
 use canopen::device;
 use canopen::emcy;
 use canopen::od::{Access, DataType, Entry, Table};
-use canopen::program::{control_count, Numbers, APPLICATION_STATE_ENTRIES};
+use canopen::program::{control_count, Numbers, APPLICATION_STATE_ENTRIES, DATE_ENTRIES};
 use coboot_app::layout::Layout;
 use coboot_app::renewal;
 
@@ -35,6 +35,7 @@ pub const fn entry_count(numbers: Numbers) -> usize {
         + SHOW_ENTRIES.len()
         + control_count(numbers)
         + APPLICATION_STATE_ENTRIES.len()
+        + DATE_ENTRIES.len()
 }
 
 /// The object dictionary of a device with these [`numbers`], [`entry_count`] entries long. coboot
@@ -46,4 +47,5 @@ pub const fn entries<const LEN: usize>(numbers: Numbers) -> Table<LEN> {
         .with(&SHOW_ENTRIES)
         .with_program_control(numbers)
         .with(&APPLICATION_STATE_ENTRIES)
+        .with(&DATE_ENTRIES)
 }

@@ -10,8 +10,8 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Address, Entry, Objects};
 use canopen::program::{
-    region_value, Numbers, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID, PROGRAM_REGION,
-    PROGRAM_VERSION,
+    region_value, Numbers, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID,
+    PROGRAM_REGION, PROGRAM_VERSION,
 };
 use canopen::slave::Slave;
 use canopen::slave::SlaveDevice;
@@ -152,6 +152,10 @@ impl Objects for Application {
         let Self { control, bootloader, .. } = self;
         match at.index {
             PROGRAM_CONTROL => put(buf, &[control.state(at.sub, bootloader)?]),
+            PROGRAM_DATE => {
+                let [date, time] = control.software_date();
+                put(buf, &if at.sub == 1 { date } else { time }.to_le_bytes())
+            }
             PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
             FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_REGION => {

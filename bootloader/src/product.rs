@@ -124,6 +124,9 @@ pub struct Product {
     /// Whether programs can be read where the dialect says so, and 100Ah is the version of the stored
     /// program; on boards with the split map alone.
     pub read_back: bool,
+    /// Whether date and time of the program can be read (1F52h), in the bootloader and in the program; on
+    /// boards with the split map alone.
+    pub program_date: bool,
     /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
@@ -210,6 +213,7 @@ impl Product {
         second_server: LAYOUT.home.is_some(),
         resume: LAYOUT.home.is_some(),
         read_back: LAYOUT.home.is_some(),
+        program_date: LAYOUT.home.is_some(),
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -259,9 +263,13 @@ impl Product {
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(
             LAYOUT.home.is_some()
-                || !(self.block_upload || self.second_server || self.resume || self.read_back),
-            "product: block_upload, second_server, resume and read_back need the split map: the compact one \
-             has no room for them"
+                || !(self.block_upload
+                    || self.second_server
+                    || self.resume
+                    || self.read_back
+                    || self.program_date),
+            "product: block_upload, second_server, resume, read_back and program_date need the split map: the \
+             compact one has no room for them"
         );
         assert!(
             self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),
@@ -381,6 +389,7 @@ impl Product {
             sealed: SEALED,
             second_server: self.second_server,
             resume: self.resume,
+            program_date: self.program_date,
             read_back: self.reads_back(),
             bootloader: self.bootloader_number(),
             rom_loader: self.rom_loader,

@@ -112,6 +112,7 @@ impl Store {
 impl Parameters for Store {
     const RESUMES: bool = PRODUCT.resume;
     const RENEWS: bool = PRODUCT.renewal;
+    const DATES: bool = PRODUCT.program_date;
 
     fn services(&self) -> u32 {
         services().version

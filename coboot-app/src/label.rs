@@ -17,11 +17,16 @@ pub fn own() -> Option<Label> {
 }
 
 /// Puts the label of the program at its place in the image, after the vector table: vendor-ID
-/// (1018h/1), product code (1018h/2) and the version of the program, a number of the maker's own.
-/// Once in a program, outside of functions.
+/// (1018h/1), product code (1018h/2) and the version of the program, a number of the maker's own; and, if you
+/// like, its date in seconds since 1970-01-01 UTC, which 1F52h shows. Once in a program, outside of functions.
 ///
 /// ```
 /// coboot_app::label!(vendor_id: 0x0000_0001, product_code: 0x0000_0002, version: 3);
+/// # fn main() {}
+/// ```
+///
+/// ```
+/// coboot_app::label!(vendor_id: 1, product_code: 2, version: 3, date: 1_795_804_215);
 /// # fn main() {}
 /// ```
 ///
@@ -29,11 +34,14 @@ pub fn own() -> Option<Label> {
 #[macro_export]
 macro_rules! label {
     (vendor_id: $vendor_id:expr, product_code: $product_code:expr, version: $version:expr $(,)?) => {
+        $crate::label!(vendor_id: $vendor_id, product_code: $product_code, version: $version, date: 0);
+    };
+    (vendor_id: $vendor_id:expr, product_code: $product_code:expr, version: $version:expr, date: $date:expr $(,)?) => {
         const _: () = {
             #[used]
             #[cfg_attr(target_arch = "arm", link_section = ".label")]
             static LABEL: $crate::label::Label =
-                $crate::label::Label::new($vendor_id, $product_code, $version);
+                $crate::label::Label::dated($vendor_id, $product_code, $version, $date);
         };
     };
 }

@@ -34,6 +34,8 @@ use crate::start::Start;
 pub const PROGRAM_CONTROL: u16 = 0x1F51;
 /// 1F56h: program software identification.
 pub const PROGRAM_ID: u16 = 0x1F56;
+/// Verify application software (CiA 302-3): date and time of the program.
+pub const PROGRAM_DATE: u16 = 0x1F52;
 /// 1F57h: flash status identification.
 pub const FLASH_STATUS: u16 = 0x1F57;
 /// 2007h: device state, an object of coboot. An application has its sub-index 1 alone.
@@ -81,6 +83,8 @@ pub struct ProgramControl {
     /// The node-ID with which the bootloader can answer in this program's place.
     bootloader_node: Option<u8>,
     sdo: SdoBases,
+    /// The two elements of 1F52h.
+    software_date: [u32; 2],
     departure: Departure<BootRequest>,
 }
 
@@ -101,6 +105,7 @@ impl ProgramControl {
             node_id: start.node_id,
             bootloader_node: start.bootloader_node(),
             sdo: start.sdo(),
+            software_date: start.software_date(),
             departure: Departure::Staying,
         }
     }
@@ -117,6 +122,12 @@ impl ProgramControl {
     #[must_use]
     pub const fn sdo(&self) -> SdoBases {
         self.sdo
+    }
+
+    /// The two elements of 1F52h, see [`Start::software_date`].
+    #[must_use]
+    pub const fn software_date(&self) -> [u32; 2] {
+        self.software_date
     }
 
     /// The program that runs, 1 to 254.
@@ -391,6 +402,7 @@ mod tests {
             serial_number: 0,
             bootloader_number: Some(bootloader_number),
             sdo: SdoBases::PREDEFINED,
+            program_date: 1_795_804_215,
         }
     }
 

@@ -36,7 +36,7 @@ use crate::bootloader::Services;
 use crate::departure::has_reached;
 use crate::departure::Next;
 use crate::program_control::{
-    Answer, ProgramControl, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID,
+    Answer, ProgramControl, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID,
 };
 
 const DEVICE_NAME: u16 = 0x1008;
@@ -422,9 +422,14 @@ impl Responder {
             (PROGRAM_ID, sub) => Value::word(self.control.identification(sub, services)?),
             (FLASH_STATUS, sub) => Value::word(self.control.flash_status(sub)?),
             (PROGRAM_VERSION, sub) => Value::word(self.program_version(sub, services)?),
+            (PROGRAM_DATE, 0) => Value::byte(2),
+            (PROGRAM_DATE, 1) => Value::word(self.control.software_date()[0]),
+            (PROGRAM_DATE, 2) => Value::word(self.control.software_date()[1]),
             (DEVICE_STATE, 0) => Value::byte(1),
             (DEVICE_STATE, 1) => Value::byte(self.control.bootloader()),
-            (0x1000 | 0x1001 | 0x1017 | 0x1018 | DEVICE_STATE, _) => return Err(Abort::NO_SUB_INDEX),
+            (0x1000 | 0x1001 | 0x1017 | 0x1018 | PROGRAM_DATE | DEVICE_STATE, _) => {
+                return Err(Abort::NO_SUB_INDEX)
+            }
             (DEVICE_NAME | SOFTWARE_VERSION, _) if self.text(index).is_some() => {
                 return Err(Abort::NO_SUB_INDEX)
             }

@@ -1,5 +1,6 @@
 //! How the program was started.
 
+use shared_abi::date::days_and_milliseconds;
 use shared_abi::handoff::{BootInfo, Handoff, SdoBases};
 use shared_abi::layout::Layout;
 
@@ -85,6 +86,17 @@ impl Start {
         }
     }
 
+    /// The two elements of 1F52h (CiA 302-3, verify application software): the date of this program in days since
+    /// 1984-01-01, and the time in milliseconds after midnight (UTC). Zeros if neither its block 0 nor its
+    /// label has a date, or no bootloader started the program.
+    #[must_use]
+    pub const fn software_date(&self) -> [u32; 2] {
+        match self.told {
+            Some(told) => days_and_milliseconds(told.program_date),
+            None => [0; 2],
+        }
+    }
+
     /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
     /// this program's place. `None` where it has to find the bit rate out first.
     #[must_use]
@@ -114,6 +126,8 @@ mod tests {
         serial_number: 9,
         bootloader_number: None,
         sdo: SdoBases { request: 0x680, response: 0x480 },
+        // 2026-11-27 18:30:15.
+        program_date: 1_795_804_215,
     };
 
     #[test]
@@ -127,6 +141,8 @@ mod tests {
         assert_eq!((start.program, start.fresh, start.told), (1, false, None));
         assert_eq!(start.sdo(), SdoBases { request: 0x600, response: 0x580 });
         assert_eq!(Start::new(Some(TOLD), DEFAULTS).sdo(), TOLD.sdo);
+        assert_eq!(start.software_date(), [0, 0]);
+        assert_eq!(Start::new(Some(TOLD), DEFAULTS).software_date(), [15_671, 66_615_000]);
     }
 
     #[test]

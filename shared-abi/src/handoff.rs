@@ -19,7 +19,8 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 /// | 2 | [`Handoff::flags`] |
 /// | 3 | [`Handoff::bootloader_number`] |
 /// | 4 | [`Handoff::sdo_request_base`], [`Handoff::sdo_response_base`] |
-pub const VERSION: u16 = 4;
+/// | 5 | [`Handoff::program_date`] |
+pub const VERSION: u16 = 5;
 /// The oldest version that a reader accepts.
 pub const OLDEST: u16 = 1;
 
@@ -125,6 +126,9 @@ pub struct BootInfo {
     pub bootloader_number: Option<u8>,
     /// The bases of the COB-IDs of SDO.
     pub sdo: SdoBases,
+    /// The creation date of the program, from its block 0 or its label, in seconds since 1970-01-01 UTC; 0 if
+    /// unknown.
+    pub program_date: u32,
 }
 
 /// The bases of the COB-IDs of SDO, to which the node-ID is added; 80h to 780h.
@@ -186,8 +190,10 @@ pub struct Handoff {
     pub sdo_request_base: u16,
     /// The base of the COB-ID of SDO answers, in the same way. Since version 4.
     pub sdo_response_base: u16,
-    /// 0; later versions may define these words.
-    pub reserved: [u32; 2],
+    /// The creation date of the program in seconds since 1970-01-01 UTC, 0 if unknown. Since version 5.
+    pub program_date: u32,
+    /// 0; later versions may define this word.
+    pub reserved: u32,
     /// [`check_word`] of the eleven words before.
     pub check: u32,
 }
@@ -211,6 +217,7 @@ impl Handoff {
         if !info.sdo.is_predefined() {
             words[8] = info.sdo.request as u32 | (info.sdo.response as u32) << 16;
         }
+        words[9] = info.program_date;
         words[WORDS - 1] = check_of(&words);
         // SAFETY: both are 48 bytes, and every bit pattern is a valid `Handoff`.
         unsafe { core::mem::transmute(words) }
@@ -237,6 +244,7 @@ impl Handoff {
             serial_number: self.serial_number,
             bootloader_number: u8::try_from(self.bootloader_number).ok().filter(|number| *number != 0),
             sdo: SdoBases::of_record(self.sdo_request_base, self.sdo_response_base),
+            program_date: self.program_date,
         })
     }
 
@@ -315,6 +323,7 @@ mod tests {
         serial_number: 0xDEAD_BEEF,
         bootloader_number: Some(2),
         sdo: SdoBases { request: 0x680, response: 0x480 },
+        program_date: 1_795_804_215,
     };
 
     #[test]
@@ -325,7 +334,7 @@ mod tests {
         assert_eq!(Handoff::new(&predefined).sdo_request_base, 0, "as before version 4");
     }
 
-    /// A bootloader of version 1 does not set this flag, no number and no COB-IDs; a newer bootloader may set
+    /// A bootloader of version 1 does not set this flag, no number, no COB-IDs and no date; a newer bootloader may set
     /// unknown bits, a number that none can be, and COB-IDs of other services.
     #[test]
     fn an_older_version_is_read_and_is_never_fresh() {
@@ -335,9 +344,9 @@ mod tests {
         // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
         let old: Handoff = unsafe { core::mem::transmute(words) };
         let sdo = SdoBases::PREDEFINED;
-        let expected = Some(BootInfo { fresh: false, bootloader_number: None, sdo, ..INFO });
+        let expected = Some(BootInfo { fresh: false, bootloader_number: None, sdo, program_date: 0, ..INFO });
         assert_eq!(old.info(), expected);
-        words[1] = 0x0030_0005;
+        words[1] = 0x0030_0006;
         words[6] = 0xFFFF_FFFE;
         words[7] = 0x0102;
         words[8] = 0x0480_0000;
@@ -355,7 +364,8 @@ mod tests {
         assert_eq!(Handoff { flags: 0, ..good }.info(), None);
         assert_eq!(Handoff { bootloader_number: 3, ..good }.info(), None);
         assert_eq!(Handoff { sdo_response_base: 0x580, ..good }.info(), None);
-        assert_eq!(Handoff { reserved: [0, 1], ..good }.info(), None);
+        assert_eq!(Handoff { program_date: 0, ..good }.info(), None);
+        assert_eq!(Handoff { reserved: 1, ..good }.info(), None);
         assert_eq!(Handoff { check: !good.check, ..good }.info(), None);
         let unusable = Handoff::new(&BootInfo { node_id: 0, ..INFO });
         assert_eq!(unusable.info(), None, "an application cannot use node-ID 0");

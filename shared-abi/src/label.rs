@@ -1,4 +1,4 @@
-//! The label in a program image: vendor-ID, product code and version at a fixed place after the
+//! The label in a program image: vendor-ID, product code, version and date at a fixed place after the
 //! vector table. It lets the bootloader refuse an image for another device before it changes the
 //! installed program.
 //!
@@ -27,18 +27,26 @@ pub struct Label {
     pub product_code: u32,
     /// Version of the program, chosen by its manufacturer.
     pub version: u32,
+    /// The creation date, seconds since 1970-01-01 UTC; 0 if unknown.
+    pub date: u32,
     /// 0.
-    pub reserved: [u32; 3],
+    pub reserved: [u32; 2],
     /// [`check_word`] of the seven words before.
     pub check: u32,
 }
 
 impl Label {
-    /// The label of a program.
+    /// The label of a program without a date.
     #[must_use]
     pub const fn new(vendor_id: u32, product_code: u32, version: u32) -> Self {
-        let check = check_word(&[MAGIC, vendor_id, product_code, version, 0, 0, 0]);
-        Self { magic: MAGIC, vendor_id, product_code, version, reserved: [0; 3], check }
+        Self::dated(vendor_id, product_code, version, 0)
+    }
+
+    /// The label of a program with its creation date, in seconds since 1970-01-01 UTC.
+    #[must_use]
+    pub const fn dated(vendor_id: u32, product_code: u32, version: u32, date: u32) -> Self {
+        let check = check_word(&[MAGIC, vendor_id, product_code, version, date, 0, 0]);
+        Self { magic: MAGIC, vendor_id, product_code, version, date, reserved: [0; 2], check }
     }
 
     /// The label in these bytes; `None` if it is missing or damaged.
@@ -48,8 +56,8 @@ impl Label {
             let at = 4 * i;
             u32::from_le_bytes([bytes[at], bytes[at + 1], bytes[at + 2], bytes[at + 3]])
         };
-        let label = Self::new(word(1), word(2), word(3));
-        let found = Self { magic: word(0), reserved: [word(4), word(5), word(6)], check: word(7), ..label };
+        let label = Self::dated(word(1), word(2), word(3), word(4));
+        let found = Self { magic: word(0), reserved: [word(5), word(6)], check: word(7), ..label };
         (found == label).then_some(label)
     }
 }
@@ -60,8 +68,8 @@ mod tests {
     use crate::geometry::CHIPS;
 
     fn bytes(label: &Label) -> [u8; SIZE] {
-        let [a, b, c] = label.reserved;
-        let words = [label.magic, label.vendor_id, label.product_code, label.version, a, b, c, label.check];
+        let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
+        let words = [magic, vendor_id, product_code, version, date, a, b, check];
         let mut bytes = [0; SIZE];
         for (place, word) in bytes.chunks_mut(4).zip(words) {
             place.copy_from_slice(&word.to_le_bytes());
@@ -71,11 +79,14 @@ mod tests {
 
     #[test]
     fn a_label_is_read_as_it_was_made_and_not_when_a_bit_is_wrong() {
-        let label = Label::new(0x11, 0x22, 0x33);
+        let label = Label::dated(0x11, 0x22, 0x33, 0x44);
         assert_eq!(core::mem::size_of::<Label>(), SIZE);
         assert_eq!(
-            bytes(&label)[..16],
-            [b'C', b'B', b'L', b'1', 0x11, 0, 0, 0, 0x22, 0, 0, 0, 0x33, 0, 0, 0]
+            bytes(&label)[..28],
+            [
+                b'C', b'B', b'L', b'1', 0x11, 0, 0, 0, 0x22, 0, 0, 0, 0x33, 0, 0, 0, 0x44, 0, 0, 0, 0, 0, 0,
+                0, 0, 0, 0, 0
+            ]
         );
         assert_eq!(Label::parse(&bytes(&label)), Some(label));
         for bit in 0..8 * SIZE {

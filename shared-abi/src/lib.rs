@@ -10,7 +10,8 @@
 //! | [`warm_start`] | the last RAM cell: requests of the application to the bootloader across a
 //! reset |
 //! | [`handoff`] | information from the bootloader to the application about the start |
-//! | [`label`] | the target and version in a program image |
+//! | [`label`] | the target, version and date in a program image |
+//! | [`date`] | the creation date of a program |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
 //! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
@@ -31,6 +32,7 @@ pub mod block_file;
 pub mod boot_report;
 pub mod callgate;
 pub mod clock_tree;
+pub mod date;
 pub mod geometry;
 pub mod handoff;
 pub mod label;

@@ -11,7 +11,7 @@ const PROGRAM: &str = r#"
 #include <string.h>
 #include "coboot.h"
 
-COBOOT_LABEL(0x319, 0x4007D151, 0x00010203);
+COBOOT_DATED_LABEL(0x319, 0x4007D151, 0x00010203, 1795804215);
 
 static void print(const void *record, size_t len)
 {
@@ -24,9 +24,9 @@ static void print(const void *record, size_t len)
 int main(void)
 {
     static const unsigned char handoff[48] = {
-        'C', 'B', 'H', 'O', 4, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
+        'C', 'B', 'H', 'O', 5, 0, 48, 0, 5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE, 1, 0, 0, 0,
-        2, 0, 0, 0, 0x80, 6, 0x80, 4, 0, 0, 0, 0, 0, 0, 0, 0, 0x07, 0xB7, 0x24, 0xCA,
+        2, 0, 0, 0, 0x80, 6, 0x80, 4, 0x37, 0xCC, 0x09, 0x6B, 0, 0, 0, 0, 0x7D, 0xF9, 0xA5, 0x46,
     };
     /* Of a bootloader that knew no flags. */
     static const unsigned char older[48] = {
@@ -52,6 +52,7 @@ int main(void)
     memcpy(&record, handoff, sizeof record);
     printf("%d%u ", coboot_is_fresh(&record), coboot_bootloader_number(&record));
     printf("%x/%x ", coboot_sdo_request_base(&record), coboot_sdo_response_base(&record));
+    printf("%u ", (unsigned)record.program_date);
     printf("%d %u %u %u %u\n", coboot_handoff_is_sound(&record), record.node_id, (unsigned)record.bit_rate,
            (unsigned)(record.reset_cause == COBOOT_RESET_SOFTWARE), record.trial);
     unsigned sound = 0;
@@ -111,12 +112,12 @@ fn succeed(command: &mut Command) -> String {
 #[test]
 fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
     let expected = "\
-        43424C311903000051D10740030201000000000000000000000000009CC74AA3\n\
+        43424C311903000051D107400302010037CC096B00000000000000000C3AD889\n\
         434257310100000000000000F0B728D9\n\
         434257310200000001000000CD5920E5\n\
         434257310300000001000000F981E052\n\
         434257310700000002037F00A57F86CC\n\
-        100 600/580 12 680/480 1 5 125000 1 1\n\
+        100 600/580 12 680/480 1795804215 1 5 125000 1 1\n\
         0\n\
         00\n\
         0110211\n";

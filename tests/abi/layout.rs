@@ -58,7 +58,8 @@ fn handoff_byte_for_byte() {
         (offset_of!(Handoff, bootloader_number), 28),
         (offset_of!(Handoff, sdo_request_base), 32),
         (offset_of!(Handoff, sdo_response_base), 34),
-        (offset_of!(Handoff, reserved), 36),
+        (offset_of!(Handoff, program_date), 36),
+        (offset_of!(Handoff, reserved), 40),
         (offset_of!(Handoff, check), 44),
     ];
     for (actual, expected) in offsets {
@@ -75,14 +76,15 @@ fn handoff_byte_for_byte() {
         serial_number: 0xDEAD_BEEF,
         bootloader_number: Some(2),
         sdo: SdoBases { request: 0x680, response: 0x480 },
+        program_date: 1_795_804_215,
     });
     #[rustfmt::skip]
     let expected = [
-        b'C', b'B', b'H', b'O', 4, 0, 48, 0,
+        b'C', b'B', b'H', b'O', 5, 0, 48, 0,
         5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        1, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0, 0, 0, 0, 0, 0, 0, 0,
-        0x07, 0xB7, 0x24, 0xCA,
+        1, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0x37, 0xCC, 0x09, 0x6B, 0, 0, 0, 0,
+        0x7D, 0xF9, 0xA5, 0x46,
     ];
     assert_eq!(bytes(&handoff), expected);
 }

@@ -101,7 +101,17 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("LOCKED", Status::Locked),
     ];
     all.extend(codes.map(|(name, code)| (format!("STATUS_{name}"), (code as i32).into())));
-    all.extend(structure!("coboot_label", Label, magic, vendor_id, product_code, version, reserved, check));
+    all.extend(structure!(
+        "coboot_label",
+        Label,
+        magic,
+        vendor_id,
+        product_code,
+        version,
+        date,
+        reserved,
+        check
+    ));
     all.extend(structure!("coboot_warm_start", WarmStart, magic, request, argument, check));
     all.extend(structure!(
         "coboot_handoff",
@@ -120,6 +130,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         bootloader_number,
         sdo_request_base,
         sdo_response_base,
+        program_date,
         reserved,
         check
     ));
@@ -158,7 +169,9 @@ fn what_c_sees_are_the_documented_values() {
         "#define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */",
         "#define COBOOT_REQUEST_OWED UINT32_C(0x7)",
         "#define COBOOT_HANDOFF_FRESH UINT32_C(0x1)",
-        "    uint32_t reserved[3];",
+        "    uint32_t date;",
+        "    uint32_t program_date;",
+        "    uint32_t reserved[2];",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
         "COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",

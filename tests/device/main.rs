@@ -22,6 +22,7 @@ mod reentry;
 mod renewal;
 mod silicon;
 mod slcan;
+mod software_date;
 mod stack;
 mod standby;
 mod stuck_bus;

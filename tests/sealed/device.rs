@@ -74,6 +74,29 @@ fn board_with_a_program() -> Bench {
     bench
 }
 
+/// 1F52h has the date of the manifest, also for the same program sealed again. (2000-02-29 12:00 and 2026-11-27
+/// 18:30:15 by GNU date, and the days of a calendar.)
+#[test]
+fn the_date_of_a_sealed_program_is_that_of_its_manifest() {
+    fn date(bench: &mut Bench) -> [u32; 2] {
+        [1, 2].map(|sub| bench.session().read_number(Address::new(0x1F52, sub)).unwrap())
+    }
+    let mut bench = board();
+    bench.power_on();
+    bench.await_boot_up(100);
+    for (counter, created, expected) in
+        [(COUNTER, 951_825_600, [5903, 43_200_000]), (COUNTER + 1, 1_795_804_215, [15_671, 66_615_000])]
+    {
+        let file = seal(&Sealer { created, ..sealer(counter) }, firmware::APP_V1);
+        assert_eq!(write(&mut bench, &file, Transfers::Blocks), (None, status::OK));
+        assert_eq!(date(&mut bench), expected, "{created}");
+        start(&mut bench, firmware::APP_V1, "1.0.0");
+        assert_eq!(date(&mut bench), expected, "{created}, in the program");
+        call_back(&mut bench);
+        assert_eq!(date(&mut bench), expected, "{created}, after its return");
+    }
+}
+
 /// The power is cut and returns: the old program, version 1, starts by itself. It is then called
 /// back.
 fn assert_old_program_starts(bench: &mut Bench, what: &str) {

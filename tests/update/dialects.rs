@@ -121,15 +121,15 @@ fn a_lift_takes_what_is_for_it_alone() {
     for (label, status) in labels {
         let mut image = app(1);
         let at = label::OFFSET as usize;
-        let Label { magic, vendor_id, product_code, version, reserved: [a, b, c], check } = label;
+        let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = label;
         for (place, word) in image[at..at + label::SIZE].chunks_mut(4).zip([
             magic,
             vendor_id,
             product_code,
             version,
+            date,
             a,
             b,
-            c,
             check,
         ]) {
             place.copy_from_slice(&word.to_le_bytes());

@@ -9,7 +9,7 @@ use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
 use boot_core::program::{verify, Invalid};
-use boot_core::store::Key;
+use boot_core::store::{Key, ProgramRecord};
 use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
@@ -147,6 +147,15 @@ pub unsafe extern "C" fn stage() -> ! {
         });
     }
 
+    let mut program_date = 0;
+    if let (true, BootDecision::Start { program, .. }) = (PRODUCT.program_date, &decision) {
+        let number = program.number();
+        if let (Some(record), Some(region)) =
+            (ProgramRecord::load(&parameters, &flash, number), LAYOUT.program(number))
+        {
+            program_date = record.date(&parameters, &flash, number, region);
+        }
+    }
     let has_watchdog = flash.starts_watchdog();
     drop(caches);
     flash.release(&rcc);
@@ -168,6 +177,7 @@ pub unsafe extern "C" fn stage() -> ! {
         serial_number: bsp::serial_number(),
         bootloader_number: PRODUCT.bootloader_number(),
         sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
+        program_date,
     });
     if SEALED && program.locks_flash() {
         // SAFETY: only this code runs, and it writes the flash no more.

@@ -362,6 +362,8 @@ fn object(at: Address) -> String {
         (program::IDENTITY, 4) => "serial number",
         (program::PROGRAM_DATA, _) => "program data",
         (program::PROGRAM_CONTROL, _) => "program control",
+        (program::PROGRAM_DATE, 1) => "program date",
+        (program::PROGRAM_DATE, 2) => "program time",
         (program::PROGRAM_ID, _) => "program CRC",
         (program::FLASH_STATUS, _) => "flash status",
         _ => return at.to_string(),

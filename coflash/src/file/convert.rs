@@ -70,7 +70,7 @@ impl Default for GapFill {
 pub enum Label {
     /// The contents of the image's label, if it has one; otherwise nothing.
     OfImage {
-        /// Seconds since 1970-01-01 UTC, 0 if unknown: a label contains no date.
+        /// Seconds since 1970-01-01 UTC; 0 for the one in the label, if it has one.
         date: u64,
     },
     /// No identity.
@@ -109,7 +109,7 @@ impl Label {
             vendor_id: label.vendor_id,
             product_code: label.product_code,
             version: label.version,
-            date,
+            date: if date == 0 { label.date.into() } else { date },
         })
     }
 

@@ -12,17 +12,19 @@ use canopen::line::LineEvent;
 use canopen::lss::{LssAddress, LssDevice, StoreError};
 use canopen::od::{put, Access, Address, DataType, Entry, Objects, Table};
 use canopen::program::{
-    control_count, ClockSource, FlashError, Numbers, ProgramControl, ProgramStart, Supply, DEVICE_STATE,
-    ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_ID, PROGRAM_PARTIAL,
-    PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER, ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE,
-    SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES, STATE_OPTION_BYTES, STATE_PROGRAM_START,
-    STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK, UNLOCK_ENTRIES,
+    control_count, ClockSource, FlashError, Numbers, ProgramControl, ProgramStart, Supply, DATE_ENTRIES,
+    DEVICE_STATE, ENABLE_FLASH, FLASH_STATUS, IDENTITY, PROGRAM_CONTROL, PROGRAM_DATA, PROGRAM_DATE,
+    PROGRAM_ID, PROGRAM_PARTIAL, PROGRAM_REGION, PROGRAM_VERSION, RENEWAL_ENTRIES, ROM_LOADER,
+    ROM_LOADER_ENTRIES, ROM_LOADER_SIGNATURE, SEALED_ENTRIES, SECOND_SERVER, SOFTWARE_VERSION, STATE_ENTRIES,
+    STATE_OPTION_BYTES, STATE_PROGRAM_START, STATE_RENEWAL, STATE_SUPPLY, STATE_VERSIONS, UNLOCK,
+    UNLOCK_ENTRIES,
 };
 use canopen::sdo::second::{self, SecondServer};
 use canopen::slave::SlaveDevice;
 use canopen::{password::Lock, Instant};
 use canopen::{AbortCode, NodeId};
 use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::date::days_and_milliseconds;
 use shared_abi::layout::Layout;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
@@ -46,6 +48,8 @@ pub struct Extras {
     pub second_server: bool,
     /// Whether 2006h exists, which says where a download goes on.
     pub resume: bool,
+    /// Whether 1F52h exists, date and time of the program.
+    pub program_date: bool,
     /// The program number of the bootloader itself, if it can be renewed.
     pub bootloader: Option<u8>,
     /// Whether 2008h exists, which starts the loader in the ROM of the chip.
@@ -60,6 +64,7 @@ impl Extras {
         sealed: false,
         second_server: true,
         resume: true,
+        program_date: true,
         bootloader: None,
         rom_loader: false,
     };
@@ -101,6 +106,7 @@ pub const fn entries<const LEN: usize>(programs: u8, extras: Extras) -> Table<LE
     } else {
         table
     };
+    let table = if extras.program_date { table.with(&DATE_ENTRIES) } else { table };
     let table = if extras.rom_loader { table.with(&ROM_LOADER_ENTRIES) } else { table };
     let table = if extras.sealed { table.with(&SEALED_ENTRIES) } else { table };
     match extras.password {
@@ -133,6 +139,7 @@ pub const fn entry_count(programs: u8, extras: Extras) -> usize {
         + control_count(numbers)
         + STATE_ENTRIES.len()
         + renewal
+        + if extras.program_date { DATE_ENTRIES.len() } else { 0 }
         + if extras.rom_loader { ROM_LOADER_ENTRIES.len() } else { 0 };
     always + password + sealed + second_server + resume
 }
@@ -149,6 +156,7 @@ pub trait Choices {
         sealed: true,
         second_server: true,
         resume: true,
+        program_date: true,
         bootloader: None,
         rom_loader: true,
     };
@@ -446,6 +454,14 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
                 u32::from_le_bytes(self.download.renewal().bytes())
             }
             DEVICE_STATE => return put(buf, &[self.state(at.sub)]),
+            PROGRAM_DATE if P::DATES => {
+                let [date, time] = days_and_milliseconds(self.download.date());
+                if at.sub == 1 {
+                    date
+                } else {
+                    time
+                }
+            }
             PROGRAM_ID => self.download.identification(program),
             SECOND_SERVER if C::EXTRAS.second_server => self.second_server.read(at.sub),
             FLASH_STATUS => self.download.status(program).to_word(),

@@ -20,6 +20,9 @@ pub(crate) struct Source<'b> {
     pub unsealer: Unsealer<'b>,
     /// `Some` from the end of the program's data until the program is to be verified.
     ended: Option<Expected>,
+    /// The creation date in the control block, in seconds since 1970-01-01 UTC, 0 for none. `None` when it is
+    /// stored.
+    date: Option<u32>,
 }
 
 /// What there is to do when no piece is ready.
@@ -38,7 +41,7 @@ pub(crate) enum Demand {
 
 impl<'b> Source<'b> {
     pub(crate) fn new(buffer: &'b mut [u8], unsealer: Unsealer<'b>) -> Self {
-        Self { queue: Queue::new(buffer), unsealer, ended: None }
+        Self { queue: Queue::new(buffer), unsealer, ended: None, date: None }
     }
 
     /// Another program begins, or none: the queue stays.
@@ -53,9 +56,23 @@ impl<'b> Source<'b> {
         self.rest();
     }
 
-    /// The program was sent completely.
-    pub(crate) fn complete(&mut self, expected: Expected) {
+    /// The program was sent completely, with this date. (A sealed image has its date in the manifest.)
+    pub(crate) fn complete(&mut self, expected: Expected, date: u32) {
         self.ended = Some(expected);
+        self.date = Some(date);
+    }
+
+    /// The date of the program, and the CRC of the program to which it belongs: it must be stored before the
+    /// program is verified. Once, when all of it is in flash.
+    pub(crate) fn take_date(&mut self) -> Option<Value> {
+        let expected = match self.unsealer.progress() {
+            None => self.ended?,
+            Some(Progress::Installed { .. }) if self.is_complete() => self.unsealer.expected(),
+            Some(_) => return None,
+        };
+        let told = self.date.take()?;
+        let date = if self.unsealer.is_active() { self.unsealer.created() } else { told };
+        Some([date, expected.crc.filter(|_| date != 0)?, 0, 0])
     }
 
     /// Whether the program was sent completely, and is not yet to be verified.

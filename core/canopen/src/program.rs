@@ -31,10 +31,20 @@ pub const SECOND_SERVER: u16 = 0x1201;
 pub const PROGRAM_DATA: u16 = 0x1F50;
 /// Program control: takes a [`ProgramControl`].
 pub const PROGRAM_CONTROL: u16 = 0x1F51;
+/// Verify application software (CiA 302-3): date and time of a program.
+pub const PROGRAM_DATE: u16 = 0x1F52;
 /// Program software identification: the program's CRC.
 pub const PROGRAM_ID: u16 = 0x1F56;
 /// Flash status identification: gives a [`FlashStatus`].
 pub const FLASH_STATUS: u16 = 0x1F57;
+
+/// 1F52h: days since 1984-01-01, and milliseconds after midnight (UTC); zeros if they are not known. (In a
+/// bootloader, of the installed program with the lowest number; in a program, its own.)
+pub const DATE_ENTRIES: [Entry; 3] = [
+    Entry::array(PROGRAM_DATE, "Verify application software", 2),
+    Entry::sub(PROGRAM_DATE, 1, "Application software date", DataType::Unsigned32, Access::Ro),
+    Entry::sub(PROGRAM_DATE, 2, "Application software time", DataType::Unsigned32, Access::Ro),
+];
 
 /// The names of 1F51h, 1F56h, 1F57h, 2004h and 2005h, and their elements. Bootloader and
 /// application both have them, with an element for each program of the device, whichever program

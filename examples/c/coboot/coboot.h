@@ -56,7 +56,8 @@ struct coboot_label {
     uint32_t vendor_id;
     uint32_t product_code;
     uint32_t version;
-    uint32_t reserved[3];
+    uint32_t date;
+    uint32_t reserved[2];
     uint32_t check;
 };
 COBOOT_STATIC_ASSERT(sizeof(struct coboot_label) == 32, "coboot_label");
@@ -64,20 +65,23 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, magic) == 0, "coboot_label: m
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, vendor_id) == 4, "coboot_label: vendor_id");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, product_code) == 8, "coboot_label: product_code");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, version) == 12, "coboot_label: version");
-COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, reserved) == 16, "coboot_label: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, date) == 16, "coboot_label: date");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, reserved) == 20, "coboot_label: reserved");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_label, check) == 28, "coboot_label: check");
 
 /* The label of this image, once in a program: COBOOT_LABEL(vendor-ID, product code, version). The first two are those of
  * 1018h; 0 is any. The linker script puts the section `.label` at the symbol __label, after the vectors.
+ * COBOOT_DATED_LABEL also takes the date of the program, in seconds since 1970-01-01 UTC, which 1F52h shows.
  */
-#define COBOOT_LABEL(vendor_id, product_code, version) \
+#define COBOOT_LABEL(vendor_id, product_code, version) COBOOT_DATED_LABEL(vendor_id, product_code, version, 0)
+#define COBOOT_DATED_LABEL(vendor_id, product_code, version, date) \
     __attribute__((section(".label"), used)) const struct coboot_label coboot_label_of_image = { \
-        COBOOT_LABEL_MAGIC, (vendor_id), (product_code), (version), { 0, 0, 0 }, \
-        COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+        COBOOT_LABEL_MAGIC, (vendor_id), (product_code), (version), (date), { 0, 0 }, \
+        COBOOT_LABEL_CHECK(vendor_id, product_code, version, date) \
     }
-#define COBOOT_LABEL_CHECK(vendor_id, product_code, version) \
+#define COBOOT_LABEL_CHECK(vendor_id, product_code, version, date) \
     (~COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD(COBOOT_FOLD( \
-        COBOOT_CHECK_SEED, COBOOT_LABEL_MAGIC), vendor_id), product_code), version), 0), 0), 0))
+        COBOOT_CHECK_SEED, COBOOT_LABEL_MAGIC), vendor_id), product_code), version), date), 0), 0))
 extern const struct coboot_label coboot_label_of_image;
 
 /* ---- The warm-start cell: what the application asks of the bootloader across a reset ---- */
@@ -133,7 +137,7 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 /* ---- The handoff: how the device came up ---- */
 
 #define COBOOT_HANDOFF_MAGIC UINT32_C(0x4F484243)
-#define COBOOT_HANDOFF_VERSION UINT32_C(0x4)
+#define COBOOT_HANDOFF_VERSION UINT32_C(0x5)
 #define COBOOT_HANDOFF_OLDEST UINT32_C(0x1)
 
 /* In `flags`, since version 2: the program was started right after its download in one go. */
@@ -165,7 +169,8 @@ struct coboot_handoff {
     uint32_t bootloader_number;
     uint16_t sdo_request_base;
     uint16_t sdo_response_base;
-    uint32_t reserved[2];
+    uint32_t program_date;
+    uint32_t reserved;
     uint32_t check;
 };
 COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, "coboot_handoff");
@@ -183,7 +188,8 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, "coboot_hando
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, bootloader_number) == 28, "coboot_handoff: bootloader_number");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, sdo_request_base) == 32, "coboot_handoff: sdo_request_base");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, sdo_response_base) == 34, "coboot_handoff: sdo_response_base");
-COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 36, "coboot_handoff: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, program_date) == 36, "coboot_handoff: program_date");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reserved) == 40, "coboot_handoff: reserved");
 COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, check) == 44, "coboot_handoff: check");
 
 /* Whether a bootloader wrote it, and it is whole. Later versions only give names to reserved words. */

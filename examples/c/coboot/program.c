@@ -13,6 +13,10 @@ enum {
 /* Values that a read of 1F51h returns for a program (CiA 302-3). */
 enum { STOPPED = 0, RUNNING = 1, ABSENT = 3 };
 
+/* The seconds of a day, and those from the start of 1970 to that of 1984, the origin of dates in CANopen. */
+#define DAY UINT32_C(86400)
+#define START_OF_1984 (UINT32_C(5113) * DAY)
+
 /* The number of the device's programs, from the value of a symbol of the linker. */
 static uint8_t programs(void)
 {
@@ -28,6 +32,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
     program->node_id = node_id;
     program->bit_rate = bit_rate;
     program->serial_number = 0;
+    program->date = 0;
     program->sdo_request_base = 0x600;
     program->sdo_response_base = 0x580;
     program->number = 1;
@@ -40,6 +45,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
         program->node_id = handoff.node_id;
         program->bit_rate = handoff.bit_rate;
         program->serial_number = handoff.serial_number;
+        program->date = handoff.program_date;
         program->sdo_request_base = coboot_sdo_request_base(&handoff);
         program->sdo_response_base = coboot_sdo_response_base(&handoff);
         program->number = handoff.program;
@@ -66,6 +72,12 @@ uint32_t coboot_program_read(const struct coboot_program *program, uint16_t inde
         *value = sub == 0 ? 1 : program->bootloader;
         *size = 1;
         return sub <= 1 ? COBOOT_ABORT_NONE : COBOOT_ABORT_NO_SUB_INDEX;
+    }
+    if (index == COBOOT_PROGRAM_DATE) {
+        const uint32_t since_1984 = program->date >= START_OF_1984 ? program->date - START_OF_1984 : 0;
+        *value = sub == 0 ? 2 : sub == 1 ? since_1984 / DAY : since_1984 % DAY * 1000;
+        *size = sub == 0 ? 1 : 4;
+        return sub <= 2 ? COBOOT_ABORT_NONE : COBOOT_ABORT_NO_SUB_INDEX;
     }
     if (index != COBOOT_PROGRAM_CONTROL && index != COBOOT_PROGRAM_ID && index != COBOOT_FLASH_STATUS
         && index != COBOOT_PROGRAM_VERSION) {

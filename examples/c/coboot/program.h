@@ -20,6 +20,8 @@ extern "C" {
 /* Objects with an element for each program of the device (CiA 302-3; SYS TEC manual, 3.4.1). */
 #define COBOOT_PROGRAM_CONTROL 0x1F51
 #define COBOOT_PROGRAM_ID 0x1F56
+/* Date and time of this program: 1 days since 1984-01-01, 2 milliseconds after midnight (UTC); 0 if unknown (CiA 302-3). */
+#define COBOOT_PROGRAM_DATE 0x1F52
 #define COBOOT_FLASH_STATUS 0x1F57
 /* Versions of the programs, an object of coboot. */
 #define COBOOT_PROGRAM_VERSION 0x2005
@@ -51,6 +53,8 @@ struct coboot_program {
     /* The bases of the COB-IDs of SDO requests and answers, to which the node-ID is added. */
     uint16_t sdo_request_base;
     uint16_t sdo_response_base;
+    /* The date of this program, in seconds since 1970-01-01 UTC; 0 if unknown. */
+    uint32_t date;
     /* The number of the program in the device, from 1 on. */
     uint8_t number;
     /* Services of the bootloader, or a null pointer. */

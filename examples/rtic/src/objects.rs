@@ -3,7 +3,7 @@
 
 use core::sync::atomic::{AtomicU16, Ordering};
 
-use coboot_app::program_control::{DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_ID};
+use coboot_app::program_control::{DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID};
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{Abort, Answer, Bootloader, Next, ProgramControl, Start};
 
@@ -53,6 +53,9 @@ impl Dictionary for Objects {
             (PROGRAM_CONTROL, sub) => value(&[control.state(sub, bootloader)?]),
             (PROGRAM_ID, sub) => value(&control.identification(sub, bootloader)?.to_le_bytes()),
             (FLASH_STATUS, sub) => value(&control.flash_status(sub)?.to_le_bytes()),
+            (PROGRAM_DATE, 0) => value(&[2]),
+            (PROGRAM_DATE, 1) => value(&control.software_date()[0].to_le_bytes()),
+            (PROGRAM_DATE, 2) => value(&control.software_date()[1].to_le_bytes()),
             (DEVICE_STATE, 0) => value(&[1]),
             (DEVICE_STATE, 1) => value(&[control.bootloader()]),
             // The device type: anything but the bootloader's.

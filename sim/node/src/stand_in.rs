@@ -8,8 +8,8 @@ use boot_core::canopen::device::{self, Device};
 use boot_core::canopen::lss::{LssAddress, LssDevice, StoreError};
 use boot_core::canopen::od::{put, Address, Entry, Objects};
 use boot_core::canopen::program::{
-    region_value, APPLICATION_STATE_ENTRIES, CONTROL_ARRAYS, DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL,
-    PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
+    region_value, APPLICATION_STATE_ENTRIES, CONTROL_ARRAYS, DATE_ENTRIES, DEVICE_STATE, FLASH_STATUS,
+    PROGRAM_CONTROL, PROGRAM_DATE, PROGRAM_ID, PROGRAM_REGION, PROGRAM_VERSION,
 };
 use boot_core::canopen::slave::{Slave, SlaveDevice};
 use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
@@ -111,6 +111,7 @@ impl StandIn {
             entries.extend((1..=programs).map(|sub| Entry { at: Address::new(index, sub), ..element }));
         }
         entries.extend(APPLICATION_STATE_ENTRIES);
+        entries.extend(DATE_ENTRIES);
         entries
     }
 
@@ -165,6 +166,10 @@ impl Objects for StandIn {
             PROGRAM_ID => put(buf, &control.identification(at.sub, underneath)?.to_le_bytes()),
             FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             DEVICE_STATE => put(buf, &[control.bootloader()]),
+            PROGRAM_DATE => {
+                let [date, time] = control.software_date();
+                put(buf, &if at.sub == 1 { date } else { time }.to_le_bytes())
+            }
             PROGRAM_REGION => {
                 let Region { base, size } = underneath.layout.program(at.sub).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(base, size))

@@ -64,6 +64,10 @@ struct Program {
     partial: Partial,
     /// The version in the last control block; of the bootloader itself, that of the image in 1F56h.
     version: u32,
+    /// The creation date in the last control block, in seconds since 1970-01-01 UTC; 0 for none.
+    told_date: u32,
+    /// The creation date of the stored program, in the same way.
+    date: u32,
     /// The last complete transfer was a raw image or Intel HEX, and no command followed.
     streamed: bool,
     /// The program must start after its verification, because its host did not wait for that.
@@ -136,14 +140,17 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             } else {
                 load(&parameters, flash, number, &rights)
             };
+            let region = layout.program(number).unwrap_or(Region::new(0, 0));
             Program {
-                region: layout.program(number).unwrap_or(Region::new(0, 0)),
+                region,
                 record,
                 identification: record.map_or(0, |record| record.crc),
                 failure: None,
                 session: Session::Idle,
                 partial,
                 version: 0,
+                told_date: 0,
+                date: date(&parameters, flash, number, region, record),
                 streamed: false,
                 start_when_verified: false,
                 locked: policy.locked,
@@ -234,6 +241,12 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             None if P::RENEWS && program == BOOTLOADER => state.version,
             None => 0,
         }
+    }
+
+    /// 1F52h: the creation date of the installed program with the lowest number, in seconds since 1970-01-01
+    /// UTC; 0 if unknown.
+    pub(crate) fn date(&self) -> u32 {
+        self.programs.iter().find(|state| state.record.is_some()).map_or(0, |state| state.date)
     }
 
     /// 2006h: the download that can go on, as the CRC of its control block and the address up to
@@ -371,6 +384,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 let (record, partial) = load(&self.parameters, flash, program, &self.rights);
                 if let Some(state) = find::<P>(&mut self.programs, program) {
                     state.record = record;
+                    state.date = date(&self.parameters, flash, program, state.region, record);
                     if record.is_none() {
                         state.identification = 0;
                     }
@@ -518,6 +532,20 @@ fn load<F: Flash, P: Parameters>(
     let record = ProgramRecord::from_value(value);
     let record = record.filter(|record| record.is_sealed() || !rights.takes_no_other());
     (record, if P::RESUMES { ProgramRecord::partial_of(value) } else { Partial::NONE })
+}
+
+/// The creation date of a program with this record, in seconds since 1970-01-01 UTC; 0 if unknown.
+fn date<F: Flash, P: Parameters>(
+    parameters: &P,
+    flash: &F,
+    number: u8,
+    region: Region,
+    record: Option<ProgramRecord>,
+) -> u32 {
+    match record {
+        Some(record) if P::DATES => record.date(parameters, flash, number, region),
+        _ => 0,
+    }
 }
 
 /// The program with this number, if it exists.

@@ -165,7 +165,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if let Some(begin) = findings.begins {
             // A RAM image has its version in its header.
             if staging.is_none() {
-                state.version = begin.version;
+                (state.version, state.told_date) = (begin.version, begin.date);
             }
             let mut next = 1;
             let goes_on = P::RESUMES && state.partial.is_same(begin.partial);
@@ -213,7 +213,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             *next = self.programmer.source_mut().queue.last.next();
         }
         if let Some(expected) = findings.complete {
-            self.programmer.complete(expected);
+            self.programmer.complete(expected, state.told_date);
             if is_stream {
                 state.streamed = true;
                 state.start_when_verified = self.policy.starts_by_itself;

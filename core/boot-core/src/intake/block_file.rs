@@ -12,6 +12,7 @@ use shared_abi::block_file::{
     Control, Header, Last, FRAMING, HEADER_SIZE, LAST_SIZE, LAST_SIZE_2008, LAST_SIZE_AT_2008_OFFSETS,
     MAX_BLOCK_SIZE, NUMBER_CONTROL, NUMBER_LAST,
 };
+use shared_abi::date::of_control;
 use shared_abi::geometry::Region;
 
 use super::format::{Begin, Destination, Format, Recognition, SMALLEST_PROGRAM};
@@ -121,21 +122,23 @@ impl Format for BlockFile {
                 let control = fields.and_then(Control::parse);
                 to.judge.check_identity(&AppInfo::of_block(control, to.queue))?;
                 to.queue.discard();
-                let (size, version) = match control {
-                    None | Some(Control::Plain) => (0, 0),
-                    Some(Control::Identity(identity)) => (identity.app_size, 0),
-                    Some(Control::Dated { identity, version, .. }) => (identity.app_size, version),
+                let (size, version, date) = match control {
+                    None | Some(Control::Plain) => (0, 0, 0),
+                    Some(Control::Identity(identity)) => (identity.app_size, 0, 0),
+                    Some(Control::Dated { identity, version, date }) => {
+                        (identity.app_size, version, of_control(date))
+                    }
                 };
                 // A control block without a size is the same for too many programs.
                 let id = if size == 0 { 0 } else { self.crc };
                 let partial = Partial::begin(id, to.judge.region.base);
-                to.findings.begins = Some(Begin { size, version, partial });
+                to.findings.begins = Some(Begin { size, version, date, partial });
                 if let Some(linked) = to.judge.images.only_sealed() {
                     // The sequence begins again over what was processed, if it is that of the same file.
                     if to.judge.has_begun() && !to.judge.partial.is_same(partial) {
                         return Err(Refusal::untimely(FlashError::Sequence));
                     }
-                    to.findings.begins = Some(Begin { size: 0, version: 0, partial });
+                    to.findings.begins = Some(Begin { size: 0, version: 0, date: 0, partial });
                     to.findings.sealed = Some(linked);
                 }
             }

@@ -69,6 +69,8 @@ pub(crate) struct Begin {
     pub size: u32,
     /// Its version, 0 if unknown.
     pub version: u32,
+    /// Its creation date in seconds since 1970-01-01 UTC, 0 if unknown.
+    pub date: u32,
     /// Its progress: at its start, with the identity of its block file.
     pub partial: Partial,
 }

@@ -37,8 +37,12 @@ impl Format for SealedImage {
             return Err(Refusal(FlashError::Busy, AbortCode::OUT_OF_MEMORY));
         }
         if !to.judge.has_begun() {
-            to.findings.begins =
-                Some(Begin { size: 0, version: 0, partial: Partial::begin(0, to.judge.region.base) });
+            to.findings.begins = Some(Begin {
+                size: 0,
+                version: 0,
+                date: 0,
+                partial: Partial::begin(0, to.judge.region.base),
+            });
             to.findings.sealed = Some(self.0);
         }
         Ok(())

@@ -101,7 +101,7 @@ impl Stream {
         if to.queue.open_size() > 0 && !to.judge.has_begun() && to.findings.begins.is_none() {
             judge_start(to)?;
             let partial = Partial::begin(0, to.judge.region.base);
-            to.findings.begins = Some(Begin { size: self.size, version: 0, partial });
+            to.findings.begins = Some(Begin { size: self.size, version: 0, date: 0, partial });
         }
         to.queue.commit();
         Ok(())

@@ -113,8 +113,8 @@ enum Change {
     Confirm,
     /// Node-ID and bit rate.
     Node,
-    /// The security counter of a sealed image.
-    Counter,
+    /// A value that the program must have before its record: the security counter of a sealed image, or its date.
+    Value,
     /// A value for which no host waits.
     Note,
     /// The record that permits an installation.
@@ -230,10 +230,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         self.void(program);
     }
 
-    /// The program was sent completely.
-    pub(crate) fn complete(&mut self, expected: Expected) {
+    /// The program was sent completely, with this date.
+    pub(crate) fn complete(&mut self, expected: Expected, date: u32) {
         if let Some(target) = &mut self.target {
-            self.source.complete(expected);
+            self.source.complete(expected, date);
             // Bytes without a piece belong to the program, too, and must read FFh.
             target.ahead = target.ahead.max(target.region.base + expected.size);
         }
@@ -493,10 +493,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 self.install = Some(Phase::erase(places));
                 Some(Event::Stored { program: BOOTLOADER, ends: false })
             }
-            (Job::Store(Change::Counter | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
+            (Job::Store(Change::Value | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
             (Job::Store(change, program), result) => {
                 // A record whose counter could not be stored stays, too.
-                if matches!(change, Change::Void | Change::Counter) {
+                if matches!(change, Change::Void | Change::Value) {
                     self.voids &= !bit(program);
                     self.kept = false;
                 }
@@ -755,6 +755,12 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     fn complete_program(&mut self, parameters: &mut impl Parameters) -> Result<Option<Job>, FlashError> {
         let Some(target) = &mut self.target else { return Ok(None) };
         let program = target.program;
+        if P::DATES && program != BOOTLOADER {
+            if let Some(date) = self.source.take_date() {
+                parameters.store(Key::date(program), date);
+                return Ok(Some(Job::Store(Change::Value, program)));
+            }
+        }
         Ok(match self.source.next()? {
             Demand::Wait => None,
             Demand::Process => Some(Job::Process),
@@ -842,5 +848,5 @@ fn store_note(parameters: &mut impl Parameters, (key, value): (Key, Value)) -> J
 /// Starts to store the security counter of a program.
 fn store_counter(parameters: &mut impl Parameters, program: u8, counter: Value) -> Job {
     parameters.store(Key::counter(program), counter);
-    Job::Store(Change::Counter, program)
+    Job::Store(Change::Value, program)
 }

@@ -32,6 +32,13 @@ impl Key {
         Self(0x0004_0000 | number as u32)
     }
 
+    /// The creation date of a program (1 to 254), and the CRC of the program to which it belongs, see
+    /// [`ProgramRecord::date`](super::ProgramRecord::date).
+    #[must_use]
+    pub const fn date(number: u8) -> Self {
+        Self(0x0007_0000 | number as u32)
+    }
+
     /// An event (0 to 7), see `seal::access`.
     #[must_use]
     pub const fn event(place: u8) -> Self {
@@ -71,6 +78,8 @@ pub trait Parameters {
     /// Whether the bootloader can be renewed (docs/renewal.md): then it is one more program of the
     /// [`Downloader`](crate::control::Downloader). Without it, the compiler leaves out the code.
     const RENEWS: bool = false;
+    /// Whether the dates of programs are kept (1F52h). Without it, the compiler leaves out the code.
+    const DATES: bool = true;
 
     /// The version of the services of the resident part, which owns the store. The flash must be idle.
     fn services(&self) -> u32 {

@@ -1,6 +1,9 @@
 //! The record of a program.
 
 use super::parameters::{Key, Parameters, Value};
+use shared_abi::geometry::Region;
+use shared_abi::label::{self, Label};
+
 use crate::flash::Flash;
 use crate::resume::Partial;
 
@@ -87,6 +90,19 @@ impl ProgramRecord {
     /// Loads the record from the store; `None` if there is no program.
     pub fn load<F: Flash>(parameters: &impl Parameters, flash: &F, number: u8) -> Option<Self> {
         Self::from_value(parameters.get(flash, Key::program(number))?)
+    }
+
+    /// The creation date of the program in seconds since 1970-01-01 UTC: the one that came with it
+    /// ([`Key::date`]), or the one in its label; 0 if neither is known.
+    pub fn date<F: Flash>(&self, parameters: &impl Parameters, flash: &F, number: u8, region: Region) -> u32 {
+        match parameters.get(flash, Key::date(number)) {
+            Some([date, crc, ..]) if crc == self.crc => return date,
+            _ if self.size < label::OFFSET + label::SIZE as u32 => return 0,
+            _ => {}
+        }
+        let mut bytes = [0; label::SIZE];
+        flash.read(region.base + label::OFFSET, &mut bytes);
+        Label::parse(&bytes).map_or(0, |label| label.date)
     }
 
     /// Decodes the stored form; `None` for [`none`](Self::none).

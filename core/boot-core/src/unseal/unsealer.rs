@@ -2,6 +2,7 @@
 
 use canopen::program::FlashError;
 use seal::wire::{flag, Fault, Head};
+use shared_abi::date::of_control;
 
 use super::buffers::{start, Buffers};
 use super::image::{Image, Place, Progress};
@@ -231,6 +232,11 @@ impl<'b> Unsealer<'b> {
         let writes = head.flags() & flag::WRITES_FLASH != 0;
         let seal = if writes { Seal::WritesFlash } else { Seal::Locked };
         ProgramRecord { version: head.version(), seal: Some(seal), ..record }
+    }
+
+    /// The creation date of a sealed image, in seconds since 1970-01-01 UTC; 0 if unknown.
+    pub(crate) fn created(&self) -> u32 {
+        self.head().filter(|_| self.is_active()).map_or(0, |head| of_control(head.created()))
     }
 
     /// Continues with one bounded step.

@@ -4,6 +4,7 @@
 
 use boot_core::control::{AppInfo, Policy, Verdict};
 use boot_core::store::{Journal, ProgramRecord};
+use canopen::od::{Address, Objects};
 use canopen::program::FlashError;
 use canopen::AbortCode;
 use kit::bench::{
@@ -24,8 +25,8 @@ const NEW: u8 = 0xB0;
 /// A program of 700 bytes with this label.
 fn labelled(seed: u8, label: &Label) -> Vec<u8> {
     let mut bytes = program(700, seed);
-    let Label { magic, vendor_id, product_code, version, reserved: [a, b, c], check } = *label;
-    let words = [magic, vendor_id, product_code, version, a, b, c, check];
+    let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
+    let words = [magic, vendor_id, product_code, version, date, a, b, check];
     let at = label::OFFSET as usize;
     for (place, word) in bytes[at..at + label::SIZE].chunks_mut(4).zip(words) {
         place.copy_from_slice(&word.to_le_bytes());
@@ -121,6 +122,103 @@ fn a_label_that_fits_is_taken_and_tells_the_version() {
             assert_eq!(autostart(&flash), Ok(NEW));
         }
     }
+}
+
+/// 1F52h.
+fn date(bench: &mut Bench<'_>) -> [u32; 2] {
+    [1, 2].map(|sub| bench.word(Address::new(0x1F52, sub)))
+}
+
+/// 2000-02-29 12:00 and 2026-11-27 18:30:15, by GNU date.
+const LEAP_DAY: u32 = 951_825_600;
+const TODAY: u32 = 1_795_804_215;
+
+/// Block 0 with this date and version 1.
+fn control(date: u64) -> Vec<u8> {
+    let words = [700, DEVICE.0, DEVICE.1, 1, date as u32, (date >> 32) as u32];
+    block(0, 0, &words.map(u32::to_le_bytes).concat())
+}
+
+/// The date of block 0 precedes that of the label, as its version does. (Days and milliseconds are those of a calendar.)
+#[test]
+fn date_and_time_are_those_of_block_0_or_of_the_label() {
+    let label = |date| Label::dated(DEVICE.0, DEVICE.1, 1, date);
+    let mut flash = ModelFlash::new(&CHIP);
+    assert_eq!(date(&mut Bench::with_buffer(&mut flash, POLICY, 2048)), [0, 0], "no program");
+    let leap_day = [5903, 43_200_000];
+    let today = [15_671, 66_615_000];
+    for (image, told, expected) in [
+        (labelled(NEW, &label(LEAP_DAY)), 0, leap_day),
+        (labelled(NEW, &label(LEAP_DAY)), TODAY.into(), today),
+        (labelled(NEW, &label(0)), TODAY.into(), today),
+        // The same program again, and another one: what was stored for the first is not its date.
+        (labelled(NEW, &label(0)), LEAP_DAY.into(), leap_day),
+        (labelled(NEW, &label(0)), 0, leap_day),
+        (labelled(OLD, &label(0)), 0, [0, 0]),
+        (program(700, NEW), TODAY.into(), today),
+        (program(200, NEW), 0, [0, 0]),
+        // Dates that 1F52h cannot show.
+        (program(700, OLD), u64::from(TODAY) | 1 << 32, [0, 0]),
+        (program(700, OLD), 1, [0, 0]),
+    ] {
+        let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
+        assert_eq!(bench.command(CLEAR), 0);
+        bench.good(&control(told));
+        block_file(&image, 512)[1..].iter().for_each(|block| bench.good(block));
+        assert_eq!(date(&mut bench), expected, "{told}");
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+        assert_eq!(date(&mut bench), expected, "{told}: released");
+        let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
+        assert_eq!(date(&mut bench), expected, "{told}: after a reset");
+        assert_eq!(bench.node.write(Address::new(0x1F52, 1), &[0; 4]), Err(AbortCode(0x0601_0000)));
+    }
+    let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
+    bench.command(CLEAR);
+    bench.command(CLEAR);
+    assert_eq!(date(&mut bench), [0, 0], "erased");
+}
+
+/// A program is never seen with the date of another one, wherever the power fails.
+#[test]
+fn the_date_belongs_to_its_program_after_every_power_cut() {
+    let send = |flash: &mut ModelFlash, seed: u8, date: u32| {
+        let mut bench = Bench::with_buffer(flash, POLICY, 2048);
+        bench.command(CLEAR);
+        bench.good(&control(date.into()));
+        block_file(&program(700, seed), 512)[1..].iter().for_each(|block| bench.good(block));
+        assert_eq!(bench.command(SET_SIGNATURE), 0);
+    };
+    let mut installed = ModelFlash::new(&CHIP);
+    send(&mut installed, OLD, LEAP_DAY);
+    let cells = installed.cells(CHIP.flash).to_vec();
+    let fresh = || {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(CHIP.flash.base, &cells);
+        flash
+    };
+    let mut whole = fresh();
+    send(&mut whole, NEW, TODAY);
+    let mut seen = [0; 3];
+    for operation in 1..=whole.operations {
+        for cut in [Cut::Before, Cut::After, Cut::Torn(7), Cut::Torn(8)] {
+            let mut flash = fresh();
+            flash.cut = Some((operation, cut));
+            assert!(until_power_cut(|| send(&mut flash, NEW, TODAY)));
+            flash.power_on();
+            let (place, expected) = match autostart(&flash) {
+                Ok(OLD) => (0, [5903, 43_200_000]),
+                Ok(_) => (1, [15_671, 66_615_000]),
+                Err(_) => (2, [0, 0]),
+            };
+            let mut bench = Bench::with_buffer(&mut flash, POLICY, 2048);
+            // A program that is not released has a date, too; the new one alone can be so.
+            let expected =
+                if place == 2 && bench.read_state() != 3 { [15_671, 66_615_000] } else { expected };
+            assert_eq!(date(&mut bench), expected, "cut {cut:?} at operation {operation}");
+            seen[place] += 1;
+        }
+    }
+    assert!(seen.iter().all(|count| *count > 0), "old, new, none: {seen:?}");
 }
 
 /// The product's own check also gets the label: block 0 cannot claim another version.
