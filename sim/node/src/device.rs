@@ -8,9 +8,10 @@
 use std::io;
 use std::time::Duration;
 
-use boot_core::bootloader::{self, Bootloader};
+use boot_core::bootloader::{self, Bootloader, Choices};
 use boot_core::canopen::node::{self, NmtPolicy, Node};
 use boot_core::canopen::od::Entry;
+use boot_core::canopen::program::ProgramStart;
 use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::{Sealed, Step};
@@ -45,6 +46,20 @@ const POLICY: Policy = Policy {
     rescue_window_confirmed_ms: 0,
     start_allowed: |_| true,
 };
+
+/// A bootloader with everything, which starts its programs by [`POLICY`].
+struct Ours<const PROGRAMS: usize>;
+
+impl<const PROGRAMS: usize> Choices for Ours<PROGRAMS> {
+    const PROGRAM_START: ProgramStart = ProgramStart {
+        by_itself: match PROGRAMS {
+            1 => [POLICY.programs[0], 0],
+            _ => [POLICY.programs[0], POLICY.programs[1]],
+        },
+        ..ProgramStart::NONE
+    };
+}
+
 /// The value for "no node-ID" (CiA 305).
 const NO_NODE_ID: u8 = 255;
 
@@ -105,7 +120,7 @@ pub struct Device<'b, const PROGRAMS: usize> {
 
 /// What runs between two resets.
 enum Phase<'b, const PROGRAMS: usize> {
-    Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS>>>),
+    Bootloader(Box<Running<Bootloader<'b, FileFlash, Journal, PROGRAMS, Ours<PROGRAMS>>>>),
     StandIn(Box<Running<StandIn>>, &'b mut [u8], Option<Hosted>),
     Silent(Idle<'b>),
     /// Only during the change from one to the other.

@@ -79,8 +79,10 @@ fn a_stand_in_answers_for_the_program_and_lets_itself_be_called_back() {
     let nodes = Nodes::start(&folder, &["--node", "7", "--flash", "instant", "--stand-in"]);
     let coflash = Coflash::new(&folder, &nodes);
     let release = ["-N", "7", "--verify", "--vid", "0", "--pid", "0", "--ver", "0x00640A01"];
+    // 2007h/10: program 1 starts by itself, as the node does when it is switched on.
+    assert_eq!(coflash.json(&["read", "2007/10", "-N", "7"])["number"], 0x0001_0000);
     let said = coflash.done(&[FLASH, &release].concat());
-    assert!(said.contains("running: an application"), "{said}");
+    assert!(said.contains("running: an application") && !said.contains("by itself"), "{said}");
     nodes.await_line("serial 1, node 7: would start program 1, on trial");
     nodes.await_line("serial 1, node 7: bootloader (Requested)");
     nodes.await_line("serial 1, node 7: would start program 1");
