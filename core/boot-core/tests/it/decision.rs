@@ -9,6 +9,7 @@ use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, Parameters, ProgramRecord};
 use kit::model::ModelFlash;
 use shared_abi::boot_report::Reason;
+use shared_abi::geometry::Region;
 use shared_abi::handoff::ResetCause;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
@@ -299,6 +300,59 @@ fn the_reason_names_what_is_wrong_with_the_program() {
             matches!(decision, BootDecision::Stay { reason: stays, .. } if stays == reason),
             "{invalid:?}"
         );
+    }
+}
+
+/// A chip that had the map with the bootloader in sectors 0 and 1, its journal in 2 and 3 and its program from
+/// sector 4 on, gets today's: sector 1 has code, and sector 2 a whole journal with the record of a program
+/// that is not where it says. Nothing starts, for a reason that has a name, and each value can be stored.
+#[test]
+fn a_journal_of_the_map_before_this_one_starts_nothing_and_can_be_written() {
+    let before = [Region::new(0x0800_8000, 0x4000), Region::new(0x0800_C000, 0x4000)];
+    assert_eq!(LAYOUT.parameters.map(|region| region.base), [0x0800_4000, before[0].base]);
+    // A slot has 28 bytes: after more than 585 stores the other region has the values.
+    let blank = (vec![], Invalid::Vectors(VectorFault::StackPointer), Reason::Vectors);
+    let vectors = [0x2001_FFC0_u32, 0x0802_0189].map(u32::to_le_bytes).concat();
+    for (stores, (there, invalid, reason)) in
+        [(1, blank.clone()), (600, blank), (600, (vectors, Invalid::Crc, Reason::Damaged))]
+    {
+        let mut flash = ModelFlash::new(LAYOUT.chip);
+        let program = [0xA5; 64];
+        flash.poke(0x0801_0000, &program);
+        let mut journal = Journal::open(&flash, before);
+        let record = ProgramRecord {
+            seal: None,
+            withdrawn: false,
+            size: 64,
+            crc: boot_core::crc32(&program),
+            signed: true,
+            confirmed: true,
+            version: 0,
+            half_erased: false,
+        };
+        let store = |flash: &mut ModelFlash, journal: &mut Journal, key, value| {
+            journal.store(key, value);
+            run(flash, |flash, outcome| journal.next(flash, outcome)).unwrap();
+        };
+        store(&mut flash, &mut journal, Key::program(1), record.value());
+        for count in 0..stores {
+            store(&mut flash, &mut journal, Key::CRASH_COUNT, [count, 0, 0, 0]);
+        }
+        flash.poke(0x0800_4000, &[0x4B; 0x3000]);
+        flash.poke(0x0802_0000, &there);
+
+        let mut journal = Journal::open(&flash, LAYOUT.parameters);
+        let found = verify(&flash, &journal, &LAYOUT, CrcKind::Crc32, 1);
+        assert_eq!(found, Err(invalid), "{stores} stores");
+        let decision = decide(&QUIET, &policy(), |_| Err(found.unwrap_err()));
+        // 1F57h/1 says that it is no valid program.
+        assert_eq!(decision, BootDecision::Stay { reason, refused: 1 });
+        for count in 0..600 {
+            store(&mut flash, &mut journal, Key::NODE, [count, 1, 0, 0]);
+            let again = Journal::open(&flash, LAYOUT.parameters);
+            assert_eq!(again.get(&flash, Key::NODE), Some([count, 1, 0, 0]), "{stores} stores");
+        }
+        assert_eq!(flash.cells(Region::new(0x0801_0000, 64)), program, "outside of the journal");
     }
 }
 
