@@ -501,6 +501,38 @@ fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
     }
 }
 
+/// The table of services and the record of facts only grow: an image runs on a resident part that has more
+/// of both, and one that needs less than there is.
+#[test]
+fn an_image_takes_longer_tables_than_it_knows() {
+    let board = firmware::board();
+    let good = Parts::of(firmware::BOOTLOADER);
+    let table = (board.callgate() + OFFSET - board.bootloader.base) as usize;
+    let at = |resident: &[u8], at: usize| words(&resident[at..at + 4])[0];
+    // Two words, seven functions, and the address of the facts, of which the second word begins with the size.
+    let facts = (at(&good.resident, table + 36) - board.bootloader.base) as usize;
+    assert_eq!([at(&good.resident, table), at(&good.resident, table + 4)], [SERVICES_VERSION, 40]);
+    assert_eq!(good.resident[facts + 4..facts + 6], [20, 0]);
+    let mut longer = good.clone();
+    longer.resident[table..][..4].copy_from_slice(&(SERVICES_VERSION + 7).to_le_bytes());
+    longer.resident[table + 4..][..4].copy_from_slice(&64_u32.to_le_bytes());
+    longer.resident[facts + 4..][..2].copy_from_slice(&48_u16.to_le_bytes());
+    let mut older = good;
+    older.set(SERVICES, 0);
+    older.seal();
+    for (what, parts) in [("a newer resident part", longer), ("an older image", older)] {
+        let mut bench = Bench::new();
+        load(&mut bench, &parts);
+        bench.power_on();
+        bench.await_boot_up(100);
+        assert!(bench.is_bootloader(NODE), "{what}");
+        let options = FlashOptions::default();
+        flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
+            .unwrap_or_else(|error| panic!("{what}: {error}"));
+        assert!(!bench.is_bootloader(NODE), "{what}");
+    }
+}
+
 /// A fault before the RAM image is ready has its handler in flash, by the vectors in flash: it
 /// requests the bootloader and resets.
 #[test]
