@@ -25,7 +25,7 @@ pub(super) fn look(
     number: u8,
     crcs: [u32; 2],
 ) -> DeviceAfterUpdate {
-    let unseen = |answer| DeviceAfterUpdate { state: update.state, answer };
+    let unseen = |answer| DeviceAfterUpdate { state: update.last_known(), answer };
     let untouched = update.state == DeviceState::Untouched && !update.touched;
     if untouched || matches!(error, Error::Adapter(_)) {
         return unseen(DeviceAnswer::NotAsked);

@@ -15,6 +15,9 @@ pub enum DeviceState {
     Untouched,
     /// The bootloader was called; the old program is intact.
     Called,
+    /// The device has postponed the erase until the first good data, and has acknowledged none: the old
+    /// program may be intact.
+    Postponed,
     /// The erase was started: as far as is known, there is no program, or an incomplete one.
     Erased,
     /// The new program is complete, in a dialect without a release for autostart.
@@ -32,6 +35,7 @@ impl DeviceState {
         match self {
             Self::Untouched => "untouched",
             Self::Called => "called",
+            Self::Postponed => "postponed",
             Self::Erased => "erased",
             Self::Written => "written",
             Self::Unreleased => "unreleased",
@@ -51,6 +55,7 @@ impl fmt::Display for DeviceState {
         f.write_str(match self {
             Self::Untouched => "it was not changed",
             Self::Called => "it was called back to the bootloader, and its program is unchanged",
+            Self::Postponed => "it erases its program with the first good data, and has acknowledged none of the new one",
             Self::Erased => "it contains no complete program",
             Self::Written => "it contains the new program, which starts after a reset",
             Self::Unreleased => {

@@ -3,7 +3,8 @@
 use std::cell::RefCell;
 
 use super::device_after::DeviceState;
-use super::event::{Event, Note, Warning};
+use super::event::{Event, Note, Phase, Warning};
+use super::phase::PUT_OFF;
 use crate::device::flying_master::{self, Mastership};
 use crate::device::session::Silence;
 use crate::device::Session;
@@ -46,6 +47,8 @@ pub(super) struct RunningUpdate<'t> {
     pub(super) resting: DeviceState,
     /// The value of 1F56h before the erase, if it was read.
     pub(super) before: Option<u32>,
+    /// Whether the device has postponed the erase, and has acknowledged no data since then.
+    pub(super) postponed: bool,
     /// Whether the device may contain a part of the new program.
     pub(super) wrote: bool,
     /// The NMT mastership, while the tool holds it.
@@ -64,6 +67,7 @@ impl<'t> RunningUpdate<'t> {
             touched: false,
             resting: DeviceState::Untouched,
             before: None,
+            postponed: false,
             wrote: false,
             mastership: None,
             tell,
@@ -87,8 +91,19 @@ impl<'t> RunningUpdate<'t> {
         }
     }
 
+    /// The state as far as it is known without an answer of the device.
+    pub(super) fn last_known(&self) -> DeviceState {
+        match self.state {
+            DeviceState::Erased if self.postponed => DeviceState::Postponed,
+            state => state,
+        }
+    }
+
     /// Reports an event.
     pub(super) fn tell(&mut self, event: Event) {
+        if let Event::Phase(Phase::Erased { took }) = &event {
+            self.postponed = *took < PUT_OFF && !self.wrote;
+        }
         if let Some(told) = &mut self.told {
             if told.contains(&event) {
                 return;

@@ -231,6 +231,8 @@ fn send(
     if let Some(partial) = partial {
         let total = file.own.program_size() as usize;
         let done = partial.end.saturating_sub(file.own.program_start()) as usize;
+        // The record of the old program goes with the first good data.
+        update.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
         update.tell(Phase::GoingOn { done: done.min(total), total }.into());
     } else if let Err(error) = steps::erase(session, number, &mut |event| update.tell(event)) {
         if error.is_refusal() {
@@ -304,6 +306,7 @@ fn send_blocks(
         let is_split = matches!(sent, Ok(Sent { split: true, .. }));
         update.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
         let sent = sent?;
+        update.postponed &= block.number == NUMBER_CONTROL || sent.split;
         repeats += sent.repeats;
         if sent.by_other_crc {
             checksum = checksum.other();

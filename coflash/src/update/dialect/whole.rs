@@ -83,6 +83,7 @@ fn send(
         let mut long = session.with(node, slow);
         let mut progress = |part: u32| {
             update.wrote |= part > 0;
+            update.postponed &= part == 0;
             update.tell(Event::Progress { done: part as usize, total });
         };
         let sent = long.write(at, content, Doing::Program, &mut progress);

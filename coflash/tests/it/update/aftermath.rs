@@ -8,10 +8,11 @@ use coflash::bus::AdapterError;
 use coflash::device::error::Intruder;
 use coflash::device::{Dialect, Session, Timing};
 use coflash::file::block_file::BlockFile;
+use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash::{Adapter, Error};
 
-use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const CLEAR: u8 = 0x03;
 const CALL: u8 = 0x80;
@@ -148,6 +149,87 @@ fn a_device_that_is_gone_is_not_said_to_wait_in_its_bootloader() {
     let lost = left(BOOTLOADER, &|fake| fake.frames_left = frames, FlashOptions::default());
     assert_eq!(lost.answer, DeviceAnswer::NotAsked);
     assert_eq!(lost.to_string(), "it cannot be asked any more; last known: it contains no complete program");
+}
+
+/// A device that has postponed the erase, and acknowledged nothing since then, may have its program; the tool
+/// cannot say that there is none. One that was long about the erase has none.
+#[test]
+fn without_an_answer_a_postponed_erase_is_not_called_done() {
+    for its in STANDARD {
+        let postpones = |fake: &mut Fake| fake.erase_time = Duration::ZERO;
+        let mut whole = Fake::new(BOOTLOADER);
+        postpones(&mut whole);
+        let _ = run(&mut whole, &dialect(its));
+        let command = |command| {
+            let request = [0x2F, 0x51, 0x1F, 1, command, 0, 0, 0];
+            whole.sent.iter().position(|frame| frame.exactly::<8>() == Some(&request))
+        };
+        // CLEAR and the read of 1F57h; the last is lost before the program is complete.
+        let begin = command(CLEAR).unwrap() + 2;
+        let first = left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = begin).0, dialect(its));
+        assert_eq!((first.state, first.answer), (DeviceState::Postponed, DeviceAnswer::NotAsked), "{its}");
+        assert_eq!(
+            first.to_string(),
+            "it cannot be asked any more; last known: it erases its program with the first good data, and has \
+             acknowledged none of the new one"
+        );
+        let mut states = Vec::new();
+        for frames in begin..command(1).unwrap_or(whole.sent.len()) {
+            states.push(
+                left(BOOTLOADER, &|fake| (postpones(fake), fake.frames_left = frames).0, dialect(its)).state,
+            );
+            let slow = left(BOOTLOADER, &|fake| fake.frames_left = begin, dialect(its));
+            assert_eq!(slow.state, DeviceState::Erased, "{its}");
+        }
+        states.dedup();
+        assert_eq!(states[..2], [DeviceState::Postponed, DeviceState::Erased], "{its}: {states:?}");
+        assert!(!states[2..].contains(&DeviceState::Postponed), "{its}: {states:?}");
+    }
+}
+
+/// A device with a begun download (2006h) of the file that has no data yet.
+struct Begun;
+
+impl Maker for Begun {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        // The CRC of block 0, which has 12 bytes of data after its 12 of header, and the start of the program.
+        let crc = &data!("identity-110.blk")[24..28];
+        (at == (0x2006, 1)).then(|| Ok([crc, &0x0801_0000_u32.to_le_bytes()].concat()))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+/// The same of a download that goes on and has no data yet: the old program is there if its CRC is.
+#[test]
+fn a_begun_download_without_data_may_have_left_the_old_program() {
+    for (crc, state) in [(0x0BAD_CAFE, DeviceState::Postponed), (0, DeviceState::Erased)] {
+        let begun = |fake: &mut Fake| {
+            fake.maker = Some(Box::new(Begun));
+            fake.crc = Some(crc);
+        };
+        let mut whole = Fake::new(BOOTLOADER);
+        begun(&mut whole);
+        let (_, events) = run(&mut whole, &FlashOptions::default());
+        assert!(events.contains(&Phase::GoingOn { done: 0, total: 4001 }.into()), "{events:?}");
+        let data = |frame: &Frame| frame.exactly::<8>().is_some_and(|data| data[1..4] == [0x50, 0x1F, 1]);
+        let frames = whole.sent.iter().position(data).unwrap() + 1;
+        let cut = left(
+            BOOTLOADER,
+            &|fake| {
+                begun(fake);
+                fake.frames_left = frames;
+            },
+            FlashOptions::default(),
+        );
+        assert_eq!(cut.state, state, "{crc:08X}");
+    }
 }
 
 #[test]
