@@ -5,6 +5,7 @@ mod attacker;
 mod blocks;
 mod client;
 mod confirmation;
+mod conform;
 mod device;
 mod dictionary;
 mod flash_lock;
