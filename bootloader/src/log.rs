@@ -9,6 +9,7 @@
 //!
 //! A line is left out if its output has no room: the bootloader never waits for a reader.
 
+pub mod feeds;
 #[cfg(feature = "log-defmt")]
 mod logger;
 #[cfg(any(feature = "log-rtt", feature = "log-defmt"))]

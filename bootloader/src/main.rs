@@ -155,10 +155,11 @@ mod app {
     }
 
     #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
-    fn init(cx: init::Context) -> (Shared, Local) {
+    fn init(mut cx: init::Context) -> (Shared, Local) {
         // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
-        let clock = Source::Crystal.speed_up(&cx.device.RCC);
+        let clock =
+            log::feeds::during_clock_start(&mut cx.core.SYST, || Source::Crystal.speed_up(&cx.device.RCC));
         // SAFETY: the flash controller and the CRC unit of `cx.device` are not used.
         let flash = unsafe { BootFlash::steal() };
         let board = bsp::init(&mut cx.device.RCC.constrain(), cx.device.CAN1);
@@ -326,6 +327,7 @@ mod app {
         if pending_reset.wanted && !finishing && slave.is_idle() && can.lock(CanPort::is_idle) {
             pending_reset.at = Some(now + PRODUCT.answer_to_reset_ms);
             log!("leaving; request", WarmStart::new(pending_reset.request).request);
+            log!("longest between two feeds; us", log::feeds::longest());
         }
     }
 

@@ -8,6 +8,7 @@ use core::sync::atomic::{AtomicBool, Ordering};
 
 use bsp::{pac, watchdog};
 
+use crate::log::feeds;
 use crate::product::PRODUCT;
 
 /// The tasks that must check in.
@@ -46,6 +47,7 @@ impl Watchdog {
                 task.store(false, Ordering::Relaxed);
             }
             watchdog::feed(&self.0);
+            feeds::fed();
         }
     }
 }

@@ -1,12 +1,14 @@
 //! The bootloader's log for developers of ports, in each of its forms; and a release has no log.
 
 use canopen::program::ProgramControl;
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::listener::{decoder, heard, Listener};
 use coflash::update::{flash, FlashOptions};
 use emulator::defmt::Decoder;
+use emulator::machine::Options;
 use emulator::peripheral::Peripheral;
+use emulator::time::Span;
 use object::{Object, ObjectSection, ObjectSymbol};
 
 /// The images with a log, and the reader of each.
@@ -52,8 +54,87 @@ fn it_tells_why_it_stayed_what_it_refuses_and_that_it_leaves() {
         // NMT: reset node.
         bench.post(0x000, &[0x81, 0]);
         bench.run_ms(10);
-        assert_eq!(listener.told(&mut bench), ["leaving; request 00000005"]);
+        let longest = longest_between_feeds(&mut bench);
+        let lines = listener.told(&mut bench);
+        assert_eq!(lines.len(), 2, "{lines:?}");
+        assert_eq!(lines[0], "leaving; request 00000005");
+        assert_same_time(&lines[1], longest);
         bench.assert_nothing_unmodelled();
+    }
+}
+
+/// The longest time between two feeds, as the watchdog of the chip saw it, in us.
+fn longest_between_feeds(bench: &mut Bench) -> u64 {
+    bench.machine().counters().longest_between_feeds.0 / Span::from_micros(1).0
+}
+
+/// The line has this time, in us: two clocks are read at both ends, and each has its own last digit; a feed
+/// and the look at the clock are some instructions and an interrupt apart.
+fn assert_same_time(line: &str, us: u64) {
+    let said = line.strip_prefix("longest between two feeds; us ").unwrap_or_else(|| panic!("{line:?}"));
+    let said = u64::from_str_radix(said, 16).expect("eight digits");
+    println!("the longest time between two feeds: the bootloader says {said} us, the watchdog saw {us} us");
+    assert!(said.abs_diff(us) <= 10, "{said} us, {us} us");
+}
+
+/// SYS TEC manual L-1112d_10, 3.4.8: the longest time is kept, and read "shortly before the start of the
+/// application". The other observer is the watchdog itself (RM0090 section 21.4.1: AAAAh).
+#[test]
+fn the_longest_time_between_two_feeds_is_what_the_watchdog_saw() {
+    /// ARMv7-M A7.7.12: a branch to itself.
+    const HANG: [u8; 2] = 0xE7FE_u16.to_le_bytes();
+    let said = |listener: &mut Listener, bench: &mut Bench| {
+        let lines = listener.told(bench).into_iter();
+        let mut lines: Vec<_> = lines.filter(|line| line.starts_with("longest ")).collect();
+        assert_eq!(lines.len(), 1, "{lines:?}");
+        lines.remove(0)
+    };
+    // A whole update; the program starts.
+    for (image, mut listener) in ways() {
+        println!("{image}: an update");
+        let mut bench = Bench::of_image(image);
+        bench.power_on();
+        bench.await_boot_up(100);
+        let file = firmware::blocks(firmware::APP_V1);
+        flash(&mut bench.session(), &file, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+        // Room for the lines to come.
+        listener.told(&mut bench);
+        bench.session().command(1, ProgramControl::Start).unwrap();
+        // Two lines on a UART take 6 ms; the reset comes 15 ms after the answer.
+        bench.run_ms(9);
+        let longest = longest_between_feeds(&mut bench);
+        assert_same_time(&said(&mut listener, &mut bench), longest);
+    }
+    // The crystal does not start: the watchdog runs while it is waited for.
+    let dead = Options { hse_hz: 0, ..Options::default() };
+    for (what, options, hangs_ms, range) in [
+        // The last feed was up to 2 ms before, and the next one is up to 2 ms later.
+        ("a task that hangs for 60 ms", Options::default(), 60, 60_000..=64_000),
+        // Ten times the start-up time of a crystal (bsp/src/pll.rs).
+        ("no crystal", dead, 0, 40_000..=170_000),
+    ] {
+        println!("{what}");
+        let mut bench = Bench::of_image_with(firmware::BOOTLOADER_LOG_RTT, options);
+        bench.world.add_host_port(BIT_RATE);
+        bench.power_on();
+        bench.run_ms(300);
+        let sleeps_at = bench.machine().pc();
+        let mut there = [0; 2];
+        bench.machine().read_memory(sleeps_at, &mut there).expect("idle sleeps in RAM");
+        bench.machine().write_ram(sleeps_at, &HANG).expect("idle sleeps in RAM");
+        bench.run_ms(hangs_ms);
+        bench.machine().write_ram(sleeps_at, &there).expect("idle sleeps in RAM");
+        // Without its crystal the device takes part after a request of LSS alone: switch state global,
+        // waiting (CiA 305).
+        bench.post(0x7E5, &[0x04, 0, 0, 0, 0, 0, 0, 0]);
+        bench.run_ms(20);
+        // NMT: reset node.
+        bench.post(0x000, &[0x81, 0]);
+        bench.run_ms(10);
+        let longest = longest_between_feeds(&mut bench);
+        let mut listener = Listener::probe();
+        assert_same_time(&said(&mut listener, &mut bench), longest);
+        assert!(range.contains(&longest), "{what}: {longest} us");
     }
 }
 

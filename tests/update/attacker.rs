@@ -25,6 +25,8 @@ fn attack(name: &str, seed: u64) {
     assert!(summary.bursts > 15 && summary.resets > 10, "{summary:?}");
     assert!(summary.errors > 0 || name == "serial" || name.starts_with("node"), "{summary:?}");
     assert!(summary.updates > 0 && summary.running > 0, "{summary:?}");
+    // A node has no watchdog.
+    assert_eq!(summary.unfed_us == 0, name.starts_with("node"), "{summary:?}");
     // Nobody has a right to store in a sealed device.
     assert_eq!(summary.stores == 0, name == "keys", "{summary:?}");
 }

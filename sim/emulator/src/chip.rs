@@ -189,6 +189,8 @@ pub struct Counters {
     pub flash_stalls: u64,
     /// How long it was stalled for that, altogether.
     pub flash_stall_time: Span,
+    /// The longest time between two feeds of the independent watchdog since the machine was made.
+    pub longest_between_feeds: Span,
 }
 
 /// The chip around the CPU.
@@ -310,6 +312,7 @@ impl Chip {
                 flash_weak: 0,
                 flash_stalls: 0,
                 flash_stall_time: Span(0),
+                longest_between_feeds: Span(0),
             },
             slice: Slice::default(),
             hse_hz: options.hse_hz,

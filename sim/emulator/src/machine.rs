@@ -751,7 +751,11 @@ impl Machine {
     #[must_use]
     pub fn counters(&self) -> Counters {
         let chip = self.cpu.chip();
-        Counters { cycles: chip.clock.cycles, ..chip.counters.clone() }
+        Counters {
+            cycles: chip.clock.cycles,
+            longest_between_feeds: chip.iwdg.longest_between_feeds(),
+            ..chip.counters.clone()
+        }
     }
 
     /// How often translated code was entered: the measure of what an idle machine costs the host.

@@ -157,6 +157,10 @@ impl Target for Board {
         }
     }
 
+    fn longest_between_feeds_us(&mut self) -> u64 {
+        self.bench.machine().counters().longest_between_feeds.0 / US
+    }
+
     fn complaint(&mut self) -> Option<String> {
         let device = self.bench.device;
         let reports = self.bench.world.machine_mut(device).reports();

@@ -15,6 +15,8 @@ pub enum Broken {
     Record(String),
     /// A reset that nobody asked for.
     Reset(String),
+    /// The watchdog was fed late.
+    Watchdog(String),
     /// Another one.
     Other(String),
 }
@@ -27,6 +29,7 @@ impl fmt::Display for Broken {
             Self::Program(what) => ("programs stay", what),
             Self::Record(what) => ("records are true", what),
             Self::Reset(what) => ("no reset unasked", what),
+            Self::Watchdog(what) => ("the watchdog is fed", what),
             Self::Other(what) => ("device", what),
         };
         write!(f, "{rule}: {what}")

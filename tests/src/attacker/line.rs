@@ -215,6 +215,10 @@ impl Target for SerialBoard {
         self.order(&bytes);
     }
 
+    fn longest_between_feeds_us(&mut self) -> u64 {
+        self.board.longest_between_feeds_us()
+    }
+
     fn complaint(&mut self) -> Option<String> {
         self.board.complaint()
     }

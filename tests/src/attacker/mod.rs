@@ -5,6 +5,7 @@
 //! - the device answers: a read of 1000h after an SDO abort, within [`Target::answer_us`];
 //! - the programs and the node parameters are as they were, unless a master asked for a change;
 //! - no reset that nobody asked for;
+//! - the watchdog is fed in time, also if its clock is the fastest ([`FEED_US`]);
 //! - the record of a program is true: its CRC is that of the flash and of an image that was sent;
 //! - LSS answers only what was asked in its state.
 //!
@@ -57,6 +58,11 @@ const WORK_US: u64 = 40_000_000;
 /// (`core/canopen/src/password.rs`), in us.
 const PASSWORD_US: u64 = 33_000_000;
 
+/// The longest time between two feeds of the watchdog, in us: the shortest `watchdog_ms` that a product may
+/// have is 250 (docs/product.md), which is 125 counts of LSI / 64 (RM0090 section 21.4.3), and the LSI has
+/// 47 kHz at most (datasheet DocID022152).
+const FEED_US: u64 = 125 * 64 * 1_000_000 / 47_000;
+
 /// The counts of an attack.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Summary {
@@ -82,6 +88,8 @@ pub struct Summary {
     pub slowest_us: u64,
     /// The slowest one after bus-off, in us.
     pub slowest_off_us: u64,
+    /// The longest time between two feeds of the watchdog, in us.
+    pub unfed_us: u64,
 }
 
 impl Summary {
@@ -98,6 +106,7 @@ impl Summary {
         self.stores += other.stores;
         self.slowest_us = self.slowest_us.max(other.slowest_us);
         self.slowest_off_us = self.slowest_off_us.max(other.slowest_off_us);
+        self.unfed_us = self.unfed_us.max(other.unfed_us);
     }
 }
 
@@ -485,6 +494,11 @@ impl Attack {
             self.answers()?;
         }
         self.flash_is_right()?;
+        self.summary.unfed_us = self.target.longest_between_feeds_us();
+        if self.summary.unfed_us > FEED_US {
+            let us = self.summary.unfed_us;
+            return Err(Broken::Watchdog(format!("fed after {us} us; {FEED_US} is allowed")));
+        }
         if let Some(what) = self.target.complaint() {
             return Err(Broken::Other(what));
         }

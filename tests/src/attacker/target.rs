@@ -94,6 +94,11 @@ pub trait Target {
     /// The masters change to this bit rate, in bit/s.
     fn set_bit_rate(&mut self, bit_rate: u32);
 
+    /// The longest time between two feeds of its watchdog so far, in us; 0 without a watchdog.
+    fn longest_between_feeds_us(&mut self) -> u64 {
+        0
+    }
+
     /// What the device did that it must not do and no rule names; `None` for nothing.
     fn complaint(&mut self) -> Option<String>;
 }

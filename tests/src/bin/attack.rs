@@ -108,13 +108,15 @@ fn main() -> ExitCode {
         }
     });
     let work = work.into_inner().expect("no attack panics");
-    println!("setup          frames   bursts  resets  cuts  updates  slowest answer  behind bus-off");
+    println!("setup          frames   bursts  resets  cuts  updates  slowest answer  behind bus-off  between feeds");
     for Row { name, summary, .. } in &work.rows {
-        let Summary { frames, bursts, resets, cuts, updates, slowest_us, slowest_off_us, .. } = summary;
+        let Summary { frames, bursts, resets, cuts, updates, slowest_us, slowest_off_us, unfed_us, .. } =
+            summary;
         println!(
-            "{name:<12} {frames:>8} {bursts:>8} {resets:>7} {cuts:>5} {updates:>8} {:>12.1} ms {:>12.1} ms",
+            "{name:<12} {frames:>8} {bursts:>8} {resets:>7} {cuts:>5} {updates:>8} {:>12.1} ms {:>12.1} ms {:>11.1} ms",
             *slowest_us as f64 / 1e3,
-            *slowest_off_us as f64 / 1e3
+            *slowest_off_us as f64 / 1e3,
+            *unfed_us as f64 / 1e3
         );
     }
     let all = work.rows.iter().fold(Summary::default(), |mut all, row| {
@@ -181,7 +183,7 @@ fn refuse(why: &str) -> ExitCode {
 
 fn counts(summary: &Summary) -> String {
     format!(
-        "\"frames\": {}, \"bursts\": {}, \"answers\": {}, \"errors\": {}, \"resets\": {}, \"power_cuts\": {}, \"updates\": {}, \"stores\": {}, \"slowest_answer_ms\": {:.1}, \"slowest_answer_behind_bus_off_ms\": {:.1}",
+        "\"frames\": {}, \"bursts\": {}, \"answers\": {}, \"errors\": {}, \"resets\": {}, \"power_cuts\": {}, \"updates\": {}, \"stores\": {}, \"slowest_answer_ms\": {:.1}, \"slowest_answer_behind_bus_off_ms\": {:.1}, \"longest_between_feeds_ms\": {:.1}",
         summary.frames,
         summary.bursts,
         summary.answers,
@@ -191,7 +193,8 @@ fn counts(summary: &Summary) -> String {
         summary.updates,
         summary.stores,
         summary.slowest_us as f64 / 1e3,
-        summary.slowest_off_us as f64 / 1e3
+        summary.slowest_off_us as f64 / 1e3,
+        summary.unfed_us as f64 / 1e3
     )
 }
 

@@ -59,6 +59,10 @@ pub struct Iwdg {
     /// `None` until it is started.
     counter: Option<Counter>,
     expired: bool,
+    /// When the program last wrote AAAAh, or started the watchdog, since the reset.
+    fed: Option<Time>,
+    /// It stays in a reset.
+    longest_between_feeds: Span,
 }
 
 impl Iwdg {
@@ -73,6 +77,8 @@ impl Iwdg {
             unlocked: false,
             counter: None,
             expired: false,
+            fed: None,
+            longest_between_feeds: Span(0),
         }
     }
 
@@ -86,6 +92,12 @@ impl Iwdg {
     #[must_use]
     pub fn has_expired(&self) -> bool {
         self.expired
+    }
+
+    /// The longest time without AAAAh that ended with AAAAh; also while the watchdog does not run.
+    #[must_use]
+    pub fn longest_between_feeds(&self) -> Span {
+        self.longest_between_feeds
     }
 
     /// The LSI is on or off from `now` on.
@@ -155,6 +167,12 @@ impl Iwdg {
 
     fn write_key(&mut self, key: u32, now: Time) -> Result<(), Unmodelled> {
         self.unlocked = key == KEY_ACCESS;
+        if let (KEY_RELOAD, Some(fed)) = (key, self.fed) {
+            self.longest_between_feeds = self.longest_between_feeds.max(now - fed);
+        }
+        if key == KEY_RELOAD || key == KEY_START && !self.is_running() {
+            self.fed = Some(now);
+        }
         match key {
             KEY_RELOAD if self.is_running() => {
                 self.counter = Some(Counter { value: self.reload.used, at: now });
@@ -231,7 +249,8 @@ impl Peripheral for Iwdg {
     fn interrupts(&self, _active: &mut Vec<u16>) {}
 
     fn reset(&mut self) {
-        *self = Self::new(self.silicon);
+        let longest_between_feeds = self.longest_between_feeds;
+        *self = Self { longest_between_feeds, ..Self::new(self.silicon) };
     }
 }
 
@@ -279,6 +298,22 @@ mod tests {
         assert!(!dog.has_expired());
         dog.advance(Time(612 * MS));
         assert!(dog.has_expired());
+    }
+
+    /// Section 21.4.1: AAAAh reloads the counter. A time that ends in a reset is none.
+    #[test]
+    fn the_longest_time_between_two_feeds_stays_in_a_reset() {
+        let mut dog = started();
+        for ms in [100, 110, 370, 380] {
+            write(&mut dog, Time(ms * MS), &[(KR, 0xAAAA)]);
+        }
+        assert_eq!(dog.longest_between_feeds(), Span(260 * MS));
+        dog.advance(Time(800 * MS));
+        dog.reset();
+        write(&mut dog, Time(1_000 * MS), &[(KR, 0xCCCC), (KR, 0xAAAA)]);
+        assert_eq!(dog.longest_between_feeds(), Span(260 * MS));
+        write(&mut dog, Time(1_261 * MS), &[(KR, 0xAAAA)]);
+        assert_eq!(dog.longest_between_feeds(), Span(261 * MS));
     }
 
     /// RM0090 table 107: the times for RL = 0 and RL = FFFh at 32 kHz, by prescaler; section 21.3: AAAAh
