@@ -4,7 +4,7 @@
 //! memory map is in `shared-abi/src/layout/boards/`. To port coboot, create both files with `cargo
 //! xtask new-board`. All boards share the rest of the crate.
 //!
-//! On the host the crate has the values of a board, without the drivers.
+//! On the host the crate has the values of a board, without the drivers (`host.rs`).
 //!
 //! | file | what it does |
 //! |---|---|
@@ -42,6 +42,8 @@ pub mod clock;
 pub mod debugger;
 #[cfg(target_arch = "arm")]
 mod drivers;
+#[cfg(not(target_arch = "arm"))]
+mod host;
 mod identity;
 pub mod line;
 #[cfg(target_arch = "arm")]
@@ -74,6 +76,8 @@ pub mod watchdog;
 #[cfg(target_arch = "arm")]
 pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
 pub use facts::*;
+#[cfg(not(target_arch = "arm"))]
+pub use host::{cycles, inputs};
 pub use identity::{serial_number, unique_id, Identity};
 #[cfg(target_arch = "arm")]
 pub use pll::slow_down;

@@ -1,19 +1,21 @@
 //! The EDS files (CiA 306-1), which describe a device to a configuration tool.
 //!
-//! They are made from the tables of the firmware itself, so they cannot differ from it. Values that
-//! every image of a board shares come from its board file. `cargo xtask eds` writes them to
-//! `docs/eds/`.
+//! They are made from the tables and the product of the firmware itself (`bootloader/src/product.rs`,
+//! compiled for the host), so they cannot differ from it. Values that every image of a board shares come
+//! from its board file. `cargo xtask eds` writes them to `docs/eds/`.
 
 use std::fmt::Write;
 
 use app_template::entries as application;
-use boot_core::bootloader::{entries, entry_count, Extras};
-use boot_core::profile::Profile;
+use boot_core::bootloader::{entries, Extras};
+use boot_core::crc::CrcKind;
 use bsp::can::BitTiming;
 use canopen::device::Device;
 use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, Numbers, IDENTITY, PROGRAM_REGION};
-use shared_abi::renewal;
+use canopen::BitRate;
+
+use crate::product::{self, NodeSource, Product};
 
 /// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
 const DATE: &str = "11-21-2026";
@@ -21,119 +23,138 @@ const TIME: &str = "12:00AM";
 
 /// The serial number differs between devices.
 const SERIAL_NUMBER: Address = Address::new(IDENTITY, 4);
-
-/// The tables of the bootloader: standard and Paulus, ESAcademy, lift.
-static STANDARD: [Entry; len(extras(Profile::STANDARD))] =
-    entries(PROGRAMS, extras(Profile::STANDARD)).entries();
-static ESACADEMY: [Entry; len(extras(Profile::ESACADEMY))] =
-    entries(PROGRAMS, extras(Profile::ESACADEMY)).entries();
-static LIFT: [Entry; len(extras(Profile::LIFT))] = entries(PROGRAMS, extras(Profile::LIFT)).entries();
-
-/// The objects of a profile: the bootloader can be renewed where the layout has staging.
-const fn extras(profile: Profile) -> Extras {
-    let number = renewal::number(PROGRAMS, profile.download.data);
-    Extras { bootloader: if bsp::LAYOUT.staging.is_some() { Some(number) } else { None }, ..profile.extras }
-}
-
-/// The objects of a bootloader for sealed images.
-const SEALED: Extras = Extras { sealed: true, ..extras(Profile::STANDARD) };
-static SEALED_ENTRIES: [Entry; len(SEALED)] = entries(PROGRAMS, SEALED).entries();
-
-const fn len(extras: Extras) -> usize {
-    entry_count(PROGRAMS, extras)
-}
+/// The bit rates of an EDS file, in kbit/s (CiA 306-1).
+const BIT_RATES: [u32; 8] = [10, 20, 50, 125, 250, 500, 800, 1000];
 
 const PROGRAMS: u8 = bsp::LAYOUT.programs.len() as u8;
+/// More entries than any table has.
+const MANY: usize = 256;
 /// The table of the application.
 static APPLICATION: [Entry; application::entry_count(NUMBERS)] = application::entries(NUMBERS).entries();
 const NUMBERS: Numbers = application::numbers(bsp::LAYOUT);
 
+/// The product of a bootloader that names none.
+const DEFAULT: &str = "default";
+
 /// The description of one image for its EDS file.
 pub struct Image {
-    /// Name of the file in `docs/eds/`.
-    pub file: &'static str,
+    /// Name of the file.
+    pub file: String,
     /// A description in one line.
-    pub description: &'static str,
+    pub description: String,
     /// Its object dictionary.
-    pub entries: &'static [Entry],
+    pub entries: Vec<Entry>,
     /// Its device information. The serial number is not used.
     pub device: Device,
     /// Whether node-ID and bit rate can be set over the bus.
     pub lss: bool,
+    /// The bit rates at which it can run, in kbit/s.
+    pub bit_rates: Vec<u32>,
 }
 
-/// All images: the bootloader with each profile and for sealed images, and the application
-/// template.
+/// The images of `docs/eds/`: the bootloader with each profile and for sealed images, and the
+/// application template.
+///
+/// # Panics
+/// Never: the products exist.
 #[must_use]
-pub fn images() -> [Image; 6] {
-    [
-        bootloader(),
-        bootloader_of(
-            "coboot-bootloader-paulus.eds",
-            "coboot, the CANopen bootloader, as port's Paulus",
-            Profile::PAULUS,
-            &STANDARD,
-        ),
-        bootloader_of(
-            "coboot-bootloader-sealed.eds",
-            "coboot, the CANopen bootloader, for sealed images",
-            Profile::STANDARD,
-            &SEALED_ENTRIES,
-        ),
-        bootloader_of(
-            "coboot-bootloader-esacademy.eds",
-            "coboot, the CANopen bootloader, as that of ESAcademy",
-            Profile::ESACADEMY,
-            &ESACADEMY,
-        ),
-        bootloader_of(
-            "coboot-bootloader-lift.eds",
-            "coboot, the CANopen bootloader of a lift (CiA 417)",
-            Profile::LIFT,
-            &LIFT,
-        ),
+pub fn images() -> Vec<Image> {
+    let bootloader = |name, sealed| bootloader_of(name, sealed).expect("a product of the repository");
+    vec![
+        bootloader(DEFAULT, false),
+        bootloader("paulus", false),
+        bootloader(DEFAULT, true),
+        bootloader("esacademy", false),
+        bootloader("lift", false),
         application(),
     ]
 }
 
-/// The bootloader of the standard profile.
+/// The bootloader of the chosen product (`cargo xtask eds --product`), also for sealed images if it may take
+/// them; `None` for the default product, which [`images`] has.
 #[must_use]
-pub fn bootloader() -> Image {
-    bootloader_of("coboot-bootloader.eds", "coboot, the CANopen bootloader", Profile::STANDARD, &STANDARD)
+pub fn chosen() -> Option<Vec<Image>> {
+    let product = product::PRODUCT;
+    let may_seal = bsp::LAYOUT.home.is_some() && product.crc == CrcKind::Crc32 && !product.rom_loader;
+    let kinds = if may_seal { &[false, true][..] } else { &[false] };
+    (product::CHOSEN != DEFAULT)
+        .then(|| kinds.iter().map(|sealed| bootloader(product::CHOSEN, &product, *sealed)).collect())
 }
 
-/// The bootloader. The tests compare these values with its `main.rs` over the bus.
-fn bootloader_of(
-    file: &'static str,
-    description: &'static str,
-    profile: Profile,
-    entries: &'static [Entry],
-) -> Image {
+/// The bootloader of the default product.
+///
+/// # Panics
+/// Never: the product exists.
+#[must_use]
+pub fn default_bootloader() -> Image {
+    bootloader_of(DEFAULT, false).expect("a product of the repository")
+}
+
+/// The bootloader of a product in `bootloader/products`.
+#[must_use]
+pub fn bootloader_of(name: &str, sealed: bool) -> Option<Image> {
+    let (_, product) = product::ALL.iter().find(|(product, _)| *product == name)?;
+    Some(bootloader(name, &product.clone().checked(), sealed))
+}
+
+/// The bootloader of a product, with the feature `sealed` or without. The tests compare the values with its
+/// `main.rs` over the bus.
+fn bootloader(name: &str, product: &Product, sealed: bool) -> Image {
+    let (mut file, mut description) = ("coboot-bootloader".to_owned(), DESCRIPTION.to_owned());
+    let mut software_version = concat!("coboot ", env!("CARGO_PKG_VERSION")).to_owned();
+    if sealed {
+        file += "-sealed";
+        description += ", for sealed images";
+    }
+    if name != DEFAULT {
+        write!(file, "-{name}").expect("a string takes everything");
+        write!(description, ", product {name}").expect("a string takes everything");
+        write!(software_version, " {name}").expect("a string takes everything");
+    }
+    let extras = Extras { sealed, ..product.extras() };
+    let is_fixed =
+        !product.lss && !product.auto_bit_rate && !matches!(product.node_source, NodeSource::Function(_));
+    let own =
+        product.profile.default_node.map_or(bsp::BIT_RATE, |(_, rate)| rate.bits_per_second().unwrap_or(0));
+    let has = |kbit: &u32| {
+        let rate = BitRate::from_bits_per_second(kbit * 1000);
+        let is_allowed = rate.is_some_and(|rate| product.bit_rates.contains(&(rate as u8)));
+        is_allowed && can_run_at(kbit * 1000) && (!is_fixed || kbit * 1000 == own)
+    };
     Image {
-        file,
+        file: file + ".eds",
         description,
-        entries,
+        entries: entries::<MANY>(PROGRAMS, extras).parts().to_vec(),
         device: Device {
-            device_type: profile.device_type,
-            software_version: concat!("coboot ", env!("CARGO_PKG_VERSION")),
-            heartbeat_ms: 1000,
+            device_type: product.profile.device_type,
+            software_version: software_version.leak(),
+            heartbeat_ms: product.heartbeat_ms,
             ..BOARD
         },
-        lss: true,
+        lss: product.lss,
+        bit_rates: BIT_RATES.into_iter().filter(has).collect(),
     }
 }
+
+const DESCRIPTION: &str = "coboot, the CANopen bootloader";
 
 /// The application template, version 1. The tests compare these values with its `objects.rs` over
 /// the bus.
 #[must_use]
 pub fn application() -> Image {
     Image {
-        file: "coboot-application.eds",
-        description: "The application template of coboot",
-        entries: &APPLICATION,
+        file: "coboot-application.eds".to_owned(),
+        description: "The application template of coboot".to_owned(),
+        entries: APPLICATION.to_vec(),
         device: Device { device_type: 0, software_version: "1.0.0", heartbeat_ms: 500, ..BOARD },
         lss: true,
+        bit_rates: BIT_RATES.into_iter().filter(|kbit| can_run_at(kbit * 1000)).collect(),
     }
+}
+
+/// Whether the board's CAN controller can run at this bit rate: its own, and those that its clock allows.
+fn can_run_at(bit_rate: u32) -> bool {
+    bit_rate == bsp::BIT_RATE || BitTiming::new(bsp::CAN_CLOCK, bit_rate).is_some()
 }
 
 /// The values of the board file.
@@ -189,11 +210,11 @@ impl Image {
     /// The sections before the objects.
     fn about(&self, eds: &mut Ini) {
         eds.section("FileInfo");
-        eds.line("FileName", self.file);
+        eds.line("FileName", &self.file);
         eds.line("FileVersion", 1);
         eds.line("FileRevision", 0);
         eds.line("EDSVersion", "4.0");
-        eds.line("Description", self.description);
+        eds.line("Description", &self.description);
         for what in ["Creation", "Modification"] {
             eds.line(format_args!("{what}Time"), TIME);
             eds.line(format_args!("{what}Date"), DATE);
@@ -208,8 +229,8 @@ impl Image {
         eds.line("ProductNumber", format_args!("0x{:08X}", self.device.product_code));
         eds.line("RevisionNumber", format_args!("0x{:08X}", self.device.revision));
         eds.line("OrderCode", "");
-        for kbit in [10, 20, 50, 125, 250, 500, 800, 1000] {
-            eds.line(format_args!("BaudRate_{kbit}"), u8::from(self.supports(kbit * 1000)));
+        for kbit in BIT_RATES {
+            eds.line(format_args!("BaudRate_{kbit}"), u8::from(self.bit_rates.contains(&kbit)));
         }
         eds.line("SimpleBootUpMaster", 0);
         eds.line("SimpleBootUpSlave", 1);
@@ -231,11 +252,6 @@ impl Image {
         eds.line("Lines", 2);
         eds.line("Line1", format_args!("{}, on the board {}.", self.description, bsp::LAYOUT.board));
         eds.line("Line2", "Made from the table that the firmware serves; change that, not this.");
-    }
-
-    /// The board's own bit rate; with LSS every bit rate that its clock allows.
-    fn supports(&self, bit_rate: u32) -> bool {
-        bit_rate == bsp::BIT_RATE || self.lss && BitTiming::new(bsp::CAN_CLOCK, bit_rate).is_some()
     }
 
     /// An object and its parts.

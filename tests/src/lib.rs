@@ -12,6 +12,9 @@ pub mod listener;
 pub mod masters;
 pub mod node;
 pub mod powercut;
+/// The choices of the bootloader's products, as the firmware has them (build.rs makes the list).
+#[path = "../../bootloader/src/product.rs"]
+mod product;
 pub mod renewal;
 pub mod script;
 pub mod sealed;

@@ -314,6 +314,12 @@ impl<const LEN: usize> Table<LEN> {
         self
     }
 
+    /// The entries so far: for a tool that makes tables of several devices.
+    #[must_use]
+    pub fn parts(&self) -> &[Entry] {
+        &self.entries[..self.len]
+    }
+
     /// The complete table.
     ///
     /// # Panics

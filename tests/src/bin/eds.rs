@@ -1,4 +1,5 @@
-//! Writes the EDS files to a folder: `cargo xtask eds`.
+//! Writes the EDS files to a folder, of the product of the build if it is not the default one: `cargo xtask
+//! eds`.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -12,8 +13,12 @@ fn main() -> ExitCode {
         eprintln!("usage: eds FOLDER");
         return ExitCode::from(2);
     };
-    for image in eds::images() {
-        let path = Path::new(folder).join(image.file);
+    if let Err(error) = fs::create_dir_all(folder) {
+        eprintln!("{folder}: {error}");
+        return ExitCode::FAILURE;
+    }
+    for image in eds::chosen().unwrap_or_else(eds::images) {
+        let path = Path::new(folder).join(&image.file);
         if let Err(error) = fs::write(&path, image.eds()) {
             eprintln!("{}: {error}", path.display());
             return ExitCode::FAILURE;
