@@ -36,6 +36,10 @@ use crate::variant::{self, Variant};
 pub const BOOT_ALIAS: u32 = 0;
 /// The pages of the system memory, and behind it of the unique ID and the flash size.
 pub const SYSTEM: Region = Region::new(SYSTEM_MEMORY.base, 8 * PAGE);
+/// The one-time programmable bytes, 16 blocks of 32 and a lock byte for each (RM0090 section 3.8).
+pub const OTP: Region = Region::new(0x1FFF_7800, OTP_BLOCKS * OTP_BLOCK + OTP_BLOCKS);
+const OTP_BLOCKS: u32 = 16;
+const OTP_BLOCK: u32 = 32;
 const UNIQUE_ID: u32 = 0x1FFF_7A10;
 const FLASH_SIZE: u32 = 0x1FFF_7A22;
 /// Page of the option bytes.
@@ -235,7 +239,7 @@ pub struct Chip {
     pub sram: HostMemory,
     /// Core-coupled memory.
     pub ccm: HostMemory,
-    /// The pages with system memory, unique ID and flash size. ST's loader is not there: the system memory is
+    /// The pages with system memory, one-time programmable bytes, unique ID and flash size. ST's loader is not there: the system memory is
     /// empty, unless a test puts a program there.
     pub system: HostMemory,
     /// The page with the option bytes.
@@ -319,6 +323,23 @@ impl Chip {
             is_halved: false,
             lines: Vec::new(),
         }
+    }
+
+    /// Programs one-time programmable bytes as a debug probe does: a bit only goes from 1 to 0, and one of a
+    /// locked block stays. Returns whether all of these blocks could be programmed. `address` and the bytes
+    /// are in [`OTP`].
+    pub fn program_otp(&mut self, address: u32, bytes: &[u8]) -> bool {
+        let otp = &mut self.system.bytes_mut()[(OTP.base - SYSTEM.base) as usize..][..OTP.size as usize];
+        let (data, locks) = otp.split_at_mut((OTP_BLOCKS * OTP_BLOCK) as usize);
+        let mut is_open = true;
+        for (offset, byte) in ((address - OTP.base) as usize..).zip(bytes) {
+            match data.get_mut(offset) {
+                Some(_) if locks[offset / OTP_BLOCK as usize] == 0 => is_open = false,
+                Some(cell) => *cell &= byte,
+                None => locks[offset - data.len()] &= byte,
+            }
+        }
+        is_open
     }
 
     /// The memory at an address from 0 on, and its address there: flash, or the system memory.

@@ -26,8 +26,8 @@ use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Pro
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
-    counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS, PRIVATE,
-    SRAM_ALIAS, SYSTEM,
+    counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
+    PRIVATE, SRAM_ALIAS, SYSTEM,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
@@ -1535,8 +1535,12 @@ fn on_protected_write(uc: &mut Unicorn<'_, State>, address: u32, size: usize, va
         let bytes = value.to_le_bytes();
         chip.store_flash(address, &bytes[..size.min(8)], pc);
     } else {
-        let what = "read-only memory: the write is lost".into();
-        chip.report(Access::Write, address, size as u8, value as u32, pc, what);
+        let what = if OTP.contains(address, 1) {
+            "one-time programmable bytes, which only a debug probe programs here: the write is lost"
+        } else {
+            "read-only memory: the write is lost"
+        };
+        chip.report(Access::Write, address, size as u8, value as u32, pc, what.into());
     }
     forget_it_state(uc);
     true

@@ -8,8 +8,8 @@ use std::collections::BTreeSet;
 use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 
 use crate::bxcan::BxCan;
-use crate::chip::Chip;
 pub use crate::chip::Counters;
+use crate::chip::{Chip, OTP};
 use crate::cpu::{Cpu, Entry, Exit};
 pub use crate::error::Error;
 use crate::noise::Noise;
@@ -67,6 +67,11 @@ enum Activity {
 /// architecture allows WFE to end for no reason (DDI 0403E B1.5.18).
 const DOZE: Span = Span::from_micros(10);
 
+/// Whether these are one-time programmable bytes, or lock bytes of them.
+fn is_otp(address: u32, len: usize) -> bool {
+    u32::try_from(len).is_ok_and(|len| OTP.contains(address, len))
+}
+
 /// The pin WKUP is PA0 (datasheet, pin definitions).
 const WKUP: (usize, u8) = (0, 0);
 
@@ -117,7 +122,7 @@ impl Machine {
     }
 
     fn load_segments(&mut self, segments: &[image::Segment]) -> Result<Vec<(u32, u32)>, Error> {
-        for segment in segments {
+        for segment in segments.iter().filter(|segment| !is_otp(segment.address, segment.bytes.len())) {
             self.check_flash(segment.address, segment.bytes.len())?;
         }
         for segment in segments {
@@ -127,11 +132,17 @@ impl Machine {
         Ok(segments.iter().map(|segment| (segment.address, len(segment))).collect())
     }
 
-    /// Stores bytes in flash as a debug probe does.
+    /// Stores bytes in flash, or in the one-time programmable (OTP) bytes, as a debug probe does.
     ///
     /// # Errors
-    /// [`Error::Address`] where they are not all in flash.
+    /// [`Error::Address`] where they are not all in flash or in open blocks of the OTP bytes.
     pub fn load_bin(&mut self, address: u32, bytes: &[u8]) -> Result<(), Error> {
+        if is_otp(address, bytes.len()) {
+            let is_open = self.cpu.chip_mut().program_otp(address, bytes);
+            let wanted = "blocks of the OTP bytes that are not locked";
+            let refused = Error::Address { address, len: bytes.len(), wanted };
+            return if is_open { Ok(()) } else { Err(refused) };
+        }
         let offset = self.check_flash(address, bytes.len())?;
         let chip = self.cpu.chip_mut();
         chip.flash.preset(offset, bytes);

@@ -1048,6 +1048,37 @@ fn the_chip_says_who_it_is() {
     assert_eq!(word(&machine, 0x0000_0000), STACK, "flash is aliased at 0");
 }
 
+/// RM0090 section 3.8 and table 18: blocks of 32 bytes from 1FFF_7800h on, a lock byte for each from 1FFF_7A00h on; no
+/// erase. A program here cannot program them.
+#[test]
+fn one_time_programmable_bytes_are_a_debug_probes_to_program() {
+    // movw r0, #7820h; movt r0, #1FFFh; str r0, [r0]; ldr r1, [r0]; movs r2, #1; lsls r2, r2, #29; str r1, [r2];
+    // b . (ARMv7-M A7.7)
+    let code: [u16; 10] = [0xF647, 0x0020, 0xF6C1, 0x70FF, 0x6000, 0x6801, 0x2201, 0x0752, 0x6011, 0xE7FE];
+    let program = Program { base: 0x0800_0200, vectors: Vec::new(), code: bytes(&code) };
+    let mut machine = machine(&program);
+    assert_eq!(machine.run_until(ms(1)), Stop::Deadline);
+    let reports: Vec<_> = machine.reports().iter().map(|report| (report.access, report.address)).collect();
+    assert_eq!(reports, [(Access::Write, 0x1FFF_7820)]);
+    assert_eq!(words(&machine, 1), [u32::MAX], "erased");
+
+    machine.load_bin(0x1FFF_7820, &[0x12, 0x34, 0x56, 0x78]).unwrap();
+    machine.load_hex(":020000041FFFDC\n:0179E0000F97\n:00000001FF\n").unwrap();
+    machine.power_on(ms(2));
+    machine.run_until(ms(3));
+    assert_eq!(words(&machine, 1), [0x7856_3412]);
+    assert_eq!(word(&machine, 0x1FFF_79E0), 0xFFFF_FF0F);
+    // A bit only goes from 1 to 0, and none of a locked block.
+    machine.load_bin(0x1FFF_7820, &[0xF0, 0xFF]).unwrap();
+    assert_eq!(word(&machine, 0x1FFF_7820), 0x7856_3410);
+    machine.load_bin(0x1FFF_7A01, &[0]).unwrap();
+    assert!(machine.load_bin(0x1FFF_783C, &[0; 8]).is_err());
+    assert_eq!([0x1FFF_783C, 0x1FFF_7840].map(|address| word(&machine, address)), [u32::MAX, 0]);
+    for (address, len) in [(0x1FFF_77FF, 2), (0x1FFF_7A0F, 2), (0x1FFF_7A10, 4)] {
+        assert!(machine.load_bin(address, &vec![0; len]).is_err(), "{address:X}");
+    }
+}
+
 #[test]
 fn where_in_ram_a_piece_of_code_goes_is_told() {
     let program = &programs::STORES_AND_SLEEPS;
