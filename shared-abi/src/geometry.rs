@@ -11,7 +11,7 @@ mod chips;
 mod line;
 mod pins;
 
-pub use chip::{Geometry, Region, Sector, SectorRun, CORE_VECTORS, CORE_VECTORS_SIZE, SYSTEM_MEMORY};
+pub use chip::{Geometry, Region, Sector, SectorRun, CORE_VECTORS, CORE_VECTORS_SIZE, OTP, SYSTEM_MEMORY};
 pub use chips::*;
 pub use line::{Limits, Line};
 pub use pins::{is_debug_pin, CanLine, Pin};

@@ -12,6 +12,7 @@
 //! | [`handoff`] | information from the bootloader to the application about the start |
 //! | [`label`] | the target, version and date in a program image |
 //! | [`date`] | the creation date of a program |
+//! | [`nameplate`] | the identity of the device in the one-time programmable bytes of its chip |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
 //! | [`ram_image`] | the part of the bootloader that runs from RAM, as it is in flash |
@@ -38,6 +39,7 @@ pub mod handoff;
 pub mod label;
 pub mod layout;
 pub mod memory_map;
+pub mod nameplate;
 pub mod ram_image;
 #[cfg(target_arch = "arm")]
 pub mod reentry;

@@ -97,11 +97,14 @@ pub struct Geometry {
 
 const KIB: u32 = 1024;
 
-/// Number of the core's vectors, which precede those of the interrupts: the initial stack pointer,
 /// The system memory, a ROM with a loader of ST: the same on every chip (RM0090 section 3.4, RM0390, RM0402 and
 /// RM0430 section 3.3).
 pub const SYSTEM_MEMORY: Region = Region::new(0x1FFF_0000, 30 * 1024);
+/// The one-time programmable bytes after it: 16 blocks of 32 bytes, the same on every chip (RM0090 section 3.8;
+/// tables "Flash module organization" of RM0390, RM0402 and RM0430). A lock byte for each block follows them.
+pub const OTP: Region = Region::new(0x1FFF_7800, 512);
 
+/// Number of the core's vectors, which precede those of the interrupts: the initial stack pointer,
 /// Reset and the other exceptions (ARMv7-M B1.5.3).
 pub const CORE_VECTORS: u32 = 16;
 /// Size of these vectors in bytes.
