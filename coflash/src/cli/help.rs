@@ -108,7 +108,7 @@ const RARE: [&str; 39] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 35] = [
+const EXAMPLES: [(&str, &str); 36] = [
     (
         "",
         "\
@@ -187,6 +187,13 @@ Examples:
         "\
 Examples:
   coflash provision bootloader-sealed.elf --board stm32f407g-disc1 --root root.pub -o production.hex",
+    ),
+    (
+        "nameplate",
+        "\
+Examples:
+  coflash nameplate plate.hex --vendor 0x123 --product 0x5EA10007 --revision 0x00020003 --lock
+  coflash nameplate plate.hex --vendor 0x123 --product 0x5EA10007 --revision 0x00020004 --block 1",
     ),
     (
         "scan",

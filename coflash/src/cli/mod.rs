@@ -36,6 +36,7 @@ mod legacy;
 mod lss;
 mod many;
 mod monitor;
+mod nameplate;
 mod nmt;
 mod objects;
 mod output;
@@ -125,6 +126,7 @@ enum Command {
     VerifyDevice(verify_device::VerifyDevice),
     Show(verify::Show),
     Provision(provision::Provision),
+    Nameplate(nameplate::MakeNameplate),
     Flash(Box<flash::Flash>),
     Adapters(adapters::Adapters),
     Scan(scan::Scan),
@@ -168,6 +170,7 @@ impl Command {
                 | Self::Verify(_)
                 | Self::Show(_)
                 | Self::Provision(_)
+                | Self::Nameplate(_)
                 | Self::Adapters(_)
                 | Self::Completions(_)
                 | Self::Man(_)
@@ -187,6 +190,7 @@ impl Command {
             Self::VerifyDevice(verify) => verify.run(context),
             Self::Show(show) => show.run(context),
             Self::Provision(provision) => provision.run(context),
+            Self::Nameplate(nameplate) => nameplate.run(context),
             Self::Flash(flash) => flash.run(context),
             Self::Adapters(adapters) => adapters.run(context),
             Self::Scan(scan) => scan.run(context),

@@ -13,6 +13,7 @@ pub mod inspect;
 pub mod judge;
 pub mod label;
 pub mod limit;
+pub mod nameplate;
 mod note;
 pub mod ram_image;
 mod range;

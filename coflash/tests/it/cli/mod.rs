@@ -17,6 +17,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Duration;
 
+use coflash::file::ihex;
+
 use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
 use crate::tool::{coflash, data, folder, run, serve, snapshot};
 
@@ -115,6 +117,52 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
         assert_eq!(done.err.contains("cannot change a block file"), warns, "{options:?}: {}", done.err);
         assert!(fs::read(&out).unwrap() == fs::read(&input).unwrap());
     }
+}
+
+/// The bytes of `tests/abi/layout.rs`, whose check word comes from an implementation in another language; addresses of
+/// RM0090 section 3.8, table 18.
+#[test]
+fn a_nameplate_goes_into_its_block() {
+    const PLATE: [u8; 32] =
+        *b"CBNP\x23\x01\0\0\x07\0\xA1\x5E\x03\0\x02\0\x40\xE2\x01\0\0\0\0\0\0\0\0\0\xFE\x3F\x2A\x54";
+    let folder = folder("nameplate");
+    let out = folder.path("plate.hex");
+    let numbers = ["--vendor", "0x123", "--product", "0x5EA10007", "--revision", "0x00020003"];
+    let make = |more: &[&str]| coflash(&[&["nameplate", &out][..], &numbers, more].concat());
+    for (more, address, locks) in [
+        (&["--serial", "123456"][..], 0x1FFF_7800, 0),
+        (&["--serial", "123456", "--lock"], 0x1FFF_7800, 16),
+        (&["--serial", "123456", "--block", "14", "--lock"], 0x1FFF_79C0, 2),
+    ] {
+        let done = make(more);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let image = ihex::read(&fs::read(&out).unwrap()).unwrap();
+        assert_eq!(image.bytes(address), Some(PLATE));
+        // The lock bytes are those up to 1FFF_7A0Fh.
+        for lock in 0x1FFF_7A10 - locks..0x1FFF_7A10 {
+            assert_eq!(image.bytes(lock), Some([0]), "{lock:X}");
+        }
+        assert_eq!(image.byte_count(), 32 + u64::from(locks));
+    }
+    let done = make(&["--json"]);
+    assert!(
+        done.out.contains(r#""serial_number":0"#) && done.out.contains(r#""locked":false"#),
+        "{}",
+        done.out
+    );
+    assert!(
+        ihex::read(&fs::read(&out).unwrap()).unwrap().bytes(0x1FFF_781C) == Some([0xEC, 0x22, 0x54, 0x33])
+    );
+    for (more, words) in [
+        (&["--block", "16"][..], "0..=15"),
+        (&["--serial", "0x100000000"], "it is not a number of up to 32 bits"),
+    ] {
+        let done = make(more);
+        assert!(done.exit == 2 && done.err.contains(words), "{}", done.err);
+    }
+    // What it makes is nothing for a device's flash.
+    let done = coflash(&["convert", &out, &folder.path("none.blk"), "--board", "stm32f407g-disc1"]);
+    assert!(done.exit == 3 && done.err.contains("one-time programmable"), "{} {}", done.exit, done.err);
 }
 
 /// Each fault of a file comes with something that the user can do.
