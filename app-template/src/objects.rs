@@ -17,6 +17,7 @@ use canopen::slave::Slave;
 use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
 use coboot_app::callgate::PROGRAM_SIGNED;
+use coboot_app::nameplate::Nameplate;
 use coboot_app::rules::Command;
 use coboot_app::warm_start::{BootRequest, Owed};
 use coboot_app::{Answer, Bootloader, Next, ProgramControl, ReentryPath, Services, Start};
@@ -28,6 +29,8 @@ use crate::entries::{entries, entry_count, numbers, CONFIRMATION, REENTRY_PATH};
 const DEVICE_TYPE: u32 = 0;
 /// 1017h, in ms.
 pub const HEARTBEAT_MS: u16 = 500;
+/// 1018h/1 to 3, from the board file.
+const BOARD: Nameplate = Nameplate::new(IDENTITY.vendor_id, IDENTITY.product_code, IDENTITY.revision, 0);
 /// 80h to 1F51h: a master calls the bootloader (SYS TEC manual L-1112d_10, table 2).
 const START_BOOTLOADER: u8 = Command::StartBootloader as u8;
 
@@ -62,15 +65,17 @@ impl Application {
     /// Builds the state from the bootloader's values. Asks the bootloader for the CRC over this
     /// program, once. `software_version` is 100Ah.
     pub fn new(start: &Start, bit_rate: BitRate, software_version: &'static str) -> Self {
+        // A bootloader that has another identity from the nameplate of the device shows that one.
+        let Nameplate { vendor_id, product_code, revision, .. } = start.nameplate().unwrap_or(BOARD);
         let device = Device {
             device_type: DEVICE_TYPE,
             name: IDENTITY.device_name,
             hardware_version: IDENTITY.hardware_version,
             software_version,
             heartbeat_ms: HEARTBEAT_MS,
-            vendor_id: IDENTITY.vendor_id,
-            product_code: IDENTITY.product_code,
-            revision: IDENTITY.revision,
+            vendor_id,
+            product_code,
+            revision,
             serial_number: start.serial_number,
         };
         let control = ProgramControl::new(start, NUMBERS.programs, BOOTLOADER.program_crc(start.program));

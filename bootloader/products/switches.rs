@@ -22,6 +22,7 @@ pub const PRODUCT: Product = Product {
     lss_start_in_configuration: true,
     lss_announce: true,
     lss_store: false,
+    identity: IdentitySource::Otp,
     erase: Some(|_| Erase::AtOnce),
     ..Product::DEFAULT
 };

@@ -50,17 +50,19 @@ mod app {
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
-    use boot_core::control::{Room, Sealed, Step};
+    use boot_core::control::{Renewal, Room, Sealed, Step};
     use boot_core::store::NodeParameters;
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
     use bsp::hal::rcc::RccExt;
     use bsp::{line, pac, CanPort, IDENTITY, LAYOUT};
+    use core::mem::MaybeUninit;
     use core::ops::RangeInclusive;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
+    use shared_abi::nameplate::Nameplate;
     use shared_abi::services::{StoreState, STORE_STATE_WORDS};
     use shared_abi::warm_start::{BootRequest, Owed, TrialStep, WarmStart};
 
@@ -85,6 +87,8 @@ mod app {
     const ENTRY_COUNT: usize = entry_count(PROGRAMS as u8, EXTRAS) + debugger::ENTRIES.len();
     static ENTRIES: [Entry; ENTRY_COUNT] = entries(PROGRAMS as u8, EXTRAS).with(&debugger::ENTRIES).entries();
 
+    const RENEWAL: Renewal = product::renewal(&product::BOARD);
+
     static CONFIG: bootloader::Config = bootloader::Config {
         entries: &ENTRIES,
         device: Device {
@@ -103,7 +107,7 @@ mod app {
         layout: LAYOUT,
         supports: product::supports,
         boot_up_emergency: PRODUCT.boot_up_emergency,
-        download: PRODUCT.download(),
+        download: PRODUCT.download(&product::BOARD, &RENEWAL),
         password: PRODUCT.profile.password,
     };
 
@@ -154,7 +158,27 @@ mod app {
         at: Option<Instant>,
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS])])]
+    /// The configuration of a device whose identity is not the board's.
+    struct Own {
+        config: MaybeUninit<bootloader::Config>,
+        renewal: MaybeUninit<Renewal>,
+    }
+
+    impl Own {
+        const NONE: Self = Self { config: MaybeUninit::uninit(), renewal: MaybeUninit::uninit() };
+
+        fn of(&'static mut self, device: &Nameplate) -> &'static bootloader::Config {
+            let renewal = self.renewal.write(product::renewal(device));
+            let Nameplate { vendor_id, product_code, revision, .. } = *device;
+            self.config.write(bootloader::Config {
+                device: Device { vendor_id, product_code, revision, ..CONFIG.device },
+                download: PRODUCT.download(device, renewal),
+                ..CONFIG
+            })
+        }
+    }
+
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS]), own: [Own; product::HAS_NAMEPLATE as usize] = [const { Own::NONE }; product::HAS_NAMEPLATE as usize]])]
     fn init(mut cx: init::Context) -> (Shared, Local) {
         // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
@@ -193,9 +217,14 @@ mod app {
             }),
             is_silent: clock == Source::Internal && PRODUCT.crystal_failure == CrystalFailure::Silent,
         };
+        let nameplate = product::nameplate();
+        let config = match (cx.local.own.first_mut(), &nameplate) {
+            (Some(own), Some(device)) => own.of(device),
+            _ => &CONFIG,
+        };
         let mut bootloader = Bootloader::new(
-            &CONFIG,
-            bsp::serial_number(),
+            config,
+            product::serial_number(nameplate.as_ref()),
             node,
             &report,
             parameters,

@@ -19,6 +19,7 @@ use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
+use shared_abi::nameplate::Nameplate;
 use shared_abi::ram_image::feature;
 use shared_abi::renewal;
 use shared_abi::services::Facts;
@@ -127,6 +128,9 @@ pub struct Product {
     /// Whether date and time of the program can be read (1F52h), in the bootloader and in the program; on
     /// boards with the split map alone.
     pub program_date: bool,
+    /// Where vendor-ID, product code, revision and serial number (1018h) come from
+    /// (`BLCOP_IDENTITY_VENDORID` to `BLCOP_IDENTITY_SERIALNR`).
+    pub identity: IdentitySource,
     /// Whether vendor-ID and product code of a program must be the device's
     /// (`BLCOP_IDENTITY_CHECK`).
     pub identity_check: bool,
@@ -214,6 +218,7 @@ impl Product {
         resume: LAYOUT.home.is_some(),
         read_back: LAYOUT.home.is_some(),
         program_date: LAYOUT.home.is_some(),
+        identity: IdentitySource::Board,
         identity_check: true,
         check: |_, _| Verdict::Standard,
         programming_allowed: || true,
@@ -360,14 +365,11 @@ impl Product {
         self
     }
 
-    /// The policy for downloads: the profile's rules with the product's choices.
-    pub const fn download(&self) -> Policy {
+    /// The policy for downloads to a device of this identity: the profile's rules with the product's
+    /// choices.
+    pub const fn download(&self, device: &Nameplate, renewal: &'static Renewal) -> Policy {
         Policy {
-            identity: if self.identity_check {
-                Some((IDENTITY.vendor_id, IDENTITY.product_code))
-            } else {
-                None
-            },
+            identity: if self.identity_check { Some((device.vendor_id, device.product_code)) } else { None },
             check: self.check,
             allowed: self.programming_allowed,
             erase: match self.erase {
@@ -376,9 +378,9 @@ impl Product {
             },
             crc: self.crc,
             crc_step: self.crc_step,
-            seal: if SEALED { self.seal() } else { SealPolicy::NONE },
+            seal: if SEALED { self.seal(device) } else { SealPolicy::NONE },
             read_back: self.reads_back(),
-            renewal: if self.renewal { Some(&RENEWAL) } else { None },
+            renewal: if self.renewal { Some(renewal) } else { None },
             ..self.profile.download
         }
     }
@@ -410,12 +412,12 @@ impl Product {
         self.read_back && self.profile.extras.read_back
     }
 
-    /// The values with which sealed images are checked.
-    const fn seal(&self) -> SealPolicy {
+    /// The values with which a device of this identity checks sealed images.
+    const fn seal(&self, device: &Nameplate) -> SealPolicy {
         SealPolicy {
-            vendor_id: IDENTITY.vendor_id,
-            product_code: IDENTITY.product_code,
-            revision: IDENTITY.revision,
+            vendor_id: device.vendor_id,
+            product_code: device.product_code,
+            revision: device.revision,
             data: self.profile.download.data,
             unique_id: bsp::unique_id,
             cycles: bsp::cycles,
@@ -436,6 +438,16 @@ impl Product {
             start_allowed: self.start_allowed,
         }
     }
+}
+
+/// The source of the device's identity.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IdentitySource {
+    /// The board file, for all devices; the serial number is a fold of the chip's unique identifier.
+    Board,
+    /// The nameplate that the production line of an OEM has written into the one-time programmable (OTP)
+    /// bytes of the chip ([`shared_abi::nameplate`]). A device without a good one has the identity of `Board`.
+    Otp,
 }
 
 /// The source of node-ID and bit rate.
@@ -495,14 +507,38 @@ const fn first_two(list: &[u8]) -> [u8; 2] {
 /// This product.
 pub const PRODUCT: Product = chosen::PRODUCT.checked();
 
-/// The values for a renewal of the bootloader.
-const RENEWAL: Renewal = Renewal {
-    board: BOARD_IDENTITY,
-    features: FEATURES,
-    identity: Some((IDENTITY.vendor_id, IDENTITY.product_code)),
-    revision: IDENTITY.revision,
-    confirm_within_s: PRODUCT.renewal_s,
-};
+/// The values for a renewal of the bootloader in a device of this identity.
+pub const fn renewal(device: &Nameplate) -> Renewal {
+    Renewal {
+        board: BOARD_IDENTITY,
+        features: FEATURES,
+        identity: Some((device.vendor_id, device.product_code)),
+        revision: device.revision,
+        confirm_within_s: PRODUCT.renewal_s,
+    }
+}
+
+/// The identity of the board file, with the chip's serial number.
+pub const BOARD: Nameplate = Nameplate::new(IDENTITY.vendor_id, IDENTITY.product_code, IDENTITY.revision, 0);
+
+/// Whether a device may have an identity that is not the board's.
+pub const HAS_NAMEPLATE: bool = matches!(PRODUCT.identity, IdentitySource::Otp);
+
+/// The nameplate of this device, if the product has one.
+pub fn nameplate() -> Option<Nameplate> {
+    match PRODUCT.identity {
+        IdentitySource::Board => None,
+        IdentitySource::Otp => bsp::nameplate(),
+    }
+}
+
+/// 1018h/4 of this device.
+pub fn serial_number(nameplate: Option<&Nameplate>) -> u32 {
+    match nameplate {
+        Some(&Nameplate { serial_number: number @ 1.., .. }) => number,
+        _ => bsp::serial_number(),
+    }
+}
 
 /// The choices that the resident part decides by and that the RAM image shares.
 pub const FACTS: Facts = Facts {
@@ -517,7 +553,8 @@ pub const FACTS: Facts = Facts {
     bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
         | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
     abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 }
-        | if PRODUCT.rom_loader { Facts::ROM_LOADER } else { 0 },
+        | if PRODUCT.rom_loader { Facts::ROM_LOADER } else { 0 }
+        | if HAS_NAMEPLATE { Facts::NAMEPLATE } else { 0 },
     sdo_request_base: PRODUCT.sdo_request_base,
     sdo_response_base: PRODUCT.sdo_response_base,
 };

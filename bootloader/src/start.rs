@@ -8,7 +8,7 @@ use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Header};
 use shared_abi::services::{self, Facts};
 
-use crate::product::{BOARD_IDENTITY, FACTS, FEATURES, PRODUCT, SEALED};
+use crate::product::{BOARD_IDENTITY, FACTS, FEATURES, HAS_NAMEPLATE, PRODUCT, SEALED};
 
 /// The bytes of the resident part: of the released one that the product names, or a fresh one.
 const BYTES: &[u8] = match PRODUCT.resident {
@@ -41,6 +41,7 @@ const _: () = {
     );
     let differs = facts.abilities ^ FACTS.abilities;
     assert!(differs & Facts::ROM_LOADER == 0, "product: `resident` has another rom_loader");
+    assert!(differs & Facts::NAMEPLATE == 0, "product: `resident` has another identity");
     assert!(differs == 0, "product: `resident` has another renewal");
 };
 
@@ -65,6 +66,10 @@ global_asm!(
     reset = const services::word(BYTES, 4).unwrap(),
 );
 
+/// Vendor-ID and product code of the devices that the RAM image is for. With nameplates one image serves the
+/// devices of all of them: 0 is any.
+const FOR: (u32, u32) = if HAS_NAMEPLATE { (0, 0) } else { (IDENTITY.vendor_id, IDENTITY.product_code) };
+
 // The header of the RAM image. The build writes the second word, the CRC, after the link. It is in
 // assembly, because the linker knows the image's size.
 global_asm!(
@@ -80,8 +85,8 @@ global_asm!(
     services = const ram_image::SERVICES_VERSION,
     features = const FEATURES,
     board = const BOARD_IDENTITY,
-    vendor = const IDENTITY.vendor_id,
-    product = const IDENTITY.product_code,
+    vendor = const FOR.0,
+    product = const FOR.1,
     revisions = const PRODUCT.bootloader_revisions,
     version = const crate::product::VERSION,
     counter = const PRODUCT.bootloader_counter,

@@ -1,5 +1,8 @@
 //! Who the device is.
 
+use shared_abi::geometry::OTP;
+use shared_abi::nameplate::{Nameplate, Words};
+
 /// The device's identity in 1008h–100Ah and 1018h, for bootloader and application.
 #[derive(Clone, Copy, Debug)]
 pub struct Identity {
@@ -38,4 +41,12 @@ pub fn unique_id() -> [u8; 12] {
 #[must_use]
 pub fn serial_number() -> u32 {
     shared_abi::check_word(&unique_words())
+}
+
+/// The identity that the production line has written into the one-time programmable bytes of the chip; `None` if
+/// there is none.
+#[must_use]
+pub fn nameplate() -> Option<Nameplate> {
+    // SAFETY: these bytes are a word-aligned part of every STM32F4, and can be read at any time.
+    unsafe { Nameplate::read(OTP.base as usize as *const Words) }
 }

@@ -78,7 +78,7 @@ pub use drivers::{clocks, entry_strap, init, inputs, Board, Led};
 pub use facts::*;
 #[cfg(not(target_arch = "arm"))]
 pub use host::{cycles, inputs};
-pub use identity::{serial_number, unique_id, Identity};
+pub use identity::{nameplate, serial_number, unique_id, Identity};
 #[cfg(target_arch = "arm")]
 pub use pll::slow_down;
 #[cfg(target_arch = "arm")]

@@ -43,7 +43,7 @@ pub use program_control::{Answer, ProgramControl};
 pub use start::{Defaults, Start};
 
 pub use shared_abi::bit_timing::BitTiming;
-pub use shared_abi::{geometry, handoff, layout, renewal, warm_start};
+pub use shared_abi::{geometry, handoff, layout, nameplate, renewal, warm_start};
 
 /// The memory map of the board as the build script has written it
 /// (`coboot_linker::Application::emit`), for a `static` of the program:

@@ -403,6 +403,7 @@ mod tests {
             bootloader_number: Some(bootloader_number),
             sdo: SdoBases::PREDEFINED,
             program_date: 1_795_804_215,
+            nameplate: false,
         }
     }
 

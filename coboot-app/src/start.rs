@@ -1,8 +1,10 @@
 //! How the program was started.
 
 use shared_abi::date::days_and_milliseconds;
+use shared_abi::geometry::OTP;
 use shared_abi::handoff::{BootInfo, Handoff, SdoBases};
 use shared_abi::layout::Layout;
+use shared_abi::nameplate::{Nameplate, Words};
 
 /// The values to use when no bootloader has started the program (but a debugger, for example).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -97,6 +99,16 @@ impl Start {
         }
     }
 
+    /// The identity of the device where that is not the one of its board: the bootloader has it from the
+    /// one-time programmable bytes (its choice `identity`), and the program must show the same one.
+    /// The serial number in use is [`serial_number`](Self::serial_number).
+    #[must_use]
+    pub fn nameplate(&self) -> Option<Nameplate> {
+        self.told.filter(|told| told.nameplate)?;
+        // SAFETY: the bootloader has read it there: the program runs on a chip with these bytes.
+        unsafe { Nameplate::read(OTP.base as usize as *const Words) }
+    }
+
     /// The node-ID with which the bootloader comes up at the same bit rate, so that it can answer in
     /// this program's place. `None` where it has to find the bit rate out first.
     #[must_use]
@@ -128,6 +140,7 @@ mod tests {
         sdo: SdoBases { request: 0x680, response: 0x480 },
         // 2026-11-27 18:30:15.
         program_date: 1_795_804_215,
+        nameplate: false,
     };
 
     #[test]
@@ -143,6 +156,8 @@ mod tests {
         assert_eq!(Start::new(Some(TOLD), DEFAULTS).sdo(), TOLD.sdo);
         assert_eq!(start.software_date(), [0, 0]);
         assert_eq!(Start::new(Some(TOLD), DEFAULTS).software_date(), [15_671, 66_615_000]);
+        // Nothing is read where the bootloader does not look.
+        assert_eq!((start.nameplate(), Start::new(Some(TOLD), DEFAULTS).nameplate()), (None, None));
     }
 
     #[test]

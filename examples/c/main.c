@@ -165,6 +165,11 @@ static void start_can(uint32_t clock)
 int main(void)
 {
     coboot_program_init(&program, DEFAULT_NODE_ID, DEFAULT_BIT_RATE);
+    if (program.nameplate != NULL) {
+        identity[1] = program.nameplate->vendor_id;
+        identity[2] = program.nameplate->product_code;
+        identity[3] = program.nameplate->revision;
+    }
     identity[4] = program.serial_number;
     start_can(board_start());
     send_state(BOOT_UP);

@@ -157,6 +157,11 @@ const object objects[] = {
 extern "C" int main()
 {
     coboot_program_init(&program, DEFAULT_NODE_ID, DEFAULT_BIT_RATE);
+    if (program.nameplate != nullptr) {
+        identity[1] = program.nameplate->vendor_id;
+        identity[2] = program.nameplate->product_code;
+        identity[3] = program.nameplate->revision;
+    }
     identity[4] = program.serial_number;
     start_can(board_start());
     node.send(State::BootUp);

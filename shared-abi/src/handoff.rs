@@ -19,13 +19,15 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBHO");
 /// | 2 | [`Handoff::flags`] |
 /// | 3 | [`Handoff::bootloader_number`] |
 /// | 4 | [`Handoff::sdo_request_base`], [`Handoff::sdo_response_base`] |
-/// | 5 | [`Handoff::program_date`] |
+/// | 5 | [`FLAG_NAMEPLATE`], [`Handoff::program_date`] |
 pub const VERSION: u16 = 5;
 /// The oldest version that a reader accepts.
 pub const OLDEST: u16 = 1;
 
 /// In [`Handoff::flags`]: [`BootInfo::fresh`].
 pub const FLAG_FRESH: u32 = 1 << 0;
+/// In [`Handoff::flags`]: [`BootInfo::nameplate`]. Since version 5.
+pub const FLAG_NAMEPLATE: u32 = 1 << 1;
 
 /// Why the chip left reset, from `RCC_CSR` and `PWR_CSR` (RM0090 sections 7.3.21 and 5.4.2).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -129,6 +131,9 @@ pub struct BootInfo {
     /// The creation date of the program, from its block 0 or its label, in seconds since 1970-01-01 UTC; 0 if
     /// unknown.
     pub program_date: u32,
+    /// The identity of the device is that of its [`Nameplate`](crate::nameplate::Nameplate), and not that of
+    /// its board.
+    pub nameplate: bool,
 }
 
 /// The bases of the COB-IDs of SDO, to which the node-ID is added; 80h to 780h.
@@ -181,7 +186,7 @@ pub struct Handoff {
     pub bootloader_version: u32,
     /// Serial number of the device.
     pub serial_number: u32,
-    /// [`FLAG_FRESH`]; the other bits are 0. Since version 2.
+    /// [`FLAG_FRESH`] and [`FLAG_NAMEPLATE`]; the other bits are 0. Since version 2.
     pub flags: u32,
     /// The sub-index of the bootloader itself, 0 for none. Since version 3.
     pub bootloader_number: u32,
@@ -209,7 +214,7 @@ impl Handoff {
         words[3] = info.bit_rate;
         words[4] = info.bootloader_version;
         words[5] = info.serial_number;
-        words[6] = if info.fresh { FLAG_FRESH } else { 0 };
+        words[6] = if info.fresh { FLAG_FRESH } else { 0 } | if info.nameplate { FLAG_NAMEPLATE } else { 0 };
         words[7] = match info.bootloader_number {
             Some(number) => number as u32,
             None => 0,
@@ -245,6 +250,7 @@ impl Handoff {
             bootloader_number: u8::try_from(self.bootloader_number).ok().filter(|number| *number != 0),
             sdo: SdoBases::of_record(self.sdo_request_base, self.sdo_response_base),
             program_date: self.program_date,
+            nameplate: self.flags & FLAG_NAMEPLATE != 0,
         })
     }
 
@@ -324,6 +330,7 @@ mod tests {
         bootloader_number: Some(2),
         sdo: SdoBases { request: 0x680, response: 0x480 },
         program_date: 1_795_804_215,
+        nameplate: true,
     };
 
     #[test]
@@ -334,7 +341,7 @@ mod tests {
         assert_eq!(Handoff::new(&predefined).sdo_request_base, 0, "as before version 4");
     }
 
-    /// A bootloader of version 1 does not set this flag, no number, no COB-IDs and no date; a newer bootloader may set
+    /// A bootloader of version 1 does not set these flags, no number, no COB-IDs and no date; a newer one may set
     /// unknown bits, a number that none can be, and COB-IDs of other services.
     #[test]
     fn an_older_version_is_read_and_is_never_fresh() {
@@ -344,10 +351,12 @@ mod tests {
         // SAFETY: both are 48 bytes, and any bits make a `Handoff`.
         let old: Handoff = unsafe { core::mem::transmute(words) };
         let sdo = SdoBases::PREDEFINED;
-        let expected = Some(BootInfo { fresh: false, bootloader_number: None, sdo, program_date: 0, ..INFO });
+        let (nameplate, program_date) = (false, 0);
+        let expected =
+            Some(BootInfo { fresh: false, bootloader_number: None, sdo, nameplate, program_date, ..INFO });
         assert_eq!(old.info(), expected);
         words[1] = 0x0030_0006;
-        words[6] = 0xFFFF_FFFE;
+        words[6] = 0xFFFF_FFFC;
         words[7] = 0x0102;
         words[8] = 0x0480_0000;
         words[WORDS - 1] = check_of(&words);

@@ -64,8 +64,8 @@ pub struct Facts {
     /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1; bit 9:
     /// the device may find it out.
     pub bit_rates: u16,
-    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS) and
-    /// [`ROM_LOADER`](Self::ROM_LOADER).
+    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS),
+    /// [`ROM_LOADER`](Self::ROM_LOADER) and [`NAMEPLATE`](Self::NAMEPLATE).
     pub abilities: u16,
     /// The bases of the COB-IDs of SDO requests, and of answers, which programs get with the handoff.
     pub sdo_request_base: u16,
@@ -78,6 +78,9 @@ impl Facts {
     pub const RENEWS: u16 = 1;
     /// In [`abilities`](Self::abilities): it leaves for the loader in the ROM of the chip on request.
     pub const ROM_LOADER: u16 = 2;
+    /// In [`abilities`](Self::abilities): the identity of the device is that of its nameplate
+    /// ([`crate::nameplate`]), if it has one.
+    pub const NAMEPLATE: u16 = 4;
     /// Its size in bytes.
     pub const SIZE: u16 = size_of::<Self>() as u16;
 

@@ -67,6 +67,31 @@ int main(void)
     memset(&record, 0, sizeof record);
     printf("%d\n", coboot_handoff_is_sound(&record));
 
+    /* The last good one counts: the same without a serial number in block 9, a damaged one in block 15. */
+    static const unsigned char plate[32] = {
+        'C', 'B', 'N', 'P', 0x23, 0x01, 0, 0, 0x07, 0, 0xA1, 0x5E, 3, 0, 2, 0,
+        0x40, 0xE2, 0x01, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xFE, 0x3F, 0x2A, 0x54,
+    };
+    static const unsigned char later[4] = { 0xEC, 0x22, 0x54, 0x33 };
+    struct coboot_nameplate otp[16];
+    memset(otp, 0xFF, sizeof otp);
+    printf("%d", coboot_last_nameplate(otp) == NULL);
+    memcpy(&otp[2], plate, sizeof plate);
+    printf("%d", coboot_last_nameplate(otp) == &otp[2]);
+    memcpy(&otp[9], plate, sizeof plate);
+    otp[9].serial_number = 0;
+    memcpy(&otp[9].check, later, sizeof later);
+    printf("%d", coboot_last_nameplate(otp) == &otp[9]);
+    memcpy(&otp[15], plate, sizeof plate);
+    printf("%d", coboot_last_nameplate(otp) == &otp[15]);
+    sound = 0;
+    for (size_t bit = 0; bit < 8 * sizeof plate; bit++) {
+        memcpy(&otp[15], plate, sizeof plate);
+        ((unsigned char *)&otp[15])[bit / 8] ^= (unsigned char)(1u << bit % 8);
+        sound += coboot_last_nameplate(otp) != &otp[9];
+    }
+    printf("%u\n", sound);
+
     static const unsigned char table[16] = { 'C', 'B', 'C', 'G', 1, 0, 16, 0, 1, 0, 0, 0, 0x11, 0x02, 0x00, 0x08 };
     struct coboot_callgate gate;
     memcpy(&gate, table, sizeof gate);
@@ -120,6 +145,7 @@ fn c_and_cpp_make_the_same_bytes_and_come_to_the_same_verdicts() {
         100 600/580 12 680/480 1795804215 1 5 125000 1 1\n\
         0\n\
         00\n\
+        11110\n\
         0110211\n";
     for (extension, standard) in [("c", "-std=c11"), ("c", "-std=gnu17"), ("cpp", "-std=c++17")] {
         let folder = kit::folder!("header");
@@ -161,7 +187,7 @@ int call(void)
     struct coboot_node_args node;
     struct coboot_program_args program;
     uint32_t crc;
-    return coboot_read_handoff(&handoff) && coboot_crc32(gate, 0, 4, &crc) == 0 && coboot_read_node(gate, &node) == 0
+    return coboot_read_handoff(&handoff) && coboot_nameplate(&handoff) == NULL && coboot_crc32(gate, 0, 4, &crc) == 0 && coboot_read_node(gate, &node) == 0
         && coboot_store_node(gate, 1, 125000) == 0 && coboot_program_info(gate, 1, &program) == 0
         && coboot_confirm(gate, 1) == 0 && coboot_invalidate(gate, 1) == 0;
 }

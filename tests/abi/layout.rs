@@ -3,8 +3,9 @@
 use std::mem::{align_of, offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args};
-use shared_abi::geometry::Region;
+use shared_abi::geometry::{Region, OTP};
 use shared_abi::handoff::{BootInfo, Handoff, ResetCause, SdoBases};
+use shared_abi::nameplate::{self, Nameplate};
 use shared_abi::warm_start::{BootRequest, Owed, WarmStart};
 
 /// The bytes of a structure in RAM. (The host is little-endian, like the chip.)
@@ -77,16 +78,47 @@ fn handoff_byte_for_byte() {
         bootloader_number: Some(2),
         sdo: SdoBases { request: 0x680, response: 0x480 },
         program_date: 1_795_804_215,
+        nameplate: true,
     });
     #[rustfmt::skip]
     let expected = [
         b'C', b'B', b'H', b'O', 5, 0, 48, 0,
         5, 1, 3, 1, 0x48, 0xE8, 0x01, 0x00,
         0x02, 0x00, 0x01, 0x00, 0xEF, 0xBE, 0xAD, 0xDE,
-        1, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0x37, 0xCC, 0x09, 0x6B, 0, 0, 0, 0,
-        0x7D, 0xF9, 0xA5, 0x46,
+        3, 0, 0, 0, 2, 0, 0, 0, 0x80, 6, 0x80, 4, 0x37, 0xCC, 0x09, 0x6B, 0, 0, 0, 0,
+        0xD4, 0x71, 0x22, 0x61,
     ];
     assert_eq!(bytes(&handoff), expected);
+}
+
+/// The check words come from the same implementation in another language.
+#[test]
+fn nameplate_byte_for_byte() {
+    assert_eq!((size_of::<Nameplate>(), align_of::<Nameplate>()), (32, 4));
+    assert_eq!(offset_of!(Nameplate, magic), 0);
+    assert_eq!(offset_of!(Nameplate, vendor_id), 4);
+    assert_eq!(offset_of!(Nameplate, product_code), 8);
+    assert_eq!(offset_of!(Nameplate, revision), 12);
+    assert_eq!(offset_of!(Nameplate, serial_number), 16);
+    assert_eq!(offset_of!(Nameplate, reserved), 20);
+    assert_eq!(offset_of!(Nameplate, check), 28);
+    // RM0090 table 18: blocks of 32 bytes from 1FFF_7800h on, the last at 1FFF_79E0h.
+    assert_eq!((OTP.base, OTP.end(), nameplate::BLOCKS), (0x1FFF_7800, 0x1FFF_7A00, 16));
+    let [mut with, mut without] = [[0; 32]; 2];
+    for (made, plate) in [(&mut with, 123_456), (&mut without, 0)] {
+        let words = Nameplate::new(0x123, 0x5EA1_0007, 0x0002_0003, plate).words();
+        made.copy_from_slice(words.map(u32::to_le_bytes).as_flattened());
+    }
+    #[rustfmt::skip]
+    assert_eq!(with, [
+        b'C', b'B', b'N', b'P', 0x23, 0x01, 0, 0, 0x07, 0, 0xA1, 0x5E, 3, 0, 2, 0,
+        0x40, 0xE2, 0x01, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xFE, 0x3F, 0x2A, 0x54,
+    ]);
+    #[rustfmt::skip]
+    assert_eq!(without, [
+        b'C', b'B', b'N', b'P', 0x23, 0x01, 0, 0, 0x07, 0, 0xA1, 0x5E, 3, 0, 2, 0,
+        0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xEC, 0x22, 0x54, 0x33,
+    ]);
 }
 
 #[test]

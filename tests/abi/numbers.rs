@@ -5,8 +5,10 @@ use std::collections::BTreeMap;
 use std::mem::{offset_of, size_of};
 
 use shared_abi::callgate::{self, Crc32Args, NodeArgs, ProgramArgs, Selector, Status, Table};
+use shared_abi::geometry::OTP;
 use shared_abi::handoff::{self, Handoff, ResetCause};
 use shared_abi::label::{self, Label};
+use shared_abi::nameplate::{self, Nameplate};
 use shared_abi::renewal;
 use shared_abi::warm_start::{self, BootRequest, Owed, StoredNode, WarmStart};
 
@@ -64,6 +66,10 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("HANDOFF_VERSION", handoff::VERSION.into()),
         ("HANDOFF_OLDEST", handoff::OLDEST.into()),
         ("HANDOFF_FRESH", handoff::FLAG_FRESH),
+        ("HANDOFF_NAMEPLATE", handoff::FLAG_NAMEPLATE),
+        ("NAMEPLATE_MAGIC", nameplate::MAGIC),
+        ("OTP", OTP.base),
+        ("OTP_BLOCKS", nameplate::BLOCKS as u32),
         ("RESET_UNKNOWN", ResetCause::Unknown as u32),
         ("RESET_POWER_ON", ResetCause::PowerOn as u32),
         ("RESET_PIN", ResetCause::Pin as u32),
@@ -134,6 +140,17 @@ fn of_rust() -> BTreeMap<String, i64> {
         reserved,
         check
     ));
+    all.extend(structure!(
+        "coboot_nameplate",
+        Nameplate,
+        magic,
+        vendor_id,
+        product_code,
+        revision,
+        serial_number,
+        reserved,
+        check
+    ));
     let table =
         structure!("coboot_callgate", Table<u32>, magic, abi_version, length, bootloader_version, entry);
     all.extend(table);
@@ -172,6 +189,7 @@ fn what_c_sees_are_the_documented_values() {
         "    uint32_t date;",
         "    uint32_t program_date;",
         "    uint32_t reserved[2];",
+        "#define COBOOT_OTP UINT32_C(0x1FFF7800)",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, flags) == 24, \"coboot_handoff: flags\");",
         "COBOOT_STATIC_ASSERT(sizeof(struct coboot_handoff) == 48, \"coboot_handoff\");",
         "COBOOT_STATIC_ASSERT(offsetof(struct coboot_handoff, reset_cause) == 10, \"coboot_handoff: reset_cause\");",

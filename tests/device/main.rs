@@ -16,6 +16,7 @@ mod leftovers;
 mod line;
 mod log;
 mod mute;
+mod nameplate;
 mod options;
 mod program_control;
 mod reentry;

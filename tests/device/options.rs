@@ -13,7 +13,7 @@ use emulator::time::Time;
 
 /// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the index of the bit
 /// rate on 4 to 7.
-fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
+pub(crate) fn set_switches(bench: &mut Bench, node: u8, rate: BitRate) {
     let pins = u16::from(node) << 8 | (rate as u16) << 4;
     for pin in 4..15 {
         bench.machine().set_pin('E', pin, Some(pins >> pin & 1 == 1));

@@ -205,6 +205,7 @@ fn a_bootloader_is_built_for_a_released_resident_part() {
         ),
         (format!("{include}, sdo_request_base: 0x680"), "product: `resident` has another sdo_request_base"),
         (format!("{include}, rom_loader: true"), "product: `resident` has another rom_loader"),
+        (format!("{include}, identity: IdentitySource::Otp"), "product: `resident` has another identity"),
     ] {
         let refused = product(&choices);
         assert!(!refused.status.success() && text(&refused).contains(says), "{says}: {}", text(&refused));

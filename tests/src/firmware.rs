@@ -9,6 +9,7 @@ use coflash::file::read::{read, Firmware};
 use coflash::update::JOINED_BLOCKS;
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
+use shared_abi::label::{self, Label};
 use shared_abi::layout::{self, Layout};
 
 /// The images, with their names in `cargo xtask build`.
@@ -159,6 +160,18 @@ pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
         bytes[at..at + data.len()].copy_from_slice(&data);
     }
     bytes
+}
+
+/// A raw image with another label.
+///
+/// # Panics
+/// If the image is shorter than that.
+#[must_use]
+pub fn with_label(mut image: Vec<u8>, label: &Label) -> Vec<u8> {
+    let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
+    let words = [magic, vendor_id, product_code, version, date, a, b, check].map(u32::to_le_bytes);
+    image[label::OFFSET as usize..][..label::SIZE].copy_from_slice(words.as_flattened());
+    image
 }
 
 /// The bytes of an image.

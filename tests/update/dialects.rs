@@ -8,7 +8,7 @@ use coboot_tests::{firmware, script};
 use coflash::device::Doing;
 use coflash::Error;
 use emulator::time::{Span, Time};
-use shared_abi::label::{self, Label};
+use shared_abi::label::Label;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -119,21 +119,7 @@ fn a_lift_takes_what_is_for_it_alone() {
         (Label { magic: 0, ..Label::new(vendor_id, product_code, 1) }, 0x04),
     ];
     for (label, status) in labels {
-        let mut image = app(1);
-        let at = label::OFFSET as usize;
-        let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = label;
-        for (place, word) in image[at..at + label::SIZE].chunks_mut(4).zip([
-            magic,
-            vendor_id,
-            product_code,
-            version,
-            date,
-            a,
-            b,
-            check,
-        ]) {
-            place.copy_from_slice(&word.to_le_bytes());
-        }
+        let image = firmware::with_label(app(1), &label);
         let mut session = bench.session_with(LIFT);
         let refused = session.write(Address::new(0x1F50, 1), &image, Doing::Block(0), &mut |_| {});
         let Err(Error::Refused { code, .. }) = refused else { panic!("{refused:?}") };

@@ -71,14 +71,16 @@ const FIELDS: [(&str, &[&str]); 47] = [
     ("bootloader_counter", &["0", "3"]),
     ("bootloader_revisions", &["0", "1"]),
     (SEALED, &["false", "true"]),
-    // The compact map has no room for these two in the largest product.
+    // The compact map has no room for these three in the largest product.
     ("two_resets", &["false", "LAYOUT.home.is_some()"]),
     ("rom_loader", &["false", "LAYOUT.home.is_some()"]),
+    ("identity", &["IdentitySource::Board", NAMEPLATE]),
 ];
 
-/// Sealed images: a feature, and no field of a product. A board with the compact map has the other
-/// choices of the row.
+/// Sealed images: a feature, no field of a product. On the compact map the row has its other choices alone.
 const SEALED: &str = "sealed";
+
+const NAMEPLATE: &str = "if LAYOUT.home.is_some() { IdentitySource::Otp } else { IdentitySource::Board }";
 
 /// Seven switches for the node-ID, four for the bit rate.
 const SWITCHES: &str = "NodeSource::Function(|| {

@@ -166,6 +166,7 @@ pub unsafe extern "C" fn stage() -> ! {
         cortex_m::asm::delay(HSI / 1000 * RESET_PERIOD_MS / 3);
         SCB::sys_reset()
     };
+    let nameplate = product::nameplate();
     let handoff = Handoff::new(&BootInfo {
         node_id,
         bit_rate: node.bit_rate.or_zero(),
@@ -174,10 +175,11 @@ pub unsafe extern "C" fn stage() -> ! {
         trial,
         fresh: matches!(request, Some(BootRequest::Fresh(_))),
         bootloader_version: product::VERSION,
-        serial_number: bsp::serial_number(),
+        serial_number: product::serial_number(nameplate.as_ref()),
         bootloader_number: PRODUCT.bootloader_number(),
         sdo: SdoBases { request: PRODUCT.sdo_request_base, response: PRODUCT.sdo_response_base },
         program_date,
+        nameplate: nameplate.is_some(),
     });
     if SEALED && program.locks_flash() {
         // SAFETY: only this code runs, and it writes the flash no more.

@@ -142,6 +142,8 @@ static inline struct coboot_warm_start coboot_request(uint32_t request, uint32_t
 
 /* In `flags`, since version 2: the program was started right after its download in one go. */
 #define COBOOT_HANDOFF_FRESH UINT32_C(0x1)
+/* In `flags`, since version 5: the identity of the device is that of its nameplate. */
+#define COBOOT_HANDOFF_NAMEPLATE UINT32_C(0x2)
 
 /* Reset causes. */
 #define COBOOT_RESET_UNKNOWN UINT32_C(0x0)
@@ -232,6 +234,51 @@ static inline uint16_t coboot_sdo_request_base(const struct coboot_handoff *hand
 static inline uint16_t coboot_sdo_response_base(const struct coboot_handoff *handoff)
 {
     return coboot_has_sdo_bases(handoff) ? handoff->sdo_response_base : 0x580;
+}
+
+/* ---- The nameplate: the identity of a device in the one-time programmable (OTP) bytes of its chip ---- */
+
+#define COBOOT_NAMEPLATE_MAGIC UINT32_C(0x504E4243)
+
+/* The OTP bytes of every STM32F4, and their blocks, each of the size of a nameplate. */
+#define COBOOT_OTP UINT32_C(0x1FFF7800)
+#define COBOOT_OTP_BLOCKS UINT32_C(0x10)
+
+struct coboot_nameplate {
+    uint32_t magic;
+    uint32_t vendor_id;
+    uint32_t product_code;
+    uint32_t revision;
+    uint32_t serial_number;
+    uint32_t reserved[2];
+    uint32_t check;
+};
+COBOOT_STATIC_ASSERT(sizeof(struct coboot_nameplate) == 32, "coboot_nameplate");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, magic) == 0, "coboot_nameplate: magic");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, vendor_id) == 4, "coboot_nameplate: vendor_id");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, product_code) == 8, "coboot_nameplate: product_code");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, revision) == 12, "coboot_nameplate: revision");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, serial_number) == 16, "coboot_nameplate: serial_number");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, reserved) == 20, "coboot_nameplate: reserved");
+COBOOT_STATIC_ASSERT(offsetof(struct coboot_nameplate, check) == 28, "coboot_nameplate: check");
+
+/* Whether a block has a good nameplate. */
+static inline bool coboot_nameplate_is_sound(const struct coboot_nameplate *plate)
+{
+    const size_t guarded = offsetof(struct coboot_nameplate, check) / sizeof(uint32_t);
+    return plate->magic == COBOOT_NAMEPLATE_MAGIC && plate->reserved[0] == 0 && plate->reserved[1] == 0
+        && plate->check == coboot_check_word(plate, guarded);
+}
+
+/* The nameplate in these COBOOT_OTP_BLOCKS blocks: the last good one, or a null pointer. */
+static inline const struct coboot_nameplate *coboot_last_nameplate(const struct coboot_nameplate *otp)
+{
+    for (size_t block = COBOOT_OTP_BLOCKS; block-- > 0;) {
+        if (coboot_nameplate_is_sound(&otp[block])) {
+            return &otp[block];
+        }
+    }
+    return NULL;
 }
 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----
@@ -354,6 +401,15 @@ static inline bool coboot_read_handoff(struct coboot_handoff *handoff)
         to[i] = from[i];
     }
     return coboot_handoff_is_sound(handoff);
+}
+
+/* The nameplate of the device, which the program must show in 1018h as the bootloader does: serial_number is the handoff's.
+ * A null pointer where the identity is that of the board.
+ */
+static inline const struct coboot_nameplate *coboot_nameplate(const struct coboot_handoff *handoff)
+{
+    const bool there = (handoff->flags & COBOOT_HANDOFF_NAMEPLATE) != 0;
+    return there ? coboot_last_nameplate((const struct coboot_nameplate *)(uintptr_t)COBOOT_OTP) : NULL;
 }
 
 /* The callgate of the bootloader underneath, or a null pointer. */

@@ -33,6 +33,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
     program->bit_rate = bit_rate;
     program->serial_number = 0;
     program->date = 0;
+    program->nameplate = NULL;
     program->sdo_request_base = 0x600;
     program->sdo_response_base = 0x580;
     program->number = 1;
@@ -46,6 +47,7 @@ void coboot_program_init(struct coboot_program *program, uint8_t node_id, uint32
         program->bit_rate = handoff.bit_rate;
         program->serial_number = handoff.serial_number;
         program->date = handoff.program_date;
+        program->nameplate = coboot_nameplate(&handoff);
         program->sdo_request_base = coboot_sdo_request_base(&handoff);
         program->sdo_response_base = coboot_sdo_response_base(&handoff);
         program->number = handoff.program;

@@ -50,6 +50,8 @@ struct coboot_program {
     uint8_t node_id;
     uint32_t bit_rate;
     uint32_t serial_number;
+    /* Vendor-ID, product code and revision of the device, or a null pointer for those of its board. */
+    const struct coboot_nameplate *nameplate;
     /* The bases of the COB-IDs of SDO requests and answers, to which the node-ID is added. */
     uint16_t sdo_request_base;
     uint16_t sdo_response_base;
