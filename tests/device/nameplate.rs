@@ -140,7 +140,7 @@ fn programs_are_for_the_oem_and_show_its_identity() {
         let refused = with(&mut bench, |session| flash(session, &file, &once, &mut |_| {}));
         assert!(matches!(refused, Err(Error::WrongTarget { .. })), "{refused:?}");
         with(&mut bench, |session| {
-            flash(session, &file, &once.clone().force(true), &mut |_| {}).unwrap_err();
+            flash(session, &file, &once.force(true), &mut |_| {}).unwrap_err();
             assert_eq!(session.read_number(Address::new(0x1F57, 1)).unwrap() & 0xFF, code);
             // The label alone, in a raw image.
             session.command(1, ProgramControl::Clear).unwrap();
