@@ -5,7 +5,7 @@
 //! - the device answers: a read of 1000h after an SDO abort, within [`Target::answer_us`];
 //! - the programs and the node parameters are as they were, unless a master asked for a change;
 //! - no reset that nobody asked for;
-//! - the watchdog is fed in time, also if its clock is the fastest ([`FEED_US`]);
+//! - the watchdog is fed in time, also if its clock is the fastest;
 //! - the record of a program is true: its CRC is that of the flash and of an image that was sent;
 //! - LSS answers only what was asked in its state.
 //!
