@@ -157,12 +157,12 @@ impl Objects for Application {
         let Self { control, bootloader, .. } = self;
         match at.index {
             PROGRAM_CONTROL => put(buf, &[control.state(at.sub, bootloader)?]),
+            PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
+            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_DATE => {
                 let [date, time] = control.software_date();
                 put(buf, &if at.sub == 1 { date } else { time }.to_le_bytes())
             }
-            PROGRAM_ID => put(buf, &control.identification(at.sub, bootloader)?.to_le_bytes()),
-            FLASH_STATUS => put(buf, &control.flash_status(at.sub)?.to_le_bytes()),
             PROGRAM_REGION => {
                 let region = control.region(at.sub, LAYOUT).ok_or(AbortCode::NO_DATA)?;
                 put(buf, &region_value(region.base, region.size))

@@ -54,8 +54,8 @@ const START_US: u64 = 700_000;
 /// All work on the flash ends within this time, in us: the erase of 1 MiB takes 11 s.
 const WORK_US: u64 = 40_000_000;
 
-/// A device with a password waits with a reset until no wrong password delays the next attempt
-/// (`core/canopen/src/password.rs`), in us.
+/// A device with a password, or with keys, waits with a reset until no wrong password or signature delays the
+/// next attempt (`core/canopen/src/password.rs`), in us.
 const PASSWORD_US: u64 = 33_000_000;
 
 /// The longest time between two feeds of the watchdog, in us: the shortest `watchdog_ms` that a product may
@@ -502,7 +502,7 @@ impl Attack {
         if let Some(what) = self.target.complaint() {
             return Err(Broken::Other(what));
         }
-        if self.setup.password.is_some() && self.may_leave() && !self.was_reset {
+        if self.setup.delays_resets() && self.may_leave() && !self.was_reset {
             self.leaves_until = self.target.now_us() + PASSWORD_US;
         }
         self.model.forget();
@@ -516,7 +516,8 @@ impl Attack {
         loop {
             self.lss([0x04, 0, 0, 0, 0, 0, 0, 0], 0)?;
             // After bus-off, answers of before come first.
-            let patience = match (self.was_disturbed, self.may_leave() || self.was_reset) {
+            let may_leave = self.may_leave() || self.target.now_us() < self.leaves_until;
+            let patience = match (self.was_disturbed, may_leave || self.was_reset) {
                 (true, _) => BUS_OFF_US,
                 (false, true) => 3 * START_US,
                 (false, false) => 0,

@@ -159,6 +159,13 @@ impl Setup {
         }
     }
 
+    /// Whether it may wait with a reset that was asked for: it would end the wait after a wrong password or
+    /// signature.
+    #[must_use]
+    pub fn delays_resets(&self) -> bool {
+        self.password.is_some() || matches!(self.device, Device::Sealed)
+    }
+
     /// How many frames it takes in the time of one on an emulated board, at least.
     #[must_use]
     pub fn pace(&self) -> u64 {
