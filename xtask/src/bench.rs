@@ -9,7 +9,7 @@ use crate::{build, evidence, process, workspace, Outcome};
 pub const HELP: &str = "\
 usage: cargo xtask bench [--json] [--board BOARD]
 
-Downloads programs of 64, 256 and 900 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
+Downloads programs of 64, 256 and 896 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
 time, and prints how long that took beside what the wire and the flash allow at best; how busy the
 bus is while `coflash flash` sends a program; what it costs or gains to seal and to compress one; and
 how long several boards on one bus take.
