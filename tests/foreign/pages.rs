@@ -67,6 +67,7 @@ pages! {
     emulator "docs/emulator.md"
     masters "docs/masters.md"
     node "docs/node.md"
+    product "docs/product.md"
     renewal "docs/renewal.md"
     security "docs/security.md"
     testing "docs/testing.md"
