@@ -24,7 +24,8 @@ const BOOT_CORE: &[Rule] = &[
     ("refusal", ""),
     ("renewal", "flash store"),
     ("resume", ""),
-    ("policy", "crc keys refusal resume session"),
+    // A product's check reads block 0 where its data wait.
+    ("policy", "crc keys queue refusal resume session"),
     ("session", ""),
     // It turns bytes into judged pieces with an address: no flash, no store, no command.
     ("intake", "keys policy program queue refusal resume session"),
