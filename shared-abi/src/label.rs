@@ -49,6 +49,18 @@ impl Label {
         Self { magic: MAGIC, vendor_id, product_code, version, date, reserved: [0; 2], check }
     }
 
+    /// The bytes of the label.
+    #[must_use]
+    pub fn emit(&self) -> [u8; SIZE] {
+        let Self { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *self;
+        let words = [magic, vendor_id, product_code, version, date, a, b, check];
+        let mut bytes = [0; SIZE];
+        for (place, word) in bytes.chunks_exact_mut(4).zip(words) {
+            place.copy_from_slice(&word.to_le_bytes());
+        }
+        bytes
+    }
+
     /// The label in these bytes; `None` if it is missing or damaged.
     #[must_use]
     pub fn parse(bytes: &[u8; SIZE]) -> Option<Self> {
@@ -67,30 +79,20 @@ mod tests {
     use super::*;
     use crate::geometry::CHIPS;
 
-    fn bytes(label: &Label) -> [u8; SIZE] {
-        let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
-        let words = [magic, vendor_id, product_code, version, date, a, b, check];
-        let mut bytes = [0; SIZE];
-        for (place, word) in bytes.chunks_mut(4).zip(words) {
-            place.copy_from_slice(&word.to_le_bytes());
-        }
-        bytes
-    }
-
     #[test]
     fn a_label_is_read_as_it_was_made_and_not_when_a_bit_is_wrong() {
         let label = Label::dated(0x11, 0x22, 0x33, 0x44);
         assert_eq!(core::mem::size_of::<Label>(), SIZE);
         assert_eq!(
-            bytes(&label)[..28],
+            label.emit()[..28],
             [
                 b'C', b'B', b'L', b'1', 0x11, 0, 0, 0, 0x22, 0, 0, 0, 0x33, 0, 0, 0, 0x44, 0, 0, 0, 0, 0, 0,
                 0, 0, 0, 0, 0
             ]
         );
-        assert_eq!(Label::parse(&bytes(&label)), Some(label));
+        assert_eq!(Label::parse(&label.emit()), Some(label));
         for bit in 0..8 * SIZE {
-            let mut damaged = bytes(&label);
+            let mut damaged = label.emit();
             damaged[bit / 8] ^= 1 << (bit % 8);
             assert_eq!(Label::parse(&damaged), None, "bit {bit}");
         }

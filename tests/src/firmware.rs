@@ -168,9 +168,7 @@ pub fn raw_from(base: u32, name: &str) -> Vec<u8> {
 /// If the image is shorter than that.
 #[must_use]
 pub fn with_label(mut image: Vec<u8>, label: &Label) -> Vec<u8> {
-    let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
-    let words = [magic, vendor_id, product_code, version, date, a, b, check].map(u32::to_le_bytes);
-    image[label::OFFSET as usize..][..label::SIZE].copy_from_slice(words.as_flattened());
+    image[label::OFFSET as usize..][..label::SIZE].copy_from_slice(&label.emit());
     image
 }
 

@@ -409,12 +409,7 @@ pub fn program(region: Region, product_code: u32, len: usize, seed: u8) -> Vec<u
     bytes[4..8].copy_from_slice(&(region.base + 0x101).to_le_bytes());
     let at = label::OFFSET as usize;
     if len >= at + label::SIZE {
-        let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } =
-            Label::new(VENDOR_ID, product_code, seed.into());
-        let words = [magic, vendor_id, product_code, version, date, a, b, check];
-        for (place, word) in bytes[at..].chunks_mut(4).zip(words) {
-            place.copy_from_slice(&word.to_le_bytes());
-        }
+        bytes[at..at + label::SIZE].copy_from_slice(&Label::new(VENDOR_ID, product_code, seed.into()).emit());
     }
     bytes
 }

@@ -25,12 +25,8 @@ const NEW: u8 = 0xB0;
 /// A program of 700 bytes with this label.
 fn labelled(seed: u8, label: &Label) -> Vec<u8> {
     let mut bytes = program(700, seed);
-    let Label { magic, vendor_id, product_code, version, date, reserved: [a, b], check } = *label;
-    let words = [magic, vendor_id, product_code, version, date, a, b, check];
     let at = label::OFFSET as usize;
-    for (place, word) in bytes[at..at + label::SIZE].chunks_mut(4).zip(words) {
-        place.copy_from_slice(&word.to_le_bytes());
-    }
+    bytes[at..at + label::SIZE].copy_from_slice(&label.emit());
     bytes
 }
 
