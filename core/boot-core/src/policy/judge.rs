@@ -124,9 +124,9 @@ impl Judge<'_> {
         let Some(label) = Label::parse(bytes) else {
             return if self.policy.wants_label { Err(Refusal::unfit(FlashError::Format)) } else { Ok(0) };
         };
-        let Label { vendor_id, product_code, version, .. } = label;
+        let Label { vendor_id, product_code, version, date, .. } = label;
         let identity = Identity { app_size: 0, vendor_id, product_code };
-        self.check_identity(&AppInfo::of_label(Control::Dated { identity, version, date: 0 }))?;
+        self.check_identity(&AppInfo::of_label(Control::Dated { identity, version, date: date.into() }))?;
         Ok(version)
     }
 }

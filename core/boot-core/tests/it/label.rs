@@ -222,6 +222,10 @@ fn the_date_belongs_to_its_program_after_every_power_cut() {
 fn a_products_own_check_sees_the_label() {
     fn no_downgrade(_: u8, info: &AppInfo<'_>) -> Verdict {
         match info.control {
+            // The label's date comes with its version.
+            Some(Control::Dated { date, .. }) if date != u64::from(TODAY) => {
+                Verdict::Refuse(FlashError::Format)
+            }
             Some(Control::Dated { version: 0..=7, .. }) => Verdict::Refuse(FlashError::Unspecified),
             _ => Verdict::Standard,
         }
@@ -229,7 +233,7 @@ fn a_products_own_check_sees_the_label() {
     let mut flash = ModelFlash::new(&CHIP);
     let mut bench = Bench::with_buffer(&mut flash, Policy { check: no_downgrade, ..POLICY }, 2048);
     for (version, outcome) in [(7, (Err(UNFIT), 0x7E)), (8, (Ok(()), 0))] {
-        let image = labelled(NEW, &Label::new(DEVICE.0, DEVICE.1, version));
+        let image = labelled(NEW, &Label::dated(DEVICE.0, DEVICE.1, version, TODAY));
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&block(0, 0, &[0; 8]));
         assert_eq!(bench.block(&block_file(&image, 512)[1]), outcome);
