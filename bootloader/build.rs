@@ -38,6 +38,10 @@ fn main() {
         // chip.
         println!("cargo:rustc-link-arg-bins=-Tdefmt.x");
     }
+    if env::var("CARGO_CFG_TARGET_OS").is_ok_and(|system| system != "none") {
+        // The library alone, for the tests.
+        return;
+    }
     match template {
         "resident.x" => println!("cargo:rustc-link-arg-bins=--oformat=binary"),
         _ => resident(&package, &out, layout, &product),
@@ -66,11 +70,13 @@ fn product(package: &Path, out: &Path) -> String {
         file.display()
     );
     println!("cargo:rerun-if-changed={}", file.display());
-    fs::write(out.join("product.rs"), format!("#[path = {file:?}]\nmod chosen;\n"))
-        .expect("OUT_DIR is writable");
+    let name = file.file_stem().and_then(|name| name.to_str()).unwrap_or_default();
+    let text = format!(
+        "#[path = {file:?}]\nmod chosen;\n/// The name of this product.\npub const NAME: &str = {name:?};\n"
+    );
+    fs::write(out.join("product.rs"), text).expect("OUT_DIR is writable");
 
     let version = format!("coboot {}", env::var("CARGO_PKG_VERSION").expect("cargo sets it"));
-    let name = file.file_stem().and_then(|name| name.to_str()).unwrap_or_default();
     if chosen == DEFAULT_PRODUCT {
         println!("cargo:rustc-env=COBOOT_VERSION={version}");
     } else {

@@ -3,7 +3,7 @@
 //! | file | what it does | unsafe |
 //! |---|---|---|
 //! | `main.rs` | the tasks: it only connects the other parts | no |
-//! | `product.rs` | the choices that a product has; it makes them in `products/` | no |
+//! | `product.rs` | the choices that a product has; it makes them in `products/`. A library of its own, which the resident part and the tests have, too | no |
 //! | `resident/` | the part that runs from flash: boot stage and callgate | jump, ABI |
 //! | `start.rs` | the resident part's bytes, the header of the RAM image, the boot report | handoff |
 //! | `flash_controller.rs` | starts flash operations and polls them | registers |
@@ -19,7 +19,6 @@
 mod flash_controller;
 mod log;
 mod memory;
-mod product;
 mod start;
 mod storage;
 mod watchdog;
@@ -60,15 +59,15 @@ mod app {
     use core::ops::RangeInclusive;
     use cortex_m::peripheral::SCB;
     use heapless::spsc::{Consumer, Producer, Queue};
+    use product::{CrystalFailure, PRODUCT};
     use rtic::Mutex;
     use shared_abi::boot_report::BootReport;
     use shared_abi::nameplate::Nameplate;
     use shared_abi::services::{StoreState, STORE_STATE_WORDS};
     use shared_abi::warm_start::{BootRequest, Owed, TrialStep, WarmStart};
 
-    use super::{product, start, Mono};
+    use super::{start, Mono};
     use crate::log::{self, log};
-    use crate::product::{CrystalFailure, PRODUCT};
     use crate::storage::{BootFlash, Store};
     use crate::watchdog::{self, Task, Watchdog};
     use rtic_monotonics::fugit::ExtU32;

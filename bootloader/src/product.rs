@@ -1,21 +1,26 @@
 //! The choices that a product has. A product makes them in its file, `products/default.rs`.
 //!
-//! The resident part and the RAM image are both built from it. Names in brackets are those of the
+//! A library of its own: the resident part and the RAM image are both built from it, and the tests on the
+//! host read it. Names in brackets are those of the
 //! SYS TEC manual (L-1112d_10, chapter 4.8). If choices contradict each other, the build fails with
 //! the names of the choices.
-#![allow(dead_code, reason = "each of the two programs uses some of it")]
+#![no_std]
 
 use core::ops::RangeInclusive;
 
+// What the fields of a product are made of: its file has them by `use super::*`.
+pub use boot_core::canopen::{BitRate, NodeId};
+pub use boot_core::control::{AppInfo, Erase, Verdict};
+pub use boot_core::crc::CrcKind;
+pub use boot_core::decision::Autostart;
+pub use boot_core::profile::Profile;
+
 use boot_core::bootloader::Extras;
 use boot_core::canopen::program::ProgramStart;
-use boot_core::canopen::{BitRate, NodeId};
-use boot_core::control::{AppInfo, Erase, Policy, Renewal, Verdict};
-use boot_core::crc::CrcKind;
-use boot_core::decision::{self, Autostart};
+use boot_core::control::{Policy, Renewal};
+use boot_core::decision;
 use boot_core::flash::Flash;
 use boot_core::policy::SealPolicy;
-use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
@@ -25,7 +30,7 @@ use shared_abi::renewal;
 use shared_abi::services::Facts;
 use shared_abi::warm_start::Cell;
 
-// The file of this product, as the module `chosen`, and the identity of the board (build.rs).
+// The file of this product, as the module `chosen`, with its name, and the identity of the board (build.rs).
 include!(concat!(env!("OUT_DIR"), "/product.rs"));
 include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 

@@ -8,7 +8,7 @@ use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Header};
 use shared_abi::services::{self, Facts};
 
-use crate::product::{BOARD_IDENTITY, FACTS, FEATURES, HAS_NAMEPLATE, PRODUCT, SEALED};
+use product::{BOARD_IDENTITY, FACTS, FEATURES, HAS_NAMEPLATE, PRODUCT, SEALED};
 
 /// The bytes of the resident part: of the released one that the product names, or a fresh one.
 const BYTES: &[u8] = match PRODUCT.resident {
@@ -88,7 +88,7 @@ global_asm!(
     vendor = const FOR.0,
     product = const FOR.1,
     revisions = const PRODUCT.bootloader_revisions,
-    version = const crate::product::VERSION,
+    version = const product::VERSION,
     counter = const PRODUCT.bootloader_counter,
 );
 

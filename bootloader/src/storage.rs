@@ -11,7 +11,7 @@ use shared_abi::geometry::{Region, Sector};
 use shared_abi::services::{OperationResult, Services, Step, StoreState, ERASE, OFFSET};
 
 use crate::flash_controller::FlashController;
-use crate::product::PRODUCT;
+use product::PRODUCT;
 
 /// The resident part's services.
 fn services() -> &'static Services {

@@ -9,7 +9,7 @@ use core::sync::atomic::{AtomicBool, Ordering};
 use bsp::{pac, watchdog};
 
 use crate::log::feeds;
-use crate::product::PRODUCT;
+use product::PRODUCT;
 
 /// The tasks that must check in.
 #[derive(Clone, Copy)]

@@ -1,7 +1,7 @@
 //! The EDS files (CiA 306-1), which describe a device to a configuration tool.
 //!
 //! They are made from the tables and the product of the firmware itself (`bootloader/src/product.rs`,
-//! compiled for the host), so they cannot differ from it. Values that every image of a board shares come
+//! built for the host), so they cannot differ from it. Values that every image of a board shares come
 //! from its board file. `cargo xtask eds` writes them to `docs/eds/`.
 
 use std::fmt::Write;
@@ -15,7 +15,9 @@ use canopen::od::{Access, Address, DataType, DefaultValue, Entry, Kind};
 use canopen::program::{region_value, Numbers, IDENTITY, PROGRAM_REGION};
 use canopen::BitRate;
 
-use crate::product::{self, NodeSource, Product};
+use product::{NodeSource, Product};
+
+use crate::products;
 
 /// CiA 306-1 requires dates. The contents have none: the same table gives the same file.
 const DATE: &str = "11-21-2026";
@@ -77,8 +79,8 @@ pub fn chosen() -> Option<Vec<Image>> {
     let product = product::PRODUCT;
     let may_seal = bsp::LAYOUT.home.is_some() && product.crc == CrcKind::Crc32 && !product.rom_loader;
     let kinds = if may_seal { &[false, true][..] } else { &[false] };
-    (product::CHOSEN != DEFAULT)
-        .then(|| kinds.iter().map(|sealed| bootloader(product::CHOSEN, &product, *sealed)).collect())
+    (product::NAME != DEFAULT)
+        .then(|| kinds.iter().map(|sealed| bootloader(product::NAME, &product, *sealed)).collect())
 }
 
 /// The bootloader of the default product.
@@ -93,7 +95,7 @@ pub fn default_bootloader() -> Image {
 /// The bootloader of a product in `bootloader/products`.
 #[must_use]
 pub fn bootloader_of(name: &str, sealed: bool) -> Option<Image> {
-    let (_, product) = product::ALL.iter().find(|(product, _)| *product == name)?;
+    let (_, product) = products::ALL.iter().find(|(product, _)| *product == name)?;
     Some(bootloader(name, &product.clone().checked(), sealed))
 }
 

@@ -12,9 +12,7 @@ pub mod listener;
 pub mod masters;
 pub mod node;
 pub mod powercut;
-/// The choices of the bootloader's products, as the firmware has them (build.rs makes the list).
-#[path = "../../bootloader/src/product.rs"]
-mod product;
+mod products;
 pub mod renewal;
 pub mod script;
 pub mod sealed;

@@ -25,9 +25,9 @@ use shared_abi::warm_start::BootRequest;
 
 use crate::flash::ResidentFlash;
 use crate::flash_controller::FlashController;
-use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
 use crate::ram_image::{home, HOST};
 use crate::storing::{crash_count, store};
+use product::{self, NO_NODE_ID, PRODUCT, SEALED};
 
 /// The entry of all services: it checks the argument structure, takes the flash once, calls the
 /// service, and leaves everything as it found it.

@@ -28,8 +28,6 @@ mod flash_controller;
 mod flash_lock;
 #[path = "../memory.rs"]
 mod memory;
-#[path = "../product.rs"]
-mod product;
 mod ram_image;
 mod renewal;
 mod service_table;

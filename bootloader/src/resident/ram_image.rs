@@ -8,7 +8,7 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
-use crate::product::{BOARD_IDENTITY, FEATURES, SEALED};
+use product::{BOARD_IDENTITY, FEATURES, SEALED};
 
 /// What this resident part has for an image.
 pub const HOST: Host = Host { board: BOARD_IDENTITY, services: SERVICES_VERSION, features: FEATURES };

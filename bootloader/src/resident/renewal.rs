@@ -11,8 +11,8 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
 use crate::flash::ResidentFlash;
-use crate::product::{Parameters, PRODUCT};
 use crate::ram_image;
+use product::{Parameters, PRODUCT};
 
 /// Loads the first image that is good. A trial whose image is not is over: `trial_end` says so.
 ///

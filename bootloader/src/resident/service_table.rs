@@ -7,7 +7,7 @@ use shared_abi::ram_image::SERVICES_VERSION;
 use shared_abi::services::{FlashOperation, OperationResult, Services, Step, StoreState, ERASE, PROGRAM};
 
 use crate::flash::ResidentFlash;
-use crate::product::{self, Parameters};
+use product::{self, Parameters};
 
 pub const SERVICES: Services = Services {
     version: SERVICES_VERSION,

@@ -21,8 +21,8 @@ use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
-use crate::product::{self, NO_NODE_ID, PRODUCT, SEALED};
 use crate::{renewal, storing};
+use product::{self, NO_NODE_ID, PRODUCT, SEALED};
 
 /// Minimum time between two resets if nothing can run, in ms, approximately: a debugger can read
 /// the warm-start cell in this time.

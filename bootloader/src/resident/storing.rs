@@ -5,7 +5,7 @@ use boot_core::store::{Key, Parameters as _, StoreError, Value};
 
 use crate::caches::Caches;
 use crate::flash::ResidentFlash;
-use crate::product::Parameters;
+use product::Parameters;
 
 /// Stores a value and waits for it.
 pub fn store(
