@@ -10,7 +10,7 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, files, process, setup, workspace, Outcome};
+use crate::{corpus, evidence, files, process, setup, test, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
@@ -25,7 +25,7 @@ target/evidence/fuzz.json.
   --keep          afterwards, makes the smallest corpus that covers as much, and puts the shortest
                   inputs of it into tests/fuzz/corpus, one file for each target
   --replay        runs no fuzzer: every input of tests/fuzz/corpus and target/fuzz/corpus once, with
-                  the Rust that builds the rest; it needs no nightly toolchain, and about a minute
+                  the Rust that builds the rest; it needs no nightly toolchain
 
 Without --replay, it needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
 where it is missing.
@@ -56,15 +56,14 @@ fn longest_commands(target: &str) -> Option<u32> {
     COMMANDS.iter().find(|(name, _)| *name == target).map(|(_, longest)| *longest)
 }
 
-/// Runs every kept input once, without the fuzzer.
-fn replay_all(folder: &Path, targets: &[String]) -> Outcome {
-    let programs = target_dir().join("replay");
-    // Building takes longer than running: without optimisation, and without what a debugger needs.
-    let mut build = process::cargo_on(folder, "build");
-    build.args(["--quiet", "--bins"]).env("CARGO_TARGET_DIR", &programs);
-    process::run(build.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
+/// Runs every kept input once, without the fuzzer. The programs are built as the tests are, so that
+/// nothing of others is compiled again.
+fn replay_all(targets: &[String]) -> Outcome {
+    let mut build = process::cargo("build");
+    build.current_dir(workspace::root()).args(test::on_host());
+    process::run(build.args(targets.iter().map(|target| format!("--bin={target}"))))?;
     for target in targets {
-        let mut program = Command::new(programs.join("debug").join(target));
+        let mut program = Command::new(workspace::target_dir().join("debug").join(target));
         // They are unpacked anew: a name may have gone.
         let kept = target_dir().join("kept").join(target);
         files::remove(&kept)?;
@@ -117,7 +116,7 @@ pub fn run(mut args: Args) -> Outcome {
         targets = chosen;
     }
     if replay {
-        return replay_all(&folder, &targets);
+        return replay_all(&targets);
     }
     toolchain()?;
     let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
@@ -201,6 +200,8 @@ impl Tools {
         }
         command.arg(target).current_dir(workspace::root());
         command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
+        // The lines of a panic.
+        command.env("CARGO_PROFILE_RELEASE_DEBUG", "1");
         command
     }
 

@@ -212,7 +212,7 @@ const NOT_ON_HOST: [&str; 6] =
 
 /// Selects the packages that are built for this machine. What cargo builds at one time has the features
 /// of all selected packages: calls that select the same build the crates of others once.
-fn on_host() -> Vec<String> {
+pub fn on_host() -> Vec<String> {
     let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]);
     let without = without.flat_map(|package| ["--exclude", package]).map(str::to_owned);
     ["--workspace".to_owned()].into_iter().chain(without).collect()

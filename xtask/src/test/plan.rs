@@ -37,6 +37,10 @@ const fn later(program: &'static str, tests: &'static str, tier: Tier, why: &'st
 const TWO: &str = "images of the board with two programs";
 /// The same where it takes all of them.
 const ALL_OF_TWO: &str = "all images of the board with two programs";
+/// The reason of tests that measure; a broken time is seen in `.ci/run`.
+const TIMES: &str = "measures times, 1 minute";
+/// The reason of tests of sealed images beyond a download, its blocks and strangers.
+const SEALED: &str = "sealed images beyond the main flow";
 /// The reason of a second client of others.
 const OTHERS: &str = "one more client of others";
 
@@ -44,11 +48,13 @@ const OTHERS: &str = "one more client of others";
 pub const LATER: &[Later] = &[
     later("coboot-kit/abi", "header::it_compiles_for_the_chip", Tier::Ci, "arm-none-eabi-gcc"),
     later("device", "application::", Tier::Ci, "builds an application anew, 2 minutes"),
+    later("device", "boot_time::", Tier::Ci, TIMES),
     later("device", "c_application::the_other_program", Tier::All, ALL_OF_TWO),
     later("device", "image::gdb_loads_it", Tier::Ci, "gdb"),
     later("device", "leftovers::whatever", Tier::Ci, "sixteen states of a chip, 1 minute"),
     later("device", "stuck_bus::", Tier::All, "minutes of a bus that does not move"),
     later("device", "supply::with_every_combination", Tier::All, "32 combinations of option bytes, 1 minute"),
+    later("device", "supply::", Tier::Ci, "each supply voltage, 1 minute"),
     later("device", "silicon::each_scenario_works_with_the_chips", Tier::Ci, "more chips than the worst one"),
     later("update", "attacker::", Tier::All, "the standing attacker on boards, 2 minutes"),
     later("update", "coflash_dialects::the_profile_of_lifts", Tier::Ci, TWO),
@@ -63,9 +69,15 @@ pub const LATER: &[Later] = &[
         "whole programs, cut anywhere, 3 minutes; the model is cut in each run",
     ),
     later("update", "streams::", Tier::All, "whole programs at the slowest flash, 2 minutes"),
+    later("update", "throughput::", Tier::Ci, TIMES),
     later("update", "two_programs::", Tier::Ci, TWO),
     later("sealed", "blocks::eight_sealed_devices", Tier::All, "groups of devices"),
     later("sealed", "powercut::", Tier::All, "each power cut of the model, 1 minute"),
+    later("sealed", "attacker::", Tier::Ci, SEALED),
+    later("sealed", "client::", Tier::Ci, SEALED),
+    later("sealed", "confirmation::", Tier::Ci, SEALED),
+    later("sealed", "model::", Tier::Ci, SEALED),
+    later("sealed", "refusals::", Tier::Ci, SEALED),
     later("foreign", "block_upload::", Tier::Ci, OTHERS),
     later("foreign", "eds::", Tier::Ci, OTHERS),
     later("foreign", "examples::", Tier::All, "builds a project of each tool chain"),
