@@ -19,7 +19,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use canopen::NodeId;
-use coflash::bus::{self, Adapter};
+use coboot_can::Adapter;
 use coflash::device::lss::{ensure_node_id, Master, ANSWER};
 use coflash::device::{info, Error, Session, Timing};
 use coflash::file::convert::{blocks_of, Options, Region};
@@ -78,7 +78,7 @@ impl Order {
 
     /// The whole task; `tell` gets each line.
     fn carry_out(&self, tell: &mut dyn FnMut(serde_json::Value)) -> Result<(), Stop> {
-        let mut bus = bus::open(&self.bus).map_err(Error::from)?;
+        let mut bus = coboot_can::open(&self.bus).map_err(Error::from)?;
         if self.lss {
             self.commission(&mut *bus)?;
         }

@@ -1,14 +1,14 @@
-//! Host side of coboot: firmware files, bus adapters, and the update of a device over CANopen.
+//! Host side of coboot: firmware files, and the update of a device over CANopen. The ways to a bus are
+//! in the crate `coboot-can`.
 //!
 //! | room | what is in it | uses |
 //! |---|---|---|
-//! | [`bus`] | ways to a CAN bus, chosen by URL; traces, frames in words | |
 //! | [`file`](mod@file) | firmware files: read, checked, converted | |
-//! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
-//! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
-//! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `bus`, `device`, `file`, `update` |
-//! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device` |
-//! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
+//! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | |
+//! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `device`, `file` |
+//! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `device`, `file`, `update` |
+//! | `conform` (feature `conform`) | conformance checks on a device | `device` |
+//! | `ui` (feature `ui`) | a local web server and its page in the browser | `device`, `file`, `update` |
 //!
 //! The command line (`src/cli`, feature `cli`) is an ordinary user of this library: decisions are
 //! made here, and output is printed there.
@@ -26,7 +26,7 @@
 //! let firmware = coflash::file::load("app.elf".as_ref(), None, None)?;
 //! let blocks = blocks_of(firmware, &options)?.file;
 //!
-//! let mut bus = coflash::bus::open("socketcand://127.0.0.1:29536/can0")?;
+//! let mut bus = coboot_can::open("socketcand://127.0.0.1:29536/can0")?;
 //! let node = canopen::NodeId::new(1).ok_or("no such node-ID")?;
 //! let mut session = Session::new(&mut bus, node, Timing::default());
 //! flash(&mut session, &blocks, &FlashOptions::default(), &mut |event| println!("{event}"))?;
@@ -46,7 +46,6 @@ mod unicode;
 
 #[cfg(feature = "agent")]
 pub mod agent;
-pub mod bus;
 #[cfg(feature = "cli")]
 #[doc(hidden)]
 pub mod cli;
@@ -58,7 +57,6 @@ pub mod file;
 pub mod ui;
 pub mod update;
 
-pub use bus::Adapter;
 pub use device::{Error, Session};
 
 /// The example on the crate's page compiles and runs.

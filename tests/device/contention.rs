@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::bus::Adapter;
 use coflash::device::{Doing, Transfers};
 use coflash::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};

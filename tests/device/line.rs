@@ -5,9 +5,9 @@
 use std::time::Duration;
 
 use canopen::{Address, BitRate, NodeId};
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::bus::Adapter;
 use coflash::device::{Doing, Session, Timing};
 use coflash::update::{flash, FlashOptions};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};

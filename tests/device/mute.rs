@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::bus::{Adapter, AdapterError};
 use coflash::device::error::TrialFailure;
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;

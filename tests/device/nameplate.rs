@@ -3,9 +3,9 @@
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
+use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
-use coflash::bus::SdoIds;
 use coflash::device::{Doing, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};

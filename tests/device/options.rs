@@ -4,9 +4,9 @@
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
+use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::bus::SdoIds;
 use coflash::device::{Doing, Session, Timing};
 use coflash::update::{flash, FlashOptions};
 use emulator::time::Time;

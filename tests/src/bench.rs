@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::device::{Session, Timing};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;

@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::{BitRate, NodeId};
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::DEFAULT_BLOCK_SIZE;
 use coflash::file::sealed::SealedFile;

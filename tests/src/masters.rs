@@ -8,7 +8,7 @@
 use std::time::Duration;
 
 use canopen::{Address, Frame, NodeId};
-use coflash::bus::Adapter;
+use coboot_can::Adapter;
 use coflash::device::{Doing, Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
 use embedded_can::{Frame as _, StandardId};

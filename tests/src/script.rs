@@ -29,7 +29,7 @@ use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
-use coflash::bus::Adapter;
+use coboot_can::Adapter;
 use coflash::device::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;

@@ -7,12 +7,12 @@ use std::time::Duration;
 
 use canopen::program::{FlashError, DEVICE_STATE, PROGRAM_ID, STATE_RENEWAL};
 use canopen::{Address, BitRate};
+use coboot_can::Adapter as _;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::fleet::{file, Fleet, Update};
 use coboot_tests::renewal::{crc_of, image_of, number};
-use coflash::bus::Adapter as _;
 use coflash::device::Doing;
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::{Note, Warning};

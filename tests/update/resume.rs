@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use canopen::program::PROGRAM_ID;
 use canopen::{Address, BitRate};
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::file;
-use coflash::bus::{Adapter, AdapterError};
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::{Phase, Warning};

@@ -43,17 +43,18 @@ const RULES: &[(&str, &str)] = &[
     ("app-template-v2", "app-template canopen coboot-app coboot-linker bsp"),
     ("test-app", "app-template canopen coboot-app coboot-linker bsp shared-abi"),
     ("vendor-can", ""),
-    ("coflash", "canopen coboot-linker seal shared-abi vendor-can kit"),
-    ("coflash-native", "canopen coflash shared-abi"),
-    ("coboot-node", "boot-core canopen coboot-app coflash shared-abi kit"),
+    ("coboot-can", "canopen vendor-can"),
+    ("coflash", "canopen coboot-can coboot-linker seal shared-abi kit"),
+    ("coflash-native", "canopen coboot-can coflash shared-abi"),
+    ("coboot-node", "boot-core canopen coboot-app coboot-can coflash shared-abi kit"),
     // Its command line reads memory maps.
     ("emulator", "coboot-linker shared-abi"),
     (KIT, "boot-core canopen coboot-app shared-abi"),
     (
         "coboot-tests",
-        "app-template boot-core bsp canopen coboot-app coboot-node coflash emulator seal shared-abi kit",
+        "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash emulator seal shared-abi kit",
     ),
-    ("coboot-zencan", "bsp canopen coboot-tests coflash emulator"),
+    ("coboot-zencan", "bsp canopen coboot-can coboot-tests coflash emulator"),
     ("new-board", "shared-abi"),
     ("xtask", "new-board shared-abi kit"),
 ];
@@ -64,8 +65,18 @@ const KIT: &str = "kit";
 const TESTS: &str = "coboot-tests";
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
-const PURE: &[&str] =
-    &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "kit", "new-board", "xtask"];
+const PURE: &[&str] = &[
+    "canopen",
+    "seal",
+    "boot-core",
+    "coboot-linker",
+    "coboot-can",
+    "coflash",
+    "coboot-node",
+    "kit",
+    "new-board",
+    "xtask",
+];
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

@@ -11,8 +11,8 @@ use std::thread;
 use std::time::Duration;
 
 use canopen::NodeId;
-use coflash::bus::decode::state_words;
-use coflash::bus::Link;
+use coboot_can::decode::state_words;
+use coboot_can::Link;
 use coflash::device::{self, Dialect, ScanOptions, Session, Timing};
 use coflash::file::convert::{blocks_of, ConvertError, Options, Region};
 use coflash::file::sealed::SealedFile;
@@ -135,7 +135,7 @@ fn scan<'py>(
         options = options.nodes(nodes.into_iter().map(node_id).collect::<PyResult<_>>()?);
     }
     let found = work(py, None, |cancelled, _| {
-        let mut adapter = coflash::bus::open(&bus).map_err(device::Error::from)?;
+        let mut adapter = coboot_can::open(&bus).map_err(device::Error::from)?;
         Ok(device::scan(&mut *adapter, &options, &cancelled)?)
     })?;
     let nodes = PyDict::new(py);

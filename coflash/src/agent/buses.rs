@@ -16,13 +16,13 @@ use canopen::Address;
 use super::config::Device;
 use super::controller::{Flashed, News};
 use super::run::{Devices, Order};
-use crate::bus::Link;
 use crate::device::lock::Lock;
 use crate::device::state::{reason, source, supply};
 use crate::device::{info, DeviceInfo, Error, Session, Timing};
 use crate::update::event::Phase;
 use crate::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
 use crate::update::{DeviceState, Event, FlashOptions, Program, Report};
+use coboot_can::Link;
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);

@@ -253,7 +253,7 @@ impl Entry {
     fn device(&self, file: &File, folder: &Path, token: Option<Token>) -> Result<Device, String> {
         let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
         let bus = self.bus.as_ref().or(file.bus.as_ref()).ok_or("it has no bus")?;
-        crate::bus::check(bus).map_err(|error| error.to_string())?;
+        coboot_can::check(bus).map_err(|error| error.to_string())?;
         let board = self.board.as_ref().or(file.board.as_ref()).map(|word| board::in_folder(word, folder));
         let board = board.map(|word| board::named(&word)).transpose().map_err(|error| error.to_string())?;
         if !(1..=254).contains(&self.program) {

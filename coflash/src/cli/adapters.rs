@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use clap::Args;
-use coflash::bus::{list, Found, List};
+use coboot_can::{list, Found, List};
 use serde_json::{json, Value};
 
 use super::context::Context;

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::bus::Adapter;
+use coboot_can::Adapter;
 use coflash::conform::{checks, junit, run, Check, Means, Outcome, Power, Verdict};
 use coflash::device::option_bytes::OptionBytes;
 use coflash::device::read_state::read_state;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use canopen::NodeId;
-use coflash::bus::{self, Adapter, Kind, Link, SdoIds, Trace};
+use coboot_can::{Adapter, Kind, Link, SdoIds, Trace};
 use coflash::device::lock::Lock;
 
 use super::output::{Failure, Output};
@@ -30,7 +30,7 @@ pub(super) struct Context {
 impl Context {
     /// The CAN bus.
     pub(super) fn open(&self) -> Result<Box<dyn Adapter + Send>, Failure> {
-        let adapter = bus::open(&self.url(self.bus.as_deref())?)?;
+        let adapter = coboot_can::open(&self.url(self.bus.as_deref())?)?;
         self.traced(adapter)
     }
 

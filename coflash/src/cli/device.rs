@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::Args;
-use coflash::bus::Link;
+use coboot_can::Link;
 use coflash::device::{Session, Timing, Transfers};
 
 use super::output::{Exit, Failure};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use clap::{Args, ValueEnum};
-use coflash::bus::Link;
+use coboot_can::Link;
 use coflash::device::lock::Lock;
 use coflash::device::lss::{ensure_node_id, LssAddress};
 use coflash::device::Dialect;

@@ -5,7 +5,7 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::NodeId;
 use clap::{Args, Subcommand};
-use coflash::bus::Adapter;
+use coboot_can::Adapter;
 use coflash::device::lss::{BitRate, LssAddress, Master};
 use coflash::Error;
 use serde_json::{json, Value};

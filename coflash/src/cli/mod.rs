@@ -179,7 +179,7 @@ impl Command {
 
     fn run(&self, context: &Context) -> Result<(), Failure> {
         if let Some(bus) = context.bus.as_deref().filter(|_| self.takes_a_bus()) {
-            coflash::bus::check(bus)?;
+            coboot_can::check(bus)?;
         }
         match self {
             Self::Convert(convert) => convert.run(context),

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use canopen::{Frame, NodeId};
 use clap::Args;
-use coflash::bus::candump::Line;
-use coflash::bus::decode::Decoder;
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
 use serde_json::json;
 
 use super::context::Context;

@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::nmt::{parse_state_message, NmtCommand, NmtState};
 use canopen::NodeId;
 use clap::{Args, ValueEnum};
-use coflash::bus::decode::state_words;
+use coboot_can::decode::state_words;
 use coflash::device::diagnose::LISTEN;
 use coflash::device::listen;
 use serde_json::json;

@@ -7,7 +7,7 @@ use std::path::Path;
 use canopen::NodeId;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::Args;
-use coflash::bus::AdapterError;
+use coboot_can::AdapterError;
 use coflash::device::diagnose::{diagnose, Diagnosis};
 use coflash::device::error::LssFailure;
 use coflash::device::{legacy, Session};

@@ -11,10 +11,10 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use canopen::{Frame, NodeId};
-use coflash::bus::candump::Line;
-use coflash::bus::decode::Decoder;
-use coflash::bus::redact::Redactor;
-use coflash::bus::{Adapter, Tap};
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
+use coboot_can::redact::Redactor;
+use coboot_can::{Adapter, Tap};
 use coflash::file::inspect::Date;
 use coflash::update::Event;
 use serde_json::{json, Value};

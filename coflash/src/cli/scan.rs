@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::program::ProgramState;
 use canopen::NodeId;
 use clap::Args;
-use coflash::bus::decode::state_words;
+use coboot_can::decode::state_words;
 use coflash::device::info::ProgramInfo;
 use coflash::device::scan::{scan, Found, ScanOptions};
 use coflash::device::Timing;

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use coflash::bus::{list, Found, Kind, URLS};
+use coboot_can::{list, Found, Kind, URLS};
 
 use super::output::{Failure, Output};
 

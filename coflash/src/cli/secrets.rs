@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 
-use coflash::bus::redact::is_password;
+use coboot_can::redact::is_password;
 
 use super::values::address;
 

@@ -7,9 +7,9 @@ use std::time::Duration;
 use canopen::nmt::{NmtCommand, NmtState};
 use canopen::{CobId, Frame, NodeId};
 
-use crate::bus::{Adapter, AdapterError};
 use crate::device::{Error, Session, Timing};
 use crate::update::Program;
+use coboot_can::{Adapter, AdapterError};
 
 /// Switches the power of the device on or off.
 pub type Power<'p> = Box<dyn FnMut(bool) -> Result<(), String> + 'p>;

@@ -8,8 +8,8 @@ use embedded_can::{ExtendedId, Frame as _, StandardId};
 
 use super::bench::{failed, request, skipped, Bench, Stop};
 use super::check::Check;
-use crate::bus::AdapterError;
 use crate::device::Error;
+use coboot_can::AdapterError;
 
 const UPLOAD: [u8; 8] = request(0x40, 0x1000, 0, [0; 4]);
 const FRAME: &str = "CiA 301 4.2, SDO protocols";

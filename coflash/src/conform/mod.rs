@@ -41,8 +41,8 @@ use self::bench::Bench;
 pub use self::bench::{Means, Power, Stop};
 pub use self::check::{Check, Outcome, Verdict};
 pub use self::junit::junit;
-use crate::bus::Adapter;
 use crate::device::Error;
+use coboot_can::Adapter;
 
 /// All checks, in the order in which they run.
 #[must_use]

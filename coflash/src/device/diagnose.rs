@@ -9,9 +9,9 @@ use canopen::NodeId;
 
 use super::error::Error;
 use super::session::Session;
-use crate::bus::decode::state_words;
-use crate::bus::health::Trouble;
-use crate::bus::Health;
+use coboot_can::decode::state_words;
+use coboot_can::health::Trouble;
+use coboot_can::Health;
 
 /// How long to listen: in most networks, heartbeats come once a second.
 pub const LISTEN: Duration = Duration::from_millis(1200);
@@ -153,7 +153,8 @@ mod tests {
         assert!(words.starts_with("the bus works, and node 9 is heard"), "{words}");
         assert!(words.contains("besides, the adapter has reported 1 error of the bus"), "{words}");
         // A missing acknowledgement is over when others are heard.
-        let health = Health { unacknowledged: 7, ..Health::default() };
+        let mut health = Health::default();
+        health.unacknowledged = 7;
         diagnosis.health = Some(health);
         assert!(!diagnosis.to_string().contains("besides"), "{diagnosis}");
     }

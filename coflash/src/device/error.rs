@@ -13,8 +13,8 @@ use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
 use super::state::{reason, source, trial_end, BootloaderState};
-use crate::bus::gateway::GatewayError;
-use crate::bus::AdapterError;
+use coboot_can::gateway::GatewayError;
+use coboot_can::AdapterError;
 
 mod advice;
 

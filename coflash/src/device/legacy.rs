@@ -10,7 +10,7 @@ use std::io::ErrorKind;
 use canopen::program::FlashError;
 
 use super::error::{Error, LssFailure};
-use crate::bus::AdapterError;
+use coboot_can::AdapterError;
 
 /// `ERR_BL_ERROR`: the bootloader reports an error that the tool does not know.
 pub const UNKNOWN: u32 = 0x6000_0008;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use canopen::Frame;
 
 use super::error::Error;
-use crate::bus::Adapter;
+use coboot_can::Adapter;
 
 /// Receives for `time`, or until `enough` returns true.
 ///

@@ -14,7 +14,7 @@ use super::doing::Doing;
 pub use super::doing::LssDoing;
 use super::error::{Error, LssFailure};
 use super::listen::listen;
-use crate::bus::Adapter;
+use coboot_can::Adapter;
 
 // Command specifiers (CiA 305).
 const SWITCH_GLOBAL: u8 = 0x04;

@@ -15,7 +15,7 @@ use super::info::{info, DeviceInfo};
 use super::listen::listen;
 use super::session::Session;
 use super::timing::Timing;
-use crate::bus::Adapter;
+use coboot_can::Adapter;
 
 /// A node that answered or was heard.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

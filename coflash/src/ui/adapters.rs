@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use serde::Serialize;
 
-use crate::bus::{self, Found, Kind};
+use coboot_can::{Found, Kind};
 
 /// An adapter.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
@@ -18,7 +18,7 @@ pub(super) struct Listed {
 /// the page does not wait for them.
 pub(super) fn list(kinds: &[Kind]) -> Vec<Listed> {
     let kinds: Vec<Kind> = kinds.iter().copied().filter(|kind| *kind != Kind::Socketcand).collect();
-    bus::list(&kinds, Duration::ZERO).found.into_iter().map(listed).collect()
+    coboot_can::list(&kinds, Duration::ZERO).found.into_iter().map(listed).collect()
 }
 
 fn listed(found: Found) -> Listed {

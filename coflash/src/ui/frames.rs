@@ -9,9 +9,9 @@ use serde::Serialize;
 use tokio::sync::watch;
 
 use super::load;
-use crate::bus::candump::Line;
-use crate::bus::decode::Decoder;
-use crate::bus::{Adapter, AdapterError, Health};
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
+use coboot_can::{Adapter, AdapterError, Health};
 
 /// The most frames in words that the page can request.
 const ROWS: usize = 2000;

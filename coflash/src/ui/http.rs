@@ -26,10 +26,10 @@ use super::shared::{lock, Order, Refusal, Shared};
 use super::state::{Fits, Notice, Settings};
 use super::upload::{self, Room, Upload};
 
-use crate::bus::Kind;
 use crate::device::lss::{BitRate, LssAddress};
 use crate::file::board;
 use crate::update::FlashOptions;
+use coboot_can::Kind;
 
 /// The most bytes of a request without a file.
 const BODY_MAX: usize = 64 * 1024;

@@ -25,7 +25,7 @@ use super::http::{router, Site};
 use super::shared::{Order, Shared};
 use super::upload::Room;
 use super::worker;
-use crate::bus::Kind;
+use coboot_can::Kind;
 
 /// The most connections. A browser opens six for each page.
 const CONNECTIONS: usize = 64;

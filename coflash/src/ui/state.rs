@@ -7,12 +7,12 @@ use canopen::NodeId;
 use serde::{Serialize, Serializer};
 use shared_abi::layout::Layout;
 
-use crate::bus::decode::state_words;
 use crate::device::info::{DeviceInfo, ProgramInfo};
 use crate::device::lss::LssAddress;
 use crate::device::scan::Found;
 use crate::device::Error;
 use crate::update::Event;
+use coboot_can::decode::state_words;
 
 /// The most reports; the oldest are dropped first.
 const REPORTS: usize = 500;

@@ -12,11 +12,11 @@ use super::frames::wall;
 use super::job::{Job, Step};
 use super::shared::{lock, Shared};
 use super::state::{Notice, Phase, Readback, Report};
-use crate::bus::Link;
 use crate::device::lss::{self, BitRate, LssAddress, Master};
 use crate::device::{info, scan, Error, ScanOptions, Session, Timing};
 use crate::update::many::{Failed, Job as One};
 use crate::update::{self, steps, Event, FlashOptions, ManyOptions, Target};
+use coboot_can::Link;
 
 /// The most devices in an update at the same time.
 const AT_ONCE: usize = 8;

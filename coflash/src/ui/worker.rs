@@ -10,8 +10,8 @@ use super::frames::Tap;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
 use super::work;
-use crate::bus::{bit_rate_of, AdapterError, Link, SdoIds};
 use crate::device::Timing;
+use coboot_can::{bit_rate_of, AdapterError, Link, SdoIds};
 
 /// How long the thread listens before it checks for an order.
 const SLICE: Duration = Duration::from_millis(50);

@@ -13,8 +13,8 @@ use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Event, Note, Report, Warning};
 use super::flash::flash_program;
 use super::options::FlashOptions;
-use crate::bus::{hub, Adapter, Gateway};
 use crate::device::{Error, Session, Timing, Transfers};
+use coboot_can::{hub, Adapter, Gateway};
 
 /// The update of one device.
 #[derive(Clone, Debug)]

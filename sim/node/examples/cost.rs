@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use std::{env, fs};
 
 use boot_core::canopen::{Frame, NodeId};
-use coflash::bus::{self, Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::device::{Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options, Region};
@@ -102,7 +102,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let file = program(kib)?;
             // A new node for each run: the first update of a node has nothing to erase.
             let node = Node::start()?;
-            let mut bus = Counted { bus: bus::open(&node.url)?, frames: 0 };
+            let mut bus = Counted { bus: coboot_can::open(&node.url)?, frames: 0 };
             let mut session = Session::new(&mut bus, NodeId::new(1).ok_or("no node-ID")?, Timing::default());
             session.transfer_by(transfers);
             let options = FlashOptions::default().start(false);

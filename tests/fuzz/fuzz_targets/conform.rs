@@ -13,7 +13,7 @@ use std::time::Duration;
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
 use coboot_fuzz::Input;
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Means, Outcome};
 use coflash::file::convert::{blocks_of, Options, Region};
 use coflash::update::Program;

@@ -254,7 +254,7 @@ mod tests {
         let read = |file: &str| files::ours(Path::new("coflash").join(file)).unwrap();
         let mut wanted = Vec::new();
         for (file, constant, subsystem) in
-            [("src/bus/gs_usb/usb.rs", "const DEVICES", "usb"), ("src/bus/ports.rs", "const SLCAN", "tty")]
+            [("can/src/gs_usb/usb.rs", "const DEVICES", "usb"), ("can/src/ports.rs", "const SLCAN", "tty")]
         {
             let source = read(file);
             let (_, list) = source.split_once(constant).unwrap();

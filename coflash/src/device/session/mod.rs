@@ -13,9 +13,9 @@ use super::device_type::DeviceType;
 use super::doing::Doing;
 use super::error::Error;
 use super::timing::{Timing, Transfers};
-use crate::bus::adapter::Adapter;
-use crate::bus::gateway::Gateway;
-use crate::bus::{Health, Link};
+use coboot_can::adapter::Adapter;
+use coboot_can::gateway::Gateway;
+use coboot_can::{Health, Link};
 
 mod attention;
 mod listen;

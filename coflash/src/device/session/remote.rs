@@ -7,9 +7,9 @@ use canopen::{AbortCode, Address};
 
 use super::transfer::{VALUE_MAX, WORTH_BLOCKS};
 use super::{Session, Way, UPLOAD_MAX};
-use crate::bus::gateway::{Ask, Gateway, GatewayError};
 use crate::device::doing::Doing;
 use crate::device::error::{of_gateway, Error};
+use coboot_can::gateway::{Ask, Gateway, GatewayError};
 
 /// How much longer than its node a gateway may take for a short value.
 const GATEWAY_GRACE: Duration = Duration::from_secs(5);

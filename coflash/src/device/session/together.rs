@@ -6,9 +6,9 @@ use canopen::sdo::second::{INVALID, REQUEST, RESPONSE};
 use canopen::{Address, CobId};
 
 use super::{Session, Way};
-use crate::bus::adapter::{Group, Met};
 use crate::device::doing::Doing;
 use crate::device::error::Error;
+use coboot_can::adapter::{Group, Met};
 
 impl Session<'_> {
     fn group(&mut self) -> Option<&mut dyn Group> {

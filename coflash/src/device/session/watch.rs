@@ -8,8 +8,8 @@ use canopen::nmt::parse_boot_up;
 use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
-use crate::bus::echo::Echoes;
 use crate::device::doing::Doing;
+use coboot_can::echo::Echoes;
 
 /// A silence of this length is reported while it lasts.
 pub const SILENCE: Duration = Duration::from_secs(2);

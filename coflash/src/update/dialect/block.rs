@@ -9,7 +9,6 @@ use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
-use crate::bus::adapter::Met;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
@@ -24,6 +23,7 @@ use crate::update::judge::{judge, Judgement};
 use crate::update::options::FlashOptions;
 use crate::update::running::RunningUpdate;
 use crate::update::{steps, trial};
+use coboot_can::adapter::Met;
 
 /// See the [module](self).
 pub(super) struct Block;

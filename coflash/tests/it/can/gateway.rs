@@ -9,8 +9,8 @@ use std::thread;
 use std::time::Duration;
 
 use canopen::{Address, NodeId};
-use coflash::bus::gateway::{Ask, Gateway, GatewayError};
-use coflash::bus::Cia309;
+use coboot_can::gateway::{Ask, Gateway, GatewayError};
+use coboot_can::Cia309;
 use coflash::device::{Doing, Session, Timing};
 use coflash::Error;
 
@@ -386,7 +386,7 @@ impl Gateway for Patient {
         Ok(())
     }
 
-    fn greet(&mut self, _: Duration) -> Result<(), coflash::bus::AdapterError> {
+    fn greet(&mut self, _: Duration) -> Result<(), coboot_can::AdapterError> {
         Ok(())
     }
 

@@ -1,4 +1,3 @@
 //! Adapters and frames.
 
-mod decode;
 mod gateway;

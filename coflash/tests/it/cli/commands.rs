@@ -8,7 +8,7 @@ use std::time::Duration;
 use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use crate::tool::{coflash, data, folder, run, serve, snapshot};
 use canopen::{CobId, Frame};
-use coflash::bus::candump::Line;
+use coboot_can::candump::Line;
 use serde_json::Value;
 
 /// A device without delays.
@@ -408,12 +408,12 @@ fn monitor_ends_with_its_reader() {
 /// A bus with a heartbeat every ten milliseconds.
 struct Heartbeats(Duration);
 
-impl coflash::Adapter for Heartbeats {
-    fn send(&mut self, _: &Frame) -> Result<(), coflash::bus::AdapterError> {
+impl coboot_can::Adapter for Heartbeats {
+    fn send(&mut self, _: &Frame) -> Result<(), coboot_can::AdapterError> {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         let beat = Duration::from_millis(10);
         if timeout < beat {
             return Ok(None);
@@ -487,8 +487,8 @@ struct LssDevice {
     now: Duration,
 }
 
-impl coflash::Adapter for LssDevice {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
+impl coboot_can::Adapter for LssDevice {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
         let bytes: [u8; 8] = *frame.exactly().unwrap();
         let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
         let address = [0x3Fu32, 2, 0x10000, 7];
@@ -519,7 +519,7 @@ impl coflash::Adapter for LssDevice {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         self.now += timeout;
         Ok(self.answers.pop_front().map(|bytes| Frame::of(CobId::new(0x7E4).unwrap(), &bytes)))
     }

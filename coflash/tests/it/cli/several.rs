@@ -112,8 +112,8 @@ struct Unconfigured {
 
 const ADDRESS: [u32; 4] = [0x3F, 2, 3, 4];
 
-impl coflash::Adapter for Unconfigured {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
+impl coboot_can::Adapter for Unconfigured {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
         let bytes: Option<&[u8; 8]> = frame.exactly();
         let Some(bytes) = bytes.filter(|_| frame.cob_id() == CobId::new(0x7E5)) else {
             return self.fake.send(frame);
@@ -148,7 +148,7 @@ impl coflash::Adapter for Unconfigured {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         if self.outbox.is_empty() {
             return self.fake.receive(timeout);
         }
@@ -244,13 +244,13 @@ struct Mirror {
     back: VecDeque<Frame>,
 }
 
-impl coflash::Adapter for Mirror {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
+impl coboot_can::Adapter for Mirror {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
         self.back.push_back(*frame);
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         match self.back.pop_front() {
             None => self.fake.receive(timeout),
             frame => Ok(frame),
@@ -291,12 +291,12 @@ struct Chatter {
     next: Duration,
 }
 
-impl coflash::Adapter for Chatter {
-    fn send(&mut self, frame: &Frame) -> Result<(), coflash::bus::AdapterError> {
+impl coboot_can::Adapter for Chatter {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
         self.fake.send(frame)
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         if self.fake.now >= self.next {
             self.next = self.fake.now + Duration::from_millis(50);
             self.frames.iter().for_each(|frame| self.fake.inject(*frame));

@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{AbortCode, Address, CobId, Frame, NodeId};
-use coflash::bus::AdapterError;
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::info::info;
 use coflash::device::scan::{scan, ScanOptions};
 use coflash::device::{Session, Timing, Transfers};
-use coflash::{Adapter, Error};
+use coflash::Error;
 use embedded_can::Frame as _;
 
 use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::device::error::{Error, LssFailure};
 use coflash::device::lss::{BitRate, LssAddress, LssDoing, Master, ANSWER};
 

@@ -6,7 +6,7 @@ use std::io;
 use std::time::Duration;
 
 use canopen::{CobId, Frame};
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coflash::update::{DeviceState, Event};
 
 /// The state of the device after a failed update, from its events.

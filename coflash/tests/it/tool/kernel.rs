@@ -8,7 +8,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
-use coflash::Adapter;
+use coboot_can::Adapter;
 use embedded_can::{Frame as _, Id, StandardId};
 
 use kit::folder::Folder;

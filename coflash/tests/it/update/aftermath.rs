@@ -4,13 +4,14 @@
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::AdapterError;
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::error::Intruder;
 use coflash::device::{Dialect, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
-use coflash::{Adapter, Error};
+use coflash::Error;
 
 use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 

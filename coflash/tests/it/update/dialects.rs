@@ -4,6 +4,7 @@
 use std::sync::{Arc, Mutex};
 
 use canopen::NodeId;
+use coboot_can::Adapter;
 use coflash::device::{recognise, Dialect, Doing, Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
 use coflash::file::convert::{blocks_of, Options};
@@ -12,7 +13,6 @@ use coflash::update::dialect::{self, read_locked};
 use coflash::update::event::{Note, Phase};
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report, Target};
-use coflash::Adapter;
 use coflash::Error;
 use embedded_can::Frame as _;
 

@@ -6,13 +6,13 @@ use std::time::Duration;
 
 use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::hub::{self, Act, Conversation, Terms};
+use coboot_can::hub::{self, Act, Conversation, Terms};
+use coboot_can::Adapter;
 use coflash::device::Transfers;
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::update::{DeviceState, Event, FlashOptions, Report};
-use coflash::Adapter;
 use coflash::Error;
 
 const FILE: &[u8] = data!("identity-110.blk");

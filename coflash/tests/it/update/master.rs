@@ -5,12 +5,13 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::AdapterError;
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::{Session, Timing};
 use coflash::file::BlockFile;
 use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report};
-use coflash::{Adapter, Error};
+use coflash::Error;
 
 use crate::fake::{left, Blocks, Fake, APPLICATION, BOOTLOADER, NODE};
 

@@ -5,12 +5,12 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::AdapterError;
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::{Dialect, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::{Note, Warning};
 use coflash::update::{flash, Event, FlashOptions, Password, Report};
-use coflash::Adapter;
 use coflash::Error;
 
 use crate::fake::{Deed, Fake, Maker, APPLICATION, NODE};

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use crate::fake::{crc16, left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{CobId, Frame, NodeId};
+use coboot_can::Adapter;
 use coflash::device::info::info;
 use coflash::device::{Session, Timing, Transfers};
 use coflash::file::block_file::BlockFile;
@@ -13,7 +14,6 @@ use coflash::file::convert::{blocks_of, Options};
 use coflash::file::{raw, Firmware};
 use coflash::update::event::{Phase, RepeatReason, Retry, Warning};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
-use coflash::Adapter;
 use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
 use proptest::prelude::*;
@@ -931,11 +931,11 @@ struct Chaos {
 }
 
 impl Adapter for Chaos {
-    fn send(&mut self, _: &Frame) -> Result<(), coflash::bus::AdapterError> {
+    fn send(&mut self, _: &Frame) -> Result<(), coboot_can::AdapterError> {
         Ok(())
     }
 
-    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coflash::bus::AdapterError> {
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
         if timeout.is_zero() {
             return Ok(None);
         }

@@ -6,13 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::AdapterError;
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::error::{Error, IdentityPart};
 use coflash::device::{Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
 use coflash::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
-use coflash::Adapter;
 
 use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 

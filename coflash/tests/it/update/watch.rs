@@ -6,13 +6,14 @@ use std::time::Duration;
 use crate::fake::{left, Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::gateway::{Ask, Gateway, GatewayError};
-use coflash::bus::AdapterError;
+use coboot_can::gateway::{Ask, Gateway, GatewayError};
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
 use coflash::device::{Doing, Session, Timing};
 use coflash::file::block_file::BlockFile;
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
-use coflash::{Adapter, Error};
+use coflash::Error;
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {

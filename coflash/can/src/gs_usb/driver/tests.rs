@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use canopen::CobId;
 
 use super::*;
-use crate::bus::health::Trouble;
+use crate::health::Trouble;
 
 /// A device: the transfers that it sends, and those that it received.
 #[derive(Default)]

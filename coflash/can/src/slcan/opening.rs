@@ -19,9 +19,9 @@
 use std::time::Duration;
 
 use super::{is_version, Line, Message, Slcan, ANSWER};
-use crate::bus::adapter::AdapterError;
-use crate::bus::found::shown;
-use crate::bus::ports;
+use crate::adapter::AdapterError;
+use crate::found::shown;
+use crate::ports;
 
 /// The same for an adapter that answers, but too late for the order of the commands.
 const LATE_ANSWER: Duration = Duration::from_secs(1);

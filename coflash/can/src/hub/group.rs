@@ -9,7 +9,7 @@ use canopen::sdo::client::{Config, GroupDownload, GroupResult, GroupStep, Server
 use canopen::{AbortCode, Frame, Instant};
 
 use super::line::{Item, Line, State, Terms, What};
-use crate::bus::adapter::{Adapter, AdapterError, Met};
+use crate::adapter::{Adapter, AdapterError, Met};
 
 /// After this many frames in a row, the bus is read.
 const BURST: usize = 8;

@@ -1,8 +1,8 @@
 //! Frames in words. The frames are written by hand from CiA 301 and CiA 305.
 
 use canopen::Frame;
-use coflash::bus::candump::Line;
-use coflash::bus::decode::Decoder;
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
 use proptest::prelude::*;
 
 fn frame(text: &str) -> Frame {

@@ -1,7 +1,7 @@
-//! Access to a CAN bus, and the formats of frames.
+//! Ways to a CAN bus, chosen by URL, and the formats of frames.
 //!
-//! This module handles frames. Their meaning for a device is the subject of
-//! [`device`](crate::device).
+//! This crate handles frames. Their meaning for a device is the subject of the crate that uses it.
+#![forbid(unsafe_code)]
 
 pub mod adapter;
 mod beacons;
@@ -10,7 +10,7 @@ pub mod cia309;
 pub mod decode;
 #[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
 mod driven;
-pub(crate) mod echo;
+pub mod echo;
 mod found;
 pub mod gateway;
 #[cfg(feature = "gs_usb")]
@@ -55,6 +55,11 @@ pub use self::socketcan::SocketCan;
 pub use self::socketcand::Socketcand;
 pub use self::tap::{Ear, Tap};
 pub use self::trace::{OnFailure, Trace};
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;
 
 #[cfg(test)]
 mod tests {

@@ -6,8 +6,8 @@ use std::time::Duration;
 use canopen::Frame;
 
 use super::wire::{self, request, Constants, Said};
-use crate::bus::driven::{Driver, Fault, Sent};
-use crate::bus::health::Health;
+use crate::driven::{Driver, Fault, Sent};
+use crate::health::Health;
 
 /// The most frames that may be in the device's queue (`GS_MAX_TX_URBS`).
 pub(super) const MOST_UNDER_WAY: usize = 10;

@@ -8,7 +8,7 @@ use nusb::{DeviceInfo, Endpoint, ErrorKind, Interface, MaybeFuture};
 
 use super::driver::{Usb, MOST_UNDER_WAY};
 use super::which::Choice;
-use crate::bus::adapter::AdapterError;
+use crate::adapter::AdapterError;
 
 /// USB vendor and product IDs of gs_usb adapters (the list of the Linux driver, and CANnectivity).
 const DEVICES: [(u16, u16); 5] =

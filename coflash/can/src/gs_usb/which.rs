@@ -4,7 +4,7 @@ use std::fmt;
 
 /// The device, and its channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(in crate::bus) struct Which {
+pub(crate) struct Which {
     pub(super) device: Choice,
     pub(super) channel: u8,
 }
@@ -20,7 +20,7 @@ pub(super) enum Choice {
 impl Which {
     /// Parses `0`, `0/1` or `0030003A3438511834353732`. A number below 100 is a place, any other
     /// text a serial number.
-    pub(in crate::bus) fn parse(text: &str) -> Option<Self> {
+    pub(crate) fn parse(text: &str) -> Option<Self> {
         let (device, channel) = match text.split_once('/') {
             Some((device, channel)) => (device, Some(channel)),
             None => (text, None),

@@ -341,7 +341,7 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::bus::health::Trouble;
+    use crate::health::Trouble;
 
     fn frame(id: u16, data: &[u8]) -> Frame {
         Frame::of(CobId::new(id).unwrap(), data)
@@ -438,7 +438,7 @@ mod tests {
             ("< rawmode >", "< ok >< frame 701 1.000000 00 >< frame 701 1.1 7F >< stat 1 >"),
             ("< send 601 8 40 00 10 00 00 00 00 00 >", "\n< frame 581 2.000000 4300100000000010 > "),
         ]);
-        let mut bus = crate::bus::open(&format!("socketcand://{address}/can0")).unwrap();
+        let mut bus = crate::open(&format!("socketcand://{address}/can0")).unwrap();
         let long = Duration::from_secs(20);
         assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0])));
         assert_eq!(bus.receive(long).unwrap(), Some(frame(0x701, &[0x7F])));
@@ -494,7 +494,7 @@ mod tests {
             ("< send 601 8 40 00 10 00 00 00 00 00 >", "[1] OK\r\n< frame 701 1.0 7F >"),
             ("< send 601 8 40 00 10 00 00 00 00 00 >", ""),
         ]);
-        let mut bus = crate::bus::open(&format!("socketcand://{address}/can0")).unwrap();
+        let mut bus = crate::open(&format!("socketcand://{address}/can0")).unwrap();
         assert_eq!(bus.health().unwrap().trouble(), None);
         bus.send(&Frame::of(CobId::sdo_request(NodeId::MIN), &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
         assert_eq!(bus.receive(Duration::from_secs(20)).unwrap(), Some(frame(0x701, &[0x7F])));
@@ -634,7 +634,7 @@ mod tests {
             ("socketcand:///can0", "must be socketcand://HOST:PORT/BUS"),
             ("socketcand://localhost/can0 >", "must be socketcand://HOST:PORT/BUS"),
         ] {
-            let error = crate::bus::open(url).map(|_| ()).unwrap_err();
+            let error = crate::open(url).map(|_| ()).unwrap_err();
             assert!(error.to_string().contains(words), "{error}");
         }
     }

@@ -6,11 +6,11 @@ use canopen::Frame;
 
 /// The last `MOST` frames that were sent and did not come back yet, in their order.
 #[derive(Debug, Default)]
-pub(crate) struct Echoes<const MOST: usize>(VecDeque<Frame>);
+pub struct Echoes<const MOST: usize>(VecDeque<Frame>);
 
 impl<const MOST: usize> Echoes<MOST> {
     /// A frame was sent.
-    pub(crate) fn sent(&mut self, frame: &Frame) {
+    pub fn sent(&mut self, frame: &Frame) {
         if self.0.len() == MOST {
             self.0.pop_front();
         }
@@ -19,7 +19,7 @@ impl<const MOST: usize> Echoes<MOST> {
 
     /// Whether a received frame is the echo of one that was sent, and not another node's. Who returns
     /// frames returns all of them, in their order.
-    pub(crate) fn takes(&mut self, frame: &Frame) -> bool {
+    pub fn takes(&mut self, frame: &Frame) -> bool {
         let at = self.0.iter().position(|sent| sent == frame);
         if let Some(at) = at {
             self.0.drain(..=at);
@@ -28,7 +28,7 @@ impl<const MOST: usize> Echoes<MOST> {
     }
 
     /// No more echoes of these frames will come.
-    pub(crate) fn clear(&mut self) {
+    pub fn clear(&mut self) {
         self.0.clear();
     }
 }

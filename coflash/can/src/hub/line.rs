@@ -8,7 +8,7 @@ use std::time::Duration;
 use canopen::frame::Channel;
 use canopen::{Address, Frame, NodeId};
 
-use crate::bus::adapter::{AdapterError, Met};
+use crate::adapter::{AdapterError, Met};
 
 /// How conversations run.
 #[derive(Clone, Debug)]

@@ -124,7 +124,7 @@ pub(super) fn list() -> Result<Vec<Found>, Missing> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bus::health::Trouble;
+    use crate::health::Trouble;
 
     /// The output of iproute2 for a real interface (a sun4i_can at 250 kbit/s on a bus with another
     /// bit rate), and for a USB adapter that is switched off; shortened.

@@ -3,12 +3,12 @@
 use super::driver::GsUsb;
 use super::usb;
 use super::which::{Choice, Which};
-use crate::bus::adapter::AdapterError;
-use crate::bus::driven::Driven;
-use crate::bus::found::{shown, Found, Kind};
+use crate::adapter::AdapterError;
+use crate::driven::Driven;
+use crate::found::{shown, Found, Kind};
 
 /// Opens a device at a bit rate in bit/s.
-pub(in crate::bus) fn open(which: Which, rate: u32) -> Result<Driven, AdapterError> {
+pub(crate) fn open(which: Which, rate: u32) -> Result<Driven, AdapterError> {
     let name = format!("gs_usb adapter {which}");
     let adapter = name.clone();
     Driven::open(name, move || {
@@ -21,7 +21,7 @@ pub(in crate::bus) fn open(which: Which, rate: u32) -> Result<Driven, AdapterErr
 }
 
 /// The connected devices, or the system's error.
-pub(in crate::bus) fn list() -> Result<Vec<Found>, String> {
+pub(crate) fn list() -> Result<Vec<Found>, String> {
     let devices = usb::list()?;
     let found = devices.iter().enumerate().map(|(place, device)| {
         let serial = device
