@@ -49,7 +49,7 @@ const RULES: &[(&str, &str)] = &[
     ("coboot-node", "boot-core canopen coboot-app coboot-can coflash shared-abi kit"),
     // Its command line reads memory maps.
     ("emulator", "coboot-linker shared-abi"),
-    (KIT, "boot-core canopen coboot-app shared-abi"),
+    (KIT, "boot-core canopen coboot-app coboot-can shared-abi"),
     (
         "coboot-tests",
         "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash emulator seal shared-abi kit",

@@ -12,7 +12,6 @@ mod agent;
 mod can;
 mod cli;
 mod device;
-mod fake;
 mod file;
 mod tool;
 mod ui;

@@ -13,8 +13,8 @@ use coflash::file::sealed::{Kek, Sealer, SigningKey};
 use coflash::ui::{Options, Server};
 use serde_json::{json, Value};
 
-use crate::fake::vault::Vault;
-use crate::fake::Fake;
+use kit::fake::vault::Vault;
+use kit::fake::Fake;
 
 /// How long something may take before it counts as hanging. It measures nothing.
 const PATIENCE: Duration = Duration::from_secs(120);
@@ -564,15 +564,15 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
         (0x8E, "failed", "the device has no key for this program", Some("coflash show")),
     ] {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
-        let mut fake = Fake::new(crate::fake::BOOTLOADER);
+        let mut fake = Fake::new(kit::fake::BOOTLOADER);
         fake.erase_time = Duration::from_millis(30);
         let vault = Vault { kept: kept.clone(), start: 0x0801_0000, room: 0x10000, status };
         fake.maker = Some(Box::new(vault));
-        let (bus, _server) = crate::tool::serve(fake);
+        let (bus, _server) = kit::fake::serve(fake);
         let ui = Ui::new(Some(bus));
         ui.until("the adapter", |state| state["adapter"]["state"] == "open");
         assert_eq!(ui.file("app.cbs", &file).status, 200);
-        ui.post("update", &json!({ "nodes": [crate::fake::NODE], "trial": true, "start": true }));
+        ui.post("update", &json!({ "nodes": [kit::fake::NODE], "trial": true, "start": true }));
         let state = ui.until("the end", |state| !state["notice"].is_null() && state["task"].is_null());
         let update = &state["updates"][0];
         assert_eq!(update["phase"], phase, "{update}");
@@ -587,7 +587,7 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
 
 /// A device whose erase takes longer than the test.
 fn slow() -> Fake {
-    let mut fake = Fake::new(crate::fake::BOOTLOADER);
+    let mut fake = Fake::new(kit::fake::BOOTLOADER);
     fake.erase_time = Duration::from_secs(3600);
     fake
 }
@@ -596,18 +596,18 @@ fn slow() -> Fake {
 /// running task.
 #[test]
 fn a_second_update_is_refused_while_one_runs() {
-    let (bus, _server) = crate::tool::serve(slow());
+    let (bus, _server) = kit::fake::serve(slow());
     let ui = Ui::new(Some(bus));
     ui.until("the adapter", |state| state["adapter"]["state"] == "open");
     assert_eq!(ui.file("app.hex", HEX).status, 200);
-    let update = json!({ "nodes": [crate::fake::NODE], "trial": false, "start": true });
+    let update = json!({ "nodes": [kit::fake::NODE], "trial": false, "start": true });
     assert_eq!(ui.post("update", &update).status, 200);
     let state = ui.until("the update", |state| state["updates"][0]["phase"] == "running");
     assert_eq!(state["task"]["kind"], "update");
     for (what, value) in [
         ("update", update),
         ("scan", json!({})),
-        ("step", json!({ "node": crate::fake::NODE, "program": 1, "step": "erase" })),
+        ("step", json!({ "node": kit::fake::NODE, "program": 1, "step": "erase" })),
         ("open", json!({ "url": "slcan:/dev/null" })),
         ("close", json!({})),
         ("settings", json!({ "board": null, "program": 2 })),
@@ -629,11 +629,11 @@ fn a_second_update_is_refused_while_one_runs() {
 /// Ctrl-C during an update ends it in an orderly way, and reports the state of the device.
 #[test]
 fn the_end_of_the_server_ends_an_update_in_order() {
-    let (bus, server) = crate::tool::serve(slow());
+    let (bus, server) = kit::fake::serve(slow());
     let ui = Ui::new(Some(bus));
     ui.until("the adapter", |state| state["adapter"]["state"] == "open");
     ui.file("app.hex", HEX);
-    ui.post("update", &json!({ "nodes": [crate::fake::NODE], "trial": false, "start": true }));
+    ui.post("update", &json!({ "nodes": [kit::fake::NODE], "trial": false, "start": true }));
     ui.until("the update", |state| state["updates"][0]["phase"] == "running");
     let words = ui.finish().expect("an update was running");
     assert!(words.contains("node 5: cancelled") && words.contains("The device: "), "{words}");

@@ -14,8 +14,8 @@ use coboot_can::Cia309;
 use coflash::device::{Doing, Session, Timing};
 use coflash::Error;
 
-use crate::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 use crate::tool::{coflash, data};
+use kit::fake::{Blocks, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 /// The gateway's answer to a line, or none. The gateway adds `[7]` to the answer itself.
 type Play = Box<dyn FnMut(&str) -> Option<String> + Send>;
@@ -241,7 +241,7 @@ fn a_binary_without_an_address_goes_to_devices_that_have_none() {
         let image = Arc::new(Mutex::new(Vec::new()));
         let mut fake = quick(APPLICATION);
         fake.maker = Some(Box::new(Standard(image.clone())));
-        let (bus, server) = crate::tool::serve(fake);
+        let (bus, server) = kit::fake::serve(fake);
         (bus, (server, image))
     };
     let binary = ["flash", "-N", "5", &file, "-I", "binary"];

@@ -6,11 +6,11 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use crate::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
 use crate::tool::kernel::{converse, standard};
 use crate::tool::{coflash, data};
 use canopen::Frame;
 use embedded_can::{Frame as _, StandardId};
+use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
 
 fn device() -> Fake {
     let mut fake = Fake::new(BOOTLOADER);

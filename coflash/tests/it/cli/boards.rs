@@ -7,8 +7,8 @@ use kit::folder::Folder;
 use shared_abi::layout::nucleo_f446re::LAYOUT;
 use shared_abi::layout::toml::Toml;
 
-use crate::fake::{Fake, APPLICATION};
-use crate::tool::{coflash, data, folder, serve, Done};
+use crate::tool::{coflash, data, folder, Done};
+use kit::fake::{serve, Fake, APPLICATION};
 
 /// The commands with `--board`, as the manual pages name them: these are made of the definition of the
 /// command line.

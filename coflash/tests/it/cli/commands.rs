@@ -5,10 +5,10 @@ use std::io::Write;
 use std::process::Stdio;
 use std::time::Duration;
 
-use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{coflash, data, folder, run, serve, snapshot};
+use crate::tool::{coflash, data, folder, run, snapshot};
 use canopen::{CobId, Frame};
 use coboot_can::candump::Line;
+use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 /// A device without delays.

@@ -5,9 +5,9 @@ use std::net::TcpListener;
 use std::time::Duration;
 
 use super::adapters::serve_slcan;
-use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{coflash, data, folder, run, serve, Done};
-use crate::update::renew::image;
+use crate::tool::{coflash, data, folder, run, Done};
+use kit::fake::renewal::image;
+use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 /// The exit code that the system reports: Unix keeps eight bits, Windows all of them.
 fn shown(number: u32) -> i32 {

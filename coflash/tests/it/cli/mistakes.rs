@@ -14,9 +14,9 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{data, folder, run, serve, Done};
+use crate::tool::{data, folder, run, Done};
 use canopen::{CobId, Frame};
+use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 use kit::folder::Folder;
 
 /// The situation of the command.

@@ -6,6 +6,7 @@ mod commands;
 mod legacy;
 mod mistakes;
 mod pages;
+mod renew;
 mod sealing;
 mod several;
 mod vendor;
@@ -19,8 +20,8 @@ use std::time::Duration;
 
 use coflash::file::ihex;
 
-use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{coflash, data, folder, run, serve, snapshot};
+use crate::tool::{coflash, data, folder, run, snapshot};
+use kit::fake::{serve, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 #[test]
 fn convert_writes_the_block_file_of_the_manual() {

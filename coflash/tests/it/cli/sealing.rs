@@ -7,11 +7,11 @@ use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use crate::fake::vault::Vault;
-use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{coflash, folder, serve, Done};
+use crate::tool::{coflash, folder, Done};
 use coflash::file::sealed::{verify, Device, Kek, PublicKey};
 use coflash::file::{ihex, raw};
+use kit::fake::vault::Vault;
+use kit::fake::{serve, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
 use kit::folder::Folder;
 use kit::ihex::{intel_hex, END_OF_FILE};
 use serde_json::Value;

@@ -5,9 +5,9 @@ use std::fs;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
-use crate::tool::{coflash, data, folder, serve};
+use crate::tool::{coflash, data, folder};
 use canopen::{CobId, Frame};
+use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use serde_json::Value;
 
 fn device(node: u8, running: u32) -> Fake {

@@ -9,9 +9,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use crate::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
 use crate::tool::kernel::{library, serve};
 use crate::tool::{data, folder, run, Done};
+use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
 use kit::folder::Folder;
 
 /// A folder with the library of a vendor.

@@ -12,7 +12,7 @@ use coflash::device::{Session, Timing, Transfers};
 use coflash::Error;
 use embedded_can::Frame as _;
 
-use crate::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
+use kit::fake::{Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE, SILENT};
 
 const NAME: Address = Address::new(0x1008, 0);
 const TYPE: Address = Address::new(0x1000, 0);

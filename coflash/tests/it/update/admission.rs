@@ -1,13 +1,13 @@
 //! Refusals before the device is changed, in every dialect: files that cannot be a program, and
 //! programs for another device or for another place in flash.
 
-use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::NodeId;
 use coflash::device::info::info;
 use coflash::device::{Dialect, Error, Session, Timing};
 use coflash::file::convert::{blocks_of, Label as Told, Options};
 use coflash::file::{raw, BlockFile, Firmware};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
+use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const START: u32 = 0x0801_0000;
 /// The values of 1018h in the fake.

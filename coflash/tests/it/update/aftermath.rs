@@ -13,7 +13,7 @@ use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash::Error;
 
-use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const CLEAR: u8 = 0x03;
 const CALL: u8 = 0x80;
@@ -106,7 +106,7 @@ fn what_the_device_still_has_is_told() {
                 if its == Dialect::Block {
                     fake.on_block = Box::new(|_| Outcome::Abort(0x0606_0000));
                 } else {
-                    fake.knows_blocks = crate::fake::Blocks::Known(127);
+                    fake.knows_blocks = kit::fake::Blocks::Known(127);
                     fake.refuses_segment = Some((1, 0x0C));
                 }
             }
@@ -314,7 +314,7 @@ impl Adapter for Echo {
 
 #[test]
 fn an_adapters_echo_is_nobody_else() {
-    for blocks in [crate::fake::Blocks::Known(127), crate::fake::Blocks::Refused(0x0504_0001)] {
+    for blocks in [kit::fake::Blocks::Known(127), kit::fake::Blocks::Refused(0x0504_0001)] {
         for running in [BOOTLOADER, APPLICATION] {
             let mut fake = Fake::new(running);
             fake.knows_blocks = blocks;

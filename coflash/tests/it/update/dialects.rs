@@ -16,7 +16,8 @@ use coflash::update::{flash, DeviceState, Event, FlashOptions, Password, Report,
 use coflash::Error;
 use embedded_can::Frame as _;
 
-use crate::fake::{left, Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use super::left;
+use kit::fake::{Blocks, Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// Abort codes (CiA 301 table 22).
 const WRITE_ONLY: u32 = 0x0601_0001;

@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{AbortCode, NodeId};
 use coflash::device::{DeviceType, Dialect, Session, Timing};
 use coflash::file::block_file::Checksum;
@@ -10,6 +9,7 @@ use coflash::file::BlockFile;
 use coflash::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
 use coflash::update::{flash, Event, FlashOptions, Target};
 use coflash::Error;
+use kit::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use serde_json::{json, Value};
 
 fn node() -> NodeId {

@@ -4,7 +4,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::hub::{self, Act, Conversation, Terms};
 use coboot_can::Adapter;
@@ -14,6 +13,7 @@ use coflash::update::event::Phase;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::update::{DeviceState, Event, FlashOptions, Report};
 use coflash::Error;
+use kit::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = data!("identity-110.blk");
 

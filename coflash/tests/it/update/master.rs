@@ -13,7 +13,8 @@ use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report};
 use coflash::Error;
 
-use crate::fake::{left, Blocks, Fake, APPLICATION, BOOTLOADER, NODE};
+use super::left;
+use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER, NODE};
 
 const fn ms(time: u64) -> Duration {
     Duration::from_millis(time)

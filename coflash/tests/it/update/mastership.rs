@@ -13,7 +13,7 @@ use coflash::update::event::{Note, Warning};
 use coflash::update::{flash, Event, FlashOptions, Password, Report};
 use coflash::Error;
 
-use crate::fake::{Deed, Fake, Maker, APPLICATION, NODE};
+use kit::fake::{Deed, Fake, Maker, APPLICATION, NODE};
 
 const LIFT: u32 = 0xFE00_01A1;
 

@@ -8,6 +8,16 @@ mod many;
 mod master;
 mod mastership;
 mod procedure;
-pub mod renew;
+mod renew;
 mod search;
 mod watch;
+
+use coflash::update::{DeviceState, Event};
+
+/// The state of the device after a failed update, from its events.
+pub fn left(events: &[Event]) -> DeviceState {
+    match events.last() {
+        Some(Event::Done(done)) => done.left.state,
+        other => panic!("{other:?}"),
+    }
+}

@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::fake::{crc16, left, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use super::left;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coflash::device::info::info;
@@ -16,6 +16,7 @@ use coflash::update::event::{Phase, RepeatReason, Retry, Warning};
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
 use coflash::Error;
 use embedded_can::{Frame as _, StandardId};
+use kit::fake::{crc16, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
 
 fn file() -> BlockFile {
@@ -235,13 +236,13 @@ fn after_a_damaged_block_comes_block_transfer_again() {
 /// A bootloader of coboot, which reports the region of its program.
 struct Coboot;
 
-impl crate::fake::Maker for Coboot {
+impl kit::fake::Maker for Coboot {
     fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
         let region = [LARGE_AT.to_le_bytes(), 0x6_0000_u32.to_le_bytes()].concat();
         (at == (0x2004, 1)).then_some(Ok(region))
     }
 
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<crate::fake::Deed, u32>> {
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<kit::fake::Deed, u32>> {
         None
     }
 

@@ -14,7 +14,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::update::event::Phase;
 use coflash::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 
-use crate::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
     let file = BlockFile::parse(data!("plain-400.blk")).unwrap();

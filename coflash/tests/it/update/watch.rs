@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use crate::fake::{left, Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
+use super::left;
 use canopen::nmt::parse_boot_up;
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::gateway::{Ask, Gateway, GatewayError};
@@ -14,6 +14,7 @@ use coflash::file::block_file::BlockFile;
 use coflash::update::many::{flash_many, Job, ManyOptions};
 use coflash::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash::Error;
+use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {

@@ -7,17 +7,12 @@ use std::time::Duration;
 
 use canopen::{CobId, Frame};
 use coboot_can::{Adapter, AdapterError};
-use coflash::update::{DeviceState, Event};
 
-/// The state of the device after a failed update, from its events.
-pub fn left(events: &[Event]) -> DeviceState {
-    match events.last() {
-        Some(Event::Done(done)) => done.left.state,
-        other => panic!("{other:?}"),
-    }
-}
-
+pub mod renewal;
+mod serve;
 pub mod vault;
+
+pub use self::serve::serve;
 
 /// In place of the abort code for an object: no answer at all.
 pub const SILENT: u32 = 0;
