@@ -13,8 +13,8 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
-use coflash::device::{Session, Timing};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 
 /// A board in its bootloader, with no program installed.
 fn empty_board() -> Bench {

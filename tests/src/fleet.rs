@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use canopen::{BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::DEFAULT_BLOCK_SIZE;
-use coflash::file::sealed::SealedFile;
-use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::DEFAULT_BLOCK_SIZE;
+use coflash_core::file::sealed::SealedFile;
+use coflash_core::update::many::{flash_many, Failed, Job, ManyOptions};
+use coflash_core::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use canopen::NodeId;
 use coboot_can::slcan::Line;
 use coboot_can::{Adapter, AdapterError};
-use coflash::device::{Session, Timing};
+use coflash_core::device::{Session, Timing};
 use embedded_can::{Frame as _, Id, StandardId};
 use emulator::time::{Span, Time};
 

@@ -13,11 +13,11 @@ use std::{env, fs};
 
 use boot_core::canopen::{Frame, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash::device::{Session, Timing, Transfers};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Format};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 const SIZES: [u32; 2] = [256, 896];

@@ -165,7 +165,7 @@ fn linux(release: &Release) -> Outcome {
     let name = format!("coflash-{VERSION}");
     let folder = stage.join(&name);
     build::with_extras(release, &folder)?;
-    for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/README.md"] {
+    for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/cli/README.md"] {
         let from = workspace::root().join(file);
         files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
@@ -269,7 +269,7 @@ mod tests {
             }
         }
         assert!(wanted.len() >= 7, "{wanted:?}");
-        let rules = read("packaging/70-coflash.rules");
+        let rules = read("cli/packaging/70-coflash.rules");
         let rules: Vec<_> = rules.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
         assert_eq!(rules, wanted);
     }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use crate::bus::{Folder, Nodes};
 use canopen::{CobId, Frame, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash::conform::{checks, run, Check, Means, Outcome};
+use coflash_conform::{checks, run, Check, Means, Outcome};
 use embedded_can::Frame as _;
 
 /// A fault: what the device gets, and what it answers. `asked` is the last SDO request.

@@ -1,3 +1,0 @@
-//! Adapters and frames.
-
-mod gateway;
