@@ -19,6 +19,22 @@ const FROM: &str =
     "install the adapter's driver and CANlib from www.kvaser.com (Windows and Linux; there is none for \
                     macOS); on Linux the kernel's own driver needs no library: socketcan:can0";
 
+/// Checks a channel's number and a bit rate.
+pub(super) fn check(channel: &str, rate: Option<u32>) -> Result<(), &'static str> {
+    number(channel)?;
+    if rate.is_some_and(|rate| parameters(rate).is_none()) {
+        return Err("Kvaser adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k and 20k");
+    }
+    Ok(())
+}
+
+/// A channel by its number.
+fn number(channel: &str) -> Result<u16, &'static str> {
+    let digits = channel.bytes().all(|byte| byte.is_ascii_digit());
+    let number = channel.parse().ok().filter(|_| digits);
+    number.ok_or("it names no channel of CANlib by its number: kvaser:0@500k")
+}
+
 /// The arguments of `canSetBusParams` for each bit rate: one of the constants `canBITRATE_…`, or
 /// the rate itself with its segments (16 quanta sampled at 87.5 %, 10 at 80 %).
 const BIT_RATES: [(u32, i32, (u32, u32)); 8] = [
@@ -58,12 +74,14 @@ mod flag {
 }
 
 /// The arguments of `canSetBusParams` for a bit rate in bit/s.
-pub(super) fn parameters(rate: u32) -> Option<(i32, (u32, u32))> {
+fn parameters(rate: u32) -> Option<(i32, (u32, u32))> {
     BIT_RATES.iter().find_map(|(known, given, segments)| (*known == rate).then_some((*given, *segments)))
 }
 
 /// Opens a channel at a bit rate in bit/s.
-pub(super) fn open(channel: u16, rate: u32) -> Result<Driven, AdapterError> {
+pub(super) fn open(channel: &str, rate: u32) -> Result<Driven, AdapterError> {
+    let channel = number(channel)
+        .map_err(|what| AdapterError::unusable("Kvaser adapter", what, "choose another one"))?;
     let name = format!("Kvaser channel {channel}");
     let adapter = name.clone();
     let unusable = move |what: String, advice: &str, in_use| AdapterError::Unusable {

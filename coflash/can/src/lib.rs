@@ -10,6 +10,7 @@ pub mod cia309;
 pub mod decode;
 #[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
 mod driven;
+mod drivers;
 pub mod echo;
 mod found;
 pub mod gateway;

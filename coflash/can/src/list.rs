@@ -2,16 +2,11 @@
 
 use std::time::Duration;
 
+use super::drivers::driver;
 use super::found::{Found, Kind, Missing};
-#[cfg(feature = "gs_usb")]
-use super::gs_usb;
 use super::in_time::in_time;
-#[cfg(feature = "kvaser")]
-use super::kvaser;
 #[cfg(target_os = "linux")]
 use super::links;
-#[cfg(feature = "peak")]
-use super::peak;
 use super::{beacons, ports};
 
 /// The result of a search.
@@ -65,21 +60,11 @@ fn search(kind: Kind, listen: Duration) -> Result<Vec<Found>, Missing> {
         Kind::SocketCan => links::list(),
         #[cfg(not(target_os = "linux"))]
         Kind::SocketCan => Ok(Vec::new()),
-        #[cfg(feature = "peak")]
-        Kind::Peak => peak::list(),
-        #[cfg(feature = "kvaser")]
-        Kind::Kvaser => kvaser::list(),
-        #[cfg(feature = "gs_usb")]
-        Kind::GsUsb => gs_usb::list().map_err(|what| Missing {
-            what: format!("the USB devices cannot be listed: {what}"),
-            advice: "check that this computer has USB",
-        }),
         Kind::Socketcand => beacons::list(listen),
-        #[allow(unreachable_patterns)]
-        kind => Err(Missing {
-            what: format!("this coflash was built without {kind}"),
-            advice: "build it with all features",
-        }),
+        Kind::Peak | Kind::Kvaser | Kind::GsUsb => match driver(kind) {
+            Ok(driver) => (driver.list)(),
+            Err(what) => Err(Missing { what, advice: "build it with all features" }),
+        },
     }
 }
 

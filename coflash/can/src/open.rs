@@ -3,12 +3,7 @@
 #[cfg(doc)]
 use super::adapter::URLS;
 use super::adapter::{Adapter, AdapterError};
-#[cfg(feature = "gs_usb")]
-use super::gs_usb;
-#[cfg(feature = "kvaser")]
-use super::kvaser;
-#[cfg(feature = "peak")]
-use super::peak;
+use super::drivers::driver;
 use super::slcan::Slcan;
 #[cfg(target_os = "linux")]
 use super::socketcan::SocketCan;
@@ -36,29 +31,23 @@ fn target(url: &str) -> Result<Target, AdapterError> {
 }
 
 /// Opens the adapter of a URL. `bit_rate` (in bit/s) applies if the URL contains none and the
-/// adapter sets the bit rate. To add another adapter, add it here.
+/// adapter sets the bit rate. To add another adapter, add it here; one with a driver in `drivers`.
 ///
 /// # Errors
 /// The URL is invalid, or the adapter does not open.
 pub fn open_at(url: &str, bit_rate: Option<u32>) -> Result<Box<dyn Adapter + Send>, AdapterError> {
     let bad = |why: &str| AdapterError::Url { url: url.to_string(), why: why.to_string() };
-    #[cfg(any(feature = "peak", feature = "kvaser", feature = "gs_usb"))]
-    let needed = |rate: Option<u32>| {
-        rate.or(bit_rate)
-            .ok_or_else(|| bad(&format!("it needs the bit rate of the bus: {url}@125k, or 250k, 500k, 1M")))
-    };
     Ok(match target(url)? {
         Target::Socketcand { server, bus } => Box::new(Socketcand::connect(&server, &bus)?),
         Target::SlcanTcp { server, rate } => Box::new(Slcan::connect(&server, rate.or(bit_rate))?),
         Target::SlcanPort { port, rate } => Box::new(Slcan::serial(&port, rate.or(bit_rate))?),
         #[cfg(target_os = "linux")]
         Target::SocketCan { interface } => Box::new(SocketCan::open(&interface)?),
-        #[cfg(feature = "peak")]
-        Target::Peak { channel, rate } => Box::new(peak::open(&channel, needed(rate)?)?),
-        #[cfg(feature = "kvaser")]
-        Target::Kvaser { channel, rate } => Box::new(kvaser::open(channel, needed(rate)?)?),
-        #[cfg(feature = "gs_usb")]
-        Target::GsUsb { which, rate } => Box::new(gs_usb::open(which, needed(rate)?)?),
+        Target::Driver { kind, which, rate } => {
+            let needed = || bad(&format!("it needs the bit rate of the bus: {url}@125k, or 250k, 500k, 1M"));
+            let driver = driver(kind).map_err(|why| bad(&why))?;
+            (driver.open)(&which, rate.or(bit_rate).ok_or_else(needed)?)?
+        }
         Target::Gateway => {
             return Err(bad("a gateway carries only SDO, and this command needs the CAN bus itself"))
         }

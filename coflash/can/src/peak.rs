@@ -81,8 +81,19 @@ mod kind {
 /// all systems.
 const PAUSE: Duration = Duration::from_micros(500);
 
+/// Checks a channel's name and a bit rate.
+pub(super) fn check(name: &str, rate: Option<u32>) -> Result<(), &'static str> {
+    if channel(name).is_none() {
+        return Err("it names no channel of PCANBasic: peak:PCAN_USBBUS1@500k");
+    }
+    if rate.is_some_and(|rate| registers(rate).is_none()) {
+        return Err("PEAK adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k, 20k, 10k and 5k");
+    }
+    Ok(())
+}
+
 /// The value for a channel's name, with or without `PCAN_`.
-pub(super) fn channel(name: &str) -> Option<u16> {
+fn channel(name: &str) -> Option<u16> {
     let name = name.to_ascii_uppercase();
     let name = name.strip_prefix("PCAN_").unwrap_or(&name);
     names().find_map(|(known, value)| (known.strip_prefix("PCAN_") == Some(name)).then_some(value))
@@ -97,7 +108,7 @@ fn names() -> impl Iterator<Item = (String, u16)> {
 }
 
 /// The register values for a bit rate in bit/s.
-pub(super) fn registers(rate: u32) -> Option<u16> {
+fn registers(rate: u32) -> Option<u16> {
     BIT_RATES.iter().find_map(|(known, registers)| (*known == rate).then_some(*registers))
 }
 

@@ -1,12 +1,8 @@
 //! The URL of an adapter, checked before anything is opened.
 
 use super::adapter::{NO_ADAPTER, NO_SCHEME};
-#[cfg(feature = "gs_usb")]
-use super::gs_usb::Which;
-#[cfg(feature = "kvaser")]
-use super::kvaser;
-#[cfg(feature = "peak")]
-use super::peak;
+use super::drivers::driver;
+use super::found::Kind;
 
 /// The target of a URL.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -20,15 +16,8 @@ pub(super) enum Target {
     /// An interface of the Linux kernel.
     #[cfg(target_os = "linux")]
     SocketCan { interface: String },
-    /// A PEAK channel.
-    #[cfg(feature = "peak")]
-    Peak { channel: String, rate: Option<u32> },
-    /// A Kvaser channel.
-    #[cfg(feature = "kvaser")]
-    Kvaser { channel: u16, rate: Option<u32> },
-    /// A gs_usb device and its channel.
-    #[cfg(feature = "gs_usb")]
-    GsUsb { which: Which, rate: Option<u32> },
+    /// An adapter with a driver of its own: which one of this kind.
+    Driver { kind: Kind, which: String, rate: Option<u32> },
     /// A gateway, which is not an adapter.
     Gateway,
 }
@@ -37,13 +26,7 @@ impl Target {
     /// The bit rate in the URL, in bit/s.
     pub(super) fn rate(&self) -> Option<u32> {
         match self {
-            Self::SlcanPort { rate, .. } | Self::SlcanTcp { rate, .. } => *rate,
-            #[cfg(feature = "peak")]
-            Self::Peak { rate, .. } => *rate,
-            #[cfg(feature = "kvaser")]
-            Self::Kvaser { rate, .. } => *rate,
-            #[cfg(feature = "gs_usb")]
-            Self::GsUsb { rate, .. } => *rate,
+            Self::SlcanPort { rate, .. } | Self::SlcanTcp { rate, .. } | Self::Driver { rate, .. } => *rate,
             _ => None,
         }
     }
@@ -81,9 +64,9 @@ impl Target {
                 }
             }
             "socketcan" => interface(rest),
-            "peak" => peak_channel(rest),
-            "kvaser" => kvaser_channel(rest),
-            "gs_usb" => gs_usb_device(rest),
+            "peak" => with_driver(Kind::Peak, rest),
+            "kvaser" => with_driver(Kind::Kvaser, rest),
+            "gs_usb" => with_driver(Kind::GsUsb, rest),
             "cia309" => Ok(Self::Gateway),
             // A Windows drive is not a port, but users often write COM7: for a port.
             scheme if is_port(scheme) => Err(no_scheme(url.trim_end_matches(':'))),
@@ -125,53 +108,11 @@ fn interface(_: &str) -> Result<Target, String> {
     Err("only Linux has SocketCAN; peak:, kvaser:, gs_usb: and slcan: work without it".to_string())
 }
 
-#[cfg(feature = "peak")]
-fn peak_channel(rest: &str) -> Result<Target, String> {
-    let (channel, rate) = with_rate(rest)?;
-    if peak::channel(channel).is_none() {
-        return Err("it names no channel of PCANBasic: peak:PCAN_USBBUS1@500k".to_string());
-    }
-    if rate.is_some_and(|rate| peak::registers(rate).is_none()) {
-        return Err(
-            "PEAK adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k, 20k, 10k and 5k".to_string()
-        );
-    }
-    Ok(Target::Peak { channel: channel.to_string(), rate })
-}
-
-#[cfg(feature = "kvaser")]
-fn kvaser_channel(rest: &str) -> Result<Target, String> {
-    let (channel, rate) = with_rate(rest)?;
-    let digits = channel.bytes().all(|byte| byte.is_ascii_digit());
-    let Some(channel) = channel.parse::<u16>().ok().filter(|_| digits) else {
-        return Err("it names no channel of CANlib by its number: kvaser:0@500k".to_string());
-    };
-    if rate.is_some_and(|rate| kvaser::parameters(rate).is_none()) {
-        return Err("Kvaser adapters support 1M, 800k, 500k, 250k, 125k, 100k, 50k and 20k".to_string());
-    }
-    Ok(Target::Kvaser { channel, rate })
-}
-
-#[cfg(feature = "gs_usb")]
-fn gs_usb_device(rest: &str) -> Result<Target, String> {
+fn with_driver(kind: Kind, rest: &str) -> Result<Target, String> {
+    let driver = driver(kind)?;
     let (which, rate) = with_rate(rest)?;
-    let which = Which::parse(which).ok_or("it names no device by place or serial number: gs_usb:0@500k")?;
-    Ok(Target::GsUsb { which, rate })
-}
-
-#[cfg(not(feature = "peak"))]
-fn peak_channel(_: &str) -> Result<Target, String> {
-    Err("this coflash was built without peak".to_string())
-}
-
-#[cfg(not(feature = "kvaser"))]
-fn kvaser_channel(_: &str) -> Result<Target, String> {
-    Err("this coflash was built without kvaser".to_string())
-}
-
-#[cfg(not(feature = "gs_usb"))]
-fn gs_usb_device(_: &str) -> Result<Target, String> {
-    Err("this coflash was built without gs_usb".to_string())
+    (driver.check)(which, rate)?;
+    Ok(Target::Driver { kind, which: which.to_string(), rate })
 }
 
 /// The text before the last `@`, and the bit rate after it.
@@ -273,18 +214,14 @@ mod tests {
         }
         #[cfg(target_os = "linux")]
         assert_eq!(Target::parse("socketcan:can0"), Ok(Target::SocketCan { interface: "can0".to_string() }));
-        #[cfg(feature = "peak")]
-        assert_eq!(
-            Target::parse("peak:PCAN_USBBUS1@500k"),
-            Ok(Target::Peak { channel: "PCAN_USBBUS1".to_string(), rate })
-        );
-        #[cfg(feature = "kvaser")]
-        assert_eq!(Target::parse("kvaser:12@500k"), Ok(Target::Kvaser { channel: 12, rate }));
-        #[cfg(feature = "gs_usb")]
-        assert_eq!(
-            Target::parse("gs_usb:0/1@500k"),
-            Ok(Target::GsUsb { which: Which::parse("0/1").unwrap(), rate })
-        );
+        for (url, kind, which) in [
+            ("peak:PCAN_USBBUS1@500k", Kind::Peak, "PCAN_USBBUS1"),
+            ("kvaser:12@500k", Kind::Kvaser, "12"),
+            ("gs_usb:0/1@500k", Kind::GsUsb, "0/1"),
+        ] {
+            let there = driver(kind).map(|_| Target::Driver { kind, which: which.to_string(), rate });
+            assert_eq!(Target::parse(url), there, "{url}");
+        }
     }
 
     /// Each of these is a common mistake.

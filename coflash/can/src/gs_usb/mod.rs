@@ -11,5 +11,4 @@ mod usb;
 mod which;
 mod wire;
 
-pub(super) use self::open::{list, open};
-pub(super) use self::which::Which;
+pub(super) use self::open::{check, list, open};

@@ -5,10 +5,21 @@ use super::usb;
 use super::which::{Choice, Which};
 use crate::adapter::AdapterError;
 use crate::driven::Driven;
-use crate::found::{shown, Found, Kind};
+use crate::found::{shown, Found, Kind, Missing};
+
+/// Checks what names a device. It tells its bit rates when it is open.
+pub(crate) fn check(which: &str, _: Option<u32>) -> Result<(), &'static str> {
+    Which::parse(which).map(|_| ()).ok_or(NO_DEVICE)
+}
+
+/// What is wrong with a text that names no device.
+const NO_DEVICE: &str = "it names no device by place or serial number: gs_usb:0@500k";
 
 /// Opens a device at a bit rate in bit/s.
-pub(crate) fn open(which: Which, rate: u32) -> Result<Driven, AdapterError> {
+pub(crate) fn open(which: &str, rate: u32) -> Result<Driven, AdapterError> {
+    let Some(which) = Which::parse(which) else {
+        return Err(AdapterError::unusable("gs_usb adapter", NO_DEVICE, "choose another one"));
+    };
     let name = format!("gs_usb adapter {which}");
     let adapter = name.clone();
     Driven::open(name, move || {
@@ -21,8 +32,11 @@ pub(crate) fn open(which: Which, rate: u32) -> Result<Driven, AdapterError> {
 }
 
 /// The connected devices, or the system's error.
-pub(crate) fn list() -> Result<Vec<Found>, String> {
-    let devices = usb::list()?;
+pub(crate) fn list() -> Result<Vec<Found>, Missing> {
+    let devices = usb::list().map_err(|what| Missing {
+        what: format!("the USB devices cannot be listed: {what}"),
+        advice: "check that this computer has USB",
+    })?;
     let found = devices.iter().enumerate().map(|(place, device)| {
         let serial = device
             .serial
