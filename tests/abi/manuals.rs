@@ -11,7 +11,7 @@ const LIST: &str = include_str!("../../docs/from-the-manuals.txt");
 const PRODUCT: &str = include_str!("../../bootloader/src/product.rs");
 const PRODUCT_PAGE: &str = include_str!("../../docs/product.md");
 /// The help of coflash, which its tests record.
-const HELP: &str = include_str!("../../coflash/tests/snapshots/help.txt");
+const HELP: &str = include_str!("../../coflash/cli/tests/snapshots/help.txt");
 
 /// How the names of the manuals begin. Nothing of coboot begins in this way.
 const PREFIXES: [&str; 20] = [

@@ -3,10 +3,10 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Firmware, Format};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as ChipOptions;
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::{Span, Time};

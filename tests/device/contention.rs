@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate};
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::bus::Adapter;
-use coflash::device::{Doing, Transfers};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
 /// The segments of a sub-block at 125 kbit/s: as many as fit into 80 ms, with 135 bits each.

@@ -4,7 +4,7 @@
 use canopen::Address;
 use coboot_tests::bench::{Bench, BIT_RATE, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{dead_crystal, firmware};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::Time;

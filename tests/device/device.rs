@@ -4,11 +4,11 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
 use coboot_tests::bench::{press, Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::device::Doing;
-use coflash::update::event::Phase;
-use coflash::update::steps::enter_bootloader;
-use coflash::update::{flash, Event, FlashOptions};
-use coflash::Error;
+use coflash_core::device::Doing;
+use coflash_core::update::event::Phase;
+use coflash_core::update::steps::enter_bootloader;
+use coflash_core::update::{flash, Event, FlashOptions};
+use coflash_core::Error;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::{Span, Time};
 

@@ -7,11 +7,11 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
-use coflash::device::Doing;
-use coflash::file::convert::{blocks_of, Options};
-use coflash::file::read::{read, Format};
-use coflash::update::steps::release;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::Doing;
+use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::steps::release;
+use coflash_core::update::{flash, FlashOptions};
 
 /// The application template's return (object 2000h): the value for the jump.
 const REENTRY_PATH: Address = Address::new(0x2000, 0);

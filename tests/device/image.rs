@@ -7,7 +7,7 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{press, Bench, NODE};
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::machine::{ResetCause, Stop};
 use object::elf::{FileHeader32, PT_LOAD};

@@ -3,10 +3,10 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::device::Doing;
-use coflash::file::convert::{blocks_of, Options};
-use coflash::file::read::{read, Format};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::Doing;
+use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 

@@ -5,11 +5,11 @@
 use std::time::Duration;
 
 use canopen::{Address, BitRate, NodeId};
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::bus::Adapter;
-use coflash::device::{Doing, Session, Timing};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Doing, Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::bus::Outcome;
 use emulator::frame::Frame;
@@ -334,7 +334,7 @@ fn a_damaged_block_is_told_by_an_emergency_and_the_next_good_one_ends_it() {
     let mut block = [0; 24];
     block[8] = 8;
     let address = canopen::Address::new(0x1F50, 1);
-    let doing = coflash::device::Doing::Block(0);
+    let doing = coflash_core::device::Doing::Block(0);
     bench.session().write(address, &block, doing, &mut |_| {}).unwrap_err();
     bench.run_ms(20);
     assert_eq!(emergencies(&bench, from), [[0x00, 0x63, 0x81, 0x06, 1, 0, 0, 0]]);

@@ -4,7 +4,7 @@ use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::listener::{decoder, heard, Listener};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::defmt::Decoder;
 use emulator::machine::Options;
 use emulator::peripheral::Peripheral;

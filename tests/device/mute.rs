@@ -3,18 +3,18 @@
 
 use std::time::Duration;
 
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::bus::{Adapter, AdapterError};
-use coflash::device::error::TrialFailure;
-use coflash::device::{Session, Timing};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options};
-use coflash::file::read::{read, Format};
-use coflash::update::{
+use coflash_core::device::error::TrialFailure;
+use coflash_core::device::{Session, Timing};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{
     catch, flash, CatchOptions, Caught, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions,
 };
-use coflash::Error;
+use coflash_core::Error;
 
 /// A jump to itself, in Thumb.
 const HERE: [u8; 2] = [0xFE, 0xE7];

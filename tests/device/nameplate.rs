@@ -3,15 +3,15 @@
 
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
+use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
-use coflash::bus::SdoIds;
-use coflash::device::{Doing, Session, Timing};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Format};
-use coflash::update::{flash, FlashOptions};
-use coflash::Error;
+use coflash_core::device::{Doing, Session, Timing};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{flash, FlashOptions};
+use coflash_core::Error;
 use shared_abi::label::Label;
 
 use crate::options::set_switches;

@@ -4,11 +4,11 @@
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
+use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::bus::SdoIds;
-use coflash::device::{Doing, Session, Timing};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Doing, Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::time::Time;
 
 /// Pins of port E that the product `switches` reads: the node-ID on 8 to 14, the index of the bit
@@ -145,7 +145,7 @@ fn a_pin_says_whether_a_program_is_valid() {
         let mut session = Session::new(&mut ids, node, Timing::default());
         let options = FlashOptions::default().start(false);
         flash(&mut session, &file, &options, &mut |_| {}).unwrap();
-        coflash::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
+        coflash_core::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     }
     let restart = |bench: &mut Bench, valid: bool| {
         bench.power_off();

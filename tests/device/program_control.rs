@@ -10,10 +10,10 @@ use coboot_tests::bench::{
     control, Bench, ACKNOWLEDGED, HEARTBEAT, NODE, REQUEST, RESCUE_WINDOW_MS, RESPONSE,
 };
 use coboot_tests::{firmware, renewal};
-use coflash::device::info::info;
-use coflash::update::steps::call_back;
-use coflash::update::{flash, FlashOptions};
-use coflash::Error;
+use coflash_core::device::info::info;
+use coflash_core::update::steps::call_back;
+use coflash_core::update::{flash, FlashOptions};
+use coflash_core::Error;
 use emulator::machine::Stop;
 use emulator::time::{Span, Time};
 use shared_abi::renewal::Progress;
@@ -301,8 +301,8 @@ fn an_owed_answer_in_a_damaged_cell_is_not_sent() {
 /// Downloads an application in one transfer, by the segments of any client.
 fn raw_download(bench: &mut Bench, node: u8, image: &str) {
     let mut session = bench.session_with(node);
-    session.transfer_by(coflash::device::Transfers::Segments);
-    let doing = coflash::device::Doing::Program;
+    session.transfer_by(coflash_core::device::Transfers::Segments);
+    let doing = coflash_core::device::Doing::Program;
     let at = canopen::Address::new(0x1F50, 1);
     session.write(at, &firmware::raw(image), doing, &mut |_| {}).unwrap();
     let _ = session.await_idle(1, doing);

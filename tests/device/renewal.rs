@@ -12,8 +12,8 @@ use coboot_tests::renewal::{
     cells, confirm, crc_of, identification, image_of, number, progress, running, stage, start, status,
     version, with_crc,
 };
-use coflash::device::Doing;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::Doing;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Options, Stop};
 use emulator::silicon::{Silicon, WORST};
 use emulator::time::Span;
@@ -354,7 +354,7 @@ fn a_cut_anywhere_leaves_a_bootloader_and_the_program() {
 }
 
 /// What a tool does, from whatever state.
-fn renew(bench: &mut Bench, new: &[u8]) -> Result<(), coflash::Error> {
+fn renew(bench: &mut Bench, new: &[u8]) -> Result<(), coflash_core::Error> {
     let doing = Doing::Write(Address::new(PROGRAM_DATA, number()));
     let n = number();
     let mut session = bench.session();

@@ -3,7 +3,7 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::silicon::{Silicon, TYPICAL};
 

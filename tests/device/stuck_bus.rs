@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options;
 use emulator::silicon::{Silicon, TYPICAL, WORST};
 use emulator::time::{Span, Time};

@@ -4,10 +4,10 @@ use canopen::program::{FlashError, ProgramControl};
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::device::option_bytes::OptionBytes;
-use coflash::device::read_state::read_state;
-use coflash::device::{Doing, Error};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::option_bytes::OptionBytes;
+use coflash_core::device::read_state::read_state;
+use coflash_core::device::{Doing, Error};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Operation, ResetCause, Stop};
 use emulator::time::Span;
 

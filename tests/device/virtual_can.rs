@@ -7,14 +7,14 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
+use coboot_can::slcan::Slcan;
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
-use coflash::bus::slcan::Slcan;
-use coflash::bus::Adapter;
-use coflash::device::{Session, Timing};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 
 /// A board in its bootloader, with no program installed.
 fn empty_board() -> Bench {

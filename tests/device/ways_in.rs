@@ -5,7 +5,7 @@ use canopen::program::{ProgramControl, DEVICE_STATE, STATE_CRASH_RESETS, STATE_R
 use canopen::{AbortCode, Address};
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 

@@ -9,7 +9,7 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 
 fn bootloader() -> Bench {
     let mut bench = Bench::new();

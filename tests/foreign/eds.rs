@@ -9,8 +9,8 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::eds::{self, Image};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coflash::file::read::Firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::file::read::Firmware;
+use coflash_core::update::{flash, FlashOptions};
 
 fn images() -> Vec<Image> {
     eds::images()
@@ -277,7 +277,8 @@ fn the_protocol_page_names_every_object() {
 #[test]
 fn the_firmware_does_not_carry_the_names() {
     for elf in [firmware::BOOTLOADER, firmware::APP_V1] {
-        let Ok(Firmware::Image(image)) = coflash::file::read::read(&firmware::elf(elf), None, None) else {
+        let Ok(Firmware::Image(image)) = coflash_core::file::read::read(&firmware::elf(elf), None, None)
+        else {
             panic!("{elf} is no ELF of ours")
         };
         let has = |text: &str| {

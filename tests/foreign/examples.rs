@@ -10,8 +10,8 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::{call_back, dead_crystal, firmware};
-use coflash::update::{flash, FlashOptions};
-use coflash::Error;
+use coflash_core::update::{flash, FlashOptions};
+use coflash_core::Error;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::{stm32f407g_disc1, stm32f407g_disc1_two, Image};
 

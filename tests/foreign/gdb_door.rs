@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::gdb::Door;
 use emulator::pacing::{Pacer, Speed};
 use emulator::socketcand::Server;

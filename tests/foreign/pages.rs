@@ -432,7 +432,7 @@ fn lelys_recipe_updates_the_node_of_the_page() {
     let mut bus = (0..200)
         .find_map(|_| {
             std::thread::sleep(Duration::from_millis(50));
-            coflash::bus::open(&url).ok()
+            coboot_can::open(&url).ok()
         })
         .expect("the node offers its bus");
     let image = firmware::raw(firmware::APP_V1);
@@ -450,7 +450,7 @@ fn lelys_recipe_updates_the_node_of_the_page() {
     assert_eq!(told, Ok(()));
 }
 
-fn compare(dcf: &str, bus: &mut dyn coflash::bus::Adapter) -> Result<(), String> {
+fn compare(dcf: &str, bus: &mut dyn coboot_can::Adapter) -> Result<(), String> {
     let mut master = Master::new(bus, 1, Duration::from_secs(2));
     for (object, (index, sub)) in COMPARED {
         let Some(expected) = expected(dcf, object).filter(|expected| *expected != 0) else { continue };

@@ -4,10 +4,10 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::read;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::read;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::peripheral::Peripheral;
 use shared_abi::layout::stm32f407g_disc1_can2::LAYOUT;
 

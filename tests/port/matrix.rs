@@ -9,10 +9,10 @@ use coboot_tests::listener::Listener;
 use coboot_tests::script::{play_on, Wire};
 use coboot_tests::serial::TextBus;
 use coboot_tests::{firmware, script};
-use coflash::device::{Doing, Session};
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::read;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Doing, Session};
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::read;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 use kit::ihex::intel_hex;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
@@ -216,7 +216,7 @@ fn a_bootloader_with_the_debugger_takes_hex() {
 /// program.
 #[test]
 fn a_product_with_crc_16_is_updated_by_block_file() {
-    use coflash::file::block_file::Checksum;
+    use coflash_core::file::block_file::Checksum;
 
     let Some(mut bench) = board("bootloader-crc-16") else { return };
     let file = |checksum| {
@@ -234,7 +234,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
     let crc = crc16(&crc[..file.program_size() as usize]);
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     let mut session = bench.session();
-    coflash::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
+    coflash_core::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();
     assert_eq!(session.read_number(Address::new(0x1F56, 1)).unwrap(), crc);
 
     // It is not confirmed yet: boot-up message of the bootloader, and of the program 300 ms later.

@@ -9,7 +9,7 @@ use std::process::{Command, Output};
 
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Operation, Options};
 use kit::folder::Alone;
 use object::{Object, ObjectSection};

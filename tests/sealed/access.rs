@@ -7,7 +7,7 @@ use coboot_tests::sealed::{
     crc32, image, keys, seal, sealer, Device, Host, Parts, CLEAR, CLR_SIGNATURE, STANDARD_1, STANDARD_2,
 };
 use coboot_tests::sealed_board::status;
-use coflash::file::sealed::{key_block, Sealer};
+use coflash_core::file::sealed::{key_block, Sealer};
 use seal::access::{event, right, EVENTS, REQUEST, SEALED};
 
 /// CiA 301: the length does not match; a value that is not allowed; not now.

@@ -22,7 +22,7 @@ use coboot_tests::sealed::{
     block, certificate, crc32, image, keys, seal, sealer, Device, Host, Parts, Setup, CONFIRMED_2,
     ESACADEMY_2, FORMS, LIFT_2, STANDARD_1, STANDARD_2,
 };
-use coflash::file::sealed::{Certificate, Sealer};
+use coflash_core::file::sealed::{Certificate, Sealer};
 use kit::ihex::intel_hex;
 use kit::model::{until_power_cut, Cut};
 use kit::random::Random;

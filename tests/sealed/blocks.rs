@@ -9,12 +9,12 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::Fleet;
 use coboot_tests::sealed_board::{board, keys, release, sealer, status, write, COUNTER, KEKS};
-use coflash::device::{Doing, Transfers};
-use coflash::file::convert::blocks_of_sealed;
-use coflash::file::sealed::{SealedFile, Sealer};
-use coflash::update::event::{Note, Phase};
-use coflash::update::{flash_sealed, Event, FlashOptions};
-use coflash::Error;
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::convert::blocks_of_sealed;
+use coflash_core::file::sealed::{SealedFile, Sealer};
+use coflash_core::update::event::{Note, Phase};
+use coflash_core::update::{flash_sealed, Event, FlashOptions};
+use coflash_core::Error;
 use shared_abi::block_file::Header;
 
 const DATA: Address = Address::new(0x1F50, 1);

@@ -11,7 +11,7 @@ use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, release, sealer, COUNTER, KEKS};
-use coflash::file::sealed::Sealer;
+use coflash_core::file::sealed::Sealer;
 
 /// 100Ah, software version.
 const VERSION: Address = Address::new(0x100A, 0);

@@ -8,7 +8,7 @@ use coboot_tests::bench::{
 };
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, release, sealer, write, COUNTER};
-use coflash::device::Transfers;
+use coflash_core::device::Transfers;
 use shared_abi::warm_start::{BootRequest, StoredNode, WarmStart};
 
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];

@@ -6,7 +6,7 @@ use std::time::Duration;
 use canopen::NodeId;
 use coboot_tests::bench::NODE;
 use coboot_tests::sealed_board::{board, open_board};
-use coflash::conform::{checks, run, Means, Outcome};
+use coflash_conform::{checks, run, Means, Outcome};
 
 #[test]
 fn sealed_devices_pass() {

@@ -14,10 +14,10 @@ use coboot_tests::listener::Listener;
 use coboot_tests::sealed_board::{
     board, board_of, key, keys, open_board, release, root, sealer, status, write, COUNTER, KEKS,
 };
-use coflash::device::access::{ask, challenge, events};
-use coflash::device::debugger::Debugger;
-use coflash::device::{Doing, Transfers};
-use coflash::file::sealed::{Kek, Sealer, SigningKey};
+use coflash_core::device::access::{ask, challenge, events};
+use coflash_core::device::debugger::Debugger;
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
 use seal::access::{event, right};
 
 const VERSION: Address = Address::new(0x100A, 0);
@@ -238,7 +238,7 @@ fn without_keys_the_device_is_open() {
     start(&mut bench, firmware::APP_V1, "1.0.0");
     call_back(&mut bench);
     let file = firmware::blocks(firmware::APP_V2);
-    coflash::update::flash(&mut bench.session(), &file, &Default::default(), &mut |_| {}).unwrap();
+    coflash_core::update::flash(&mut bench.session(), &file, &Default::default(), &mut |_| {}).unwrap();
     assert_eq!(bench.session().read_text(VERSION).unwrap(), "2.0.0");
     bench.assert_nothing_unmodelled();
 }

@@ -1,7 +1,7 @@
 //! Two programs: an update with the other program of the device as dictionary.
 
 use coboot_tests::sealed::{image, keys, sealer, Device, Parts, STANDARD_1, STANDARD_2};
-use coflash::file::sealed::Sealer;
+use coflash_core::file::sealed::Sealer;
 
 /// 1F57h: for another product, program or state of the device.
 const WRONG_PRODUCT: u32 = 0x82;

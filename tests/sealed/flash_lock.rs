@@ -6,8 +6,8 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{board, board_of, open_board, release, sealer, status, write, COUNTER};
-use coflash::device::{Doing, Transfers};
-use coflash::file::sealed::Sealer;
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::sealed::Sealer;
 use emulator::machine::{ResetCause, Stop};
 
 const DATA: Address = Address::new(0x1F50, 1);

@@ -8,7 +8,7 @@ use coboot_tests::sealed::{
     block, certificate, crc32, default_keys, image, keys, seal, sealer, Device, Host, Setup, CLR_SIGNATURE,
     CONFIRMED_1, CONSTANT_1, EPOCH, ESACADEMY_2, FORMS, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2, START,
 };
-use coflash::file::sealed::{key_block, Certificate, Sealer};
+use coflash_core::file::sealed::{key_block, Certificate, Sealer};
 use kit::ihex::intel_hex;
 
 /// Statuses in 1F57h.

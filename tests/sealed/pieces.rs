@@ -9,8 +9,8 @@ use coboot_tests::sealed::{
     block, crc32, image, keys, seal, sealer, Device, Host, Parts, CLEAR, FORMS, STANDARD_1, STANDARD_2,
 };
 use coboot_tests::sealed_board::status;
-use coflash::file::convert::blocks_of_sealed;
-use coflash::file::sealed::{SealedFile, Sealer};
+use coflash_core::file::convert::blocks_of_sealed;
+use coflash_core::file::sealed::{SealedFile, Sealer};
 
 /// The blocks of a sealed image.
 fn blocks(file: &[u8], size: usize) -> Vec<Vec<u8>> {

@@ -3,7 +3,7 @@
 //! counter never decreases; and a repetition succeeds.
 
 use coboot_tests::sealed::{image, seal, sealer, Device, Host, Setup, CONFIRMED_1, STANDARD_1, STANDARD_2};
-use coflash::file::sealed::Sealer;
+use coflash_core::file::sealed::Sealer;
 use kit::model::{until_power_cut, Cut, ModelFlash};
 use shared_abi::geometry::Region;
 

@@ -2,9 +2,9 @@
 //! devices protect.
 
 use coboot_tests::firmware;
-use coflash::file::sealed::provision::{protected_sectors, provision, ProvisionFault};
-use coflash::file::sealed::{key_block, SigningKey};
-use coflash::file::{load, Firmware};
+use coflash_core::file::sealed::provision::{protected_sectors, provision, ProvisionFault};
+use coflash_core::file::sealed::{key_block, SigningKey};
+use coflash_core::file::{load, Firmware};
 
 #[test]
 fn only_the_bootloader_for_sealed_images_gets_keys() {

@@ -7,7 +7,7 @@ use coboot_tests::sealed::{
     certificate, image, keys, seal, sealer, Device, Parts, EPOCH, FORMS, HIGHEST, PRODUCT_CODE, REVISION,
     STANDARD_1, UNIQUE_ID, VENDOR_ID,
 };
-use coflash::file::sealed::{key_block, Certificate, Kek, Role, Sealer};
+use coflash_core::file::sealed::{key_block, Certificate, Kek, Role, Sealer};
 use kit::random::Random;
 
 /// Statuses in 1F57h.
@@ -270,7 +270,7 @@ fn bytes_behind_the_end_are_refused() {
 // --- fields
 
 /// The issuer and the contents of a certificate.
-fn certified(certificate: Certificate, root: &coflash::file::sealed::SigningKey) -> Parts {
+fn certified(certificate: Certificate, root: &coflash_core::file::sealed::SigningKey) -> Parts {
     Parts::of(&next((false, false), 600).0).certified(&certificate.signed_by(root))
 }
 

@@ -8,8 +8,8 @@ use coboot_tests::renewal::{
     with_crc,
 };
 use coboot_tests::sealed_board::{board, key, release, root, sealer, status, write_to, COUNTER};
-use coflash::device::Transfers;
-use coflash::file::sealed::{Certificate, Role, Sealer, SigningKey};
+use coflash_core::device::Transfers;
+use coflash_core::file::sealed::{Certificate, Role, Sealer, SigningKey};
 use shared_abi::geometry::Region;
 use shared_abi::renewal::{Origin, State};
 

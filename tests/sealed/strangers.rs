@@ -9,7 +9,7 @@ use coboot_tests::sealed::{
     ESACADEMY_2, LIFT_2, SET_SIGNATURE, STANDARD_1, STANDARD_2,
 };
 use coboot_tests::sealed_board::status;
-use coflash::file::sealed::{Certificate, Sealer};
+use coflash_core::file::sealed::{Certificate, Sealer};
 use seal::access::{event, right, EVENTS};
 use shared_abi::warm_start::BootRequest;
 

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
-use coflash::bus::{Adapter, AdapterError};
-use coflash::device::{Session, Timing};
+use coboot_can::{Adapter, AdapterError};
+use coflash_core::device::{Session, Timing};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
 use emulator::machine::{Machine, Options, Stop, Usart};

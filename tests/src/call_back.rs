@@ -3,7 +3,7 @@
 use bsp::can::BitTiming;
 use canopen::program::ProgramControl;
 use canopen::BitRate;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 

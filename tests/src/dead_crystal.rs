@@ -2,8 +2,8 @@
 //! not tolerate, and must not wait for the crystal, or the device could not be reached any more.
 
 use canopen::Address;
-use coflash::file::block_file::BlockFile;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
 use emulator::silicon::{Silicon, TYPICAL};

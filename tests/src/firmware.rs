@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Firmware};
-use coflash::update::JOINED_BLOCKS;
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Firmware};
+use coflash_core::update::JOINED_BLOCKS;
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
 use shared_abi::label::{self, Label};
@@ -130,7 +130,7 @@ pub fn blocks_of_file(elf: &Path) -> BlockFile {
 }
 
 fn blocks_with(elf: &Path, options: Options) -> BlockFile {
-    let image = coflash::file::read::load(elf, None, None).expect("an ELF of ours");
+    let image = coflash_core::file::read::load(elf, None, None).expect("an ELF of ours");
     let options = options.region(Region::Strict(board().programs[0].into()));
     blocks_of(image, &options).expect("it lies in the program's flash").file
 }

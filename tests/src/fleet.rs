@@ -4,12 +4,12 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use canopen::{BitRate, NodeId};
-use coflash::bus::{Adapter, AdapterError};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::DEFAULT_BLOCK_SIZE;
-use coflash::file::sealed::SealedFile;
-use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
+use coboot_can::{Adapter, AdapterError};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::DEFAULT_BLOCK_SIZE;
+use coflash_core::file::sealed::SealedFile;
+use coflash_core::update::many::{flash_many, Failed, Job, ManyOptions};
+use coflash_core::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;

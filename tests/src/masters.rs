@@ -8,9 +8,9 @@
 use std::time::Duration;
 
 use canopen::{Address, Frame, NodeId};
-use coflash::bus::Adapter;
-use coflash::device::{Doing, Session, Timing, Transfers};
-use coflash::file::block_file::BlockFile;
+use coboot_can::Adapter;
+use coflash_core::device::{Doing, Session, Timing, Transfers};
+use coflash_core::file::block_file::BlockFile;
 use embedded_can::{Frame as _, StandardId};
 
 /// The values of 1F51h (CiA 302-3; 80h is Zephyr's).

@@ -12,10 +12,10 @@ use canopen::device::Device as Says;
 use canopen::od::Entry;
 use canopen::program::BOOTLOADER_DEVICE_TYPE;
 use canopen::{BitRate, Frame, Instant, NodeId};
+use coboot_can::{Adapter, AdapterError};
 use coboot_node::device::{Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::{FileFlash, Speed};
 use coboot_node::stand_in::StandIn;
-use coflash::bus::{Adapter, AdapterError};
 use kit::folder::Folder;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 

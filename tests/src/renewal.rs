@@ -6,10 +6,10 @@ use canopen::program::{
     FlashStatus, ProgramControl, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, STATE_RENEWAL, STATE_VERSIONS,
 };
 use canopen::Address;
-use coflash::device::Doing;
-use coflash::file::ram_image::RamImage;
-use coflash::file::read::{read, Firmware, Format};
-use coflash::update::NewBootloader;
+use coflash_core::device::Doing;
+use coflash_core::file::ram_image::RamImage;
+use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::update::NewBootloader;
 use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::time::Span;
 use shared_abi::geometry::Region;

@@ -29,8 +29,8 @@ use std::time::Duration;
 
 use canopen::sdo::wire::Request;
 use canopen::{AbortCode, Address};
-use coflash::bus::Adapter;
-use coflash::device::{Doing, Session, Transfers};
+use coboot_can::Adapter;
+use coflash_core::device::{Doing, Session, Transfers};
 use emulator::time::{Span, Time};
 use shared_abi::layout::Layout;
 use shared_abi::renewal;

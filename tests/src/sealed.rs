@@ -16,7 +16,7 @@ use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
-use coflash::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
+use coflash_core::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
 use seal::access::{right, CHALLENGE, DOMAIN as ACCESS_DOMAIN, SIGNED_CHALLENGE};
 use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
 use shared_abi::geometry::Region;

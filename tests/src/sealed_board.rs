@@ -5,9 +5,9 @@ use std::sync::LazyLock;
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coflash::device::{Doing, Transfers};
-use coflash::file::sealed::{key_block, Certificate, Kek, Role, Sealer, SigningKey};
-use coflash::Error;
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::sealed::{key_block, Certificate, Kek, Role, Sealer, SigningKey};
+use coflash_core::Error;
 
 use crate::bench::Bench;
 use crate::firmware;

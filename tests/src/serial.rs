@@ -5,9 +5,9 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::time::{Duration, Instant};
 
 use canopen::NodeId;
-use coflash::bus::slcan::Line;
-use coflash::bus::{Adapter, AdapterError};
-use coflash::device::{Session, Timing};
+use coboot_can::slcan::Line;
+use coboot_can::{Adapter, AdapterError};
+use coflash_core::device::{Session, Timing};
 use embedded_can::{Frame as _, Id, StandardId};
 use emulator::time::{Span, Time};
 

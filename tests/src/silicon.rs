@@ -3,8 +3,8 @@
 
 use canopen::program::ProgramControl;
 use canopen::Address;
-use coflash::device::Doing;
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::Doing;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Cut, FlashCut, Options, ResetCause, Stop};
 use emulator::silicon::{Choice, Silicon};
 use emulator::time::Span;

@@ -7,12 +7,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::{Address, CobId, Frame, NodeId};
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
-use coflash::bus::{Adapter, AdapterError};
-use coflash::conform::{checks, run, Check, Means, Outcome};
-use coflash::device::Error;
-use coflash::update::{flash, FlashOptions};
+use coflash_conform::{checks, run, Check, Means, Outcome};
+use coflash_core::device::Error;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Operation, Options};
 use emulator::silicon::{Silicon, TYPICAL, WORST};
 

@@ -4,8 +4,8 @@
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash::update::event::Phase;
-use coflash::update::{flash, Event, FlashOptions};
+use coflash_core::update::event::Phase;
+use coflash_core::update::{flash, Event, FlashOptions};
 
 #[test]
 fn an_empty_board_says_boot_up_and_serves_its_objects() {

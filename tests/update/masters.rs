@@ -11,9 +11,9 @@ use coboot_tests::firmware;
 use coboot_tests::masters::{confirm, lely, systec, zephyr, Master};
 use coboot_tests::node::NodeBus;
 use coboot_tests::renewal::{crc_of, identification, number, progress, running, version};
-use coflash::file::convert::{blocks_of, Options};
-use coflash::file::read::{read, Format};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{flash, FlashOptions};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 /// The applications that run on the device.
@@ -167,7 +167,7 @@ const NEW: u32 = 0x0009_0001;
 /// A device that runs a program, and whose master has called its bootloader (1F51h/1 = 80h).
 fn called_back() -> Bench {
     let mut bench = board_at(BitRate::K125, 125_000, firmware::APP_V1);
-    coflash::update::steps::call_back(&mut bench.session()).unwrap();
+    coflash_core::update::steps::call_back(&mut bench.session()).unwrap();
     bench
 }
 

@@ -8,11 +8,11 @@ use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::renewal::{number, plain, running, version};
 use coboot_tests::sealed_board;
-use coflash::device::{info, Doing};
-use coflash::file::read::{read, Format};
-use coflash::update::event::Phase;
-use coflash::update::{flash, renew, Event, FlashOptions, NewBootloader, Password, Renewal};
-use coflash::Error;
+use coflash_core::device::{info, Doing};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::event::Phase;
+use coflash_core::update::{flash, renew, Event, FlashOptions, NewBootloader, Password, Renewal};
+use coflash_core::Error;
 use emulator::machine::{Cut, FlashCut, Operation};
 use shared_abi::handoff::ResetCause;
 use shared_abi::ram_image::Version;
@@ -50,7 +50,7 @@ fn progress(bench: &mut Bench) -> Progress {
 }
 
 fn call_back(bench: &mut Bench) {
-    coflash::update::steps::call_back(&mut bench.session()).unwrap();
+    coflash_core::update::steps::call_back(&mut bench.session()).unwrap();
 }
 
 #[test]
@@ -148,9 +148,9 @@ fn a_program_that_reaches_into_staging_is_named() {
     let staging = firmware::board().staging.unwrap();
     let large =
         firmware::made_up((staging.base - firmware::board().programs[0].base) as usize + 64, |at| at as u8);
-    let blocks = coflash::file::convert::blocks_of(
+    let blocks = coflash_core::file::convert::blocks_of(
         read(&large, Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap(),
-        &coflash::file::convert::Options::default(),
+        &coflash_core::file::convert::Options::default(),
     );
     let options = FlashOptions::default().trial_run(false).start(false).force(true);
     flash(&mut bench.session(), &blocks.unwrap().file, &options, &mut |_| {}).unwrap();

@@ -9,11 +9,11 @@ use coboot_tests::firmware;
 use coboot_tests::renewal::{
     confirm, crc_of, identification, number, progress, running, stage, start, version,
 };
-use coflash::device::Doing;
-use coflash::file::ram_image::RamImage;
-use coflash::file::read::{read, Firmware, Format};
-use coflash::update::{renew, FlashOptions, NewBootloader, Renewal};
-use coflash::Error;
+use coflash_core::device::Doing;
+use coflash_core::file::ram_image::RamImage;
+use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::update::{renew, FlashOptions, NewBootloader, Renewal};
+use coflash_core::Error;
 use shared_abi::ram_image::Version;
 use shared_abi::renewal::{Origin, State};
 

@@ -4,7 +4,7 @@
 use canopen::{Address, BitRate};
 use coboot_tests::bench::{Bench, HEARTBEAT, NODE, REQUEST, RESPONSE};
 use coboot_tests::{firmware, throughput};
-use coflash::device::{Doing, Transfers};
+use coflash_core::device::{Doing, Transfers};
 use emulator::machine::{FlashTimes, Options};
 use emulator::time::{Span, Time};
 use kit::ihex::intel_hex;

@@ -5,12 +5,12 @@ use canopen::program::{ProgramControl, DEVICE_STATE, STATE_PROGRAM_START};
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::device::{Doing, Transfers};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::read;
-use coflash::update::{flash, FlashOptions};
-use coflash::Error;
+use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::read;
+use coflash_core::update::{flash, FlashOptions};
+use coflash_core::Error;
 use emulator::time::Span;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 
@@ -39,7 +39,7 @@ fn blocks(image: &str, program: usize) -> BlockFile {
 fn install(bench: &mut Bench, program: u8, file: &BlockFile) {
     let options = FlashOptions::default().program(program).start(false);
     flash(&mut bench.session(), file, &options, &mut |_| {}).unwrap();
-    coflash::update::steps::release(&mut bench.session(), program, &mut |_| {}).unwrap();
+    coflash_core::update::steps::release(&mut bench.session(), program, &mut |_| {}).unwrap();
 }
 
 fn restart(bench: &mut Bench) {

@@ -6,9 +6,9 @@
 
 use std::time::Duration;
 
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash::bus::Adapter;
 use embedded_can::{Frame, Id};
 use emulator::world::MachineId;
 use tokio::sync::mpsc::{unbounded_channel, UnboundedReceiver, UnboundedSender};

@@ -23,7 +23,7 @@ Checks the dependencies between the crates against the rules in xtask/src/arrows
 emulator takes nothing but the geometry of the silicon from shared-abi (its program the names of
 the boards, too); that the pure crates
 forbid unsafe code; that neither modules nor files of a crate use each other in circles, and those of
-boot-core and coflash no others than xtask/src/rooms.rs allows; and that everything is there that
+boot-core and coflash-core no others than xtask/src/rooms.rs allows; and that everything is there that
 the owner of the product ordered by name (xtask/src/ordered.rs).
 ";
 
@@ -44,17 +44,22 @@ const RULES: &[(&str, &str)] = &[
     ("app-template-v2", "app-template canopen coboot-app coboot-linker bsp"),
     ("test-app", "app-template canopen coboot-app coboot-linker bsp shared-abi"),
     ("vendor-can", ""),
-    ("coflash", "canopen coboot-linker seal shared-abi vendor-can kit"),
-    ("coflash-native", "canopen coflash shared-abi"),
-    ("coboot-node", "boot-core canopen coboot-app coflash shared-abi kit"),
+    ("coboot-can", "canopen vendor-can"),
+    ("coflash-core", "canopen coboot-can coboot-linker seal shared-abi kit"),
+    ("coflash-conform", "canopen coboot-can coflash-core shared-abi"),
+    ("coflash-agent", "canopen coboot-can coflash-core shared-abi kit"),
+    ("coflash-ui", "canopen coboot-can coflash-core shared-abi kit"),
+    ("coflash", "canopen coboot-can coflash-agent coflash-conform coflash-core coflash-ui seal shared-abi kit"),
+    ("coflash-native", "canopen coboot-can coflash-core shared-abi"),
+    ("coboot-node", "boot-core canopen coboot-app coboot-can coflash-agent coflash-conform coflash-core shared-abi kit"),
     // Its command line reads memory maps.
     ("emulator", "coboot-linker shared-abi"),
-    (KIT, "boot-core canopen coboot-app shared-abi"),
+    (KIT, "boot-core canopen coboot-app coboot-can shared-abi"),
     (
         "coboot-tests",
-        "app-template boot-core bsp canopen coboot-app coboot-node coflash emulator product seal shared-abi kit",
+        "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",
     ),
-    ("coboot-zencan", "bsp canopen coboot-tests coflash emulator"),
+    ("coboot-zencan", "bsp canopen coboot-can coboot-tests emulator"),
     ("new-board", "shared-abi"),
     ("xtask", "new-board shared-abi kit"),
 ];
@@ -65,8 +70,9 @@ const KIT: &str = "kit";
 const TESTS: &str = "coboot-tests";
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
-const PURE: &[&str] =
-    &["canopen", "seal", "boot-core", "coboot-linker", "coflash", "coboot-node", "kit", "new-board", "xtask"];
+const PURE: &str =
+    "canopen seal boot-core coboot-linker coboot-can coflash-core coflash-conform coflash-agent \
+                    coflash-ui coflash coboot-node kit new-board xtask";
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 
@@ -98,7 +104,7 @@ pub fn run(args: Args) -> Outcome {
             ));
         }
     }
-    for package in packages.iter().filter(|package| PURE.contains(&package.name.as_str())) {
+    for package in packages.iter().filter(|package| PURE.split(' ').any(|name| name == package.name)) {
         let roots = ["src/lib.rs", "src/main.rs"].map(|root| package.folder.join(root));
         for root in roots.iter().filter(|root| root.exists()) {
             if !files::text(root)?.lines().any(|line| line.trim() == FORBID) {
@@ -303,6 +309,8 @@ mod tests {
             "emulator dev boot-core",
             "product -> canopen",
             "product build coflash",
+            "coboot-can -> coflash-core",
+            "coflash-core -> coflash-ui",
             "coflash -> emulator",
             "coflash -> unicorn-engine",
             "boot-core dev unicorn-engine-sys",

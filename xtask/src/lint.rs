@@ -26,9 +26,9 @@ pub fn run(mut args: Args) -> Outcome {
     let mut problems = formatting()?;
     problems.extend(words::faults()?);
     problems.extend(clippy(HOST_CRATES));
-    // The library without the command line; and the package for Python, which is not a default
-    // member.
-    problems.extend(clippy(&["--package", "coflash", "--lib", "--no-default-features"]));
+    // The host tool without the adapters of vendors and the other features; and the package for Python,
+    // which is not a default member.
+    problems.extend(clippy(&["--package", "coflash", "--no-default-features"]));
     problems.extend(clippy(&["--package", "coflash-python"]));
     // Without sealed images, which its own tests give it above.
     problems.extend(clippy(&["--package", "coboot-core", "--lib"]));

@@ -1,6 +1,6 @@
 //! The rooms of a crate: its top-level modules, and which of them use which.
 //!
-//! Two checks: the permitted uses of each room of `boot-core` and of `coflash`, so that a format
+//! Two checks: the permitted uses of each room of `boot-core` and of `coflash-core`, so that a format
 //! cannot reach the flash and a file does not depend on a device; and that in no crate rooms or files
 //! use each other in a circle.
 
@@ -43,24 +43,19 @@ const BOOT_CORE: &[Rule] = &[
     ("profile", "bootloader policy"),
 ];
 
-/// The rooms of `coflash`. A new room needs a row. `update` uses `bus` for several devices at once,
-/// which share an adapter.
+/// The rooms of `coflash-core`. A new room needs a row. `update` uses `coboot_can` for several devices at
+/// once, which share an adapter.
 const COFLASH: &[Rule] = &[
     ("setters", ""),
     ("unicode", ""),
     ("json", "canopen"),
-    ("bus", "canopen"),
     ("file", "setters shared_abi unicode"),
-    ("device", "bus canopen json setters shared_abi unicode"),
-    ("update", "bus canopen device file json setters shared_abi"),
-    ("agent", "bus canopen device file shared_abi update"),
-    ("conform", "bus canopen device shared_abi update"),
-    ("cli", "agent bus canopen conform device file shared_abi ui update"),
-    ("ui", "bus canopen device file shared_abi update"),
+    ("device", "canopen coboot_can json setters shared_abi unicode"),
+    ("update", "canopen coboot_can device file json setters shared_abi"),
 ];
 
-/// The dependencies of `coflash` that a room may use only if its row lists them.
-const OURS: [&str; 2] = ["canopen", "shared_abi"];
+/// The dependencies of `coflash-core` that a room may use only if its row lists them.
+const OURS: [&str; 3] = ["canopen", "coboot_can", "shared_abi"];
 
 /// For each room, the rooms that it uses.
 pub type Graph = BTreeMap<String, BTreeSet<String>>;
@@ -124,7 +119,7 @@ pub fn broken(name: &str, sources: &[(String, String)]) -> Vec<String> {
     }
     let (rules, rooms) = match name {
         "boot-core" => (BOOT_CORE, rooms),
-        "coflash" => {
+        "coflash-core" => {
             let mut rooms = rooms;
             for (room, uses) in crates(sources) {
                 if let Some(all) = rooms.get_mut(&room) {
@@ -211,35 +206,28 @@ mod tests {
     #[test]
     fn each_wall_of_coflash_holds() {
         for (file, text, words) in [
-            ("bus/slcan.rs", "use crate::device::Session;", "bus uses device, which it may not"),
-            ("bus/slcan.rs", "use shared_abi::layout;", "bus uses shared_abi, which it may not"),
             ("file/elf.rs", "use canopen::NodeId;", "file uses canopen, which it may not"),
-            ("file/elf.rs", "fn f() { super::super::bus::open() }", "file uses bus, which it may not"),
+            ("file/elf.rs", "fn f() { coboot_can::open() }", "file uses coboot_can, which it may not"),
+            ("file/elf.rs", "fn f() { super::super::device::info() }", "file uses device, which it may not"),
             ("device/info.rs", "use crate::update::flash;", "device uses update, which it may not"),
-            ("update/job.rs", "use coflash::cli;", "update uses cli, which it may not"),
             ("attic.rs", "", "the module attic has no rule"),
         ] {
-            let mut all = sources(&[
-                ("bus/mod.rs", ""),
-                ("device/mod.rs", ""),
-                ("update/mod.rs", ""),
-                ("cli/mod.rs", ""),
-            ]);
+            let mut all = sources(&[("device/mod.rs", ""), ("update/mod.rs", "")]);
             all.push((file.to_owned(), text.to_owned()));
-            assert_eq!(broken("coflash", &all), [format!("coflash: {words}")], "{file}: {text}");
+            assert_eq!(broken("coflash-core", &all), [format!("coflash-core: {words}")], "{file}: {text}");
         }
     }
 
     #[test]
     fn files_that_use_each_other_are_told_even_inside_a_room() {
         let all = sources(&[
-            ("bus/mod.rs", "pub use self::hub::Hub;"),
-            ("bus/hub.rs", "use super::{port::Port, adapter::Adapter};"),
-            ("bus/port.rs", "use crate::bus::hub;"),
-            ("bus/adapter.rs", ""),
+            ("device/mod.rs", "pub use self::hub::Hub;"),
+            ("device/hub.rs", "use super::{port::Port, adapter::Adapter};"),
+            ("device/port.rs", "use crate::device::hub;"),
+            ("device/adapter.rs", ""),
         ]);
-        let words = "these files use each other in a circle: bus::hub -> bus::port";
-        for krate in ["coflash", "emulator"] {
+        let words = "these files use each other in a circle: device::hub -> device::port";
+        for krate in ["coflash-core", "emulator"] {
             assert_eq!(broken(krate, &all), [format!("{krate}: {words}")]);
         }
     }

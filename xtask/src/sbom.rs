@@ -6,7 +6,7 @@
 //! the same bytes. It checks that every crate is listed that cargo builds the program from.
 
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{fs, iter};
 
@@ -95,15 +95,14 @@ fn generate(released: &Released, cyclonedx: &Path) -> Outcome<String> {
     let mut command = Command::new(cyclonedx);
     command.args(["cyclonedx", "--quiet", "--format", "json", "--spec-version", "1.5"]);
     command.args(["--override-filename", &name, "--target", released.target]).args(&released.features);
-    command.arg("--manifest-path").arg(workspace::root().join(released.package).join("Cargo.toml"));
-    let made = process::run(&mut command);
-    let mut text = Err(format!("cargo-cyclonedx wrote nothing for {}.", released.package));
-    for package in list(&process::metadata()?, "packages") {
-        let manifest = Path::new(package["manifest_path"].as_str().unwrap_or_default());
-        let file = manifest.with_file_name(&name).with_extension("json");
-        if package["name"] == released.package {
-            text = files::text(&file);
-        }
+    let metadata = process::metadata()?;
+    let manifest = |package: &Value| Some(Path::new(package["manifest_path"].as_str()?).to_owned());
+    let own = list(&metadata, "packages").find(|package| package["name"] == released.package);
+    let own = own.and_then(manifest).ok_or_else(|| format!("there is no package {}.", released.package))?;
+    let made = process::run(command.arg("--manifest-path").arg(&own));
+    let beside = |manifest: PathBuf| manifest.with_file_name(&name).with_extension("json");
+    let text = files::text(&beside(own));
+    for file in list(&metadata, "packages").filter_map(manifest).map(beside) {
         // A missing file needs no removal.
         let _ = fs::remove_file(&file);
     }

@@ -1,10 +1,10 @@
 //! An error of the work, and its Python exception (`coflash/errors.py`).
 
-use coflash::device::Error;
-use coflash::file::ram_image;
-use coflash::file::sealed::Refusal;
-use coflash::file::FileError;
-use coflash::update::refusal_number;
+use coflash_core::device::Error;
+use coflash_core::file::ram_image;
+use coflash_core::file::sealed::Refusal;
+use coflash_core::file::FileError;
+use coflash_core::update::refusal_number;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 

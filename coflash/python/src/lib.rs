@@ -11,13 +11,13 @@ use std::thread;
 use std::time::Duration;
 
 use canopen::NodeId;
-use coflash::bus::decode::state_words;
-use coflash::bus::Link;
-use coflash::device::{self, Dialect, ScanOptions, Session, Timing};
-use coflash::file::convert::{blocks_of, ConvertError, Options, Region};
-use coflash::file::sealed::SealedFile;
-use coflash::file::{self, limit, Format};
-use coflash::update::{self, FlashOptions, NewBootloader, Password, Program};
+use coboot_can::decode::state_words;
+use coboot_can::Link;
+use coflash_core::device::{self, Dialect, ScanOptions, Session, Timing};
+use coflash_core::file::convert::{blocks_of, ConvertError, Options, Region};
+use coflash_core::file::sealed::SealedFile;
+use coflash_core::file::{self, limit, Format};
+use coflash_core::update::{self, FlashOptions, NewBootloader, Password, Program};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -135,7 +135,7 @@ fn scan<'py>(
         options = options.nodes(nodes.into_iter().map(node_id).collect::<PyResult<_>>()?);
     }
     let found = work(py, None, |cancelled, _| {
-        let mut adapter = coflash::bus::open(&bus).map_err(device::Error::from)?;
+        let mut adapter = coboot_can::open(&bus).map_err(device::Error::from)?;
         Ok(device::scan(&mut *adapter, &options, &cancelled)?)
     })?;
     let nodes = PyDict::new(py);

@@ -7,7 +7,7 @@
 //! | [`canlib`] | CANlib | Kvaser |
 //!
 //! This crate has the only `unsafe` code of the host tools: each module holds the signatures of one
-//! library, calls its functions, and returns plain values. Other code (`coflash::bus`) checks
+//! library, calls its functions, and returns plain values. Other code (`coboot_can`) checks
 //! these values. Nothing can stop a library that writes beyond its buffers; but a library may
 //! return invalid values, and callers must expect them in every value.
 //!

@@ -12,12 +12,12 @@ use std::time::{Duration, Instant};
 use std::{env, fs};
 
 use boot_core::canopen::{Frame, NodeId};
-use coflash::bus::{self, Adapter, AdapterError};
-use coflash::device::{Session, Timing, Transfers};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Format};
-use coflash::update::{flash, FlashOptions};
+use coboot_can::{Adapter, AdapterError};
+use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Format};
+use coflash_core::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
 const SIZES: [u32; 2] = [256, 896];
@@ -102,7 +102,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let file = program(kib)?;
             // A new node for each run: the first update of a node has nothing to erase.
             let node = Node::start()?;
-            let mut bus = Counted { bus: bus::open(&node.url)?, frames: 0 };
+            let mut bus = Counted { bus: coboot_can::open(&node.url)?, frames: 0 };
             let mut session = Session::new(&mut bus, NodeId::new(1).ok_or("no node-ID")?, Timing::default());
             session.transfer_by(transfers);
             let options = FlashOptions::default().start(false);

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use boot_core::profile::Profile;
 use clap::{Parser, ValueEnum};
-use coflash::file::board;
+use coflash_core::file::board;
 use shared_abi::layout::{self, Layout};
 
 use crate::file_flash::Speed;

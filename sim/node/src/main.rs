@@ -15,13 +15,13 @@ use boot_core::crc::CrcKind;
 use boot_core::profile::Profile;
 use boot_core::store::NodeParameters;
 use clap::Parser;
+use coboot_can::Adapter;
 use coboot_node::args::Args;
 use coboot_node::device::{Device, Event, Setup, BUFFER};
 use coboot_node::file_flash::FileFlash;
 use coboot_node::server::Server;
 use coboot_node::stand_in::StandIn;
 use coboot_node::supports;
-use coflash::bus::{self, Adapter};
 
 /// The interval between two time steps of the nodes while nothing happens.
 const TICK: Duration = Duration::from_millis(2);
@@ -73,7 +73,7 @@ fn run<const PROGRAMS: usize>(args: &Args) -> Result<std::convert::Infallible, B
         flashes.push(flash);
     }
     let mut bus: Box<dyn Adapter> = match (&args.bus, &args.listen) {
-        (Some(url), _) => bus::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
+        (Some(url), _) => coboot_can::open(url).map_err(|error| format!("{error}; {}", error.advice()))?,
         (None, Some(address)) => {
             let server =
                 Server::bind(address, "can0").map_err(|error| format!("listening at {address}: {error}"))?;

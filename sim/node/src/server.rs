@@ -12,8 +12,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use boot_core::canopen::Frame;
-use coflash::bus::socketcand::{frame_message, parse_send, Messages};
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::socketcand::{frame_message, parse_send, Messages};
+use coboot_can::{Adapter, AdapterError};
 
 /// The most clients at the same time.
 const MAX_CLIENTS: usize = 64;

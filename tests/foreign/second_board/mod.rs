@@ -14,15 +14,15 @@ use std::time::{Duration, Instant};
 use board::Board;
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
+use coboot_can::slcan::{Line, Slcan};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
-use coflash::bus::slcan::{Line, Slcan};
-use coflash::device::{Session, Timing};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::{read, Firmware, Format};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::device::{Session, Timing};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as Chip;
 
 /// The host's end of the line of QEMU's board. A read lets the board run.

@@ -4,8 +4,8 @@
 //! written in a form that parses to the same frame, with the same description in words.
 #![cfg_attr(fuzzing, no_main)]
 
-use coflash::bus::candump::Line;
-use coflash::bus::decode::Decoder;
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
 
 coboot_fuzz::target!(|bytes: &[u8]| {
     let text = String::from_utf8_lossy(bytes);

@@ -13,10 +13,10 @@ use std::time::Duration;
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
 use coboot_fuzz::Input;
-use coflash::bus::{Adapter, AdapterError};
-use coflash::conform::{checks, run, Means, Outcome};
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::update::Program;
+use coboot_can::{Adapter, AdapterError};
+use coflash_conform::{checks, run, Means, Outcome};
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::update::Program;
 use embedded_can::Frame as _;
 use kit::bus::{at, node, Device};
 
@@ -139,7 +139,7 @@ fn program() -> Program {
     PROGRAM
         .get_or_init(|| {
             let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n";
-            let firmware = coflash::file::read(hex, None, None).expect("Intel HEX");
+            let firmware = coflash_core::file::read(hex, None, None).expect("Intel HEX");
             let options = Options::default().region(Region::Unknown);
             Arc::new(blocks_of(firmware, &options).expect("a program").file).into()
         })

@@ -10,7 +10,7 @@ use boot_core::control::{Downloader, Policy, Room, Step};
 use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::Input;
-use coflash::file::block_file::{Block, CRC};
+use coflash_core::file::block_file::{Block, CRC};
 use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::layout::Layout;
 

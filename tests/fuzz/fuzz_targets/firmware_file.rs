@@ -6,9 +6,9 @@
 //! written as it was read.
 #![cfg_attr(fuzzing, no_main)]
 
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options};
-use coflash::file::read::{read, Firmware, Format};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::read::{read, Firmware, Format};
 
 const FORMATS: [Option<Format>; 6] = [
     None,

@@ -21,7 +21,7 @@ use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, St
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{is_eighth, Input};
-use coflash::file::block_file::{Block, CRC};
+use coflash_core::file::block_file::{Block, CRC};
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::geometry::Region;

@@ -22,7 +22,7 @@ use canopen::od::{Entry, Objects};
 use canopen::program::{FLASH_STATUS, PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
 use coboot_fuzz::{is_eighth, Input};
-use coflash::file::sealed::{hash, key_block, Kek, Sealer, SigningKey};
+use coflash_core::file::sealed::{hash, key_block, Kek, Sealer, SigningKey};
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use seal::wire::{head_size, Head, DOMAIN, HASH};

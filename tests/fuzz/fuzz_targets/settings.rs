@@ -7,8 +7,8 @@
 
 use std::path::Path;
 
-use coflash::update::config::{self, Setting};
-use coflash::update::job;
+use coflash_core::update::config::{self, Setting};
+use coflash_core::update::job;
 
 /// The options of a tool, and whether each is a switch.
 const KEYS: [(&str, bool); 7] = [

@@ -10,8 +10,8 @@ use std::time::Duration;
 
 use canopen::Frame;
 use coboot_fuzz::Input;
-use coflash::bus::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
-use coflash::bus::{Adapter, Line, Slcan};
+use coboot_can::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
+use coboot_can::{Adapter, Line, Slcan};
 use embedded_can::Frame as _;
 
 /// A line that gives this text in pieces and then ends; with `echo`, it returns the written text.

@@ -15,7 +15,7 @@ use std::sync::OnceLock;
 use std::thread;
 
 use coboot_fuzz::Input;
-use coflash::ui::{Options, Server};
+use coflash_ui::{Options, Server};
 
 /// The routes with a body in JSON, with bodies that are nearly good. No adapter of this computer is
 /// opened: there is none by this name.

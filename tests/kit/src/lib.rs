@@ -7,6 +7,7 @@
 //! | `folder` | a folder of a test's own |
 //! | `ihex` | Intel HEX as tools write it |
 //! | `pages` | the commands on the pages of the documentation |
+//! | `fake` | feature `fake`: devices with virtual time, as adapters and behind a socketcand server |
 //! | `hawkbit` | feature `hawkbit`: a hawkBit server with faults |
 //! | `bus` | feature `bus`: a CANopen device with a domain, and frames to it and from it |
 //! | `memory` | feature `debugger`: a device with the debugger interface, and its memory |
@@ -29,6 +30,9 @@ pub mod boot;
 pub mod bus;
 #[cfg(feature = "boot")]
 pub mod driver;
+#[cfg(feature = "fake")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod fake;
 pub mod folder;
 #[cfg(feature = "hawkbit")]
 #[allow(missing_docs, reason = "names say it")]

@@ -2,9 +2,9 @@
 
 use boot_core::profile::Profile;
 use bsp::NODE_ID;
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::file::read::read;
-use coflash::file::sealed::Sealer;
+use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::read::read;
+use coflash_core::file::sealed::Sealer;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
 use shared_abi::layout::Layout;
 

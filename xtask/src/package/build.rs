@@ -54,7 +54,10 @@ pub fn with_extras(release: &Release, folder: &Path) -> Outcome {
         files::write(&folder.join("completions").join(file), script)?;
     }
     let rules = "70-coflash.rules";
-    files::copy(&workspace::root().join("coflash/packaging").join(rules), &folder.join("udev").join(rules))?;
+    files::copy(
+        &workspace::root().join("coflash/cli/packaging").join(rules),
+        &folder.join("udev").join(rules),
+    )?;
     files::write(&folder.join("THIRD-PARTY.txt"), notices::text()?)
 }
 

@@ -130,7 +130,7 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
     process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     let mut install = process::bare_cargo();
     install.args(["install", "--locked", "--debug", "--quiet", "--no-track", "--path"]);
-    install.arg(workspace::root().join("coflash")).arg("--root").arg(root);
+    install.arg(workspace::root().join("coflash/cli")).arg("--root").arg(root);
     install.arg("--target-dir").arg(workspace::target_dir());
     process::run(&mut install)?;
     let installed = root.join("bin/coflash");

@@ -1,5 +1,5 @@
 //! Makes the package for Debian and Ubuntu with cargo-deb; `[package.metadata.deb]` in
-//! coflash/Cargo.toml says what is in it.
+//! coflash/cli/Cargo.toml says what is in it.
 
 use std::process::Command;
 
@@ -29,7 +29,7 @@ pub fn make(release: &Release) -> Outcome {
     let pages = files::within(&parts.join("man"))?;
     process::run(Command::new("gzip").args(["-9", "--no-name"]).arg(parts.join("changelog")).args(pages))?;
     let mut deb = Command::new(cargo_deb);
-    deb.arg("--manifest-path").arg(workspace::root().join("coflash/Cargo.toml"));
+    deb.arg("--manifest-path").arg(workspace::root().join("coflash/cli/Cargo.toml"));
     deb.args(["--locked", "--no-build", "--no-strip", "--profile", build::PROFILE, "--target", LINUX]);
     deb.args(["--deb-version", VERSION, "--output"]).arg(release.deb());
     deb.env("CARGO_TARGET_DIR", &release.build).env("SOURCE_DATE_EPOCH", &release.epoch);

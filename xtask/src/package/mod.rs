@@ -165,7 +165,7 @@ fn linux(release: &Release) -> Outcome {
     let name = format!("coflash-{VERSION}");
     let folder = stage.join(&name);
     build::with_extras(release, &folder)?;
-    for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/README.md"] {
+    for file in ["LICENSE-MIT", "LICENSE-APACHE", "coflash/cli/README.md"] {
         let from = workspace::root().join(file);
         files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
@@ -254,7 +254,7 @@ mod tests {
         let read = |file: &str| files::ours(Path::new("coflash").join(file)).unwrap();
         let mut wanted = Vec::new();
         for (file, constant, subsystem) in
-            [("src/bus/gs_usb/usb.rs", "const DEVICES", "usb"), ("src/bus/ports.rs", "const SLCAN", "tty")]
+            [("can/src/gs_usb/usb.rs", "const DEVICES", "usb"), ("can/src/ports.rs", "const SLCAN", "tty")]
         {
             let source = read(file);
             let (_, list) = source.split_once(constant).unwrap();
@@ -269,7 +269,7 @@ mod tests {
             }
         }
         assert!(wanted.len() >= 7, "{wanted:?}");
-        let rules = read("packaging/70-coflash.rules");
+        let rules = read("cli/packaging/70-coflash.rules");
         let rules: Vec<_> = rules.lines().filter(|line| !line.is_empty() && !line.starts_with('#')).collect();
         assert_eq!(rules, wanted);
     }

@@ -11,7 +11,7 @@ use crate::{files, process, Outcome};
 
 /// Parts that are not crates, by name, with the file of the licence.
 const OTHERS: [(&str, &str); 1] =
-    [("uPlot 1.6.32: MIT (https://github.com/leeoniya/uPlot)", "coflash/src/ui/page/uPlot.LICENSE")];
+    [("uPlot 1.6.32: MIT (https://github.com/leeoniya/uPlot)", "coflash/ui/src/page/uPlot.LICENSE")];
 /// The first letters of the names of files that must go with a copy.
 const NOTICES: [&str; 6] = ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTICE", "UNLICENSE"];
 

@@ -101,7 +101,7 @@ pub const SLOW: &str =
                         commands nodes refusals clients client model program_control attacker throughput";
 
 /// Test programs that mostly wait: their tests start programs that talk to each other in real time.
-pub const WAITING: [&str; 2] = ["coboot-node/it", "coflash/it"];
+pub const WAITING: [&str; 4] = ["coboot-node/it", "coflash/it", "coflash-agent/it", "coflash-ui/it"];
 
 /// The images of a board that the tests of a tier need.
 pub struct Images {

@@ -8,8 +8,8 @@ use std::thread;
 use std::time::Duration;
 
 use crate::bus::{Coflash, Folder, Nodes, VECTORS};
-use coflash::agent::{run, Buses, Config, Ended, Options, Said, Times};
-use coflash::bus::Link;
+use coboot_can::Link;
+use coflash_agent::{run, Buses, Config, Ended, Options, Said, Times};
 use kit::hawkbit::{Action, File, Server};
 
 const IDS: [&str; 3] = ["door-1", "door-2", "door-3"];

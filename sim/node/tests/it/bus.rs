@@ -265,7 +265,7 @@ fn beside(name: &str) -> PathBuf {
     let path = Path::new(env!("CARGO_BIN_EXE_coboot-node")).with_file_name(name);
     assert!(
         path.exists(),
-        "{}: build it by `cargo build -p coflash --bins --examples`, or run `cargo xtask test`",
+        "{}: build it by `cargo build -p coflash -p coflash-core --bins --examples`, or run `cargo xtask test`",
         path.display()
     );
     path

@@ -6,8 +6,8 @@ use std::time::Duration;
 
 use crate::bus::{Folder, Nodes};
 use canopen::{CobId, Frame, NodeId};
-use coflash::bus::{Adapter, AdapterError};
-use coflash::conform::{checks, run, Check, Means, Outcome};
+use coboot_can::{Adapter, AdapterError};
+use coflash_conform::{checks, run, Check, Means, Outcome};
 use embedded_can::Frame as _;
 
 /// A fault: what the device gets, and what it answers. `asked` is the last SDO request.
@@ -223,7 +223,7 @@ impl Adapter for Faulty<'_> {
 
 /// The checks that fail, and those that cannot be judged.
 fn verdicts(nodes: &Nodes, fault: Option<&Fault>) -> (Vec<String>, Vec<String>) {
-    let bus = coflash::bus::open(nodes.url()).unwrap();
+    let bus = coboot_can::open(nodes.url()).unwrap();
     judge(&mut Faulty { bus, fault, asked: Vec::new() }, &harmless())
 }
 
@@ -295,7 +295,7 @@ fn answers_of_other_devices_are_not_blamed_on_this_one() {
         let folder = Folder::new(&format!("conform-lot-{serial}"));
         let lot = ["--node", "1", "--count", "5", "--serial", serial, "--flash", "instant"];
         let nodes = Nodes::start(&folder, &lot);
-        let mut bus = coflash::bus::open(nodes.url()).unwrap();
+        let mut bus = coboot_can::open(nodes.url()).unwrap();
         assert_eq!(judge(&mut bus, &of(&["LSS"])), (Vec::new(), Vec::new()), "{serial}");
     }
 }
@@ -315,7 +315,7 @@ fn a_device_with_the_same_lss_address_is_named() {
         let twin = Folder::new(&format!("conform-twin-{}", name.len()));
         let nodes = Nodes::start(&folder, &["--node", "1", "--flash", "instant"]);
         let _twin = Nodes::join(&twin, nodes.url(), &[arguments, &["--flash", "instant"]].concat());
-        let mut bus = coflash::bus::open(nodes.url()).unwrap();
+        let mut bus = coboot_can::open(nodes.url()).unwrap();
         // It has joined when it answers.
         let mut answered = false;
         while !answered {
@@ -362,7 +362,7 @@ impl Adapter for Intruder {
 fn a_device_that_answers_without_being_selected_is_named() {
     let folder = Folder::new("conform-intruder");
     let nodes = Nodes::start(&folder, &["--node", "1", "--count", "2", "--flash", "instant"]);
-    let mut bus = Intruder { bus: coflash::bus::open(nodes.url()).unwrap(), node: 2, answers: Vec::new() };
+    let mut bus = Intruder { bus: coboot_can::open(nodes.url()).unwrap(), node: 2, answers: Vec::new() };
     let (failed, skipped) = judge(&mut bus, &of(&["LSS"]));
     assert!(failed.is_empty(), "{failed:#?}");
     assert!(skipped.iter().all(|line| line.contains("node 2 answers in LSS waiting state")), "{skipped:#?}");
@@ -383,7 +383,7 @@ fn a_device_without_heartbeat_time_is_not_blamed() {
             }
         })
     });
-    let bus = coflash::bus::open(nodes.url()).unwrap();
+    let bus = coboot_can::open(nodes.url()).unwrap();
     let mut bus = Faulty { bus, fault: Some(&absent), asked: Vec::new() };
     let (failed, skipped) = judge(&mut bus, &of(&["HB", "OD"]));
     assert!(failed.is_empty(), "{failed:#?}");

@@ -10,7 +10,7 @@ use boot_core::canopen::slave::{self, Output, Slave};
 use boot_core::canopen::{CobId, Frame, Instant, NodeId};
 use boot_core::control::Step;
 use boot_core::store::Journal;
-use coflash::bus::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 
 use kit::bench::{node, CONFIG};
 use kit::boot::{leaked, Boot};

@@ -8,11 +8,11 @@ use boot_core::canopen::NodeId;
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
-use coflash::device::{Session, Timing, Transfers};
-use coflash::file::block_file::BlockFile;
-use coflash::update::event::{Phase, Warning};
-use coflash::update::{flash, Event, FlashOptions, Report};
-use coflash::Error;
+use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::update::event::{Phase, Warning};
+use coflash_core::update::{flash, Event, FlashOptions, Report};
+use coflash_core::Error;
 
 use crate::cut::{CutBus, Way};
 use kit::bench::{self, block, block_file, crc32, LAYOUT, PROGRAM};

@@ -1,7 +1,7 @@
 //! coflash's example of a production line, against a node over a real socket.
 
 use crate::bus::{self, Folder, Nodes};
-use coflash::file::{ihex, read, Firmware, Format};
+use coflash_core::file::{ihex, read, Firmware, Format};
 use serde_json::Value;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 

@@ -9,9 +9,9 @@ use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{image_of, with_crc};
 use coboot_tests::sealed_board;
-use coflash::file::ram_image::RamImage;
-use coflash::file::read::{read, Firmware, Format};
-use coflash::update::{renew, Event, FlashOptions, NewBootloader};
+use coflash_core::file::ram_image::RamImage;
+use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::update::{renew, Event, FlashOptions, NewBootloader};
 use emulator::machine::{Cut, FlashCut};
 
 use super::{chapter, convert, install, introduce, print_line, Outcome};

@@ -5,8 +5,8 @@ use canopen::AbortCode;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::{key, provision, release, root, sealer, write, COUNTER, KEKS};
-use coflash::device::Transfers;
-use coflash::file::sealed::Sealer;
+use coflash_core::device::Transfers;
+use coflash_core::file::sealed::Sealer;
 
 use super::{chapter, introduce, print_line, Outcome};
 

@@ -2,7 +2,7 @@
 
 use canopen::program::{ProgramControl, DEVICE_STATE, STATE_VERSIONS};
 use canopen::Address;
-use coflash::device::{Doing, Session};
+use coflash_core::device::{Doing, Session};
 use emulator::machine::{Cells, ResetCause, Stop};
 use shared_abi::geometry::Region;
 

@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use canopen::program::ProgramControl;
 use canopen::BitRate;
-use coflash::device::Dialect;
-use coflash::file::block_file::BlockFile;
-use coflash::file::sealed::{SealedFile, Sealer};
-use coflash::update::{flash, renew, FlashOptions, Program};
+use coflash_core::device::Dialect;
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::sealed::{SealedFile, Sealer};
+use coflash_core::update::{flash, renew, FlashOptions, Program};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
@@ -222,8 +222,12 @@ fn board(bootloader: &'static str, program: &Program) -> Result<Bench, String> {
     }
     bench.power_on();
     bench.run_ms(BOOT_MS);
-    let installed =
-        coflash::update::flash_program(&mut bench.session(), program, &FlashOptions::default(), &mut |_| {});
+    let installed = coflash_core::update::flash_program(
+        &mut bench.session(),
+        program,
+        &FlashOptions::default(),
+        &mut |_| {},
+    );
     installed.map_err(|error| error.to_string())?;
     Ok(bench)
 }
@@ -350,7 +354,7 @@ fn seal_with(sealer: Sealer<'_>, image: &str) -> Result<Program, String> {
 }
 
 fn write_sealed(bench: &mut Bench, program: &Program) -> Result<(), String> {
-    coflash::update::flash_program(&mut bench.session(), program, &options(), &mut |_| {})
+    coflash_core::update::flash_program(&mut bench.session(), program, &options(), &mut |_| {})
         .map(drop)
         .map_err(|error| error.to_string())
 }

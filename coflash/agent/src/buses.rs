@@ -1,0 +1,241 @@
+//! The devices: flashes them and asks them for their attributes. The only file of the agent that
+//! calls the rest of the library for that.
+//!
+//! Devices of one bus whose orders come while the bus is in use are updated together, once it is
+//! free.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{channel, Sender};
+use std::sync::{Arc, Mutex, PoisonError};
+
+use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_ID};
+use canopen::Address;
+
+use super::config::Device;
+use super::controller::{Flashed, News};
+use super::run::{Devices, Order};
+use coboot_can::Link;
+use coflash_core::device::lock::Lock;
+use coflash_core::device::state::{reason, source, supply};
+use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
+use coflash_core::update::event::Phase;
+use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
+use coflash_core::update::{DeviceState, Event, FlashOptions, Program, Report};
+
+/// Opens a bus by its URL; an error is in words.
+pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
+
+/// The buses of an agent.
+pub struct Buses<'o> {
+    open: Open<'o>,
+    buses: Mutex<BTreeMap<String, Arc<Bus>>>,
+    cancelled: Arc<AtomicBool>,
+}
+
+/// A bus, and the orders that wait for it.
+#[derive(Default)]
+struct Bus {
+    waiting: Mutex<Vec<Waiting>>,
+    /// Held by whoever works on the bus.
+    turn: Mutex<()>,
+}
+
+struct Waiting {
+    job: Job,
+    kept: bool,
+    news: Sender<News>,
+    done: Sender<Flashed>,
+}
+
+impl fmt::Debug for Buses<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Buses").finish_non_exhaustive()
+    }
+}
+
+/// No thread panics while it holds a lock; and if one did, the values stay valid.
+fn lock<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl<'o> Buses<'o> {
+    /// Buses that are opened for each piece of work, and ended by `cancelled`.
+    #[must_use]
+    pub fn new(open: Open<'o>, cancelled: Arc<AtomicBool>) -> Self {
+        Self { open, buses: Mutex::default(), cancelled }
+    }
+
+    fn bus(&self, url: &str) -> Arc<Bus> {
+        lock(&self.buses).entry(url.to_string()).or_default().clone()
+    }
+
+    /// Carries out all orders that wait for the bus.
+    fn work(&self, url: &str, waiting: Vec<Waiting>) {
+        let mut link = match (self.open)(url) {
+            Ok(link) => link,
+            Err(why) => {
+                for order in waiting {
+                    let _ = order.done.send(Flashed::NotNow(why.clone()));
+                }
+                return;
+            }
+        };
+        let mut locks = Vec::new();
+        let mut orders = Vec::new();
+        for order in waiting {
+            match Lock::of(url, order.job.node) {
+                Ok(lock) => locks.push(lock),
+                Err(error) => {
+                    let _ = order.done.send(Flashed::NotNow(error.to_string()));
+                    continue;
+                }
+            }
+            if order.kept && self.runs(&mut link, &order.job) {
+                let words = "the device has run this program since before the agent was restarted";
+                let _ = order.done.send(Flashed::Done(vec![words.to_string(), of(&order.job.file)]));
+                continue;
+            }
+            orders.push(order);
+        }
+        let jobs: Vec<Job> = orders.iter().map(|order| order.job.clone()).collect();
+        let options = ManyOptions::default().cancelled(self.cancelled.clone());
+        let tell = |number: usize, event: Event| {
+            for news in news_of(&event) {
+                let _ = orders[number].news.send(news);
+            }
+        };
+        let results = match &mut link {
+            Link::Bus(adapter) => flash_many(&mut **adapter, &jobs, &options, &tell),
+            Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &tell),
+        };
+        for (order, result) in orders.iter().zip(results) {
+            let _ = order.done.send(flashed(&order.job, result));
+        }
+    }
+}
+
+impl Buses<'_> {
+    /// Whether the device runs the program of an order, by its own account.
+    fn runs(&self, link: &mut Link, job: &Job) -> bool {
+        let mut session = Session::on(link, job.node, Timing::default());
+        session.cancel_by(self.cancelled.clone());
+        let program = job.options.program;
+        let mut number = |index| session.read_number(Address::new(index, program)).ok();
+        number(PROGRAM_CONTROL) == Some(ProgramState::Running as u32)
+            && number(PROGRAM_ID).is_some_and(|crc| job.file.program_crcs().contains(&crc))
+    }
+}
+
+impl Devices for Buses<'_> {
+    fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String> {
+        let bus = self.bus(&device.bus);
+        let _turn = lock(&bus.turn);
+        let mut link = (self.open)(&device.bus)?;
+        let mut session = Session::on(&mut link, device.node, Timing::default());
+        session.cancel_by(self.cancelled.clone());
+        let info = info(&mut session).map_err(|error| format!("{error}: {}", error.advice()))?;
+        Ok(attributes(device, &info))
+    }
+
+    fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
+        let Order { device, program, kept } = order;
+        let options = FlashOptions::default()
+            .program(device.program)
+            .check_target(program.target().filter(|_| device.check_target))
+            .trial_run(device.trial_run)
+            .verify(device.verify);
+        let (done, result) = channel();
+        let bus = self.bus(&device.bus);
+        let job = Job::new(device.node, program, options);
+        lock(&bus.waiting).push(Waiting { job, kept, news, done });
+        let _turn = lock(&bus.turn);
+        // Another thread may have carried this order out together with its own.
+        if let Ok(flashed) = result.try_recv() {
+            return flashed;
+        }
+        if self.cancelled.load(Ordering::Relaxed) {
+            return Flashed::Interrupted;
+        }
+        let waiting = std::mem::take(&mut *lock(&bus.waiting));
+        self.work(&device.bus, waiting);
+        // Every order gets its result. If it did not, the update would be begun anew.
+        result.try_recv().unwrap_or(Flashed::Interrupted)
+    }
+}
+
+/// A program in words.
+fn of(program: &Program) -> String {
+    let kind = if program.is_bootloader() { "bootloader" } else { "program" };
+    format!("{kind} of {} bytes, CRC {:08X}h", program.program_size(), program.program_crc())
+}
+
+/// The news in an event of an update.
+fn news_of(event: &Event) -> Vec<News> {
+    let phase = News::Phase(event.to_string());
+    match event {
+        Event::Progress { done, total } => {
+            let percent = (done * 100).checked_div(*total).unwrap_or(100);
+            vec![News::Percent(u8::try_from(percent).unwrap_or(100))]
+        }
+        Event::Phase(Phase::Released | Phase::Started(_) | Phase::Installed { .. }) => {
+            vec![News::Kept, phase]
+        }
+        Event::Done(_) => Vec::new(),
+        _ => vec![phase],
+    }
+}
+
+/// The result of an update for the server.
+fn flashed(job: &Job, result: Result<Report, Failed>) -> Flashed {
+    match result {
+        Ok(report) => Flashed::Done(vec![report.to_string(), of(&job.file)]),
+        Err(Failed { error: Error::Cancelled, .. }) => Flashed::Interrupted,
+        Err(Failed { error: error @ (Error::Adapter(_) | Error::NotAlone { .. }), left })
+            if left.state == DeviceState::Untouched =>
+        {
+            Flashed::NotNow(format!("{error}: {}", error.advice()))
+        }
+        Err(Failed { error, left }) => Flashed::Failed(vec![
+            format!("{error} [{:#010X}]", error.number()),
+            format!("the device: {left}"),
+            format!("what to do: {}", error.advice()),
+        ]),
+    }
+}
+
+/// What the server gets to know of a device: what `coflash info` shows.
+fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
+    let mut all = vec![
+        ("bus".to_string(), device.bus.clone()),
+        ("node".to_string(), device.node.to_string()),
+        ("runs".to_string(), info.device_type.to_string()),
+        ("coflash".to_string(), env!("CARGO_PKG_VERSION").to_string()),
+    ];
+    let texts =
+        [("name", &info.name), ("hardware", &info.hardware_version), ("software", &info.software_version)];
+    for (key, text) in texts {
+        all.extend(text.iter().map(|text| (key.to_string(), text.clone())));
+    }
+    for (key, number) in
+        ["vendor_id", "product_code", "revision", "serial_number"].into_iter().zip(info.identity)
+    {
+        all.extend(number.map(|number| (key.to_string(), format!("{number:08X}h"))));
+    }
+    if let Some(state) = info.state {
+        all.push(("stays".to_string(), reason(state.reason)));
+        all.extend(state.ended_by().map(|by| ("program_ended_by".to_string(), source(by).to_string())));
+        all.push(("crash_resets".to_string(), state.crash_resets.to_string()));
+        all.extend(state.option_bytes.map(|options| ("option_bytes".to_string(), options.to_string())));
+        all.extend(supply(state.supply).map(|words| ("supply".to_string(), words.to_string())));
+    }
+    all.extend(info.bootloader.map(|bootloader| ("bootloader".to_string(), bootloader.version.to_string())));
+    for program in &info.programs {
+        let key = |what: &str| format!("program_{}_{what}", program.number);
+        let crc = program.crc.filter(|crc| *crc != 0);
+        all.extend(crc.map(|crc| (key("crc"), format!("{crc:08X}h"))));
+        all.extend(program.release().map(|version| (key("version"), version.to_string())));
+    }
+    all
+}

@@ -1,0 +1,396 @@
+//! The devices and the server, from a TOML file.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use canopen::NodeId;
+use serde::Deserialize;
+use shared_abi::layout::Layout;
+
+use super::url::Server;
+use coflash_core::file::board;
+
+/// The server, and the devices that get updates from it.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Config {
+    pub(super) server: Server,
+    pub(super) tenant: String,
+    /// The certificates that the server's one must come from; `None` for the usual ones.
+    pub(super) ca_file: Option<PathBuf>,
+    /// The folder for what must survive a restart, and for downloads.
+    pub(super) state: PathBuf,
+    /// The shortest and longest pause between two polls of a device.
+    pub(super) poll: (Duration, Duration),
+    /// The devices, in the order of the file.
+    pub devices: Vec<Device>,
+}
+
+/// A device.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Device {
+    /// Its name on the server: the controllerId.
+    pub controller: String,
+    /// The URL of its bus.
+    pub bus: String,
+    /// Its node-ID.
+    pub node: NodeId,
+    /// The number of the program: sub-index of 1F50h.
+    pub program: u8,
+    /// Whether the update needs a device of the vendor-ID and product code that the file names.
+    pub check_target: bool,
+    /// Whether the program is tried before it is released for autostart.
+    pub trial_run: bool,
+    /// Whether the CRC of the running program is compared at the end.
+    pub verify: bool,
+    pub(super) board: Option<&'static Layout>,
+    pub(super) part: Option<String>,
+    pub(super) artifact: Option<String>,
+    pub(super) attempt: Attempt,
+    pub(super) confirm: bool,
+    pub(super) token: Token,
+}
+
+/// What is done with a deployment that the server does not force.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Attempt {
+    /// The device is updated at once.
+    #[default]
+    Update,
+    /// The file is fetched, and waits until the server forces the deployment.
+    Hold,
+}
+
+/// The value of the header `Authorization`.
+#[derive(Clone, PartialEq, Eq)]
+pub(super) struct Token(String);
+
+impl Token {
+    pub(super) fn header(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("***")
+    }
+}
+
+/// An error in the file, in words.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct Fault(String);
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct File {
+    url: Option<String>,
+    #[serde(default = "default_tenant")]
+    tenant: String,
+    ca_file: Option<PathBuf>,
+    #[serde(default = "default_state")]
+    state: PathBuf,
+    #[serde(default)]
+    plain_http: bool,
+    #[serde(default = "default_least")]
+    poll_least: u64,
+    #[serde(default = "default_most")]
+    poll_most: u64,
+    gateway_token_file: Option<PathBuf>,
+    gateway_token_env: Option<String>,
+    bus: Option<String>,
+    board: Option<String>,
+    #[serde(default)]
+    device: Vec<Entry>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct Entry {
+    controller_id: String,
+    node: u8,
+    bus: Option<String>,
+    board: Option<String>,
+    #[serde(default = "default_program")]
+    program: u8,
+    token_file: Option<PathBuf>,
+    token_env: Option<String>,
+    part: Option<String>,
+    artifact: Option<String>,
+    #[serde(default)]
+    attempt: Attempt,
+    #[serde(default)]
+    confirm: bool,
+    #[serde(default = "yes")]
+    check_target: bool,
+    #[serde(default = "yes")]
+    trial_run: bool,
+    #[serde(default)]
+    verify: bool,
+}
+
+fn default_tenant() -> String {
+    "DEFAULT".to_string()
+}
+
+fn default_state() -> PathBuf {
+    PathBuf::from("agent-state")
+}
+
+const fn default_least() -> u64 {
+    10
+}
+
+const fn default_most() -> u64 {
+    3600
+}
+
+const fn default_program() -> u8 {
+    1
+}
+
+const fn yes() -> bool {
+    true
+}
+
+/// The longest controllerId and tenant that hawkBit knows.
+const NAME_MOST: usize = 256;
+/// The longest token.
+const TOKEN_MOST: usize = 1024;
+/// The longest poll interval that can be set: 30 days. Servers ask for more than a day.
+const POLL_MOST: u64 = 30 * 24 * 3600;
+
+/// The places of a token, as the file names them.
+struct Source<'s> {
+    file: Option<&'s Path>,
+    env: Option<&'s str>,
+    scheme: &'static str,
+}
+
+impl Config {
+    /// Reads the text of a file. Paths in it are relative to `folder`; `url` replaces its URL, and
+    /// `bus` is for devices without one. Tokens are read from their files and from the environment
+    /// at once.
+    ///
+    /// # Errors
+    /// The first error, in words.
+    pub fn parse(text: &str, folder: &Path, url: Option<&str>, bus: Option<&str>) -> Result<Self, Fault> {
+        Self::read(text, folder, (url, bus), &|name| std::env::var(name).ok()).map_err(Fault)
+    }
+
+    fn read(
+        text: &str,
+        folder: &Path,
+        (url, bus): (Option<&str>, Option<&str>),
+        variable: &dyn Fn(&str) -> Option<String>,
+    ) -> Result<Self, String> {
+        let mut file: File = toml::from_str(text).map_err(|error| {
+            let at = error.span().map_or(0, |span| span.start.min(text.len()));
+            let line = text.bytes().take(at).filter(|byte| *byte == b'\n').count() + 1;
+            format!("line {line}: {}", error.message())
+        })?;
+        file.bus = file.bus.or_else(|| bus.map(String::from));
+        let url = url.or(file.url.as_deref()).ok_or("it has no url: add it, or give --hawkbit URL")?;
+        let server = Server::parse(url)?;
+        if server.is_open() && !file.plain_http {
+            return Err(format!(
+                "'{url}' would send the tokens over the network as plain text: use https://, or set plain-http = true"
+            ));
+        }
+        if server.is_tls() && !cfg!(feature = "tls") {
+            return Err(format!("'{url}' needs TLS, and this coflash was built without the feature tls"));
+        }
+        name("tenant", &file.tenant)?;
+        if file.poll_least == 0 || file.poll_least > file.poll_most || file.poll_most > POLL_MOST {
+            return Err(format!("poll-least and poll-most must be 1 to {POLL_MOST} seconds, in this order"));
+        }
+        let read = |source: Source<'_>| token(&source, folder, variable);
+        let gateway = read(Source {
+            file: file.gateway_token_file.as_deref(),
+            env: file.gateway_token_env.as_deref(),
+            scheme: "GatewayToken",
+        })
+        .map_err(|why| format!("the gateway token: {why}"))?;
+        if file.device.is_empty() {
+            return Err("it names no device: add [[device]] with controller-id, bus and node".to_string());
+        }
+        let mut devices: Vec<Device> = Vec::new();
+        for entry in &file.device {
+            let id = entry.controller_id.as_str();
+            let of = |why: String| format!("device '{id}': {why}");
+            name("controller-id", id).map_err(of)?;
+            let own = read(Source {
+                file: entry.token_file.as_deref(),
+                env: entry.token_env.as_deref(),
+                scheme: "TargetToken",
+            })
+            .map_err(|why| of(format!("its token: {why}")))?;
+            let device = entry.device(&file, folder, own.or_else(|| gateway.clone())).map_err(of)?;
+            if let Some(other) = devices.iter().find(|other| {
+                other.controller == device.controller
+                    || (&other.bus, other.node) == (&device.bus, device.node)
+            }) {
+                return Err(of(format!("it is the same device as '{}', or has its name", other.controller)));
+            }
+            devices.push(device);
+        }
+        Ok(Self {
+            server,
+            tenant: file.tenant,
+            ca_file: file.ca_file.map(|path| folder.join(path)),
+            state: folder.join(file.state),
+            poll: (Duration::from_secs(file.poll_least), Duration::from_secs(file.poll_most)),
+            devices,
+        })
+    }
+}
+
+impl Entry {
+    fn device(&self, file: &File, folder: &Path, token: Option<Token>) -> Result<Device, String> {
+        let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
+        let bus = self.bus.as_ref().or(file.bus.as_ref()).ok_or("it has no bus")?;
+        coboot_can::check(bus).map_err(|error| error.to_string())?;
+        let board = self.board.as_ref().or(file.board.as_ref()).map(|word| board::in_folder(word, folder));
+        let board = board.map(|word| board::named(&word)).transpose().map_err(|error| error.to_string())?;
+        if !(1..=254).contains(&self.program) {
+            return Err("programs are 1 to 254".to_string());
+        }
+        if let Some(board) = board.filter(|board| board.program(self.program).is_none()) {
+            return Err(format!("{} has no program {}", board.board, self.program));
+        }
+        let advice = "it has no token: set token-file or token-env, or the gateway's one for all devices";
+        Ok(Device {
+            controller: self.controller_id.clone(),
+            bus: bus.clone(),
+            node,
+            program: self.program,
+            check_target: self.check_target,
+            trial_run: self.trial_run,
+            verify: self.verify,
+            board,
+            part: self.part.clone(),
+            artifact: self.artifact.clone(),
+            attempt: self.attempt,
+            confirm: self.confirm,
+            token: token.ok_or(advice)?,
+        })
+    }
+}
+
+/// Refuses a name that cannot be one on the server.
+fn name(what: &str, name: &str) -> Result<(), String> {
+    if name.is_empty() || name.len() > NAME_MOST || name.chars().any(char::is_control) {
+        return Err(format!("{what} must have 1 to {NAME_MOST} characters"));
+    }
+    Ok(())
+}
+
+/// Reads a token; `None` if the file names no place for it.
+fn token(
+    source: &Source<'_>,
+    folder: &Path,
+    variable: &dyn Fn(&str) -> Option<String>,
+) -> Result<Option<Token>, String> {
+    let text = match (source.file, source.env) {
+        (Some(_), Some(_)) => return Err("give a file or a variable, not both".to_string()),
+        (None, None) => return Ok(None),
+        (Some(path), None) => {
+            let path = folder.join(path);
+            coflash_core::file::limit::read_text(&path)
+                .map_err(|error| format!("{}: {error}", path.display()))?
+        }
+        (None, Some(name)) => variable(name).ok_or_else(|| format!("the variable {name} is not set"))?,
+    };
+    let text = text.trim();
+    // Nothing of the token goes into the message.
+    if text.is_empty() || text.len() > TOKEN_MOST || !text.bytes().all(|byte| byte.is_ascii_graphic()) {
+        return Err("it must be one word of letters, digits and signs".to_string());
+    }
+    Ok(Some(Token(format!("{} {text}", source.scheme))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const DOOR: &str =
+        "[[device]]\ncontroller-id = 'door'\nbus = 'socketcan:can0'\nnode = 5\ntoken-env = 'DOOR'\n";
+
+    fn read(text: &str) -> Result<Config, String> {
+        let variable = |name: &str| match name {
+            "DOOR" => Some(" secret-of-the-door\n".to_string()),
+            "ALL" => Some("secret-of-all".to_string()),
+            "BROKEN" => Some("two words".to_string()),
+            _ => None,
+        };
+        Config::read(text, Path::new("/etc/coflash"), (None, None), &variable)
+    }
+
+    #[test]
+    fn a_device_has_its_own_token_or_the_gateways() {
+        let text = format!(
+            "url = 'http://localhost'\ngateway-token-env = 'ALL'\n{DOOR}[[device]]\ncontroller-id = 'lift'\n\
+             bus = 'socketcan:can0'\nnode = 6\nattempt = 'hold'\nboard = 'stm32f407g-disc1'\n"
+        );
+        let config = read(&text).unwrap();
+        let headers: Vec<&str> = config.devices.iter().map(|device| device.token.header()).collect();
+        assert_eq!(headers, ["TargetToken secret-of-the-door", "GatewayToken secret-of-all"]);
+        assert_eq!(config.devices[1].attempt, Attempt::Hold);
+        assert_eq!(config.state, Path::new("/etc/coflash/agent-state"));
+        assert!(!format!("{config:?}").contains("secret"), "{config:?}");
+    }
+
+    #[test]
+    fn the_documentations_example_is_a_configuration() {
+        let page = include_str!("../../../docs/agent.md");
+        let example = page.split("```toml\n").nth(1).and_then(|block| block.split("```").next()).unwrap();
+        let folder = std::env::temp_dir().join(format!("coflash-agent-example-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("gateway.token"), "t").unwrap();
+        let config = Config::read(example, &folder, (None, None), &|_| Some("t".to_string()));
+        std::fs::remove_dir_all(&folder).unwrap();
+        match config {
+            Ok(config) => assert!(config.devices.len() > 1),
+            // The example's server is at https://.
+            Err(why) => assert!(!cfg!(feature = "tls") && why.contains("feature tls"), "{why}"),
+        }
+    }
+
+    #[test]
+    fn a_fault_says_what_to_do() {
+        let with = |line: &str| format!("url = 'http://localhost'\n{line}\n{DOOR}");
+        for (text, words) in [
+            (DOOR.to_string(), "--hawkbit URL"),
+            ("url = 'http://localhost'\n".to_string(), "names no device"),
+            (format!("url = 'http://hawkbit'\n{DOOR}"), "plain text"),
+            (format!("url = 'ftp://hawkbit'\n{DOOR}"), "no URL of a server"),
+            (with("speed = 5"), "line 2: "),
+            (with("poll-least = 0"), "poll-least"),
+            (with("poll-least = 60\npoll-most = 5"), "poll-least"),
+            (with("tenant = ''"), "tenant"),
+            (with(&DOOR.replace("node = 5", "node = 6")), "same device as 'door'"),
+            (with(&DOOR.replace("'door'", "'gate'")), "same device"),
+            (with("").replace("node = 5", "node = 128"), "node-IDs"),
+            (with("").replace("bus = 'socketcan:can0'\n", ""), "device 'door': it has no bus"),
+            (with("").replace("socketcan:can0", "nowhere"), "device 'door': "),
+            (with("").replace("token-env = 'DOOR'", ""), "token-file or token-env"),
+            (with("").replace("'DOOR'", "'NONE'"), "NONE is not set"),
+            (with("").replace("'DOOR'", "'BROKEN'"), "one word"),
+            (with("").replace("token-env = 'DOOR'", "token-file = 'none'"), "/etc/coflash/none"),
+            (with("").replace("node = 5", "node = 5\nboard = 'x'"), "no board 'x'"),
+            (
+                with("").replace("node = 5", "node = 5\nboard = 'stm32f407g-disc1'\nprogram = 9"),
+                "no program 9",
+            ),
+            (with("").replace("node = 5", "node = 5\nprogram = 0"), "programs are"),
+        ] {
+            let why = read(&text).unwrap_err();
+            assert!(why.contains(words), "{text}: {why}");
+            assert!(!why.contains("two words"), "{why}");
+        }
+    }
+}

@@ -1,0 +1,43 @@
+//! A client of an Eclipse hawkBit server (Direct Device Integration API): takes the deployments for
+//! the devices of its buses, flashes them, and reports progress and result of each device.
+//!
+//! | file | what is in it |
+//! |---|---|
+//! | `config` | the devices and the server, from a TOML file |
+//! | `url` | which URLs belong to the server, and get its token |
+//! | `ddi` | the messages of the interface |
+//! | `pause` | the pause between two polls, in the forms that a server sends |
+//! | `backoff` | pauses that grow, with jitter |
+//! | `record` | what an agent must know after a restart |
+//! | `controller` | what one device does next: a state machine without I/O |
+//! | `http` | requests to the server, with limits |
+//! | `download` | artifacts: fetched piece by piece, checked |
+//! | `firmware` | the artifact as a program |
+//! | `buses` | the devices: the only file that calls the rest of the library |
+//! | `run` | a thread for each device, which joins these parts |
+//!
+//! Nothing is flashed whose size and SHA-256 were not compared with the deployment.
+#![forbid(unsafe_code)]
+
+mod backoff;
+mod buses;
+mod config;
+mod controller;
+mod ddi;
+mod download;
+mod firmware;
+mod http;
+mod pause;
+mod record;
+mod run;
+mod url;
+
+pub use self::buses::{Buses, Open};
+pub use self::config::{Config, Device, Fault};
+pub use self::controller::{Flashed, Kind, News, Said};
+pub use self::run::{run, CannotStart, Devices, Ended, Options, Order, Times};
+
+/// The example on the crate's page compiles and runs.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,0 +1,349 @@
+//! A thread for each device, which joins the state machine, the server and the bus.
+
+use std::fs::{self, File, TryLockError};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{channel, Receiver, RecvTimeoutError, Sender};
+use std::sync::Arc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crc::{Crc, CRC_64_XZ};
+
+use super::backoff::Jitter;
+use super::config::{Config, Device};
+use super::controller::{Controller, Flash, Flashed, Kind, News, Rules, Said, Step, Wanted};
+use super::download::{self, Pause};
+use super::firmware;
+use super::http::{Client, Limits};
+use super::record::{Record, Store};
+use coflash_core::file::limit::MAX_FILE_SIZE;
+use coflash_core::update::Program;
+
+/// What an agent does with its devices.
+pub trait Devices: Sync {
+    /// The attributes of a device for the server; an error is in words.
+    ///
+    /// # Errors
+    /// In words, if the device does not answer.
+    fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String>;
+
+    /// Flashes a device, and says what happens.
+    fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed;
+}
+
+/// An order to flash a device.
+#[derive(Debug)]
+#[non_exhaustive]
+pub struct Order<'o> {
+    /// The device.
+    pub device: &'o Device,
+    /// The program: fetched, checked and judged.
+    pub program: Program,
+    /// Whether an earlier agent has seen that the device keeps this program. If it runs, the order
+    /// is carried out already.
+    pub kept: bool,
+}
+
+/// The options of a run.
+#[derive(Clone, Debug, Default)]
+#[non_exhaustive]
+pub struct Options {
+    /// End when each device has nothing to do before its next poll.
+    pub once: bool,
+    /// The seed of the jitter.
+    pub seed: u64,
+    /// The time limits.
+    pub times: Times,
+    /// Ends the run when it is set.
+    pub cancelled: Arc<AtomicBool>,
+}
+
+impl Options {
+    coflash_core::setters! {
+        once: bool,
+        seed: u64,
+        times: Times,
+        cancelled: Arc<AtomicBool>,
+    }
+}
+
+/// The time limits of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Times {
+    /// The first pause after a failure; each further one is twice as long.
+    pub backoff_first: Duration,
+    /// The longest pause after a failure.
+    pub backoff_most: Duration,
+    /// The shortest pause between two messages of progress.
+    pub tell: Duration,
+    /// How long a server may send nothing.
+    pub silent: Duration,
+    /// How long a request may take, apart from files.
+    pub request: Duration,
+    /// How long a file is fetched until the agent looks after other things, if the server can go on
+    /// where it ended.
+    pub piece: Duration,
+}
+
+impl Times {
+    coflash_core::setters! {
+        backoff_first: Duration,
+        backoff_most: Duration,
+        tell: Duration,
+        silent: Duration,
+        request: Duration,
+        piece: Duration,
+    }
+}
+
+impl Default for Times {
+    fn default() -> Self {
+        Self {
+            backoff_first: Duration::from_secs(5),
+            backoff_most: Duration::from_secs(300),
+            tell: Duration::from_secs(5),
+            silent: Duration::from_secs(20),
+            request: Duration::from_secs(30),
+            piece: Duration::from_secs(60),
+        }
+    }
+}
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct Ended {
+    /// How many updates were successful.
+    pub updated: usize,
+    /// How many updates have failed.
+    pub failed: usize,
+    /// How many devices were not served: the server did not answer as it should, their bus was in
+    /// use or absent, or their state file was damaged.
+    pub unserved: usize,
+}
+
+/// The reason why an agent cannot start, in words.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct CannotStart(String);
+
+/// How long a thread sleeps before it looks whether the run is to end.
+const TICK: Duration = Duration::from_millis(200);
+/// With `once`, how many failures in a row end the work for a device.
+const ONCE_FAILURES: u32 = 4;
+
+/// What a thread hears while it waits.
+enum Heard {
+    Looked(Result<Vec<(String, String)>, String>),
+    News(News),
+    Flashed(Flashed),
+}
+
+/// What all threads share.
+struct Shared<'r> {
+    config: &'r Config,
+    options: &'r Options,
+    devices: &'r dyn Devices,
+    tell: &'r (dyn Fn(&Said) + Sync),
+    client: Client,
+    limits: Limits,
+    store: Store,
+    began: Instant,
+}
+
+/// Serves the devices until the run is cancelled, or with `once` until there is nothing to do.
+///
+/// # Errors
+/// [`CannotStart`], before the first request.
+pub fn run(
+    config: &Config,
+    options: &Options,
+    devices: &dyn Devices,
+    tell: &(dyn Fn(&Said) + Sync),
+) -> Result<Ended, CannotStart> {
+    let folder = &config.state;
+    let unusable = |error: &dyn std::fmt::Display| CannotStart(format!("{}: {error}", folder.display()));
+    let store = Store::new(folder).map_err(|error| unusable(&error))?;
+    let _lock = lock(folder.join("agent.lock")).map_err(|why| unusable(&why))?;
+    let Times { silent, request, .. } = options.times;
+    let limits = Limits { silent, request };
+    let client =
+        Client::new(config.server.clone(), config.ca_file.as_deref(), limits).map_err(CannotStart)?;
+    let shared = Shared { config, options, devices, tell, client, limits, store, began: Instant::now() };
+    let shared = &shared;
+    let results: Vec<Ended> = thread::scope(|scope| {
+        let threads: Vec<_> =
+            config.devices.iter().map(|device| scope.spawn(move || serve(shared, device))).collect();
+        // A thread that panicked has served nobody.
+        let lost = Ended { unserved: 1, ..Ended::default() };
+        threads.into_iter().map(|thread| thread.join().unwrap_or(lost)).collect()
+    });
+    Ok(results.into_iter().fold(Ended::default(), |all, one| Ended {
+        updated: all.updated + one.updated,
+        failed: all.failed + one.failed,
+        unserved: all.unserved + one.unserved,
+    }))
+}
+
+/// Locks the folder, so that no second agent works with it.
+fn lock(path: PathBuf) -> Result<File, String> {
+    let file = File::create(path).map_err(|error| error.to_string())?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            Err("another agent works with this folder: end it, or give each its own state".to_string())
+        }
+        Err(TryLockError::Error(error)) => Err(error.to_string()),
+    }
+}
+
+/// The record of a device. A damaged one is said, and read again after a pause: it may be put right.
+/// `None` if the run ends before that.
+fn record(shared: &Shared<'_>, device: &Device, root: &str, seed: u64) -> Option<Record> {
+    let Options { once, times, cancelled, .. } = shared.options;
+    let mut jitter = Jitter::new(seed);
+    for failures in 1.. {
+        let why = match shared.store.load(&device.controller, root) {
+            Ok(record) => return Some(record),
+            Err(why) => why,
+        };
+        (shared.tell)(&Said { controller: device.controller.clone(), kind: Kind::Trouble, text: why });
+        let until = shared.began.elapsed() + jitter.after(failures, times.backoff_first, times.backoff_most);
+        while !once && shared.began.elapsed() < until && !cancelled.load(Ordering::Relaxed) {
+            thread::sleep(TICK.min(until.saturating_sub(shared.began.elapsed())));
+        }
+        if *once || cancelled.load(Ordering::Relaxed) {
+            break;
+        }
+    }
+    None
+}
+
+/// Serves one device.
+fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
+    let Shared { config, options, .. } = *shared;
+    let root = config.server.controller(&config.tenant, &device.controller);
+    let seed = options.seed ^ Crc::<u64>::new(&CRC_64_XZ).checksum(device.controller.as_bytes());
+    let Some(record) = record(shared, device, &root, seed) else {
+        return Ended { unserved: 1, ..Ended::default() };
+    };
+    let Times { backoff_first, backoff_most, tell, .. } = options.times;
+    let rules = Rules {
+        part: device.part.clone(),
+        artifact: device.artifact.clone(),
+        attempt: device.attempt,
+        confirm: device.confirm,
+        size_most: MAX_FILE_SIZE,
+        poll: config.poll,
+        backoff: (backoff_first, backoff_most),
+        tell,
+    };
+    let mut controller = Controller::new(&device.controller, rules, record, seed);
+    let path = shared.store.path(&device.controller, "part");
+    let (sender, heard) = channel();
+    let mut ended = Ended::default();
+    thread::scope(|scope| {
+        loop {
+            for said in controller.said() {
+                match said.kind {
+                    Kind::Updated => ended.updated += 1,
+                    Kind::Failed => ended.failed += 1,
+                    _ => {}
+                }
+                (shared.tell)(&said);
+            }
+            let now = shared.began.elapsed();
+            let over = options.cancelled.load(Ordering::Relaxed);
+            let flashing = controller.is_flashing();
+            let gives_up = options.once && controller.failures() >= ONCE_FAILURES && !flashing;
+            if gives_up || options.once && controller.is_settled(now) {
+                ended.unserved = usize::from(gives_up && !over);
+                return;
+            }
+            match controller.next(now) {
+                Step::Save(record) => {
+                    let result = shared.store.save(&device.controller, &record);
+                    if result.is_ok() && !controller.needs_file() {
+                        // Without the file the next download begins anew, which is no harm.
+                        let _ = fs::remove_file(&path);
+                    }
+                    controller.saved(shared.began.elapsed(), result);
+                }
+                // While the agent is being ended, only the end of an update is waited for.
+                _ if over && !flashing => return,
+                Step::Wait(until) => wait(shared, &mut controller, &heard, until),
+                _ if over => wait(shared, &mut controller, &heard, now + TICK),
+                Step::Ask(request) => {
+                    let reply = shared.client.send(&root, &device.token, &request, shared.limits);
+                    controller.answered(shared.began.elapsed(), reply);
+                }
+                Step::Fetch(wanted) => {
+                    let ends = || options.cancelled.load(Ordering::Relaxed);
+                    let pause = Pause { after: options.times.piece, now: &ends };
+                    let piece = download::fetch(&shared.client, &device.token, &wanted, &path, &pause);
+                    controller.fetched(shared.began.elapsed(), piece);
+                }
+                Step::Look => {
+                    let sender = sender.clone();
+                    scope.spawn(move || {
+                        let _ = sender.send(Heard::Looked(shared.devices.look(device)));
+                    });
+                }
+                Step::Flash(Flash { wanted, kept }) => {
+                    let sender = sender.clone();
+                    let path = &path;
+                    scope.spawn(move || flash(shared, device, path.clone(), &wanted, kept, &sender));
+                }
+            }
+        }
+    });
+    ended
+}
+
+/// Waits for news, at most until this time.
+fn wait(shared: &Shared<'_>, controller: &mut Controller, heard: &Receiver<Heard>, until: Duration) {
+    let now = shared.began.elapsed();
+    let pause = until.saturating_sub(now).clamp(Duration::from_millis(1), TICK);
+    let mut next = heard.recv_timeout(pause);
+    loop {
+        let now = shared.began.elapsed();
+        match next {
+            Ok(Heard::Looked(told)) => controller.looked(told),
+            Ok(Heard::News(news)) => controller.news(news),
+            Ok(Heard::Flashed(flashed)) => controller.flashed(now, flashed),
+            Err(RecvTimeoutError::Timeout | RecvTimeoutError::Disconnected) => return,
+        }
+        next = heard.recv_timeout(Duration::ZERO);
+    }
+}
+
+/// Carries out an order, on a thread of its own.
+fn flash(
+    shared: &Shared<'_>,
+    device: &Device,
+    path: PathBuf,
+    wanted: &Wanted,
+    kept: bool,
+    sender: &Sender<Heard>,
+) {
+    let (news, hear) = channel();
+    let flashed = thread::scope(|scope| {
+        scope.spawn(move || {
+            for news in hear {
+                let _ = sender.send(Heard::News(news));
+            }
+        });
+        let program = download::bytes(&path, wanted).map_err(|why| vec![why]);
+        let program = program.and_then(|bytes| firmware::program(&bytes, &wanted.name, device));
+        match program {
+            Ok(program) => shared.devices.flash(Order { device, program, kept }, news),
+            Err(lines) => {
+                drop(news);
+                Flashed::Failed(lines)
+            }
+        }
+    });
+    let _ = sender.send(Heard::Flashed(flashed));
+}

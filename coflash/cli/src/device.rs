@@ -1,0 +1,176 @@
+//! The options that name a device and set its time limits, for every command that talks to one.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use canopen::NodeId;
+use clap::Args;
+use coboot_can::Link;
+use coflash_core::device::{Session, Timing, Transfers};
+
+use super::output::{Exit, Failure};
+use super::values::{attempts, milliseconds, node_id, number, program_number};
+
+/// One device.
+#[derive(Debug, Args)]
+pub(super) struct Device {
+    /// The device's node-ID.
+    #[arg(long, short = 'N', alias = "node_id", default_value = "1", value_parser = node_id, value_name = "1..127")]
+    node: NodeId,
+
+    #[command(flatten)]
+    patience: Patience,
+}
+
+/// One program of one device.
+#[derive(Debug, Args)]
+pub(super) struct Program {
+    #[command(flatten)]
+    pub(super) device: Device,
+
+    /// The program number: sub-index of 1F51h, 1F56h and 1F57h.
+    #[arg(long, short = 'P', alias = "prog_no", value_name = "1..254", value_parser = program_number, default_value = "1")]
+    pub(super) program: u8,
+}
+
+impl Device {
+    /// A session that Ctrl-C ends.
+    pub(super) fn session<'a>(&self, link: &'a mut Link) -> Result<Session<'a>, Failure> {
+        self.patience.session(link, self.node)
+    }
+}
+
+/// The time limits.
+#[derive(Debug, Args)]
+pub(super) struct Patience {
+    /// How long the answer to one request may take, in milliseconds.
+    #[arg(long, aliases = ["sdo_timeout", "timeout"], default_value = "500", value_parser = milliseconds, value_name = "MS")]
+    sdo_timeout: Duration,
+
+    /// How many times a request that may be repeated is sent if no answer comes.
+    #[arg(long, default_value = "3", value_parser = attempts, value_name = "TIMES")]
+    sdo_attempts: u32,
+
+    /// How long a command (such as erase) may take, in milliseconds.
+    #[arg(long, default_value = "60000", value_parser = milliseconds, value_name = "MS")]
+    command_timeout: Duration,
+
+    /// How long a device may send nothing while it executes a command, in milliseconds.
+    #[arg(long, default_value = "10000", value_parser = milliseconds, value_name = "MS")]
+    silence_timeout: Duration,
+
+    /// How long a restart may take, in milliseconds.
+    #[arg(long, default_value = "5000", value_parser = milliseconds, value_name = "MS")]
+    boot_timeout: Duration,
+
+    /// The pause between two status requests to a busy device, in milliseconds; by default 10 at
+    /// first and at most 250.
+    #[arg(long, value_parser = milliseconds, value_name = "MS", conflicts_with = "command_timeout")]
+    delay: Option<Duration>,
+
+    /// How many status requests a busy device gets before it is given up, with a pause of --delay
+    /// (or a second) between them; replaces --command-timeout.
+    #[arg(long, value_parser = number, value_name = "TIMES", conflicts_with = "command_timeout")]
+    repeats: Option<u32>,
+
+    /// Download in segments, even if the device supports block transfer.
+    #[arg(long)]
+    segmented: bool,
+}
+
+/// The manual's defaults (table 9) for `--delay` and `--repeats` if only one of them is given.
+const DELAY: Duration = Duration::from_secs(1);
+const REPEATS: u32 = 0x400;
+
+impl Patience {
+    /// A session that Ctrl-C ends.
+    pub(super) fn session<'a>(&self, link: &'a mut Link, node: NodeId) -> Result<Session<'a>, Failure> {
+        let mut session = Session::on(link, node, self.timing());
+        session.cancel_by(cancelled()?);
+        session.transfer_by(self.transfers());
+        Ok(session)
+    }
+
+    pub(super) fn transfers(&self) -> Transfers {
+        if self.segmented {
+            Transfers::Segments
+        } else {
+            Transfers::Blocks
+        }
+    }
+
+    pub(super) fn timing(&self) -> Timing {
+        let timing = Timing::default()
+            .sdo(self.sdo_timeout)
+            .attempts(self.sdo_attempts)
+            .command(self.command_timeout)
+            .silent(self.silence_timeout)
+            .boot(self.boot_timeout);
+        if self.delay.is_none() && self.repeats.is_none() {
+            return timing;
+        }
+        let delay = self.delay.unwrap_or(DELAY);
+        let command = delay.saturating_mul(self.repeats.unwrap_or(REPEATS).max(1));
+        timing.command(command).poll_first(delay).poll_most(delay)
+    }
+}
+
+/// The flag that Ctrl-C sets. The first Ctrl-C ends a transfer in an orderly way, the second one
+/// ends the program at once.
+pub(super) fn cancelled() -> Result<Arc<AtomicBool>, Failure> {
+    static FLAG: OnceLock<Arc<AtomicBool>> = OnceLock::new();
+    if let Some(flag) = FLAG.get() {
+        return Ok(flag.clone());
+    }
+    let flag = FLAG.get_or_init(Arc::default).clone();
+    let cancelled = flag.clone();
+    ctrlc::set_handler(move || {
+        if cancelled.swap(true, Ordering::Relaxed) {
+            std::process::exit(i32::from(Exit::Cancelled as u8));
+        }
+    })
+    .map_err(|error| Failure::system(format!("Ctrl-C cannot be caught: {error}")))?;
+    Ok(flag)
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        patience: Patience,
+    }
+
+    fn timing(words: &[&str]) -> Timing {
+        Line::try_parse_from([&["coflash"], words].concat())
+            .unwrap_or_else(|error| panic!("{error}"))
+            .patience
+            .timing()
+    }
+
+    #[test]
+    fn delay_and_repeats_are_those_of_the_manuals_tool() {
+        let ms = Duration::from_millis;
+        assert_eq!(timing(&[]), Timing::default());
+        // Table 9: 400h status requests, a second apart, and an SDO time-out of 500 ms.
+        let legacy = timing(&["--delay", "1000", "--repeats", "0x000400", "--timeout", "500"]);
+        assert_eq!(
+            (legacy.command, legacy.poll_first, legacy.poll_most),
+            (ms(1_024_000), ms(1000), ms(1000))
+        );
+        assert_eq!(legacy.sdo, ms(500));
+        assert_eq!(timing(&["--delay", "20"]).command, ms(20 * 1024));
+        assert_eq!(timing(&["--repeats", "3"]).command, ms(3000));
+        assert_eq!(timing(&["--sdo-attempts", "7"]).attempts, 7);
+        assert!(Line::try_parse_from(["coflash", "--sdo-attempts", "0"]).is_err());
+        let own = timing(&["--sdo-timeout", "7", "--command-timeout", "8", "--boot-timeout", "9"]);
+        assert_eq!((own.sdo, own.command, own.boot), (ms(7), ms(8), ms(9)));
+        assert_eq!(own.poll_first, Timing::default().poll_first);
+        assert!(Line::try_parse_from(["coflash", "--delay", "1", "--command-timeout", "1"]).is_err());
+    }
+}

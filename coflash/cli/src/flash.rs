@@ -1,0 +1,545 @@
+//! `coflash flash`: downloads a program into a device.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use canopen::NodeId;
+use clap::{Args, ValueEnum};
+use coboot_can::Link;
+use coflash_core::device::lock::Lock;
+use coflash_core::device::lss::{ensure_node_id, LssAddress};
+use coflash_core::device::Dialect;
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{blocks_of_sealed, Label};
+use coflash_core::file::judge::judge;
+use coflash_core::file::limit::read_text;
+use coflash_core::file::sealed::show::flags;
+use coflash_core::file::sealed::SealedFile;
+use coflash_core::update::dialect::is_data;
+use coflash_core::update::job::{self, Entry, Settings};
+use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
+use coflash_core::update::{flash_program, Event, FlashOptions, Program};
+use serde_json::json;
+use shared_abi::block_file::ProgramVersion;
+
+use super::context::Context;
+use super::convert::Labels;
+use super::device::{cancelled, Patience};
+use super::dialect::Access;
+use super::file::{warn, Source};
+use super::legacy::Legacy;
+use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
+use super::output::Failure;
+use super::progress::Progress;
+use super::renew::bootloader_in;
+use super::values::{nodes, number, program_number, watch_time};
+use super::verify::{self, is_sealed};
+
+/// When devices get the same program together.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Together {
+    /// Devices that can; the others at the same time, each by itself.
+    Auto,
+    /// All devices; one that cannot is not updated.
+    Always,
+    /// None: each device gets it by itself.
+    Never,
+}
+
+/// Downloads a program into a device, or into many devices, and starts it.
+///
+/// The file may be a block file or a sealed image; any other firmware file is converted first. The
+/// tool reads and checks the whole file before it changes a device. An interrupted update can be
+/// started again at once.
+///
+/// A file with a bootloader (bootloader.elf, or a sealed one) renews the bootloader of a device: the new one
+/// runs on trial, is confirmed, and installs itself; the program stays. Of several devices the first one is
+/// renewed before the others are touched.
+///
+/// The tool detects bootloaders of other makers by itself; --dialect names one.
+///
+/// With several nodes, or with a job file, the devices are updated at the same time; if one device
+/// fails, the others continue.
+///
+/// The options of BinaryBlockDownload and DotNetFlashtool are also accepted in their original
+/// spelling (-F, --node_id, --prog_no, --chk_tgt, --chk_run, --sdo_timeout, --timeout and so on). As in
+/// DotNetFlashtool, -F, --node_id and --prog_no leave the trial out unless --chk_run is given.
+#[derive(Debug, Args)]
+pub(super) struct Flash {
+    /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary, block file or sealed image.
+    #[arg(value_name = "FILE", conflicts_with = "legacy_file", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
+    file: Option<PathBuf>,
+
+    /// The devices' node-IDs: 5, or a list with ranges like 1,5,9-12.
+    #[arg(long, short = 'N', alias = "nodes", default_value = "1", value_parser = nodes, value_name = "NODES",
+          conflicts_with = "node_id")]
+    node: Vec<Vec<NodeId>>,
+
+    /// A job file, which names the devices and their programs (see the manual), in place of FILE
+    /// and --node.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["file", "legacy_file", "node", "node_id", "vid"])]
+    job: Option<PathBuf>,
+
+    /// How many devices are updated at the same time.
+    #[arg(long, value_name = "DEVICES", value_parser = number, default_value = "8")]
+    at_once: u32,
+
+    /// Whether devices get the same program together, in one download for all of them.
+    #[arg(long, value_enum, value_name = "WHEN", default_value = "auto", default_missing_value = "always", num_args = 0..=1, require_equals = true)]
+    together: Together,
+
+    /// Write the results to this file as JSON.
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
+
+    /// The program number: sub-index of 1F50h.
+    #[arg(long, short = 'P', value_name = "1..254", value_parser = program_number, default_value = "1",
+          conflicts_with = "prog_no")]
+    program: u8,
+
+    #[command(flatten)]
+    patience: Patience,
+
+    #[command(flatten)]
+    source: Source,
+
+    #[command(flatten)]
+    labels: Labels,
+
+    /// Compare vendor-ID and product code of file and device before anything is erased.
+    #[arg(long)]
+    check_target: bool,
+
+    /// Release the program for autostart without a trial. By default, if the dialect has such a
+    /// release, the program is started once, its identity (1018h) is compared with the
+    /// bootloader's, and it is called back.
+    #[arg(long, conflicts_with = "chk_run")]
+    no_trial: bool,
+
+    /// Watch the program for this time after each start, in milliseconds; 0 does not watch. By default
+    /// 1000, or twice the time of the watchdog that the bootloader starts for it. A second boot-up, an
+    /// emergency 6000h or the bootloader ends the update: exit status 7.
+    #[arg(long, value_parser = watch_time, value_name = "MS")]
+    watch: Option<Duration>,
+
+    /// Search until the bootloader answers or Ctrl-C ends the search: the device may still be
+    /// switched off, and an application that does not leave is called again and again.
+    #[arg(long)]
+    wait: bool,
+
+    /// Continue even if another tool talks to the device, or another coflash process of this
+    /// computer works on it.
+    #[arg(long)]
+    not_alone: bool,
+
+    /// Do not ask a flying NMT master (CiA 302-2) for mastership; by default the tool takes the
+    /// mastership during the update of a lift device.
+    #[arg(long)]
+    no_mastership: bool,
+
+    /// Leave the device in the bootloader, with the program neither tried nor released for
+    /// autostart.
+    #[arg(long)]
+    no_start: bool,
+
+    /// At the very end, compare the program's CRC once more with the CRC that the running program
+    /// reports.
+    #[arg(long)]
+    verify: bool,
+
+    /// Download a sealed image block by block (--block-size) instead of in one transfer.
+    #[arg(long = "blocks")]
+    in_blocks: bool,
+
+    /// Send everything, also if the device could go on with a download of this file that was cut
+    /// off.
+    #[arg(long)]
+    from_start: bool,
+
+    /// How many times a block is sent again after a CRC error or a broken transfer.
+    #[arg(long, value_name = "TIMES", value_parser = number, default_value = "3")]
+    block_repeats: u32,
+
+    /// Let the device alone judge the image. By default the tool refuses an image that cannot be a
+    /// program of an STM32F4 (vector table, a bootloader, only zeros), and an image for another
+    /// device or another place in flash, before it changes the device.
+    #[arg(long)]
+    force: bool,
+
+    #[command(flatten)]
+    access: Access,
+
+    #[command(flatten)]
+    legacy: Legacy,
+}
+
+/// The program for one device.
+struct Assignment {
+    node: Option<NodeId>,
+    address: Option<LssAddress>,
+    image: PathBuf,
+    file: Program,
+    options: FlashOptions,
+}
+
+impl Flash {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if let Some(list) = self.legacy.list() {
+            context.out.result(&list, || json!({ "command": "flash", "list": list }));
+            return Ok(());
+        }
+        self.legacy.check(context)?;
+        let devices = match &self.job {
+            Some(job) => self.devices_of_job(context, job)?,
+            None => self.devices(context)?,
+        };
+        if devices.iter().any(|device| self.leaves_trial_out(device)) {
+            context.out.say(
+                "no trial, as DotNetFlashtool makes none: the program is released before its first start \
+                 (--chk_run tries it first)",
+            );
+        }
+        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
+        match devices.as_slice() {
+            [device] if self.job.is_none() => self.one(context, &mut link, device),
+            devices => self.many(context, &mut link, devices),
+        }
+    }
+
+    /// Whether the manual's words leave the trial of this file out. DotNetFlashtool knows neither job
+    /// files nor new bootloaders, and a bootloader is never installed without its trial.
+    fn is_untried(&self, file: &Program) -> bool {
+        self.legacy.makes_no_trial() && self.job.is_none() && !file.is_bootloader()
+    }
+
+    /// Whether that alone is the reason that this program gets no trial.
+    fn leaves_trial_out(&self, device: &Assignment) -> bool {
+        let has_trial = matches!(self.access.dialect(), None | Some(Dialect::Block));
+        self.is_untried(&device.file) && has_trial && !self.no_trial && !self.no_start
+    }
+
+    /// The program number, in either spelling.
+    fn number(&self) -> u8 {
+        self.legacy.program().unwrap_or(self.program)
+    }
+
+    /// The options for reading a file for the named dialect.
+    fn source(&self) -> Source {
+        match self.access.dialect() {
+            Some(Dialect::Raw | Dialect::Lift) => self.source.for_images(),
+            _ => self.source.clone(),
+        }
+    }
+
+    /// The devices of the command line, which all get the same program.
+    fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
+        let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
+        let image = self.file.as_deref().or(self.legacy.file()).ok_or_else(unnamed)?;
+        let file = self.program(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
+        let options = self.options(&file, &Settings::default())?;
+        match &file {
+            Program::Blocks(file) => {
+                let (size, crc) = (file.program_size(), file.program_crc());
+                context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
+            }
+            Program::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
+            Program::Bootloader(new) => {
+                let (version, size, crc) = (new.version(), new.size(), new.crc());
+                let image = image.display();
+                context
+                    .out
+                    .say(format_args!("{image}: bootloader {version} of {size} bytes, CRC {crc:08X}h"));
+            }
+        }
+        let address = self.legacy.address();
+        let mut nodes: Vec<NodeId> = Vec::new();
+        for node in self.legacy.nodes().unwrap_or(&self.node).iter().flatten() {
+            if !nodes.contains(node) {
+                nodes.push(*node);
+            }
+        }
+        if address.is_some() && nodes.len() > 1 {
+            let advice = "give one --node, or use a job file with an LSS address for each device";
+            return Err(Failure::usage("one LSS address cannot get several node-IDs", advice));
+        }
+        let assign = |node| Assignment {
+            node: Some(node),
+            address,
+            image: image.to_path_buf(),
+            file: file.clone(),
+            options,
+        };
+        Ok(nodes.into_iter().map(assign).collect())
+    }
+
+    /// The devices of a job file. Every image is read and checked before any device is changed.
+    fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
+        // Devices with the same image share it.
+        let mut known: Vec<(PathBuf, Option<String>, u8, Program)> = Vec::new();
+        let mut devices = Vec::new();
+        let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
+        let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
+        for entry in entries.map_err(|fault| Failure::job(job, &fault))? {
+            let Entry { node, address, settings, .. } = entry;
+            let image = settings.image.clone().unwrap_or_default();
+            let program = settings.program.unwrap_or(self.number());
+            let same = known.iter().find(|(path, board, number, _)| {
+                (path, board, *number) == (&image, &settings.board, program)
+            });
+            let file = match same {
+                Some((.., file)) => file.clone(),
+                None => {
+                    let source = match &settings.board {
+                        Some(board) => self.source().for_board(board),
+                        None => self.source(),
+                    };
+                    let file = self.program(context, &image, program, &source, Label::default())?;
+                    known.push((image.clone(), settings.board.clone(), program, file.clone()));
+                    file
+                }
+            };
+            let options = self.options(&file, &settings)?.program(program);
+            devices.push(Assignment { node, address, image, file, options });
+        }
+        Ok(devices)
+    }
+
+    /// Reads and checks the program for a device.
+    fn program(
+        &self,
+        context: &Context,
+        path: &Path,
+        program: u8,
+        source: &Source,
+        label: Label,
+    ) -> Result<Program, Failure> {
+        if let Some(new) = bootloader_in(path, source.format())? {
+            return Ok(new.into());
+        }
+        if is_sealed(path) {
+            let bytes = verify::read(path)?.image;
+            let file = match self.force {
+                true => SealedFile::parse(bytes),
+                false => SealedFile::for_program(bytes, program),
+            };
+            let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
+            if self.in_blocks {
+                // The device reports the program's start address later; this checks now whether
+                // such blocks are possible.
+                blocks_of_sealed(&file, 0, source.block_size())
+                    .map_err(|error| Failure::convert(error, path))?;
+            }
+            return Ok(Arc::new(file).into());
+        }
+        let done = source.blocks(path, program, label)?;
+        warn(context, path, &done);
+        self.judge(path, &done.file, program, source)?;
+        Ok(Arc::new(done.file).into())
+    }
+
+    /// Refuses a file that cannot be a program, before any request to a device. For a possible lift
+    /// device, the meaning of a program number above 1 is not known without the device.
+    fn judge(&self, path: &Path, file: &BlockFile, program: u8, source: &Source) -> Result<(), Failure> {
+        let dialect = self.access.dialect();
+        if self.force || is_data(dialect.unwrap_or(Dialect::Lift), program) {
+            return Ok(());
+        }
+        let board = source.layout()?;
+        judge(&file.image(), file.program_start(), board).map_err(|fault| Failure::no_program(path, fault))
+    }
+
+    /// The options of the command line, unless the device's own settings replace them.
+    fn options(&self, file: &Program, settings: &Settings) -> Result<FlashOptions, Failure> {
+        let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
+        let advice = "convert it with --vid and --pid, or give these options here";
+        let unnamed = || Failure::usage("the file does not name its target device", advice);
+        let check_target = if check { Some(file.target().ok_or_else(unnamed)?) } else { None };
+        let trial = settings.trial_run.unwrap_or(!(self.no_trial || self.is_untried(file)));
+        let start = settings.start.unwrap_or(!self.no_start);
+        if file.is_bootloader() && !(trial && start) {
+            let advice =
+                "leave out --no-trial and --no-start: without its trial a bootloader is not installed";
+            return Err(Failure::usage("a new bootloader is tried before it replaces the old one", advice));
+        }
+        Ok(FlashOptions::default()
+            .program(self.number())
+            .repeats(self.block_repeats)
+            .check_target(check_target)
+            .trial_run(trial)
+            .watch(self.watch)
+            .start(start)
+            .verify(settings.verify.unwrap_or(self.verify))
+            .dialect(self.access.dialect())
+            .unlock(self.access.unlock())
+            .wait(self.wait)
+            .alone(!self.not_alone)
+            .mastership(!self.no_mastership)
+            .blocks(self.in_blocks.then(|| self.source.block_size()))
+            .joined_blocks(self.source.joined_blocks())
+            .from_start(self.from_start)
+            .force(self.force))
+    }
+
+    /// The node-ID of a device. A device named by its LSS address gets its node-ID first.
+    fn node_of(&self, link: &mut Link, device: &Assignment) -> Result<NodeId, Failure> {
+        match (device.address, device.node) {
+            (Some(address), node) => {
+                let Link::Bus(adapter) = link else {
+                    let advice = "name the device by its node-ID, or connect to its CAN bus with an adapter";
+                    return Err(Failure::usage(
+                        "a device behind a gateway cannot be named by its LSS address",
+                        advice,
+                    ));
+                };
+                let boot = self.patience.timing().boot;
+                Ok(ensure_node_id(&mut **adapter, &address, node, boot, &cancelled()?)?)
+            }
+            (None, Some(node)) => Ok(node),
+            // A job with neither was refused earlier.
+            (None, None) => Err(Failure::usage("a device has no node-ID", "give it one")),
+        }
+    }
+
+    /// Locks the node, so that no other process of this computer works on it.
+    fn lock(&self, context: &Context, node: NodeId) -> Result<Option<Lock>, Failure> {
+        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        if self.not_alone {
+            Ok(None)
+        } else {
+            context.lock(bus.as_deref(), node).map(Some)
+        }
+    }
+
+    fn one(&self, context: &Context, link: &mut Link, device: &Assignment) -> Result<(), Failure> {
+        let node = self.node_of(link, device)?;
+        let _lock = self.lock(context, node)?;
+        let mut session = self.patience.session(link, node)?;
+        let mut progress = Progress::new(context.out, node);
+        let mut left = None;
+        let result = flash_program(&mut session, &device.file, &device.options, &mut |event| match event {
+            Event::Done(done) => {
+                left = Some(done.left);
+                progress.show(Event::Done(done));
+            }
+            event => progress.show(event),
+        });
+        progress.finish();
+        let waiting = result.is_err().then(|| context.waiting("the bus has been observed"));
+        let result = result.map_err(|error| Failure::diagnosed(error, &mut session).leaving(left));
+        drop(waiting);
+        let report = match (&self.report, result) {
+            (None, result) => result?,
+            (Some(path), result) => {
+                let outcome = Outcome {
+                    node: Some(node),
+                    name: format!("node {node}"),
+                    image: device.image.display().to_string(),
+                    result,
+                };
+                write_report(path, &document(std::slice::from_ref(&outcome)))?;
+                outcome.result?
+            }
+        };
+        context.out.result(report, || {
+            let mut value = json!(report);
+            value["command"] = "flash".into();
+            value["node"] = node.get().into();
+            value["program"] = report.renewal.map_or(device.options.program, |renewal| renewal.number).into();
+            value
+        });
+        Ok(())
+    }
+
+    fn many(&self, context: &Context, link: &mut Link, devices: &[Assignment]) -> Result<(), Failure> {
+        if self.together == Together::Always && matches!(link, Link::Gateway(_)) {
+            let advice = "leave out --together, or use an adapter on the bus";
+            return Err(Failure::usage("a gateway does one transfer at a time", advice));
+        }
+        let mut outcomes: Vec<Option<Outcome>> = Vec::new();
+        let mut jobs: Vec<(usize, Job)> = Vec::new();
+        let mut locks = Vec::new();
+        for (number, device) in devices.iter().enumerate() {
+            let image = device.image.display().to_string();
+            let twice = |node| jobs.iter().any(|(_, job): &(usize, Job)| job.node == node);
+            let outcome = match self.node_of(link, device) {
+                Ok(node) if twice(node) => {
+                    let advice = "name each device once, and give each its own node-ID";
+                    let failure = Failure::usage(format!("node {node} is in the job twice"), advice);
+                    Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
+                }
+                Ok(node) => match self.lock(context, node) {
+                    Ok(lock) => {
+                        locks.push(lock);
+                        let options = device.options.together(self.together == Together::Always);
+                        jobs.push((number, Job::new(node, device.file.clone(), options)));
+                        None
+                    }
+                    Err(failure) => {
+                        Some(Outcome { node: Some(node), name: device.name(), image, result: Err(failure) })
+                    }
+                },
+                Err(failure) => {
+                    Some(Outcome { node: device.node, name: device.name(), image, result: Err(failure) })
+                }
+            };
+            outcomes.push(outcome);
+        }
+        let options = ManyOptions::default()
+            .timing(self.patience.timing())
+            .transfers(self.patience.transfers())
+            .at_once(self.at_once as usize)
+            .together(self.together != Together::Never)
+            .cancelled(cancelled()?);
+        let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
+        let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
+        let board = Board::new(context.out, &nodes);
+        let show = |job, event| board.show(job, event);
+        let results = match link {
+            Link::Bus(adapter) => flash_many(&mut **adapter, &jobs, &options, &show),
+            Link::Gateway(gateway) => flash_in_turn(&mut **gateway, &jobs, &options, &show),
+        };
+        board.finish();
+        let waiting =
+            results.iter().any(Result::is_err).then(|| context.waiting("the bus has been observed"));
+        let diagnosis = match nodes.first() {
+            Some(node) => diagnose_silence(&mut self.patience.session(link, *node)?, &results),
+            None => None,
+        };
+        drop(waiting);
+        for ((number, node), result) in numbers.into_iter().zip(nodes).zip(results) {
+            let image = devices[number].image.display().to_string();
+            outcomes[number] = Some(Outcome::new(node, image, result, diagnosis.as_ref()));
+        }
+        let outcomes: Vec<Outcome> = outcomes.into_iter().flatten().collect();
+        summary(context.out, &outcomes, self.report.as_deref())
+    }
+}
+
+/// A summary of a sealed image before the download.
+fn brief(file: &SealedFile) -> String {
+    let head = file.head();
+    let names: Vec<&str> = flags(head.flags()).collect();
+    let kind = if names.is_empty() { String::new() } else { format!(" ({})", names.join(", ")) };
+    let keys: Vec<String> = file.parts().signers().into_iter().map(|id| format!("{id:08X}h")).collect();
+    format!(
+        "sealed program of {} bytes{kind}, CRC {:08X}h, version {}, counter {}, signed by {}",
+        head.size(),
+        head.crc(),
+        ProgramVersion(head.version()),
+        head.counter(),
+        keys.join(", ")
+    )
+}
+
+impl Assignment {
+    /// The device's name in messages.
+    fn name(&self) -> String {
+        match (self.node, self.address) {
+            (Some(node), _) => format!("node {node}"),
+            (None, Some(address)) => format!("device with serial number {:08X}h", address.serial_number),
+            (None, None) => "device".to_string(),
+        }
+    }
+}

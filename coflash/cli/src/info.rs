@@ -1,0 +1,35 @@
+//! `coflash info`: shows what a device reports about itself.
+
+use clap::Args;
+use coflash_core::device::info::{info, DeviceInfo};
+use serde_json::{json, Value};
+
+use super::context::Context;
+use super::device::Device;
+use super::output::Failure;
+
+/// Shows what runs on a device, its identity, and the state of its programs.
+#[derive(Debug, Args)]
+pub(super) struct Info {
+    #[command(flatten)]
+    device: Device,
+}
+
+impl Info {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let mut link = context.link()?;
+        let mut session = self.device.session(&mut link)?;
+        let waiting = context.waiting(format!("node {} answers", session.node()));
+        let info = info(&mut session).map_err(|error| Failure::diagnosed(error, &mut session))?;
+        drop(waiting);
+        context.out.result(&info, || value(&info));
+        Ok(())
+    }
+}
+
+/// The JSON value.
+pub(super) fn value(info: &DeviceInfo) -> Value {
+    let mut value = json!(info);
+    value["command"] = "info".into();
+    value
+}

@@ -1,0 +1,592 @@
+//! The output of a command: words for people, one JSON document for programs, and the exit code.
+
+use std::fmt;
+use std::io::{self, IsTerminal, Write as _};
+use std::path::Path;
+
+use canopen::NodeId;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::Args;
+use coboot_can::AdapterError;
+use coflash_core::device::diagnose::{diagnose, Diagnosis};
+use coflash_core::device::error::LssFailure;
+use coflash_core::device::{legacy, Session};
+use coflash_core::file::board::NamedError;
+use coflash_core::file::convert::ConvertError;
+use coflash_core::file::sealed::Refusal;
+use coflash_core::file::{judge, Cause, FileError};
+use coflash_core::update::job::Fault;
+use coflash_core::update::{refusal_number, DeviceAfterUpdate, DeviceAnswer};
+use coflash_core::Error;
+use serde_json::{json, Value};
+
+use super::record;
+
+/// The heading of the options that all commands have.
+pub(super) const GLOBAL: &str = "For all commands";
+
+/// The options for the amount and the form of the output, for all commands.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub(super) struct Output {
+    /// Write one JSON document to standard output in place of words.
+    #[arg(long, global = true, help_heading = GLOBAL)]
+    json: bool,
+
+    /// Write events to standard output as they happen, one JSON object on each line: found, phase,
+    /// progress, retry, done; then the result, or the error.
+    #[arg(long, global = true, help_heading = GLOBAL, conflicts_with = "json")]
+    json_events: bool,
+
+    /// Print nothing unless there is an error.
+    #[arg(long, short, global = true, help_heading = GLOBAL, conflicts_with = "verbose")]
+    quiet: bool,
+
+    /// Print more: what the tool waits for, and what it has chosen by itself.
+    #[arg(long, short, global = true, help_heading = GLOBAL)]
+    verbose: bool,
+
+    /// Exit with the error numbers of the manual's tools (0x60000013 and so on) in place of the
+    /// exit codes below; Unix keeps only the last two digits of these numbers.
+    #[arg(long, global = true, help_heading = GLOBAL, env = "COFLASH_LEGACY_EXIT_CODES",
+          value_parser = clap::builder::FalseyValueParser::new())]
+    legacy_exit_codes: bool,
+}
+
+impl Output {
+    /// Combines the options of two sources.
+    pub(super) fn or(self, other: Self) -> Self {
+        let Self { json, json_events, quiet, verbose, legacy_exit_codes } = other;
+        Self {
+            json: self.json || json,
+            json_events: self.json_events || json_events,
+            quiet: self.quiet || quiet,
+            verbose: self.verbose || verbose,
+            legacy_exit_codes: self.legacy_exit_codes || legacy_exit_codes,
+        }
+    }
+
+    /// The output options among the words of a command line that cannot be parsed as a whole.
+    pub(super) fn of_words() -> Self {
+        let set = std::env::var("COFLASH_LEGACY_EXIT_CODES").unwrap_or_default().to_lowercase();
+        let falsey = matches!(set.as_str(), "" | "0" | "n" | "no" | "f" | "false" | "off");
+        let said = |option: &str| std::env::args_os().any(|word| word == *option);
+        let legacy_exit_codes = said("--legacy-exit-codes") || !falsey;
+        Self {
+            legacy_exit_codes,
+            json: said("--json"),
+            json_events: said("--json-events"),
+            ..Self::default()
+        }
+    }
+
+    /// The program's exit code for a failure.
+    pub(super) fn code(self, failure: &Failure) -> u32 {
+        if self.legacy_exit_codes {
+            failure.legacy
+        } else {
+            failure.exit as u32
+        }
+    }
+
+    /// Ends the program with a failure.
+    pub(super) fn exit(self, failure: &Failure) -> ! {
+        let code = self.code(failure);
+        // All numbers are below 2^31.
+        std::process::exit(code as i32)
+    }
+
+    /// Whether the output is for people.
+    pub(super) fn for_people(self) -> bool {
+        !self.for_programs() && !self.quiet
+    }
+
+    /// Whether the output is for programs alone.
+    pub(super) fn for_programs(self) -> bool {
+        self.json || self.json_events
+    }
+
+    /// Whether programs get events.
+    pub(super) fn shows_events(self) -> bool {
+        self.json_events
+    }
+
+    /// Whether to show what the tool waits for; this goes to standard error.
+    pub(super) fn shows_waiting(self) -> bool {
+        self.for_people() && io::stderr().is_terminal()
+    }
+
+    /// Whether a progress bar is useful.
+    pub(super) fn on_terminal(self) -> bool {
+        self.for_people() && io::stdout().is_terminal()
+    }
+
+    /// Prints a message for people. A closed standard output (`| head`) does not stop an update.
+    pub(super) fn say(self, words: impl fmt::Display) {
+        record::note("said", &words.to_string());
+        if self.for_people() {
+            let _ = writeln!(io::stdout(), "{words}");
+        }
+    }
+
+    /// Prints a message on standard error that people need and programs do not.
+    pub(super) fn note(self, words: impl fmt::Display) {
+        if self.for_people() {
+            let _ = writeln!(io::stderr(), "{words}");
+        }
+    }
+
+    /// Prints a message for people who asked for more output.
+    pub(super) fn detail(self, words: impl fmt::Display) {
+        record::note("detail", &words.to_string());
+        if self.verbose {
+            let _ = writeln!(io::stderr(), "{words}");
+        }
+    }
+
+    /// Prints the result of a command: words for people, the value for programs.
+    pub(super) fn result(self, words: impl fmt::Display, value: impl FnOnce() -> Value) {
+        let text = words.to_string();
+        record::note("result", &text);
+        if self.for_programs() || record::is_kept() {
+            self.value(&value());
+        }
+        if self.for_people() {
+            let _ = writeln!(io::stdout(), "{}", text.trim_end());
+        }
+    }
+
+    /// Prints the result of a command as one JSON document in one line.
+    pub(super) fn value(self, value: &Value) {
+        record::result(value);
+        self.document("result", value);
+    }
+
+    /// Prints an event for programs.
+    pub(super) fn event(self, line: &Value) {
+        if self.json_events {
+            let _ = writeln!(io::stdout(), "{line}");
+        }
+    }
+
+    fn document(self, event: &str, value: &Value) {
+        if self.json_events {
+            let mut line = json!({ "event": event });
+            if let (Some(line), Some(value)) = (line.as_object_mut(), value.as_object()) {
+                line.extend(value.clone());
+            }
+            self.event(&line);
+        } else if self.json {
+            let _ = writeln!(io::stdout(), "{value}");
+        }
+    }
+
+    /// Prints a line of an endless list: words for people, a value for programs. Returns whether
+    /// standard output is still open.
+    pub(super) fn listed(self, words: impl fmt::Display, value: impl FnOnce() -> Value) -> bool {
+        if self.for_programs() {
+            writeln!(io::stdout(), "{}", value()).is_ok()
+        } else {
+            self.quiet || writeln!(io::stdout(), "{words}").is_ok()
+        }
+    }
+
+    /// Prints a warning: the command continues, but people should know about it. Never uses
+    /// standard output.
+    pub(super) fn warn(self, words: impl fmt::Display) {
+        record::note("warning", &words.to_string());
+        let _ = writeln!(io::stderr(), "{} {words}", paint("warning:", "33"));
+    }
+
+    /// Prints a failure, the last message of a command.
+    pub(super) fn failure(self, failure: &Failure) {
+        record::note("error", failure.to_string().trim_end());
+        if self.for_programs() {
+            if !failure.told {
+                self.document("error", &failure.value());
+            }
+        } else {
+            let _ = write!(io::stderr(), "{failure}");
+        }
+    }
+}
+
+/// Colours a word on standard error, if that is a terminal and the user allows colours
+/// (<https://no-color.org>).
+fn paint(word: &str, colour: &str) -> String {
+    let objected = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
+    if io::stderr().is_terminal() && !objected {
+        format!("\x1B[1;{colour}m{word}\x1B[0m")
+    } else {
+        word.to_string()
+    }
+}
+
+/// The exit codes, for the end of each `--help`.
+pub(super) const EXIT_CODES: &str = "\
+Exit codes:
+  0    done
+  1    the result cannot be written, or the system refuses something else
+  2    wrong usage
+  3    the firmware file is bad, or does not fit the board or the device; nothing was changed
+  4    the CAN adapter cannot be opened, or is gone
+  5    the device does not answer
+  6    the device refuses, or reports an error
+  7    the program does not start, or the application does not go back to the bootloader
+  8    some of several devices failed; the summary tells which
+  130  cancelled";
+
+/// The exit codes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[repr(u8)]
+pub(super) enum Exit {
+    System = 1,
+    Usage = 2,
+    File = 3,
+    Adapter = 4,
+    NoAnswer = 5,
+    Device = 6,
+    NoStart = 7,
+    Some = 8,
+    Cancelled = 130,
+}
+
+/// EIO: an error of the operating system has its own number if this is known, and this number
+/// otherwise.
+const INPUT_OUTPUT: u32 = 5;
+
+impl Exit {
+    /// The exit code of the manual's tools, if the failure itself has no number.
+    const fn legacy(self) -> u32 {
+        match self {
+            Self::System => INPUT_OUTPUT,
+            Self::Usage | Self::File => legacy::INVALID_PARAMETER,
+            Self::Adapter | Self::NoAnswer | Self::Device | Self::NoStart | Self::Some | Self::Cancelled => {
+                legacy::UNKNOWN
+            }
+        }
+    }
+}
+
+/// Why a command failed: what happened, what to do, and the exit code.
+#[derive(Debug)]
+pub(super) struct Failure {
+    pub(super) exit: Exit,
+    /// The stable error number, if there is one.
+    number: Option<u32>,
+    /// The exit code of the manual's tools.
+    pub(super) legacy: u32,
+    what: String,
+    /// The state of the device after the failure, if it is known.
+    left: Option<DeviceAfterUpdate>,
+    advice: Option<String>,
+    /// Whether the document on standard output already contains the failure.
+    told: bool,
+}
+
+impl Failure {
+    /// An error of a conversation. If the device is silent, the tool observes the bus to find the
+    /// reason.
+    pub(super) fn diagnosed(error: Error, session: &mut Session<'_>) -> Self {
+        let silent = matches!(error, Error::NoAnswer { .. }) && session.hears_the_bus();
+        let failure = Self::from(error);
+        match silent.then(|| diagnose(session)) {
+            Some(Ok(diagnosis)) => Self { advice: Some(diagnosis.to_string()), ..failure },
+            // The first error remains the reason.
+            Some(Err(_)) | None => failure,
+        }
+    }
+
+    /// An error of one of several conversations. If the device was silent, `diagnosis` gives the
+    /// reason.
+    pub(super) fn diagnosed_by(error: Error, diagnosis: Option<&Diagnosis>, node: NodeId) -> Self {
+        let silent = matches!(error, Error::NoAnswer { .. });
+        let failure = Self::from(error);
+        match diagnosis.filter(|_| silent) {
+            Some(diagnosis) => {
+                let its = Diagnosis { node, ..diagnosis.clone() };
+                Self { advice: Some(its.to_string()), ..failure }
+            }
+            None => failure,
+        }
+    }
+
+    /// Several devices have failed, and the summary has shown the reasons. `legacy` is the exit
+    /// code of the manual's tools, which handle one device, for the first failed device.
+    pub(super) fn told(exit: Exit, legacy: u32, failed: usize, of: usize) -> Self {
+        let what = format!("{failed} of {of} devices failed");
+        Self { told: true, legacy, ..Self::new(exit, None, what, None) }
+    }
+
+    /// A device that differs from a file in `count` properties; each one was shown.
+    pub(super) fn differs(node: NodeId, count: usize) -> Self {
+        let what = match count {
+            1 => format!("node {node} differs from the file in one property"),
+            count => format!("node {node} differs from the file in {count} properties"),
+        };
+        let advice =
+            "flash the file, or find the file that the device was programmed with; coflash events shows \
+                      what was installed";
+        Self { told: true, ..Self::new(Exit::File, None, what, Some(advice.to_string())) }
+    }
+
+    /// A device whose state or option bytes forbid its delivery; each reason was shown.
+    pub(super) fn not_ready(node: NodeId) -> Self {
+        let advice = "do what each line says, and run the command again".to_string();
+        Self {
+            told: true,
+            ..Self::new(Exit::Device, None, format!("node {node} is not ready"), Some(advice))
+        }
+    }
+
+    /// A device that has failed `count` conformance checks; each one was shown.
+    #[cfg(feature = "conform")]
+    pub(super) fn nonconforming(node: NodeId, count: usize) -> Self {
+        let what = format!("node {node} has failed {count} of the checks");
+        Self { told: true, ..Self::new(Exit::Device, None, what, None) }
+    }
+
+    /// The device refused some of several objects; each refusal was shown. The exit code is that of
+    /// the first refusal.
+    pub(super) fn unread(first: &Self, failed: usize, of: usize) -> Self {
+        let what = format!("{failed} of {of} objects could not be read");
+        Self { told: true, legacy: first.legacy, ..Self::new(first.exit, None, what, None) }
+    }
+
+    fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
+        let legacy = number.unwrap_or(exit.legacy());
+        Self { exit, number, legacy, what, left: None, advice, told: false }
+    }
+
+    /// An error of the command line's parser.
+    pub(super) fn unreadable_line(error: &clap::Error) -> Self {
+        let of_node = error.get(ContextKind::InvalidArg).is_some_and(|name| {
+            let ContextValue::String(name) = name else { return false };
+            name.split_whitespace().any(|word| matches!(word, "--node" | "--nodes" | "--node_id"))
+        });
+        let wrong_value = matches!(error.kind(), ErrorKind::ValueValidation | ErrorKind::InvalidValue);
+        let number = (of_node && wrong_value).then_some(legacy::INVALID_NODE_ID);
+        let legacy = number.unwrap_or(legacy::INVALID_PARAMETER);
+        Self { number, legacy, ..Self::bare_usage(error.render().to_string()) }
+    }
+
+    /// An error in a job file.
+    pub(super) fn job(path: &Path, fault: &Fault) -> Self {
+        Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
+    }
+
+    /// The same failure, with the state of the device.
+    pub(super) fn leaving(self, left: Option<DeviceAfterUpdate>) -> Self {
+        Self { left, ..self }
+    }
+
+    pub(super) fn usage(what: impl Into<String>, advice: impl Into<String>) -> Self {
+        Self::new(Exit::Usage, None, what.into(), Some(advice.into()))
+    }
+
+    /// A message of the command line's parser, which contains its advice.
+    pub(super) fn bare_usage(words: String) -> Self {
+        let what = words.strip_prefix("error: ").unwrap_or(&words).trim_end().to_string();
+        Self::new(Exit::Usage, None, what, None)
+    }
+
+    /// A file, other than firmware, that cannot be read.
+    pub(super) fn unreadable(path: &Path, error: &io::Error) -> Self {
+        let number = error.raw_os_error().and_then(|code| u32::try_from(code).ok());
+        let what = format!("{}: cannot be read: {error}", path.display());
+        Self::new(Exit::File, number, what, None)
+    }
+
+    /// A file, other than firmware, with invalid contents.
+    pub(super) fn file(path: &Path, why: &str) -> Self {
+        Self::new(Exit::File, None, format!("{}: {why}", path.display()), None)
+    }
+
+    /// There is no such board, or its file has a mistake.
+    pub(super) fn board(error: NamedError) -> Self {
+        match error {
+            NamedError::File(path, why) => Self::file(Path::new(&path), &why),
+            unknown @ NamedError::Unknown(_) => Self::bare_usage(unknown.to_string()),
+        }
+    }
+
+    /// An error in a line of a file, other than firmware.
+    pub(super) fn line(path: &Path, line: usize, why: &str) -> Self {
+        let what = format!("{}, line {line}: {why}", path.display());
+        Self::new(Exit::File, None, what, None)
+    }
+
+    pub(super) fn system(what: String) -> Self {
+        Self::new(Exit::System, None, what, None)
+    }
+
+    /// A device that sent no boot-up message after a reset.
+    pub(super) fn no_boot_up(node: NodeId) -> Self {
+        let advice = "check that node-ID and bit rate are right; a device with a new node-ID comes back under that one";
+        let what = format!("node {node} has sent no boot-up message");
+        let advice = Some(advice.to_string());
+        Self::new(Exit::NoAnswer, Some(0x6000_0013), what, advice)
+    }
+
+    /// A firmware file that cannot contain a program.
+    pub(super) fn no_program(path: &Path, fault: judge::Fault) -> Self {
+        let (what, advice) = (format!("{}: {fault}", path.display()), fault.advice().to_string());
+        Self::new(Exit::File, Some(judge::Fault::NUMBER), what, Some(advice))
+    }
+
+    /// A sealed image that breaks a rule.
+    pub(super) fn sealed(path: &Path, refusal: &Refusal) -> Self {
+        let number = Some(refusal_number(refusal));
+        let (what, advice) = (format!("{}: {refusal}", path.display()), refusal.advice().to_string());
+        // The manual's tools do not know such files.
+        let legacy = Exit::File.legacy();
+        Self { legacy, ..Self::new(Exit::File, number, what, Some(advice)) }
+    }
+
+    /// A failed conversion of `file`.
+    pub(super) fn convert(error: ConvertError, file: &Path) -> Self {
+        match error {
+            ConvertError::File(error) => error.of(file.display()).into(),
+            ConvertError::BlockSize { .. }
+            | ConvertError::Start(_)
+            | ConvertError::Range(_)
+            | ConvertError::Adjust(_)
+            | ConvertError::Blocks(_) => Self::new(Exit::Usage, Some(0x6000_0018), error.to_string(), None),
+        }
+    }
+
+    /// The JSON value.
+    pub(super) fn value(&self) -> Value {
+        json!({
+            "error": {
+                "number": self.number.map(|number| format!("{number:#010x}")),
+                "exit": self.exit as u8,
+                "what": self.what,
+                "device": self.left.map(|left| left.state.name()),
+                "seen": self.left.and_then(|left| match left.answer {
+                    DeviceAnswer::Seen(seen) => Some(json!({
+                        "device_type": seen.running.0,
+                        "bootloader": seen.running.is_bootloader(),
+                        "control": seen.control,
+                        "crc": seen.crc,
+                    })),
+                    DeviceAnswer::Silent | DeviceAnswer::NotAsked => None,
+                }),
+                "advice": self.advice,
+            }
+        })
+    }
+}
+
+impl From<FileError> for Failure {
+    fn from(error: FileError) -> Self {
+        let cause = &error.error.cause;
+        let advice = match cause {
+            Cause::Io(error) => match error.kind() {
+                io::ErrorKind::NotFound => "check the file's name and the current folder",
+                io::ErrorKind::IsADirectory => "name the firmware file in this folder",
+                io::ErrorKind::PermissionDenied => "check that you have permission to read the file",
+                _ => "copy the file to this computer's own disk, and try again",
+            },
+            Cause::Empty => "the file is empty: build the program again, or copy the file again",
+            Cause::NotFirmware => "name the linker's output (ELF, Intel HEX, S-record) or a block file",
+            Cause::Foreign { advice, .. } => advice,
+            Cause::NotNamedFormat { found: Some(_), .. } => "leave -I out: the first bytes show the format",
+            Cause::NotNamedFormat { found: None, .. } => {
+                "name the right file, or leave -I out: without it the tool says what the file is"
+            }
+            Cause::NoData => {
+                "name the linker's output: an object file, or one without loadable sections, has nothing for the flash"
+            }
+            Cause::WrongElf(_) | Cause::WrongMachine(_) => {
+                "name the linker's output for the board: Arm, 32 bit, little-endian (thumbv7em-none-eabihf, \
+                 arm-none-eabi)"
+            }
+            Cause::AfterEnd => {
+                "if these are two files one after the other, make one file of them (srec_cat, objcopy); otherwise copy \
+                 the file again from where it was built"
+            }
+            Cause::Overlap { .. } => {
+                "two parts of the file have other data for one address: link them for different addresses, or leave \
+                 one of them out"
+            }
+            Cause::CutOff { .. }
+            | Cause::TooLong { .. }
+            | Cause::NoEnd(_)
+            | Cause::Malformed(_)
+            | Cause::UnknownRecord(_)
+            | Cause::Count { .. }
+            | Cause::Checksum { .. }
+            | Cause::BadDigit { .. }
+            | Cause::ProgramHeaderSize(_)
+            | Cause::BlockCrc { .. }
+            | Cause::BlockNumber { .. }
+            | Cause::LastSize(_)
+            | Cause::ProgramCrc { .. } => "copy the file again from where it was built, or build it again",
+            // Their messages contain the advice.
+            _ => "",
+        };
+        let advice = Some(advice.to_string()).filter(|advice| !advice.is_empty());
+        Self::new(Exit::File, Some(cause.number()), error.to_string(), advice)
+    }
+}
+
+impl From<AdapterError> for Failure {
+    fn from(error: AdapterError) -> Self {
+        Error::from(error).into()
+    }
+}
+
+impl From<Error> for Failure {
+    fn from(error: Error) -> Self {
+        let exit = match &error {
+            Error::Adapter(AdapterError::Url { .. }) => Exit::Usage,
+            Error::Adapter(_) => Exit::Adapter,
+            Error::Cancelled => Exit::Cancelled,
+            Error::NotInDialect { .. } | Error::NoPassword { .. } => Exit::Usage,
+            Error::NoAnswer { .. } | Error::Lss { failure: LssFailure::NoAnswer, .. } => Exit::NoAnswer,
+            Error::Refused { .. }
+            | Error::Protocol { .. }
+            | Error::ShortAnswer { .. }
+            | Error::SealedOnly { .. }
+            | Error::Failed { .. }
+            | Error::Busy { .. }
+            | Error::WrongCrc { .. }
+            | Error::WrongTarget { .. }
+            | Error::NoProgram { .. }
+            | Error::OtherRegion { .. }
+            | Error::NotAlone { .. }
+            | Error::NotRenewable { .. }
+            | Error::Lss { .. } => Exit::Device,
+            Error::NoBootloader { .. }
+            | Error::Occupied { .. }
+            | Error::StartFailed { .. }
+            | Error::ProgramEnded { .. }
+            | Error::FellSilent { .. }
+            | Error::TrialFailed { .. }
+            | Error::RenewalFailed { .. }
+            | Error::SilentOnTrial { .. }
+            | Error::FirstFailed { .. }
+            | Error::Unconfirmable { .. }
+            | Error::OtherIdentity { .. } => Exit::NoStart,
+        };
+        let legacy = legacy::exit_code(&error);
+        Self { legacy, ..Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice())) }
+    }
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", paint("error:", "31"), self.what)?;
+        if let Some(number) = self.number {
+            write!(f, " [{number:#010x}]")?;
+        }
+        writeln!(f)?;
+        if let Some(left) = self.left {
+            writeln!(f, "  the device: {left}")?;
+        }
+        match &self.advice {
+            Some(advice) => writeln!(f, "  what to do: {advice}"),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,207 @@
+//! `coflash start`, `enter`, `erase`, `release`, `withdraw` and `status`: the single steps of an
+//! update.
+
+use canopen::program::ProgramState;
+use clap::Args;
+use coflash_core::device::info::{program_info, ProgramInfo};
+use coflash_core::device::Session;
+use coflash_core::update::event::{Event, Phase};
+use coflash_core::update::steps::{
+    call_back, enter_bootloader, erase_at_once, release, reset_status, start, withdraw,
+};
+use coflash_core::Error;
+use serde_json::{json, Value};
+
+use super::catch::{self, Limit};
+use super::context::Context;
+use super::device::Program;
+use super::output::Failure;
+
+/// Starts the program, and waits until it answers.
+#[derive(Debug, Args)]
+pub(super) struct Start {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Calls the application back to the bootloader, and waits until the bootloader answers.
+#[derive(Debug, Args)]
+pub(super) struct Enter {
+    #[command(flatten)]
+    program: Program,
+
+    /// Wait for a device that does not answer yet, like coflash catch: the device may still be
+    /// switched off.
+    #[arg(long)]
+    wait: bool,
+
+    #[command(flatten)]
+    limit: Limit,
+}
+
+/// Erases the program. A running application is called back to the bootloader first.
+#[derive(Debug, Args)]
+pub(super) struct Erase {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Releases the program for autostart (83h of 1F51h): on a product on which it does, it
+/// then starts by itself after a reset.
+#[derive(Debug, Args)]
+pub(super) struct Release {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Withdraws the program's release for autostart: the device then stays in the bootloader after a
+/// reset.
+#[derive(Debug, Args)]
+pub(super) struct Withdraw {
+    #[command(flatten)]
+    program: Program,
+}
+
+/// Shows a program's state, CRC and flash status (1F51h, 1F56h, 1F57h).
+#[derive(Debug, Args)]
+pub(super) struct Status {
+    #[command(flatten)]
+    program: Program,
+
+    /// First set the flash status to "no error".
+    #[arg(long)]
+    clear: bool,
+}
+
+/// Carries out a command on one program of one device, and shows the result.
+fn with(
+    context: &Context,
+    command: &str,
+    program: &Program,
+    act: impl FnOnce(&mut Session<'_>, u8, &mut dyn FnMut(Event)) -> Result<(String, Value), Error>,
+) -> Result<(), Failure> {
+    let mut link = context.link()?;
+    let mut session = program.device.session(&mut link)?;
+    let _lock =
+        if command == "erase" { Some(context.lock(context.bus.as_deref(), session.node())?) } else { None };
+    let waiting = context.waiting(format!("node {} has carried out the command ({command})", session.node()));
+    let (words, more) = act(&mut session, program.program, &mut |event| context.out.detail(event))
+        .map_err(|error| Failure::diagnosed(error, &mut session))?;
+    drop(waiting);
+    let node = session.node();
+    context.out.result(format_args!("node {node}: {words}"), || {
+        let mut value = json!({ "command": command, "node": node.get(), "program": program.program });
+        if let (Some(value), Value::Object(more)) = (value.as_object_mut(), more) {
+            value.extend(more);
+        }
+        value
+    });
+    Ok(())
+}
+
+impl Start {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "start", &self.program, |session, number, tell| {
+            let running = session.find()?;
+            tell(Event::Found(running));
+            if !running.is_bootloader() {
+                if runs(session, number)? {
+                    return Ok((format!("{running} is running already"), json!({ "running": running.0 })));
+                }
+                tell(Phase::CallingBack.into());
+                call_back(session)?;
+                tell(Phase::InBootloader.into());
+            }
+            let running = start(session, number)?;
+            Ok((format!("{running} is running"), json!({ "running": running.0 })))
+        })
+    }
+}
+
+impl Enter {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        if self.wait || self.limit.is_set() {
+            return catch::run(context, "enter", &self.program.device, &self.limit, false);
+        }
+        with(context, "enter", &self.program, |session, _, tell| {
+            let running = session.find()?;
+            tell(Event::Found(running));
+            let words = if running.is_bootloader() {
+                "the bootloader is running already"
+            } else {
+                call_back(session)?;
+                "the bootloader is running"
+            };
+            Ok((words.to_string(), json!({})))
+        })
+    }
+}
+
+impl Erase {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "erase", &self.program, |session, number, tell| {
+            session.ensure_alone()?;
+            enter_bootloader(session, tell)?;
+            let began = session.now();
+            erase_at_once(session, number)?;
+            let seconds = session.now().saturating_sub(began).as_secs_f64();
+            Ok((format!("program {number} is erased, in {seconds:.1} s"), json!({ "seconds": seconds })))
+        })
+    }
+}
+
+impl Release {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "release", &self.program, |session, number, tell| {
+            // Report an absent device at once; the wait below is for a device that does not answer
+            // the command.
+            tell(Event::Found(session.find()?));
+            release(session, number, tell)?;
+            Ok((format!("program {number} is released for autostart"), json!({})))
+        })
+    }
+}
+
+impl Withdraw {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "withdraw", &self.program, |session, number, tell| {
+            tell(Event::Found(session.find()?));
+            withdraw(session, number)?;
+            let words =
+                format!("program {number} is no longer released for autostart: it does not start by itself");
+            Ok((words, json!({})))
+        })
+    }
+}
+
+impl Status {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        with(context, "status", &self.program, |session, number, tell| {
+            let running = session.find()?;
+            tell(Event::Found(running));
+            if self.clear {
+                reset_status(session, number)?;
+            }
+            let info = program_info(session, number)?;
+            let value = json!({
+                "device_type": running.0,
+                "bootloader": running.is_bootloader(),
+                "control": info.control,
+                "crc": info.crc,
+                "status": json!(info)["status"],
+            });
+            Ok((format!("{running}\n{}", info_words(&info)), value))
+        })
+    }
+}
+
+/// Whether this program runs, given that an application runs. A device that does not report it has
+/// only one program.
+fn runs(session: &mut Session<'_>, number: u8) -> Result<bool, Error> {
+    let info = program_info(session, number)?;
+    Ok(info.control.is_none_or(|state| state == ProgramState::Running as u32))
+}
+
+fn info_words(info: &ProgramInfo) -> String {
+    info.to_string().trim_end().to_string()
+}

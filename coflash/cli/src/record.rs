@@ -1,0 +1,242 @@
+//! Records a run: the log of `--log-file`, and the folder of `--report-dir` for the service
+//! department.
+//!
+//! One record serves the whole program, so that code with a message need not have access to it.
+
+use std::ffi::OsString;
+use std::fs::{self, File};
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use canopen::{Frame, NodeId};
+use coboot_can::candump::Line;
+use coboot_can::decode::Decoder;
+use coboot_can::redact::Redactor;
+use coboot_can::{Adapter, Tap};
+use coflash_core::file::inspect::Date;
+use coflash_core::update::Event;
+use serde_json::{json, Value};
+
+use super::secrets;
+
+static RECORD: OnceLock<Record> = OnceLock::new();
+
+/// The open files. They are written as events happen, so that a killed program leaves everything up
+/// to that point.
+struct Record {
+    logs: Vec<Sink>,
+    report: Option<Report>,
+}
+
+struct Report {
+    folder: PathBuf,
+    events: Sink,
+    trace: Sink,
+    /// `report.json`, written at the beginning and again at the end.
+    document: Mutex<Value>,
+}
+
+/// A file that may become full. The first error is shown, and the command continues.
+struct Sink {
+    name: String,
+    file: Mutex<Option<File>>,
+}
+
+impl Sink {
+    fn new(path: &Path) -> Result<Self, String> {
+        let name = path.display().to_string();
+        match File::create(path) {
+            Ok(file) => Ok(Self { name, file: Mutex::new(Some(file)) }),
+            Err(error) => Err(cannot(path, &error)),
+        }
+    }
+
+    fn line(&self, line: &str) {
+        let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
+        let Some(open) = file.as_mut() else { return };
+        if let Err(error) = open.write_all(format!("{line}\n").as_bytes()) {
+            *file = None;
+            let _ = writeln!(io::stderr(), "warning: {}: writing failed: {error}", self.name);
+        }
+    }
+}
+
+fn cannot(path: &Path, error: &io::Error) -> String {
+    format!("{}: cannot be written: {error}", path.display())
+}
+
+/// Starts the records that the command line asks for. `command` is the command's name, for the name
+/// of the folder.
+pub(super) fn begin(
+    log: Option<&Path>,
+    reports: Option<&Path>,
+    command: &str,
+    words: &[OsString],
+    bus: Option<&str>,
+) -> Result<(), String> {
+    let mut logs: Vec<Sink> = log.map(Sink::new).transpose()?.into_iter().collect();
+    let report = match reports {
+        Some(folder) => {
+            let folder = own_folder(folder, command)?;
+            logs.push(Sink::new(&folder.join("log.txt"))?);
+            let document = json!({
+                "coflash": env!("CARGO_PKG_VERSION"),
+                "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+                "command_line": secrets::without(words),
+                "bus": bus,
+                "began": stamp(wall()),
+                "ended": null,
+            });
+            let report = Report {
+                events: Sink::new(&folder.join("events.jsonl"))?,
+                trace: Sink::new(&folder.join("trace.log"))?,
+                document: Mutex::new(document),
+                folder,
+            };
+            report.write(&[])?;
+            Some(report)
+        }
+        None => None,
+    };
+    if !logs.is_empty() {
+        let record = RECORD.get_or_init(|| Record { logs, report });
+        let line: Vec<String> = secrets::without(words);
+        record.note("command", &line.join(" "));
+    }
+    Ok(())
+}
+
+/// Creates a folder for this run.
+fn own_folder(all: &Path, command: &str) -> Result<PathBuf, String> {
+    fs::create_dir_all(all).map_err(|error| cannot(all, &error))?;
+    let time: String = stamp(wall()).chars().filter(|c| !matches!(c, '-' | ':')).take(15).collect();
+    for number in 1_u32.. {
+        let name = match number {
+            1 => format!("{time}-{command}"),
+            number => format!("{time}-{command}-{number}"),
+        };
+        let folder = all.join(name);
+        match fs::create_dir(&folder) {
+            Ok(()) => return Ok(folder),
+            // Another run in the same second.
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists && number < 1000 => {}
+            Err(error) => return Err(cannot(&folder, &error)),
+        }
+    }
+    Err(format!("{}: no folder can be created in it", all.display()))
+}
+
+/// The folder of the report, if there is one.
+pub(super) fn folder() -> Option<&'static Path> {
+    Some(&RECORD.get()?.report.as_ref()?.folder)
+}
+
+/// Records the end of the run.
+pub(super) fn end(exit: u32, error: Option<Value>) -> Result<(), String> {
+    let Some(record) = RECORD.get() else { return Ok(()) };
+    record.note("end", &format!("exit code {exit}"));
+    let Some(report) = &record.report else { return Ok(()) };
+    report.write(&[
+        ("ended", stamp(wall()).into()),
+        ("exit", exit.into()),
+        ("error", error.unwrap_or_default()),
+    ])
+}
+
+/// Whether there is a record.
+pub(super) fn is_kept() -> bool {
+    RECORD.get().is_some()
+}
+
+/// Records a message.
+pub(super) fn note(kind: &str, words: &str) {
+    if let Some(record) = RECORD.get() {
+        record.note(kind, words);
+    }
+}
+
+/// Records an event of a device.
+pub(super) fn event(node: NodeId, event: &Event) {
+    let Some(record) = RECORD.get() else { return };
+    record.note("event", &format!("node {node}: {event}"));
+    if let Some(report) = &record.report {
+        let mut line = serde_json::to_value(event.line(node)).unwrap_or_default();
+        line["time"] = stamp(wall()).into();
+        report.events.line(&line.to_string());
+    }
+}
+
+/// Records the result of a command, as JSON.
+pub(super) fn result(value: &Value) {
+    if let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) {
+        // An error of writing is reported at the end of the run.
+        let _ = report.write(&[("result", value.clone())]);
+    }
+}
+
+/// The adapter with a recorder for its frames.
+pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send> {
+    if !is_kept() {
+        return adapter;
+    }
+    let origin = wall().saturating_sub(adapter.now());
+    let (mut redactor, mut decoder) = (Redactor::default(), Decoder::new());
+    let ear = move |now: Duration, frame: &Frame| {
+        let Some(record) = RECORD.get() else { return };
+        let frame = redactor.frame(frame);
+        let line = Line { time: origin + now, interface: "can0".to_string(), frame };
+        let words = decoder.decode(&frame);
+        let text = line.to_string();
+        let shown = text.rsplit(' ').next().unwrap_or_default();
+        record.note("frame", &format!("{shown}  {words}"));
+        if let Some(report) = &record.report {
+            report.trace.line(&text);
+        }
+    };
+    Box::new(Tap::new(adapter, Box::new(ear)))
+}
+
+impl Record {
+    fn note(&self, kind: &str, words: &str) {
+        let time = stamp(wall());
+        for (number, line) in words.lines().enumerate() {
+            let kind = if number == 0 { kind } else { "" };
+            let line = format!("{time}  {kind:<7}  {line}");
+            self.logs.iter().for_each(|log| log.line(&line));
+        }
+    }
+}
+
+impl Report {
+    /// Writes `report.json` with these additional entries.
+    fn write(&self, entries: &[(&str, Value)]) -> Result<(), String> {
+        let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
+        for (name, value) in entries {
+            document[*name] = value.clone();
+        }
+        let path = self.folder.join("report.json");
+        fs::write(&path, format!("{:#}\n", *document)).map_err(|error| cannot(&path, &error))
+    }
+}
+
+fn wall() -> Duration {
+    SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
+}
+
+/// `2026-11-22T06:22:31.123Z`.
+fn stamp(time: Duration) -> String {
+    let date = Date(time.as_secs()).to_string();
+    format!("{}.{:03}Z", date.trim_end_matches(" UTC").replace(' ', "T"), time.subsec_millis())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_time_is_that_of_iso_8601() {
+        assert_eq!(stamp(Duration::from_millis(1_420_070_400_042)), "2015-01-01T00:00:00.042Z");
+    }
+}

@@ -1,0 +1,179 @@
+//! An update through every adapter, with the tool as a separate process.
+
+use std::fs;
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use crate::tool::kernel::{converse, standard};
+use crate::tool::{coflash, data};
+use canopen::Frame;
+use embedded_can::{Frame as _, StandardId};
+use kit::fake::{Blocks, Fake, APPLICATION, BOOTLOADER};
+
+fn device() -> Fake {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake.knows_blocks = Blocks::Known(127);
+    fake
+}
+
+/// The adapter's side of SLCAN (CAN232 manual): it acknowledges commands and records them in
+/// `said`.
+fn slcan<S: Write>(text: &mut Vec<u8>, stream: &mut S, said: &mut Vec<String>) -> Vec<Frame> {
+    let mut frames = Vec::new();
+    while let Some(end) = text.iter().position(|byte| *byte == b'\r') {
+        let line: Vec<u8> = text.drain(..=end).collect();
+        let line = std::str::from_utf8(&line[..end]).unwrap();
+        if let Some(frame) = line.strip_prefix('t') {
+            let id = StandardId::new(u16::from_str_radix(&frame[..3], 16).unwrap()).unwrap();
+            let data: Vec<u8> = (4..frame.len())
+                .step_by(2)
+                .map(|at| u8::from_str_radix(&frame[at..at + 2], 16).unwrap())
+                .collect();
+            assert_eq!(frame[3..4].parse::<usize>().unwrap(), data.len());
+            frames.push(Frame::new(id, &data).unwrap());
+            let _ = stream.write_all(b"z\r");
+        } else {
+            said.push(line.to_string());
+            let _ = stream.write_all(b"\r");
+        }
+    }
+    frames
+}
+
+fn slcan_text(frame: &Frame) -> Vec<u8> {
+    let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+    format!("t{:03X}{}{data}\r", standard(frame), frame.dlc()).into_bytes()
+}
+
+fn flash(bus: &str) {
+    let file = data("identity-110.blk");
+    let done = coflash(&["--bus", bus, "flash", "-N", "5", &file]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+}
+
+fn check(fake: &Fake) {
+    assert_eq!(fake.blocks.concat(), fs::read(data("identity-110.blk")).unwrap());
+    assert_eq!(fake.running, Some(APPLICATION));
+}
+
+/// Serves `fake` through an SLCAN adapter on a TCP port. Gives its address, and at the end the device
+/// and the commands that the adapter got.
+pub fn serve_slcan(fake: Fake) -> (SocketAddr, JoinHandle<(Fake, Vec<String>)>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let server = thread::spawn(move || {
+        let (stream, _) = listener.accept().unwrap();
+        stream.set_nodelay(true).unwrap();
+        stream.set_read_timeout(Some(Duration::from_millis(1))).unwrap();
+        let mut said = Vec::new();
+        let fake = converse(stream, fake, |text, stream| slcan(text, stream, &mut said), slcan_text);
+        (fake, said)
+    });
+    (address, server)
+}
+
+#[test]
+fn slcan_over_tcp() {
+    let (address, server) = serve_slcan(device());
+    flash(&format!("slcan:tcp://{address}@250k"));
+    let (fake, said) = server.join().unwrap();
+    check(&fake);
+    // Closed before and after, 250 kbit/s is S5. No empty line: some adapters repeat their last
+    // command for it.
+    assert_eq!(said, ["C", "C", "V", "S5", "O", "C"]);
+}
+
+#[test]
+fn a_url_that_names_no_slcan_adapter_is_explained() {
+    for (url, exit, words) in [
+        ("slcan:", 2, "it names no serial port"),
+        ("slcan:tcp://host@500k", 2, "it must be slcan:tcp://HOST:PORT@BITRATE"),
+        ("slcan:/dev/ttyACM0@fast", 2, "its bit rate must be like 125k"),
+        ("slcan:/dev/ttyACM0@2M", 2, "its bit rate must be like 125k"),
+        ("slcan:/dev/there-is-none@500k", 4, "SLCAN adapter /dev/there-is-none cannot be opened"),
+    ] {
+        let done = coflash(&["--bus", url, "info"]);
+        assert!(done.exit == exit && done.err.contains(words), "{url}: {}", done.err);
+    }
+}
+
+/// The serial port is one end of a pseudo-terminal.
+#[cfg(unix)]
+#[test]
+fn slcan_over_a_serial_port() {
+    use serialport::{SerialPort, TTYPort};
+    let (mut master, slave) = TTYPort::pair().unwrap();
+    let name = slave.name().unwrap();
+    master.set_timeout(Duration::from_millis(1)).unwrap();
+    let done = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
+    let over = done.clone();
+    let server = thread::spawn(move || {
+        let mut said = Vec::new();
+        let fake = converse(
+            Until(master, over),
+            device(),
+            |text, stream| slcan(text, stream, &mut said),
+            slcan_text,
+        );
+        (fake, said)
+    });
+    let file = data("identity-110.blk");
+    // The bit rate comes from the manual's option, because the URL contains none.
+    let flashed = coflash(&["--bus", &format!("slcan:{name}"), "flash", "-N", "5", "-B", "4", &file]);
+    done.store(true, std::sync::atomic::Ordering::Relaxed);
+    let (fake, said) = server.join().unwrap();
+    drop(slave);
+    assert_eq!(flashed.exit, 0, "{}{}", flashed.out, flashed.err);
+    check(&fake);
+    assert_eq!(said[1..5], ["C", "V", "S4", "O"]);
+}
+
+/// A line that ends on request: a pseudo-terminal does not notice that its other end was closed.
+#[cfg(unix)]
+struct Until<L>(L, std::sync::Arc<std::sync::atomic::AtomicBool>);
+
+#[cfg(unix)]
+impl<L: Read> Read for Until<L> {
+    fn read(&mut self, bytes: &mut [u8]) -> std::io::Result<usize> {
+        if self.1.load(std::sync::atomic::Ordering::Relaxed) {
+            return Ok(0);
+        }
+        self.0.read(bytes)
+    }
+}
+
+#[cfg(unix)]
+impl<L: Write> Write for Until<L> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        self.0.flush()
+    }
+}
+
+/// If the kernel has no CAN, a library replaces it: `shim/can.c`, which is compiled here.
+#[cfg(target_os = "linux")]
+#[test]
+fn socketcan() {
+    let folder = crate::tool::folder("socketcan");
+    let library = crate::tool::kernel::library(&folder, "shim/can.c", "can.so", &[]);
+    let (path, server) = crate::tool::kernel::serve(device());
+    let call = |interface: &str, path: &std::path::Path| {
+        let mut command = crate::tool::command();
+        let bus = format!("socketcan:{interface}");
+        command.args(["--bus", &bus, "flash", "-N", "5", &data("identity-110.blk")]);
+        crate::tool::run(command.env("LD_PRELOAD", &library).env("CAN_SHIM", path))
+    };
+    let done = call("vcan0", &path);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    check(&server.join().unwrap());
+    let done = call("can9", &path);
+    let _ = fs::remove_file(&path);
+    assert!(done.exit == 4 && done.err.contains("CAN interface can9 cannot be opened"), "{}", done.err);
+}

@@ -1,0 +1,58 @@
+//! `coflash agent`, as people run it.
+
+use kit::folder::Folder;
+use kit::hawkbit::{Action, File, Server};
+
+use crate::tool::folder;
+
+/// The controller-ID of the device.
+const ID: &str = "door";
+
+/// The command, as people run it: exit code, standard output and standard error.
+fn command(folder: &Folder, arguments: &[&str]) -> (Option<i32>, String, String) {
+    let output = crate::tool::command()
+        .args(arguments)
+        .current_dir(folder)
+        .env("TOKEN_OF_THE_DOOR", "t-door")
+        .output()
+        .unwrap();
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
+}
+
+#[test]
+fn the_command_tells_what_it_does_and_keeps_the_token_to_itself() {
+    let (server, folder) = (Server::start(&[ID]), folder("command"));
+    let door = "[[device]]\ncontroller-id = 'door'\nnode = 5\ntoken-env = 'TOKEN_OF_THE_DOOR'\n";
+    std::fs::write(folder.join("agent.toml"), door).unwrap();
+    // A file that is right and no program: the device is not needed.
+    server.assign(ID, Action::new(3, &File::new("readme.txt", b"this is no firmware")));
+    server.state().targets.get_mut(ID).unwrap().wants_attributes = false;
+    let common = ["agent", "--once", "--bus", "socketcand://127.0.0.1:1/can0", "--hawkbit", &server.url];
+    let log = ["--log-file", "log.txt", "--json-events"];
+    let (exit, out, err) = command(&folder, &[&common[..], &log].concat());
+    assert_eq!(exit, Some(8), "{out}{err}");
+    let lines: Vec<serde_json::Value> =
+        out.lines().map(|line| serde_json::from_str(line).unwrap_or_else(|_| panic!("{line}"))).collect();
+    assert!(lines.iter().any(|line| line["event"] == "failed" && line["controller"] == ID), "{out}");
+    assert_eq!(lines.last().unwrap()["failed"], 1, "{out}");
+    assert_eq!(server.action(ID).result.as_deref(), Some("failure"));
+    let log = std::fs::read_to_string(folder.join("log.txt")).unwrap();
+    assert!(log.contains("readme.txt"), "{log}");
+    assert!(![&out, &err, &log].iter().any(|text| text.contains("t-door")), "{out}{err}{log}");
+    // Nothing to do is a success; a server that is not there is none.
+    let (exit, out, err) = command(&folder, &common);
+    assert_eq!((exit, out.contains("0 updated, 0 failed, 0 not served")), (Some(0), true), "{out}{err}");
+
+    let wrong = |arguments: &[&str], words: &str| {
+        let (exit, out, err) = command(&folder, &[&["agent", "--once"], arguments].concat());
+        assert!(exit.is_some_and(|exit| exit != 0), "{out}");
+        assert!(err.contains(words), "{arguments:?}: {err}");
+    };
+    let bus = ["--bus", "socketcan:can0"];
+    wrong(&["--devices", "none.toml"], "none.toml");
+    wrong(&bus, "--hawkbit URL");
+    wrong(&["--hawkbit", &server.url], "it has no bus");
+    wrong(&[&bus[..], &["--hawkbit", "http://hawkbit.example.com"]].concat(), "plain text");
+    wrong(&[&bus[..], &["--hawkbit", &server.url, "--trace", "x.log"]].concat(), "--trace");
+}

@@ -1,0 +1,1113 @@
+//! The commands for sealed images, one after another; OpenSSL checks the results if it is
+//! installed.
+
+use std::fs;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use crate::tool::{coflash, folder, Done};
+use coflash_core::file::sealed::{verify, Device, Kek, PublicKey};
+use coflash_core::file::{ihex, raw};
+use kit::fake::vault::Vault;
+use kit::fake::{serve, Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER};
+use kit::folder::Folder;
+use kit::ihex::{intel_hex, END_OF_FILE};
+use serde_json::Value;
+use shared_abi::layout::stm32f407g_disc1::LAYOUT;
+
+const START: u32 = 0x0801_0000;
+/// The identity of the fake device (1018h).
+const VENDOR: u32 = 0x3F;
+const PRODUCT: u32 = 1234;
+
+/// A program with a label at 1E0h (docs/protocol.md), and some bytes that can be compressed.
+fn program() -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..9001_u32).map(|at| (at / 5 % 40) as u8).collect();
+    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
+    bytes[4..8].copy_from_slice(&(START + 0x201).to_le_bytes());
+    let mut words = vec![u32::from_le_bytes(*b"CBL1"), VENDOR, PRODUCT, 0x0064_0A01, 0, 0, 0];
+    words.push(shared_abi::check_word(&words));
+    for (place, word) in bytes[0x1E0..0x200].chunks_mut(4).zip(words) {
+        place.copy_from_slice(&word.to_le_bytes());
+    }
+    bytes
+}
+
+/// A folder with keys, a certificate and a program.
+struct Room(Folder);
+
+impl Room {
+    fn new(test: &str) -> Self {
+        let room = Self(folder(&format!("sealing-{test}")));
+        let image = raw::read(&program(), Some(START)).unwrap();
+        room.0.file("app.hex", ihex::emit(&image).as_bytes());
+        for role in ["root", "release", "kek"] {
+            room.good(&["key", "new", "--role", role, "-o", &room.path(&format!("{role}.pem"))]);
+        }
+        room.certify("release.cert", &[]);
+        room
+    }
+
+    fn path(&self, name: &str) -> String {
+        self.0.path(name)
+    }
+
+    fn bytes(&self, name: &str) -> Vec<u8> {
+        fs::read(self.path(name)).unwrap()
+    }
+
+    #[track_caller]
+    fn good(&self, words: &[&str]) -> Done {
+        let done = coflash(words);
+        assert_eq!(done.exit, 0, "{words:?}: {}", done.err);
+        done
+    }
+
+    fn certify(&self, name: &str, more: &[&str]) {
+        let (root, key, out) = (self.path("root.pem"), self.path("release.pub"), self.path(name));
+        let words = ["key", "certify", "--root", &root, "--key", &key, "--epoch", "3", "--vendor", "0x3F"];
+        self.good(&[&words[..], &["-o", &out], more].concat());
+    }
+
+    /// Seals the program as this file.
+    fn seal(&self, name: &str, more: &[&str]) -> Done {
+        let (app, out) = (self.path("app.hex"), self.path(name));
+        let (key, cert) = (self.path("release.pem"), self.path("release.cert"));
+        let words = ["seal", &app, "-o", &out, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert];
+        coflash(&[&words[..], more].concat())
+    }
+
+    fn verify(&self, name: &str, more: &[&str]) -> Done {
+        coflash(&[&["verify", &self.path(name), "--root", &self.path("root.pub")], more].concat())
+    }
+}
+
+fn json(words: &[&str]) -> Value {
+    let done = coflash(&[words, &["--json"]].concat());
+    serde_json::from_str(&done.out).unwrap_or_else(|error| panic!("{error}: {}{}", done.out, done.err))
+}
+
+/// The output of OpenSSL; `None` if it is not installed.
+fn openssl(words: &[&str]) -> Option<Vec<u8>> {
+    let output = Command::new("openssl").args(words).stdin(Stdio::null()).output().ok()?;
+    assert!(output.status.success(), "{words:?}: {}", String::from_utf8_lossy(&output.stderr));
+    Some(output.stdout)
+}
+
+#[test]
+fn keys_are_made_once_and_are_those_of_openssl() {
+    let room = Room::new("keys");
+    let root = room.path("root.pem");
+    let before = room.bytes("root.pem");
+    #[cfg(unix)]
+    for name in ["root.pem", "release.pem", "kek.pem"] {
+        use std::os::unix::fs::PermissionsExt as _;
+        assert_eq!(fs::metadata(room.path(name)).unwrap().permissions().mode() & 0o777, 0o600, "{name}");
+    }
+    let again = coflash(&["key", "new", "--role", "root", "-o", &root]);
+    assert_eq!(again.exit, 2);
+    assert!(again.err.contains("exists already"), "{}", again.err);
+    assert_eq!(room.bytes("root.pem"), before);
+    // Only the public key exists.
+    fs::remove_file(&root).unwrap();
+    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &root]).exit, 2);
+    assert!(!Path::new(&root).exists());
+    room.good(&["key", "new", "--role", "root", "-o", &root, "--force"]);
+    assert_ne!(room.bytes("root.pem"), before);
+    // With this name both files would have the same path.
+    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &room.path("a.pub")]).exit, 2);
+
+    if let Some(public) = openssl(&["pkey", "-in", &root, "-pubout"]) {
+        assert_eq!(public, room.bytes("root.pub"));
+        let made = room.path("openssl.pem");
+        openssl(&["genpkey", "-algorithm", "ed25519", "-out", &made]).unwrap();
+        let der = openssl(&["pkey", "-in", &made, "-pubout", "-outform", "DER"]).unwrap();
+        let digits: String = der[12..].iter().map(|byte| format!("{byte:02x}")).collect();
+        let shown = json(&["key", "show", &made]);
+        assert_eq!((&shown["kind"], &shown["public_key"]), (&"private key".into(), &digits.into()));
+        // A key of another curve is no key for coflash.
+        openssl(&["genpkey", "-algorithm", "x25519", "-out", &made]).unwrap();
+        assert_eq!(coflash(&["key", "show", &made]).exit, 3);
+    }
+}
+
+#[test]
+fn keys_and_certificates_are_shown_without_secrets() {
+    let room = Room::new("show-keys");
+    let id = PublicKey::from_pem(&String::from_utf8(room.bytes("release.pub")).unwrap()).unwrap().id();
+    for (name, kind) in [("release.pem", "private key"), ("release.pub", "public key")] {
+        let shown = json(&["key", "show", &room.path(name)]);
+        assert_eq!((&shown["kind"], &shown["id"]), (&kind.into(), &id.into()));
+    }
+    let kek = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
+    let shown = room.good(&["key", "show", &room.path("kek.pem")]);
+    assert_eq!(shown.out, format!("{}: key-encryption key {:08X}h\n", room.path("kek.pem"), kek.id()));
+    room.certify("test.cert", &["--role", "test", "--product", "1234", "--lowest", "2", "--highest", "5"]);
+    let shown = json(&["key", "show", &room.path("test.cert")]);
+    assert_eq!((&shown["kind"], &shown["role"]), (&"certificate".into(), &"test".into()));
+    assert_eq!((&shown["key_id"], &shown["epoch"]), (&id.into(), &3.into()));
+    assert_eq!((&shown["lowest"], &shown["highest"]), (&2.into(), &5.into()));
+    for (name, bytes) in
+        [("empty", &b""[..]), ("text", b"hello"), ("cut.cert", b"CBK1\x98"), ("binary", &[0xFF; 99])]
+    {
+        let file = room.0.file(name, bytes);
+        assert_eq!(coflash(&["key", "show", &file]).exit, 3, "{name}");
+    }
+    let bad = ["key", "certify", "--root", &room.path("root.pem"), "--key", &room.path("release.pub")];
+    let bad = [&bad[..], &["--epoch", "1", "--vendor", "1", "--lowest", "6", "--highest", "5"]].concat();
+    assert_eq!(coflash(&bad).exit, 2);
+}
+
+/// The value of the manual's tools: the first 32 bytes of an HMAC, by OpenSSL.
+#[test]
+fn a_value_of_128_bits_makes_a_key() {
+    let room = Room::new("value");
+    let (value, out) = ("000102030405060708090a0b0c0d0e0f", room.path("product.pem"));
+    room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &out]);
+    let text = room.0.file("text", b"coboot key of a value 1\0");
+    let option = format!("hexkey:{value}");
+    if let Some(mac) = openssl(&["dgst", "-sha512", "-binary", "-mac", "HMAC", "-macopt", &option, &text]) {
+        let kek = Kek::new(mac[..32].try_into().unwrap()).unwrap();
+        assert_eq!(json(&["key", "show", &out])["id"], kek.id());
+    }
+    for (role, value) in [("kek", "0001"), ("kek", "zz"), ("root", value)] {
+        let out = room.path("none.pem");
+        assert_eq!(coflash(&["key", "new", "--role", role, "--of-value", value, "-o", &out]).exit, 2);
+        assert!(!Path::new(&out).exists());
+    }
+}
+
+/// `--key` of the manual's converter: only the key of the same value decrypts the program.
+#[test]
+fn the_converter_encrypts_with_a_value() {
+    let room = Room::new("convert");
+    let (value, app) = ("000102030405060708090a0b0c0d0e0f", room.path("app.hex"));
+    let (sign, cert) = (room.path("release.pem"), room.path("release.cert"));
+    let words = ["convert", &app, "--board", "nucleo-f446re", "--key", value];
+    for (more, missing) in [
+        (&[][..], "--sign and --counter is missing"),
+        (&["--counter", "7"], ", and --sign is missing"),
+        (&["--sign", &sign], ", and --counter is missing"),
+    ] {
+        let done = coflash(&[&words[..], more].concat());
+        assert_eq!(done.exit, 2);
+        assert!(done.err.contains(missing) && done.err.contains("what to do: give --sign"), "{}", done.err);
+        assert!(!done.err.contains(value), "the value is a secret");
+        assert!(!Path::new(&room.path("app.blk")).exists());
+    }
+    let signed = [&words[..], &["--sign", &sign, "--cert", &cert, "--counter", "7"]].concat();
+    let done = room.good(&[&signed[..], &["--add", "0xA5"]].concat());
+    assert!(done.out.contains("app.blk: program 1 V1.10r100, counter 7, 9001 bytes"), "{}", done.out);
+    assert!(done.err.contains("--add has no effect"), "{}", done.err);
+    let kek = room.path("product.pem");
+    room.good(&["key", "new", "--role", "kek", "--of-value", value, "-o", &kek]);
+    assert!(room.verify("app.blk", &["--kek", &kek]).out.contains("the program is whole, 9001 bytes"));
+    assert!(room.verify("app.blk", &["--kek", &room.path("kek.pem")]).err.contains("for other keys"));
+    let shown = json(&["show", &room.path("app.blk")]);
+    assert_eq!(shown["flags"], serde_json::json!(["encrypted"]));
+    assert_eq!(shown["blocks"]["start"], START);
+    // No part of the program is visible.
+    let first = room.bytes("app.blk");
+    let has = |part: &[u8]| first.windows(part.len()).any(|bytes| bytes == part);
+    assert!(program()[0x300..].chunks_exact(32).all(|plain| !has(plain)));
+    room.good(&signed);
+    assert_eq!(room.bytes("app.blk"), first, "the same input, the same file");
+    // The image is the same as that of `seal`.
+    room.good(&[&["convert", &app, &room.path("own.cbs")], &signed[2..]].concat());
+    room.seal("sealed.cbs", &["--counter", "7", "--encrypt", &kek]);
+    assert_eq!(room.bytes("own.cbs"), room.bytes("sealed.cbs"));
+    // The command line sets another identity, and the certificate is checked against it.
+    let done = coflash(&[&signed[..], &["--vid", "1", "--pid", "2"]].concat());
+    assert!(done.err.contains("the certificate allows the vendor-ID 0000003Fh"), "{}", done.err);
+    for (more, words) in [
+        (&["--key", "12"][..], "32 hexadecimal digits"),
+        (&["--add", "1"], "--key"),
+        (&["--key", value, "--crc16"], "--crc16"),
+    ] {
+        let done = coflash(&[&["convert", &app], more].concat());
+        assert_eq!(done.exit, 2);
+        assert!(done.err.contains(words), "{}", done.err);
+    }
+    let junk = room.0.file("junk.bin", &[0x5A; 1000]);
+    let done = coflash(&[&["convert", &junk, "-I", "binary"], &signed[2..]].concat());
+    assert!(done.exit == 3 && done.err.contains("is not a program"), "{}", done.err);
+    assert!(!Path::new(&room.path("junk.blk")).exists());
+}
+
+fn crc32(bytes: &[u8]) -> u32 {
+    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
+}
+
+fn word(bytes: &[u8], at: usize) -> u32 {
+    u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+/// Parses blocks by the manual's figure: each has its number, its CRC, and the address after the
+/// previous block. Returns the data of block 0 and the data of the others.
+fn unwrapped(blocks: &[Vec<u8>]) -> (Vec<u8>, Vec<u8>) {
+    let data = |block: &[u8]| {
+        let end = block.len() - 4;
+        assert_eq!(word(block, end), crc32(&block[..end]));
+        assert_eq!(word(block, 8) as usize, end - 12);
+        block[12..end].to_vec()
+    };
+    let (last, rest) = blocks.split_last().unwrap();
+    let mut carried = Vec::new();
+    for (number, block) in rest.iter().enumerate() {
+        assert_eq!(word(block, 0), number as u32);
+        if number > 0 {
+            assert_eq!(word(block, 4), START + carried.len() as u32);
+            carried.extend(data(block));
+        }
+    }
+    assert_eq!(word(last, 0), u32::MAX);
+    assert_eq!(data(last), [(carried.len() as u32).to_le_bytes(), crc32(&carried).to_le_bytes()].concat());
+    (data(&blocks[0]), carried)
+}
+
+/// The blocks of a file.
+fn split(mut file: &[u8]) -> Vec<Vec<u8>> {
+    let mut blocks = Vec::new();
+    while !file.is_empty() {
+        let (block, rest) = file.split_at(16 + word(file, 8) as usize);
+        blocks.push(block.to_vec());
+        file = rest;
+    }
+    blocks
+}
+
+#[test]
+fn a_sealed_image_is_written_in_blocks_and_read_out_of_them() {
+    let room = Room::new("blocks");
+    let more = ["--counter", "7", "--date", "1420070400"];
+    room.seal("app.cbs", &more);
+    let image = room.bytes("app.cbs");
+    for (name, blocks, largest) in
+        [("usual.blk", &["--blocks"][..], 0x400), ("small.blk", &["--blocks", "0x110"], 0x110)]
+    {
+        let done = room.seal(name, &[&more[..], blocks].concat());
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let blocks = split(&room.bytes(name));
+        let (control, carried) = unwrapped(&blocks);
+        assert!(carried == image);
+        assert!(blocks.iter().all(|block| block.len() <= largest) && blocks[1].len() == largest);
+        let size = image.len() as u32;
+        let words = [size, VENDOR, PRODUCT, 0x0064_0A01, 1_420_070_400, 0];
+        assert_eq!(control, words.into_iter().flat_map(u32::to_le_bytes).collect::<Vec<u8>>());
+        // The file counts as the image that is in its blocks.
+        let verified = room.verify(name, &["--product", "1234"]);
+        assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.err);
+        let shown = json(&["show", &room.path(name)]);
+        assert_eq!((&shown["format"], &shown["counter"]), (&"sealed image".into(), &7.into()));
+        assert_eq!(shown["blocks"]["count"], blocks.len());
+        assert_eq!(shown["blocks"]["crc"], crc32(&image));
+        for command in ["show", "inspect"] {
+            let words = room.good(&[command, &room.path(name)]).out;
+            let front =
+                format!("block file, {} blocks, from 0x08010000 on; in it: sealed image", blocks.len());
+            assert!(words.contains(&front) && words.contains("counter      7"), "{words}");
+        }
+        let converted = coflash(&["convert", &room.path(name), &room.path("x.blk")]);
+        assert!(converted.exit == 3 && converted.err.contains("is a sealed image"), "{}", converted.err);
+    }
+    assert_eq!(json(&["show", &room.path("app.cbs")])["blocks"], Value::Null);
+    // The name of the result, and options that do not fit together.
+    let (app, key) = (room.path("app.hex"), room.path("release.pem"));
+    let words = ["seal", &app, "--key", &key, "--cert", &room.path("release.cert"), "--counter", "7"];
+    room.good(&[&words[..], &["--blocks"]].concat());
+    assert!(room.bytes("app.blk").len() > image.len());
+    let done = coflash(&[&words[..], &["--blocks", "20"]].concat());
+    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    // Every command reports an error in the blocks.
+    let good = room.bytes("small.blk");
+    let mut wrong = good.clone();
+    wrong[0x300] ^= 1;
+    let mut blocks = split(&good);
+    blocks.remove(3);
+    for (name, bytes, words, number) in [
+        ("cut.blk", &good[..good.len() - 30], "a block is cut off", "[0x60000022]"),
+        ("wrong.blk", &wrong, "CRC of block 3 is", "[0x60000020]"),
+        ("missing.blk", &blocks.concat(), "block 4 follows where block 3 must", "[0x60000022]"),
+    ] {
+        let file = room.0.file(name, bytes);
+        let root = room.path("root.pub");
+        for command in [
+            &["show", &file][..],
+            &["inspect", &file],
+            &["verify", &file, "--root", &root],
+            &["verify-device", &file, "--root", &root],
+            &["flash", &file],
+        ] {
+            let done = coflash(command);
+            assert_eq!(done.exit, 3, "{command:?}: {}", done.err);
+            assert!(done.err.contains(words) && done.err.contains(number), "{}", done.err);
+        }
+    }
+}
+
+#[test]
+fn a_program_is_sealed_shown_and_verified() {
+    let room = Room::new("seal");
+    let done = room.seal("app.cbs", &["--counter", "7"]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&program());
+    let expected = format!(": program 1 V1.10r100, counter 7, 9001 bytes, CRC {crc:08X}h\n");
+    assert!(done.out.ends_with(&expected), "{}", done.out);
+    let first = room.bytes("app.cbs");
+    room.seal("app.cbs", &["--counter", "7"]);
+    assert_eq!(room.bytes("app.cbs"), first, "the same input, the same file");
+
+    let shown = json(&["show", &room.path("app.cbs")]);
+    assert_eq!((&shown["vendor_id"], &shown["product_code"]), (&VENDOR.into(), &PRODUCT.into()));
+    assert_eq!((&shown["version_text"], &shown["counter"]), (&"V1.10r100".into(), &7.into()));
+    assert_eq!(
+        (&shown["size"], &shown["payload"], &shown["chunk"]),
+        (&9001.into(), &9001.into(), &4096.into())
+    );
+    let words = room.good(&["show", &room.path("app.cbs")]).out;
+    assert!(words.contains("vendor-ID 0000003Fh, product code 000004D2h"), "{words}");
+    // `inspect` recognises it, too, and no other command takes it for another format.
+    assert_eq!(room.good(&["inspect", &room.path("app.cbs")]).out, words);
+    let converted = coflash(&["convert", &room.path("app.cbs"), &room.path("x.blk")]);
+    assert_eq!(converted.exit, 3);
+    assert!(converted.err.contains("is a sealed image"), "{}", converted.err);
+
+    let verified = room.verify("app.cbs", &["--product", "1234", "--counter", "7", "--epoch", "3"]);
+    assert_eq!(verified.exit, 0, "{}", verified.err);
+    assert!(verified.out.contains("the program is whole, 9001 bytes"), "{}", verified.out);
+    for (more, words, number) in [
+        (&["--product", "1"][..], "it is for product code 000004D2h", "0x60000182"),
+        (&["--vendor", "1"], "it is for vendor-ID 0000003Fh", "0x60000180"),
+        (&["-P", "2"], "it is for program 1, and program 2 is to be written", "0x60000182"),
+        (&["--counter", "8"], "its security counter is 7", "0x6000018c"),
+        (&["--epoch", "4"], "its certificate has epoch 3", "0x6000018c"),
+        (&["--room", "9000"], "the program has 9001 bytes", "0x60000006"),
+    ] {
+        let done = room.verify("app.cbs", more);
+        assert_eq!(done.exit, 3, "{more:?}");
+        assert!(done.err.contains(words) && done.err.contains(number), "{}", done.err);
+        assert!(done.err.contains("what to do: "), "{}", done.err);
+    }
+    let mut damaged = first.clone();
+    *damaged.last_mut().unwrap() ^= 1;
+    let file = room.0.file("damaged.cbs", &damaged);
+    let done = coflash(&["verify", &file, "--root", &room.path("root.pub")]);
+    assert!(done.err.contains("chunk 3 of 3") && done.err.contains("[0x6000018a]"), "{}", done.err);
+    let done = coflash(&["verify", &room.path("app.cbs"), "--root", &room.path("release.pub")]);
+    assert!(done.err.contains("is not one of the given roots [0x6000018e]"), "{}", done.err);
+    for (name, bytes) in [("empty.cbs", &b""[..]), ("cut.cbs", &first[..600]), ("magic.cbs", b"CBS1")] {
+        let file = room.0.file(name, bytes);
+        for words in
+            [&["show", &file][..], &["verify", &file, "--root", &room.path("root.pub")], &["inspect", &file]]
+        {
+            assert_eq!(coflash(words).exit, 3, "{words:?}");
+        }
+    }
+}
+
+#[test]
+fn encrypted_and_compressed_programs_come_out_again() {
+    let room = Room::new("options");
+    let kek = room.path("kek.pem");
+    let sealed =
+        room.seal("app.cbs", &["--counter", "0", "--compress", "--encrypt", &kek, "--text", "for all"]);
+    assert!(sealed.out.contains(", compressed to "), "{}{}", sealed.out, sealed.err);
+    let shown = json(&["show", &room.path("app.cbs")]);
+    assert_eq!(shown["flags"], serde_json::json!(["encrypted", "compressed"]));
+    assert_eq!(shown["text"], "for all");
+    assert!(shown["payload"].as_u64() < shown["size"].as_u64());
+    let closed = room.verify("app.cbs", &[]);
+    assert!(closed.out.contains("give --kek"), "{}{}", closed.out, closed.err);
+    let whole = room.verify("app.cbs", &["--kek", &kek]);
+    assert!(whole.out.contains("the program is whole, 9001 bytes"), "{}{}", whole.out, whole.err);
+    let other = room.0.file("other.kek", "5a".repeat(32).as_bytes());
+    let done = room.verify("app.cbs", &["--kek", &other]);
+    assert!(done.err.contains("encrypted for other keys"), "{}", done.err);
+
+    // Against the other program, for one device, with everything else.
+    let old = room.0.file("old.bin", &program()[..8000]);
+    let (uid, sbom) = ("00112233445566778899aabb", room.0.file("sbom.json", b"{}"));
+    let more = ["--counter", "0x10", "--base", &old, "--device", uid, "--hardware", "1", "--hardware", "33"];
+    let more = [&more[..], &["--chunk", "512", "--sbom", &sbom, "--date", "1420070400", "-P", "1"]].concat();
+    let sealed = room.seal("app.cbs", &more);
+    assert_eq!(sealed.exit, 0, "{}", sealed.err);
+    let shown = json(&["show", &room.path("app.cbs")]);
+    assert_eq!((&shown["unique_id"], &shown["hardware"]), (&uid.into(), &2.into()));
+    assert_eq!((&shown["chunk"], &shown["created"]), (&512.into(), &1_420_070_400.into()));
+    // A hash of two bytes: `printf '{}' | openssl dgst -sha512-256`.
+    if let Some(said) = openssl(&["dgst", "-sha512-256", "-r", &sbom]) {
+        assert_eq!(shown["sbom"], String::from_utf8(said).unwrap().split(' ').next().unwrap());
+    }
+    assert!(room.verify("app.cbs", &[]).out.contains("give --base"));
+    assert!(room.verify("app.cbs", &["--base", &old]).out.contains("is whole"));
+    let done = room.verify("app.cbs", &["--base", &room.path("app.hex")]);
+    assert!(done.err.contains("is not the given program"), "{}", done.err);
+    let done = room.verify("app.cbs", &["--device", "000102030405060708090a0b"]);
+    assert!(done.err.contains("another unique ID"), "{}", done.err);
+    assert_eq!(room.verify("app.cbs", &["--hardware", "2"]).exit, 3);
+
+    // For tests.
+    room.certify("release.cert", &["--role", "test"]);
+    room.seal("test.cbs", &["--counter", "1"]);
+    assert!(room.verify("test.cbs", &[]).err.contains("not marked for tests"));
+    assert_eq!(room.verify("test.cbs", &["--for-tests"]).exit, 0);
+}
+
+#[test]
+fn what_cannot_be_sealed_is_refused_with_what_to_do() {
+    let room = Room::new("refused");
+    let kek = room.path("kek.pem");
+    for (more, exit, words) in [
+        (&["--counter", "1", "--vendor", "1"][..], 3, "the certificate allows the vendor-ID 0000003Fh"),
+        (&["--counter", "1", "--encrypt", &kek, "--encrypt", &kek], 3, "encrypted twice"),
+        (&["--counter", "1", "--encrypt", &room.path("root.pub")], 3, "it is not a key-encryption key"),
+        (&["--counter", "1", "--chunk", "1000"], 2, "a power of two from 512 to 8192"),
+        (&["--counter", "1", "--device", "00"], 2, "24 hexadecimal digits"),
+        (&["--counter", "1", "-P", "2"], 2, "has no program 2"),
+        (&[], 2, "--counter"),
+    ] {
+        let done = room.seal("none.cbs", more);
+        assert_eq!(done.exit, exit, "{more:?}: {}", done.err);
+        assert!(done.err.contains(words), "{}", done.err);
+        assert!(!Path::new(&room.path("none.cbs")).exists());
+    }
+    // No program, and no label.
+    let junk = room.0.file("junk.bin", &[0x5A; 1000]);
+    let key = room.path("release.pem");
+    let words = ["seal", &junk, "-I", "binary", "--board", "nucleo-f446re", "--key", &key, "--counter", "1"];
+    assert!(coflash(&words).err.contains("is not a program"));
+    let done = coflash(&[&words[..], &["--data"]].concat());
+    assert!(
+        done.err.contains("the program has no vendor-ID of its target device")
+            && done.err.contains("give --vendor"),
+        "{}",
+        done.err
+    );
+    let done = coflash(&[&words[..], &["--data", "--vendor", "1", "--product", "2"]].concat());
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert_eq!(json(&["show", &room.path("junk.cbs")])["flags"], serde_json::json!(["data"]));
+    // A sealed image is not sealed again, and not overwritten.
+    let before = room.bytes("junk.cbs");
+    let done = coflash(&["seal", &room.path("junk.cbs"), "--key", &key, "--counter", "1"]);
+    assert_eq!((done.exit, room.bytes("junk.cbs")), (2, before));
+}
+
+#[test]
+fn a_module_signs_in_two_steps() {
+    let room = Room::new("module");
+    let (app, out) = (room.path("app.hex"), room.path("app.cbs"));
+    let (key, cert, tbs) = (room.path("release.pub"), room.path("release.cert"), room.path("app.tbs"));
+    let words = ["seal", &app, "--board", "nucleo-f446re", "--key", &key, "--cert", &cert, "--counter", "1"];
+    let done = room.good(&[&words[..], &["--tbs", &tbs]].concat());
+    assert!(done.out.contains("its signature is missing"), "{}", done.out);
+    let done = room.verify("app.cbs", &[]);
+    assert!(done.err.contains("its signature is wrong"), "{}", done.err);
+    let wrong = room.0.file("wrong.sig", &[0; 64]);
+    let done = coflash(&["seal", &out, "--key", &key, "--attach", &wrong]);
+    assert_eq!(done.exit, 3);
+    assert!(done.err.contains("this is not a signature of the key"), "{}", done.err);
+    let short = room.0.file("short.sig", &[0; 63]);
+    assert!(coflash(&["seal", &out, "--key", &key, "--attach", &short]).err.contains("64 bytes"));
+
+    let signature = room.path("app.sig");
+    let private = room.path("release.pem");
+    let words = ["pkeyutl", "-sign", "-rawin", "-inkey", &private, "-in", &tbs, "-out", &signature];
+    if openssl(&words).is_none() {
+        let key = String::from_utf8(room.bytes("release.pem")).unwrap();
+        let key = coflash_core::file::sealed::SigningKey::from_pem(&key).unwrap();
+        fs::write(&signature, key.sign(&room.bytes("app.tbs"))).unwrap();
+    }
+    // In blocks, if their addresses are known.
+    let attach = ["seal", &out, "--key", &key, "--attach", &signature];
+    let done = coflash(&[&attach[..], &["--blocks"]].concat());
+    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
+    room.good(&[&attach[..], &["--blocks", "--board", "nucleo-f446re"]].concat());
+    room.good(&attach);
+    assert!(room.verify("app.cbs", &[]).out.contains("is whole"));
+    assert!(unwrapped(&split(&room.bytes("app.blk"))).1 == room.bytes("app.cbs"));
+    // OpenSSL accepts the tool's own signature.
+    room.seal("own.cbs", &["--counter", "1"]);
+    let own = room.bytes("own.cbs");
+    let manifest = usize::from(u16::from_le_bytes([own[4], own[5]]));
+    let message = room.0.file("message", &[&b"coboot sealed image 1\0"[..], &own[..manifest]].concat());
+    let signature = room.0.file("own.sig", &own[manifest + 160..manifest + 224]);
+    let words = ["pkeyutl", "-verify", "-rawin", "-pubin", "-inkey", &key, "-in", &message];
+    openssl(&[&words[..], &["-sigfile", &signature]].concat());
+    let certificate = room.bytes("release.cert");
+    let message = room.0.file("certified", &certificate[..88]);
+    let signature = room.0.file("certificate.sig", &certificate[88..]);
+    let root = room.path("root.pub");
+    let words = ["pkeyutl", "-verify", "-rawin", "-pubin", "-inkey", &root, "-in", &message];
+    openssl(&[&words[..], &["-sigfile", &signature]].concat());
+}
+
+/// A bootloader as Intel HEX: 992 bytes of a resident part with this word among its vectors, and the
+/// beginning of a RAM image.
+fn bootloader(mark: &[u8; 4]) -> String {
+    let mut resident = vec![0x5A; 992];
+    resident[0x1C..0x20].copy_from_slice(mark);
+    let image = b"CBI2\x01\0\0\0\x40\0\0\0\0\0\0\0";
+    let resident = intel_hex(LAYOUT.bootloader.base, &resident);
+    [resident.trim_end().trim_end_matches(END_OF_FILE), &intel_hex(LAYOUT.home.unwrap().base, image)].concat()
+}
+
+fn words_of(root: &str) -> [&str; 4] {
+    ["--board", "stm32f407g-disc1", "--root", root]
+}
+
+#[test]
+fn a_bootloader_gets_its_keys() {
+    let room = Room::new("provision");
+    let bootloader = bootloader(b"CBS1");
+    let boot = room.0.file("boot.hex", bootloader.as_bytes());
+    let (root, kek) = (room.path("root.pub"), room.path("kek.pem"));
+    let words = ["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek];
+    let more = ["--counter", "7", "--epoch", "2", "--for-tests"];
+    let out = room.path("production.hex");
+    let done = room.good(&[&words[..], &more, &["-o", &out]].concat());
+    let secret = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
+    assert!(done.out.contains(&format!("key-encryption keys  {:08X}h", secret.id())), "{}", done.out);
+    let image = ihex::read(&room.bytes("production.hex")).unwrap();
+    let block: [u8; 256] = image.bytes(LAYOUT.key_block().base).unwrap();
+    assert_eq!(image.byte_count(), 992 + 16 + 256);
+    // The sectors of RM0090 table 5 at 08000000h and 08010000h.
+    let words =
+        "option bytes         write protection (nWRP) of sectors 0, 4 and of no others, SPRMOD 0, BFB2 0";
+    assert!(done.out.contains(words), "{}", done.out);
+    assert_eq!(block[..16], *b"CBKB\x01\0\0\0\x07\0\0\0\x02\0\0\0");
+    let public = PublicKey::from_pem(&String::from_utf8(room.bytes("root.pub")).unwrap()).unwrap();
+    assert_eq!(block[20..52], public.bytes());
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt as _;
+        assert_eq!(fs::metadata(&out).unwrap().permissions().mode() & 0o777, 0o600);
+    }
+    for (more, exit, words) in [
+        (&["-o", &out][..], 2, "exists already"),
+        (&["-o", &room.path("x.bin")], 2, "name it with .hex"),
+        (&["-o", &room.path("x.hex"), "--root", &root], 2, "a key was given twice"),
+        (&["-o", &room.path("x.hex"), "--kek", &kek], 2, "a key was given twice"),
+    ] {
+        let done = coflash(
+            &[&["provision", &boot, "--board", "stm32f407g-disc1", "--root", &root, "--kek", &kek], more]
+                .concat(),
+        );
+        assert_eq!(done.exit, exit, "{more:?}: {}", done.err);
+        assert!(done.err.contains(words), "{}", done.err);
+    }
+    let again = coflash(&[
+        "provision",
+        &out,
+        "--board",
+        "stm32f407g-disc1",
+        "--root",
+        &root,
+        "-o",
+        &room.path("y.hex"),
+    ]);
+    assert_eq!(again.exit, 3);
+    assert!(again.err.contains("the place of the keys"), "{}", again.err);
+    // For any other file keys have no meaning.
+    let other = room.0.file("other.hex", self::bootloader(b"CBS2").as_bytes());
+    let out = room.path("none.hex");
+    let done = coflash(&[&["provision", &other][..], &words_of(&root), &["-o", &out]].concat());
+    assert!(done.exit == 3 && done.err.contains("support for sealed images"), "{}", done.err);
+    assert!(!Path::new(&out).exists());
+    let done = coflash(&["provision", &boot, "--root", &root]);
+    assert!(done.exit == 2 && done.err.contains("give --board"), "{}", done.err);
+}
+
+/// Flashes this file; returns the output, the data for the device, and the other writes.
+fn flashed(file: &str, room: u32, status: u32, more: &[&str]) -> (Done, Vec<u8>, Vec<String>) {
+    let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
+    let mut fake = Fake::new(APPLICATION);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room, status }));
+    let (bus, server) = serve(fake);
+    let done = coflash(&[&["flash", file, "--bus", &bus, "-N", "5"], more].concat());
+    let fake = server.join().unwrap();
+    let kept = kept.lock().unwrap().clone();
+    (done, kept, fake.writes().iter().map(ToString::to_string).collect())
+}
+
+#[test]
+fn a_sealed_image_goes_into_a_device_as_it_is() {
+    let room = Room::new("flash");
+    // A small image, because each frame takes time.
+    let image = raw::read(&program()[..1024], Some(START)).unwrap();
+    room.0.file("app.hex", ihex::emit(&image).as_bytes());
+    assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
+    let (file, bytes) = (room.path("app.cbs"), room.bytes("app.cbs"));
+    let (done, kept, writes) = flashed(&file, 0x10000, 0, &["--check-target"]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    assert!(kept == bytes);
+    let commands: Vec<&String> = writes.iter().filter(|write| write.starts_with("command")).collect();
+    assert_eq!(commands, ["command 80", "command 03", "command 01"]);
+    for words in
+        ["sealed program of 1024 bytes", "counter 7, signed by ", "verified: CRC", "running: an application"]
+    {
+        assert!(done.out.contains(words), "{words}: {}", done.out);
+    }
+
+    // The results that the device reports.
+    for (status, number, words, advice) in [
+        (0x8A, "[0x6000018a]", "the program's signature is wrong", "coflash verify"),
+        (
+            0x8C,
+            "[0x6000018c]",
+            "its counter or the epoch of its key is too low for the device",
+            "coflash info",
+        ),
+        (0x8E, "[0x6000018e]", "the device has no key for this program", "coflash show"),
+    ] {
+        let (done, kept, _) = flashed(&file, 0x10000, status, &[]);
+        assert_eq!(done.exit, 6, "{}", done.out);
+        assert!(kept == bytes, "it is sent once, and not again");
+        // Nothing was erased.
+        let unchanged = "its program is unchanged (CRC 12345678h)";
+        for words in [number, words, advice, unchanged] {
+            assert!(done.err.contains(words), "{words}: {}", done.err);
+        }
+    }
+
+    // The refusals that do not need the device's keys: the device is not changed.
+    let small = flashed(&file, 1000, 0, &[]);
+    assert!(small.0.err.contains("the device has room for 1000"), "{}", small.0.err);
+    assert_eq!((small.0.exit, small.2.len()), (6, 0));
+    assert_eq!(room.seal("other.cbs", &["--counter", "7", "--product", "99"]).exit, 0);
+    let other = flashed(&room.path("other.cbs"), 0x10000, 0, &[]);
+    assert!(other.0.err.contains("product code"), "{}", other.0.err);
+    assert_eq!((other.0.exit, other.2.len()), (6, 0));
+    let second = coflash(&["flash", &file, "-P", "2"]);
+    assert!(second.err.contains("it is for program 1, and program 2 is to be written"), "{}", second.err);
+    assert_eq!(second.exit, 3);
+    let cut = room.0.file("cut.cbs", &bytes[..bytes.len() - 1]);
+    let cut = coflash(&["flash", &cut]);
+    assert!(cut.exit == 3 && cut.err.contains("it is cut off"), "{}", cut.err);
+    // In the bootloader already, and in the other dialects of the same objects.
+    for dialect in ["raw", "hex"] {
+        let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.maker = Some(Box::new(Vault { kept: kept.clone(), start: START, room: 0x10000, status: 0 }));
+        let (bus, server) = serve(fake);
+        let done = coflash(&["flash", &file, "--bus", &bus, "-N", "5", "--dialect", dialect]);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        server.join().unwrap();
+        assert!(*kept.lock().unwrap() == bytes);
+    }
+}
+
+/// The lowest epoch and the lowest counter that a device takes (2002h/3), after the ids of two roots.
+fn lowest(epoch: u32, counter: u32) -> ((u16, u8), Vec<u8>) {
+    ((0x2002, 3), [1, 2, epoch, counter].into_iter().flat_map(u32::to_le_bytes).collect())
+}
+
+/// An old program and an old key are two things. Both are refused before anything is erased, by what
+/// the device says.
+#[test]
+fn an_old_counter_and_an_old_key_are_named_with_what_the_device_takes() {
+    let room = Room::new("old");
+    room.0.file("app.hex", ihex::emit(&raw::read(&program()[..1024], Some(START)).unwrap()).as_bytes());
+    // The key has epoch 3.
+    assert_eq!(room.seal("app.cbs", &["--counter", "7"]).exit, 0);
+    let file = room.path("app.cbs");
+    let counter = "its security counter is 7, and the device accepts none below 8";
+    let epoch = "its certificate has epoch 3, and the device accepts none below 4";
+    for (told, words, advice) in [
+        (lowest(3, 8), counter, "a higher --counter"),
+        (lowest(4, 7), epoch, "sign with the key that is valid now"),
+        (lowest(4, 8), counter, "a higher --counter"),
+    ] {
+        let (done, fake) = on(BOOTLOADER, Told::sealed(&program()).but(told), &["flash", &file]);
+        assert_eq!(done.exit, 6, "{}", done.err);
+        for words in [words, advice, "it was not changed", "[0x6000018c]"] {
+            assert!(done.err.contains(words), "{words}: {}", done.err);
+        }
+        assert!(!done.err.contains("program is old") && fake.writes().is_empty(), "{}", done.err);
+    }
+    // A right for a lower counter has been granted; and what the device takes.
+    let granted = Told::sealed(&program()).but(challenge(1 << 31 | 4)).but(lowest(3, 8));
+    for told in [granted, Told::sealed(&program()).but(lowest(3, 7))] {
+        let (_, fake) = on(BOOTLOADER, told, &["flash", &file]);
+        assert!(fake.count("command 03") == 1, "{:?}", fake.writes());
+    }
+    // Who forces it leaves it to the device.
+    let (_, fake) = on(BOOTLOADER, Told::sealed(&program()).but(lowest(4, 8)), &["flash", &file, "--force"]);
+    assert_eq!(fake.count("command 03"), 1);
+}
+
+/// An application has no 2002h and no 2003h: its bootloader has.
+#[test]
+fn what_the_bootloader_alone_has_is_said_with_the_way_there() {
+    let room = Room::new("way");
+    let root = room.path("root.pem");
+    for words in [&["events"][..], &["unlock", "erase", "--root", &root]] {
+        let (done, fake) = on(APPLICATION, Told::sealed(&program()), words);
+        assert_eq!((done.exit, fake.writes().len()), (6, 0), "{}", done.err);
+        assert!(done.err.contains("coflash enter"), "{words:?}: {}", done.err);
+        // In the bootloader of a product without sealed images, too, it is the object that is missing.
+        let (done, _) = on(BOOTLOADER, Told { bootloader: Vec::new(), application: Vec::new() }, words);
+        assert!(done.exit == 6 && done.err.contains("without support for sealed images"), "{}", done.err);
+    }
+}
+
+/// A sealed device refuses what needs a right with 84h; the advice names the ways.
+#[test]
+fn a_refusal_for_want_of_a_right_names_the_right() {
+    let room = Room::new("right");
+    room.0.file("app.hex", ihex::emit(&raw::read(&program()[..1024], Some(START)).unwrap()).as_bytes());
+    let app = room.path("app.hex");
+    for (command, words) in [
+        (0x03, &["erase"][..]),
+        (0x84, &["withdraw"]),
+        (0x03, &["flash", &app, "--force", "--board", "nucleo-f446re"]),
+    ] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.on_command = Box::new(move |came| match came == command {
+            true => Outcome::AbortStatus(0x0800_0022, 0x84),
+            false => Outcome::Accept,
+        });
+        fake.maker = Some(Box::new(Told::sealed(&program())));
+        let (bus, server) = serve(fake);
+        let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
+        server.join().unwrap();
+        assert!(done.exit == 6 && done.err.contains("[0x60000184]"), "{words:?}: {}", done.err);
+        for way in ["coflash info", "coflash seal", "coflash unlock"] {
+            assert!(done.err.contains(way), "{words:?}, {way}: {}", done.err);
+        }
+    }
+}
+
+/// A device with these objects in its bootloader, and those while an application runs.
+struct Told {
+    bootloader: Vec<((u16, u8), Vec<u8>)>,
+    application: Vec<((u16, u8), Vec<u8>)>,
+}
+
+const UID: [u8; 12] = *b"\x00\x11\x22\x33\x44\x55\x66\x77\x88\x99\xAA\xBB";
+
+/// 2002h/1 with this last word.
+fn challenge(word: u32) -> ((u16, u8), Vec<u8>) {
+    ((0x2002, 1), [&UID[..], &[0x5A; 32], &word.to_le_bytes()].concat())
+}
+
+/// An event in 2003h: number, kind, counter, version.
+fn event(place: u8, words: [u32; 4]) -> ((u16, u8), Vec<u8>) {
+    ((0x2003, place), words.into_iter().flat_map(u32::to_le_bytes).collect())
+}
+
+/// Sealed, with the right for LSS granted.
+const SEALED: u32 = 1 << 31 | 8;
+
+impl Told {
+    /// A sealed device that has this program, and has refused something since it was installed.
+    fn sealed(program: &[u8]) -> Self {
+        let application = vec![
+            ((0x2004, 1), [START.to_le_bytes(), 0x10000_u32.to_le_bytes()].concat()),
+            ((0x2005, 1), 0x0064_0A01_u32.to_le_bytes().to_vec()),
+            ((0x1F56, 1), crc32(program).to_le_bytes().to_vec()),
+        ];
+        let mut bootloader = application.clone();
+        bootloader.push(challenge(SEALED));
+        bootloader.push(event(1, [9, 0x2_008C, 5, 0x0001_0000]));
+        bootloader.push(event(2, [8, 0x1_0001, 7, 0x0064_0A01]));
+        bootloader.push(event(3, [7, 0x1_0001, 6, 0x0000_0001]));
+        bootloader.extend((4..=8).map(|place| event(place, [0; 4])));
+        Self { bootloader, application }
+    }
+
+    /// The same device with another value in the bootloader; an empty value removes the object.
+    fn but(mut self, (at, value): ((u16, u8), Vec<u8>)) -> Self {
+        self.bootloader.retain(|(own, _)| *own != at);
+        if !value.is_empty() {
+            self.bootloader.push((at, value));
+        }
+        self
+    }
+}
+
+impl Maker for Told {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let all = if running == BOOTLOADER { &self.bootloader } else { &self.application };
+        all.iter().find(|(own, _)| *own == at).map(|(_, value)| Ok(value.clone()))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+/// Runs a command on such a device.
+fn on(running: u32, told: Told, words: &[&str]) -> (Done, Fake) {
+    let mut fake = Fake::new(running);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake.maker = Some(Box::new(told));
+    let (bus, server) = serve(fake);
+    let done = coflash(&[words, &["--bus", &bus, "-N", "5"]].concat());
+    (done, server.join().unwrap())
+}
+
+#[test]
+fn a_sealed_image_goes_into_a_device_block_by_block() {
+    let room = Room::new("flash-blocks");
+    let program = &program()[..1024];
+    room.0.file("app.hex", ihex::emit(&raw::read(program, Some(START)).unwrap()).as_bytes());
+    room.seal("app.cbs", &["--counter", "7"]);
+    room.seal("app.blk", &["--counter", "7", "--blocks", "0x200"]);
+    let image = room.bytes("app.cbs");
+    for name in ["app.cbs", "app.blk"] {
+        let words = ["flash", &room.path(name), "--blocks", "--block-size", "0x110"];
+        let (done, fake) = on(APPLICATION, Told::sealed(program), &words);
+        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+        let (control, carried) = unwrapped(&fake.blocks);
+        assert!(carried == image, "{name}");
+        assert_eq!(word(&control, 4), VENDOR);
+        assert_eq!(fake.blocks[1].len(), 0x110);
+        // No release: it has a signature.
+        let commands: Vec<&str> =
+            fake.writes().into_iter().filter(|write| write.starts_with("command")).collect();
+        assert_eq!(commands, ["command 80", "command 03", "command 01"]);
+    }
+    // Without the option the image is sent unchanged, whatever the form of its file.
+    let (done, kept, _) = flashed(&room.path("app.blk"), 0x10000, 0, &[]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert!(kept == image);
+
+    let file = room.path("app.cbs");
+    let done = coflash(&["flash", &file, "--blocks", "--block-size", "20"]);
+    assert!(done.exit == 2 && done.err.contains("a block size of 20 is impossible"), "{}", done.err);
+    // A device that does not report its program's start, and one that does not accept blocks.
+    let untold = Told::sealed(program).but(((0x2004, 1), Vec::new()));
+    let (done, fake) = on(BOOTLOADER, untold, &["flash", &file, "--blocks"]);
+    assert!(done.exit == 6 && done.err.contains("the start of its program (2004h)"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+    let words = ["flash", &file, "--blocks", "--dialect", "raw"];
+    let (done, fake) = on(BOOTLOADER, Told::sealed(program), &words);
+    assert!(done.exit == 2 && done.err.contains("not in blocks"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+}
+
+#[test]
+fn a_device_without_keys_gets_no_sealed_image() {
+    let room = Room::new("unsealed");
+    room.seal("app.cbs", &["--counter", "7"]);
+    let file = room.path("app.cbs");
+    let open = || Told::sealed(&program()).but(challenge(SEALED & 0xFFFF));
+    let (done, fake) = on(BOOTLOADER, open(), &["flash", &file]);
+    assert_eq!(done.exit, 6);
+    assert!(
+        done.err.contains("the device is not sealed") && done.err.contains("coflash provision"),
+        "{}",
+        done.err
+    );
+    assert!(done.err.contains("it was not changed"), "{}", done.err);
+    assert!(fake.writes().is_empty(), "{:?}", fake.writes());
+    // An application does not report it; the bootloader does, before anything is erased.
+    let (done, fake) = on(APPLICATION, open(), &["flash", &file]);
+    assert!(done.exit == 6 && done.err.contains("the device is not sealed"), "{}", done.err);
+    assert!(done.err.contains("its application is running; it was not changed"), "{}", done.err);
+    assert_eq!(fake.writes(), ["command 80", "command 01"]);
+}
+
+#[test]
+fn a_device_is_compared_with_a_sealed_image() {
+    let room = Room::new("verify-device");
+    let program = program();
+    room.seal("app.cbs", &["--counter", "7", "--device", "00112233445566778899aabb", "--hardware", "1"]);
+    let (file, root) = (room.path("app.cbs"), room.path("root.pub"));
+    let words = ["verify-device", &file, "--root", &root];
+    let compared = |running: u32, told: Told, more: &[&str]| on(running, told, &[&words[..], more].concat());
+
+    let revision = ((0x1018, 3), 0x0001_0021_u32.to_le_bytes().to_vec());
+    let (done, fake) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()), &[]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    assert!(done.out.contains("node 5: holds program 1 of"), "{}", done.out);
+    assert!(done.out.contains("and does not run it"), "{}", done.out);
+    assert!(done.out.ends_with("not reported 2007h/6, 2007h/1\n"), "{}", done.out);
+    assert!(fake.writes().is_empty());
+
+    // An application does not report all values, and the command says so.
+    let (done, _) = compared(APPLICATION, Told::sealed(&program), &["--json"]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let value: Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!((&value["same"], &value["runs"]), (&true.into(), &true.into()));
+    let untold = serde_json::json!(["1018h/3", "2002h/1", "2003h/1", "2007h/6", "2007h/1"]);
+    assert_eq!(value["untold"], untold);
+
+    // Each difference is named, and each alone is enough.
+    let number = |index: u16, sub: u8, value: u32| ((index, sub), value.to_le_bytes().to_vec());
+    let other_chip = ((0x2002, 1), [&[1; 12][..], &[0; 32], &SEALED.to_le_bytes()].concat());
+    for (told, words) in [
+        (number(0x1018, 1, 0x40), "vendor-ID (1018h/1): the file has 0000003Fh, the device 00000040h"),
+        (number(0x1018, 2, 1235), "product code (1018h/2): the file has 000004D2h, the device 000004D3h"),
+        (
+            number(0x1018, 3, 2),
+            "hardware revision (1018h/3): the file has the mask 00000002h, the device 00000002h",
+        ),
+        (number(0x1F56, 1, 0), "CRC of the program (1F56h): the file has"),
+        (number(0x1F56, 1, 0x1234_5678), ", the device 12345678h"),
+        (number(0x2005, 1, 0), "version of the program (2005h): the file has V1.10r100, the device V0.0r0"),
+        (other_chip, "unique ID (2002h/1): the file has 00112233445566778899aabb, the device 010101"),
+        (challenge(0x7FFF_FFFF), "the device is not sealed"),
+        (((0x2002, 1), Vec::new()), "without support for sealed images"),
+        (
+            event(2, [8, 0x1_0001, 6, 0x0064_0A01]),
+            "security counter of the last installation (2003h): the file has 7, the device 6",
+        ),
+        (
+            event(2, [8, 0x1_0001, 7, 1]),
+            "version of the last installation (2003h): the file has V1.10r100, the device V1.0r0",
+        ),
+    ] {
+        let (done, _) = compared(BOOTLOADER, Told::sealed(&program).but(revision.clone()).but(told), &[]);
+        assert_eq!(done.exit, 3, "{words}: {}", done.out);
+        assert!(done.out.contains(words), "{words}: {}", done.out);
+        assert_eq!(done.out.matches("  differs ").count(), 1, "{}", done.out);
+        assert!(done.err.contains("node 5 differs from the file in one property"), "{}", done.err);
+    }
+    let two = Told::sealed(&program).but(number(0x1018, 3, 1)).but(number(0x1F56, 1, 1)).but(challenge(0));
+    let (done, _) = compared(BOOTLOADER, two, &["--json"]);
+    let value: Value = serde_json::from_str(&done.out).unwrap();
+    let what: Vec<&Value> =
+        value["differences"].as_array().unwrap().iter().map(|difference| &difference["what"]).collect();
+    assert_eq!((done.exit, what), (3, vec![&"crc".into(), &"keys".into()]));
+    assert_eq!(value["same"], false);
+
+    // A program of which no installation is among the last eight events, and one of another number.
+    let forgotten = Told::sealed(&program).but(revision.clone()).but(event(2, [0; 4]));
+    let forgotten = forgotten.but(event(3, [7, 0x1_0002, 1, 1]));
+    let (done, _) = compared(BOOTLOADER, forgotten, &[]);
+    assert!(done.exit == 0 && done.out.contains("not reported 2003h/1"), "{}{}", done.out, done.err);
+
+    // Nor may it be in the middle of a renewal, or have option bytes that no product has.
+    let byte = |sub: u8, value: u8| ((0x2007, sub), vec![value]);
+    let state = |bytes: [u8; 4]| ((0x2007, 9), bytes.to_vec());
+    let factory = number(0x2007, 6, 0x0FFF_AAED);
+    let renewable = || Told::sealed(&program).but(revision.clone()).but(byte(1, 2)).but(factory.clone());
+    for (bytes, fault, words) in [
+        // State, origin, end of the last trial and its detail (docs/renewal.md).
+        ([1, 0, 0, 0], "staged", "another bootloader waits for its trial: coflash flash with its file"),
+        ([1, 0, 1, 0], "staged", "on trial it was not confirmed in time: coflash flash with a good one"),
+        ([1, 0, 4, 3], "staged", "on trial it could not be loaded: its CRC is wrong"),
+        ([1, 1, 0, 0], "on_trial", "a bootloader runs on trial: coflash flash with its file confirms it"),
+        ([0, 1, 0, 0], "on_trial", "a bootloader runs on trial"),
+        ([2, 0, 0, 0], "confirmed", "is confirmed and not installed"),
+        ([2, 2, 0, 0], "confirmed", "completes the renewal"),
+        ([3, 3, 0, 0], "damaged", "is damaged, and the spare runs, which repairs it: switch the device off"),
+    ] {
+        let (done, fake) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
+        assert!(done.out.contains("holds program 1 of"), "{}", done.out);
+        assert_eq!((done.exit, done.out.matches("  not ready ").count()), (6, 1), "{bytes:?}: {}", done.out);
+        assert!(done.out.contains(words), "{words}: {}", done.out);
+        assert!(done.err.contains("node 5 is not ready"), "{}", done.err);
+        assert!(fake.writes().is_empty());
+        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &["--json"]);
+        let value: Value = serde_json::from_str(&done.out).unwrap();
+        let expected = serde_json::json!([true, false, [fault]]);
+        assert_eq!(serde_json::json!([value["same"], value["ready"], value["faults"]]), expected);
+    }
+    // At rest: nothing was ever renewed; installed, and loaded from home or, until the next reset, from
+    // staging; a trial that failed, and whose image a program has replaced.
+    for bytes in [[0; 4], [3, 0, 0, 0], [3, 1, 0, 0], [3, 2, 0, 0], [0, 0, 1, 0]] {
+        let (done, _) = compared(BOOTLOADER, renewable().but(state(bytes)), &[]);
+        assert_eq!(done.exit, 0, "{bytes:?}: {}{}", done.out, done.err);
+    }
+    // RM0090 section 3.9.10: SPRMOD is bit 31 of FLASH_OPTCR, BFB2 bit 4, nWRP bits 16 to 27.
+    for (option_bytes, fault) in [(0x8001_AAED, "read_protection"), (0x0FFE_AAFD, "second_bank")] {
+        let told = renewable().but(state([0; 4])).but(number(0x2007, 6, option_bytes));
+        let (done, _) = compared(BOOTLOADER, told, &["--json"]);
+        let value: Value = serde_json::from_str(&done.out).unwrap();
+        assert_eq!((done.exit, &value["faults"]), (6, &serde_json::json!([fault])));
+    }
+    // The protection that it has, and the one that belongs to its product.
+    for (number_of_its_own, wanted) in [(2, "it needs sector 0 and no others"), (0, "(0 and 4 on the boards")]
+    {
+        let told = renewable().but(byte(1, number_of_its_own)).but(state([0; 4]));
+        let (done, _) = compared(BOOTLOADER, told.but(number(0x2007, 6, 0x0FEE_AAED)), &[]);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let line = "  protection   the device has sectors 0, 4; ";
+        assert!(done.out.contains(line) && done.out.contains(wanted), "{}", done.out);
+    }
+    // A state of a later version is none that is known to be good.
+    let (done, _) = compared(BOOTLOADER, renewable().but(state([4, 0, 0, 0])), &[]);
+    assert!(done.exit == 0 && done.out.contains("not reported 2007h/9"), "{}{}", done.out, done.err);
+    // A difference comes first: the device may be another one.
+    let other = renewable().but(state([1, 1, 0, 0])).but(number(0x1F56, 1, 1));
+    let (done, _) = compared(BOOTLOADER, other, &[]);
+    assert!(done.exit == 3 && done.out.contains("  not ready "), "{}{}", done.out, done.err);
+
+    // A bad file is refused before a device is asked. For a missing device there is another code.
+    let other = room.path("release.pub");
+    let done = coflash(&["verify-device", &file, "--root", &other, "--bus", "socketcand://127.0.0.1:1/can0"]);
+    assert!(done.exit == 3 && done.err.contains("is not one of the given roots"), "{}", done.err);
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.running = None;
+    let (bus, server) = serve(fake);
+    let done = coflash(&[&words[..], &["--bus", &bus, "-N", "5", "--sdo-timeout", "20"]].concat());
+    assert_eq!(done.exit, 5, "{}", done.err);
+    server.join().unwrap();
+}
+
+/// The library's own check of the results of the commands.
+#[test]
+fn the_commands_make_what_the_library_verifies() {
+    let room = Room::new("library");
+    room.seal("app.cbs", &["--counter", "7", "--encrypt", &room.path("kek.pem")]);
+    let root = PublicKey::from_pem(&String::from_utf8(room.bytes("root.pub")).unwrap()).unwrap();
+    let kek = Kek::from_pem(&String::from_utf8(room.bytes("kek.pem")).unwrap()).unwrap();
+    let device = Device { roots: &[root], keks: &[kek], ..Device::default() };
+    assert_eq!(verify(&room.bytes("app.cbs"), &device).unwrap().image, Some(program()));
+}
+
+/// A RAM image of a bootloader, with the fields of its header typed from docs/adr/0020, and 4096 bytes.
+fn ram_image(counter: u32) -> Vec<u8> {
+    let mut image = b"CBI2".to_vec();
+    let words = [0, 64, 4096, 0x2000_0000, 0x2001_FFC0, 1, 1, 7, 0x3F, 0x40, 0, 0x0001_0002, counter, 0, 0];
+    image.extend(words.into_iter().flat_map(u32::to_le_bytes));
+    image.extend((0..4096_u32).map(|at| at as u8));
+    let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&image[8..]);
+    image[4..8].copy_from_slice(&crc.to_le_bytes());
+    image
+}
+
+/// Everything about a sealed bootloader is in its header.
+#[test]
+fn a_bootloader_is_sealed_by_a_key_for_bootloaders() {
+    let room = Room::new("bootloader");
+    let (root, key) = (room.path("root.pem"), room.path("release.pem"));
+    let file = room.0.file("boot.bin", &ram_image(3));
+    let (out, cert) = (room.path("boot.cbs"), room.path("boot.cert"));
+    let certify = ["key", "certify", "--root", &root, "--key", &room.path("release.pub"), "--epoch", "1"];
+    let certify = [&certify[..], &["--vendor", "0x3F", "-o", &cert]].concat();
+    let seal = ["seal", &file, "-o", &out, "--bootloader", "--key", &key, "--cert", &cert];
+    room.good(&[&certify[..], &["--role", "release"]].concat());
+    let done = coflash(&seal);
+    assert_eq!(done.exit, 3, "a key for programs: {}", done.err);
+    fs::remove_file(&cert).unwrap();
+    room.good(&[&certify[..], &["--role", "bootloader"]].concat());
+    assert_eq!(json(&["key", "show", &cert])["role"], "bootloader");
+    let done = room.good(&seal);
+    assert!(done.out.contains("counter 3, 4160 bytes"), "{}", done.out);
+    let shown = json(&["show", &out]);
+    assert_eq!((&shown["program"], &shown["counter"]), (&255.into(), &3.into()));
+    assert!(room.verify("boot.cbs", &[]).out.contains("4160 bytes"));
+    // A key for bootloaders signs no program.
+    let program = ["seal", &room.path("app.hex"), "--board", "nucleo-f446re", "--counter", "7"];
+    let done =
+        coflash(&[&program[..], &["--key", &key, "--cert", &cert, "-o", &room.path("app.cbs")]].concat());
+    assert_eq!(done.exit, 3, "{}", done.err);
+    // What the header has.
+    for more in [["--counter", "4"], ["--hardware", "1"]] {
+        assert_eq!(coflash(&[&seal[..], &more].concat()).exit, 2, "{more:?}");
+    }
+    let none = room.path("app.hex");
+    assert_eq!(coflash(&["seal", &none, "--bootloader", "--key", &key, "-o", &out]).exit, 3);
+}

@@ -1,0 +1,354 @@
+//! Several devices, interruption and diagnosis, with the tool as a separate process.
+
+use std::collections::VecDeque;
+use std::fs;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use crate::tool::{coflash, data, folder};
+use canopen::{CobId, Frame};
+use kit::fake::{serve, Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
+use serde_json::Value;
+
+fn device(node: u8, running: u32) -> Fake {
+    let mut fake = Fake::new(running);
+    fake.node = node;
+    fake.erase_time = Duration::from_millis(100);
+    fake.restart_time = Duration::from_millis(20);
+    fake.knows_blocks = Blocks::Known(127);
+    fake
+}
+
+#[test]
+fn a_list_of_nodes_is_updated_and_a_failure_stops_no_other() {
+    let bus = || {
+        let mut refusing = device(9, BOOTLOADER);
+        refusing.on_block = Box::new(|_| Outcome::Status(0x0E));
+        Bus(vec![device(5, APPLICATION), refusing, device(10, BOOTLOADER)])
+    };
+    let folder = folder("several");
+    let report = folder.path("report.json");
+    let file = data("plain-400.blk");
+    let (url, server) = serve(bus());
+    let done = coflash(&["--bus", &url, "flash", &file, "--node", "5,9-10", "--report", &report]);
+    assert_eq!(done.exit, 8, "{}", done.err);
+    let bus_after = server.join().unwrap();
+    assert_eq!(bus_after.0[0].blocks.concat(), fs::read(&file).unwrap());
+    assert_eq!(bus_after.0[2].blocks.concat(), fs::read(&file).unwrap());
+    for words in [
+        "node 5: calling the application back to the bootloader\n",
+        "node 10: 100 %\n",
+        "node 10: running: an application",
+        "\nnode 9: error: writing block 0 failed: this part of the flash is protected (1F57h reads 0Eh) [0x60000007]\n  \
+         the device: its bootloader is running; it contains no complete program\n",
+        "\n2 of 3 devices are done\n",
+    ] {
+        assert!(done.out.contains(words), "{words} is not in\n{}", done.out);
+    }
+    assert_eq!(done.err, "error: 1 of 3 devices failed\n");
+    let (url, _server) = serve(bus());
+    let json = coflash(&["--json", "--bus", &url, "flash", &file, "--node", "5,9-10"]);
+    assert_eq!((json.exit, json.err.as_str()), (8, ""));
+    let written: Value = serde_json::from_str(&fs::read_to_string(&report).unwrap()).unwrap();
+    let said: Value = serde_json::from_str(&json.out).unwrap();
+    for document in [&written, &said] {
+        assert_eq!((&document["failed"], &document["devices"][0]["ok"]), (&1.into(), &true.into()));
+        assert_eq!(document["devices"][1]["error"]["number"], "0x60000007");
+        assert_eq!(document["devices"][1]["error"]["device"], "erased");
+        assert_eq!(document["devices"][2]["report"]["size"], 4001);
+    }
+}
+
+#[test]
+fn a_job_file_says_who_gets_what() {
+    let folder = folder("job");
+    let small = folder.file(
+        "small.hex",
+        b":020000040801F1\n:080000000010002001020108BC\n:0402000001020304F0\n:00000001FF\n",
+    );
+    folder.file("plain.blk", &fs::read(data("plain-400.blk")).unwrap());
+    let job = folder.file(
+        "job.toml",
+        b"image = 'plain.blk'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\nimage = 'small.hex'\nstart = false\n\
+          [[device]]\nnode = 7\ntrial-run = false\n",
+    );
+    let (url, server) =
+        serve(Bus(vec![device(5, BOOTLOADER), device(6, APPLICATION), device(7, BOOTLOADER)]));
+    let done = coflash(&["--bus", &url, "flash", "--job", &job, "--at-once", "2"]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let bus = server.join().unwrap();
+    let plain = fs::read(data("plain-400.blk")).unwrap();
+    assert_eq!((bus.0[0].blocks.concat(), bus.0[2].blocks.concat()), (plain.clone(), plain));
+    // Block 0 and the last one around one of 516 bytes, after whose header of 12 bytes they are.
+    assert_eq!(
+        (bus.0[1].blocks[1][12 + 0x200..][..4].to_vec(), bus.0[1].running),
+        (vec![1, 2, 3, 4], Some(BOOTLOADER))
+    );
+    assert_eq!((bus.0[0].count("command 80"), bus.0[2].count("command 80")), (1, 0));
+    assert!(done.out.ends_with("3 of 3 devices are done\n"), "{}", done.out);
+    // With an invalid image, no device is changed.
+    fs::write(&small, b":020000040801F1\n:050000000102030405EC\n:00000001FF\n").unwrap();
+    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
+    assert!(
+        done.exit == 3 && done.err.contains("small.hex: is not a program: it does not begin"),
+        "{}",
+        done.err
+    );
+    fs::write(small, b"hello").unwrap();
+    let done = coflash(&["--bus", "socketcand://127.0.0.1:1/x", "flash", "--job", &job]);
+    assert!(done.exit == 3 && done.err.contains("small.hex: is not a firmware file"), "{}", done.err);
+    let done = coflash(&["flash", "--job", &job, "--node", "5"]);
+    assert!(done.exit == 2 && done.err.contains("cannot be used with"), "{}", done.err);
+}
+
+/// A device without node-ID (CiA 305) that is a bootloader as soon as it has one.
+struct Unconfigured {
+    fake: Fake,
+    node: u8,
+    configured: bool,
+    selected: usize,
+    outbox: Vec<Frame>,
+}
+
+const ADDRESS: [u32; 4] = [0x3F, 2, 3, 4];
+
+impl coboot_can::Adapter for Unconfigured {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
+        let bytes: Option<&[u8; 8]> = frame.exactly();
+        let Some(bytes) = bytes.filter(|_| frame.cob_id() == CobId::new(0x7E5)) else {
+            return self.fake.send(frame);
+        };
+        let answer =
+            |command, byte| Frame::of(CobId::new(0x7E4).unwrap(), &[command, byte, 0, 0, 0, 0, 0, 0]);
+        let number = u32::from_le_bytes(bytes[1..5].try_into().unwrap());
+        match bytes[0] {
+            0x04 => {
+                self.configured = bytes[1] == 1;
+                if !self.configured && self.fake.running.is_none() && self.node != 0xFF {
+                    self.fake.node = self.node;
+                    self.fake.running = Some(BOOTLOADER);
+                    self.outbox.push(Frame::of(CobId::new(0x700 + u16::from(self.node)).unwrap(), &[0]));
+                }
+            }
+            part @ 0x40..=0x43 => {
+                let part = usize::from(part - 0x40);
+                self.selected = if ADDRESS[part] == number && self.selected == part { part + 1 } else { 0 };
+                if self.selected == 4 {
+                    self.configured = true;
+                    self.outbox.push(answer(0x44, 0));
+                }
+            }
+            0x5E if self.configured => self.outbox.push(answer(0x5E, self.node)),
+            0x11 if self.configured => {
+                self.node = bytes[1];
+                self.outbox.push(answer(0x11, 0));
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
+        if self.outbox.is_empty() {
+            return self.fake.receive(timeout);
+        }
+        Ok(Some(self.outbox.remove(0)))
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+fn unconfigured() -> Unconfigured {
+    let mut fake = device(0x7F, BOOTLOADER);
+    fake.running = None;
+    Unconfigured { fake, node: 0xFF, configured: false, selected: 0, outbox: Vec::new() }
+}
+
+#[test]
+fn a_device_without_node_id_gets_one_by_its_lss_address() {
+    let folder = folder("lss-job");
+    let file = data("plain-400.blk");
+    let job = |node: &str, serial: u32| {
+        let text = format!(
+            "image = '{file}'\n[[device]]\n{node}\nlss = {{ vendor = 0x3F, product = 2, revision = 3, serial = {serial} }}\n"
+        );
+        folder.file("job.toml", text.as_bytes())
+    };
+    let (url, server) = serve(unconfigured());
+    let done = coflash(&["--bus", &url, "flash", "--job", &job("node = 9", 4)]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let bus = server.join().unwrap();
+    assert_eq!((bus.fake.node, bus.fake.blocks.concat()), (9, fs::read(&file).unwrap()));
+    // The manual's options (table 9).
+    let (url, server) = serve(unconfigured());
+    let legacy = ["--ser_num", "4", "--rev", "3", "--pcode", "2", "--vendor", "0x3F"];
+    let done = coflash(&[&["--bus", &url, "flash", "-N", "12", &file][..], &legacy].concat());
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    assert_eq!(server.join().unwrap().fake.node, 12);
+    for (node, serial, words) in [
+        ("", 4, "device with serial number 00000004h: error: the device has no node-ID [0x60000017]"),
+        (
+            "node = 9",
+            5,
+            "node 9: error: no device answers (selecting the device by its LSS address) [0x60000013]",
+        ),
+    ] {
+        let (url, server) = serve(unconfigured());
+        let done = coflash(&["--bus", &url, "flash", "--job", &job(node, serial)]);
+        assert!(done.exit == 8 && done.out.contains(words), "{}{}", done.out, done.err);
+        assert!(server.join().unwrap().fake.blocks.is_empty());
+    }
+}
+
+#[test]
+fn a_silent_device_is_diagnosed_by_what_the_bus_says() {
+    let advice = |frames: &[(u16, &[u8])]| {
+        let mut bus = device(5, BOOTLOADER);
+        bus.running = None;
+        // It comes some time after the request, when the diagnosis listens.
+        let frames: Vec<Frame> =
+            frames.iter().map(|(id, data)| Frame::of(CobId::new(*id).unwrap(), data)).collect();
+        let (url, server) = serve(Chatter { fake: bus, frames, next: Duration::ZERO });
+        let done =
+            coflash(&["--bus", &url, "info", "-N", "5", "--sdo-timeout", "20", "--boot-timeout", "20"]);
+        server.join().unwrap();
+        assert_eq!(done.exit, 5, "{}", done.err);
+        assert!(
+            done.err.starts_with("error: node 5 does not answer (reading 1000h/0) [0x60000013]\n"),
+            "{}",
+            done.err
+        );
+        done.err
+    };
+    for (frames, words) in [
+        (&[][..], "nothing at all is heard on the bus"),
+        (&[(0x705, &[5][..])], "node 5 sends heartbeats (operational) but does not answer"),
+        (
+            &[(0x705, &[4])],
+            "sends heartbeats in state stopped, in which SDO does not work: coflash reset --node 5",
+        ),
+        (&[(0x185, &[1])], "node 5 sends frames but does not answer"),
+        (&[(0x703, &[5]), (0x187, &[])], "the bus works, and nodes 3, 7 are heard"),
+        (&[(0x7FF, &[])], "no CANopen node sends frames"),
+    ] {
+        let said = advice(frames);
+        assert!(said.contains(words), "{said}\n not {words}");
+    }
+}
+
+/// A bus that returns what it gets, and nothing else.
+struct Mirror {
+    fake: Fake,
+    back: VecDeque<Frame>,
+}
+
+impl coboot_can::Adapter for Mirror {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
+        self.back.push_back(*frame);
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
+        match self.back.pop_front() {
+            None => self.fake.receive(timeout),
+            frame => Ok(frame),
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+#[test]
+fn a_bus_with_nobody_but_the_tool_is_told() {
+    let file = data("plain-400.blk");
+    let short = ["--sdo-timeout", "20", "--boot-timeout", "20"];
+    let scan = ["scan", "--sdo-timeout", "20", "--listen", "20"];
+    for (command, exit) in [
+        ([&["info", "-N", "5"][..], &short].concat(), 5),
+        ([&["flash", &file, "-N", "5"][..], &short].concat(), 5),
+        ([&["flash", &file, "-N", "5,6"][..], &short].concat(), 8),
+        (scan.to_vec(), 0),
+    ] {
+        let mut fake = device(5, BOOTLOADER);
+        fake.running = None;
+        let (url, server) = serve(Mirror { fake, back: VecDeque::new() });
+        let done = coflash(&[&["--bus", &url][..], &command].concat());
+        server.join().unwrap();
+        let said = format!("{}{}", done.out, done.err);
+        assert_eq!(done.exit, exit, "{said}");
+        assert!(said.contains("the server returns our own frames, and no other node has sent any"), "{said}");
+    }
+}
+
+/// A bus with permanent traffic.
+struct Chatter {
+    fake: Fake,
+    frames: Vec<Frame>,
+    next: Duration,
+}
+
+impl coboot_can::Adapter for Chatter {
+    fn send(&mut self, frame: &Frame) -> Result<(), coboot_can::AdapterError> {
+        self.fake.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, coboot_can::AdapterError> {
+        if self.fake.now >= self.next {
+            self.next = self.fake.now + Duration::from_millis(50);
+            self.frames.iter().for_each(|frame| self.fake.inject(*frame));
+        }
+        self.fake.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.fake.now
+    }
+}
+
+/// Ctrl-C in the middle of the blocks.
+#[cfg(unix)]
+#[test]
+fn an_interruption_aborts_the_transfer_and_tells_how_the_device_is_left() {
+    let mut slow = device(5, BOOTLOADER);
+    // Each block takes some time, so that the signal comes in the middle.
+    let (told, heard) = std::sync::mpsc::channel();
+    slow.on_block = Box::new(move |block| {
+        let _ = told.send(block);
+        std::thread::sleep(Duration::from_millis(if block == 1 { 300 } else { 0 }));
+        Outcome::Accept
+    });
+    let (url, server) = serve(slow);
+    let child = crate::tool::command()
+        .args(["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    while heard.recv().unwrap() != 1 {}
+    let interrupted = Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(interrupted.success());
+    let done = child.wait_with_output().unwrap();
+    let err = String::from_utf8(done.stderr).unwrap();
+    assert_eq!(done.status.code(), Some(130), "{err}");
+    assert_eq!(
+        err,
+        "error: cancelled [0x60000011]\n  the device: its bootloader is running; it contains no complete program\n  \
+         what to do: run the same command again to continue\n"
+    );
+    let mut fake = server.join().unwrap();
+    assert!(
+        fake.log.last().unwrap() == "abort 08000000" || fake.log.last().unwrap().starts_with("read"),
+        "{:?}",
+        fake.log
+    );
+    // The update can be repeated.
+    fake.on_block = Box::new(|_| Outcome::Accept);
+    let (url, server) = serve(fake);
+    let done = coflash(&["--bus", &url, "flash", "-N", "5", &data("identity-110.blk")]);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    assert_eq!(server.join().unwrap().running, Some(APPLICATION));
+}

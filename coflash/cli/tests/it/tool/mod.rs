@@ -1,0 +1,60 @@
+//! The tool as a separate process.
+
+pub mod kernel;
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use kit::folder::Folder;
+
+pub struct Done {
+    pub exit: i32,
+    pub out: String,
+    pub err: String,
+}
+
+/// The tool without the settings, the adapters and the locks of the user who runs the tests.
+pub fn command() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_coflash"));
+    // No test makes this folder. Without a folder for locks there are none: two tests may use the
+    // same name of an adapter at the same time.
+    let nowhere = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nowhere");
+    for name in ["XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_RUNTIME_DIR"] {
+        command.env(name, &nowhere);
+    }
+    command.env_remove("COFLASH_BUS").env_remove("COFLASH_CONFIG");
+    command.env("COFLASH_SEARCH", "none").env("NO_COLOR", "1");
+    command
+}
+
+pub fn coflash(arguments: &[&str]) -> Done {
+    run(command().args(arguments))
+}
+
+pub fn run(command: &mut Command) -> Done {
+    let done = command.output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    Done { exit: done.status.code().expect("no signal"), out: text(done.stdout), err: text(done.stderr) }
+}
+
+pub fn data(name: &str) -> String {
+    format!("{}/../core/tests/data/{name}", env!("CARGO_MANIFEST_DIR"))
+}
+
+/// Compares with `tests/snapshots/NAME.txt`, which a person has read and approved. With
+/// `COFLASH_BLESS` in the environment the file is written instead.
+#[track_caller]
+pub fn snapshot(name: &str, found: &str) {
+    let path = format!("{}/tests/snapshots/{name}.txt", env!("CARGO_MANIFEST_DIR"));
+    if std::env::var_os("COFLASH_BLESS").is_some() {
+        fs::write(&path, found).unwrap();
+    }
+    let expected = fs::read_to_string(&path).unwrap_or_default();
+    assert!(found == expected, "{path} says\n{expected}\nand now it is\n{found}");
+}
+
+/// A folder of one test, deleted at its end.
+pub fn folder(test: &str) -> Folder {
+    Folder::below(env!("CARGO_TARGET_TMPDIR"), test)
+}

@@ -1,0 +1,730 @@
+//! Errors of a device: what happened, a stable number, and what to do next.
+
+use std::fmt;
+use std::time::Duration;
+
+use canopen::program::{FlashError, FlashStatus, SUPPLY_DETAIL};
+use canopen::AbortCode;
+use canopen::{Address, NodeId};
+use shared_abi::handoff::ResetCause;
+use shared_abi::renewal::TrialEnd;
+
+use super::device_type::DeviceType;
+use super::dialect::Dialect;
+use super::doing::{Doing, LssDoing};
+use super::state::{reason, source, trial_end, BootloaderState};
+use coboot_can::gateway::GatewayError;
+use coboot_can::AdapterError;
+
+mod advice;
+
+/// Why a conversation with a device ended early.
+///
+/// `Display` says what happened, [`advice`](Self::advice) what to do next.
+#[derive(Debug)]
+pub enum Error {
+    /// The CAN adapter failed.
+    Adapter(AdapterError),
+    /// The user cancelled.
+    Cancelled,
+    /// The device does not answer.
+    NoAnswer {
+        /// The device.
+        node: NodeId,
+        /// The action.
+        doing: Doing,
+    },
+    /// The device answers with frames that are too short for SDO.
+    ShortAnswer {
+        /// The device.
+        node: NodeId,
+        /// The action.
+        doing: Doing,
+        /// Bytes of the last such frame, 0 to 7; SDO has 8 (CiA 301 clause 7.2.4.3).
+        len: usize,
+    },
+    /// The device answered with an SDO abort, and 1F57h gives no further reason.
+    Refused {
+        /// The device.
+        node: NodeId,
+        /// The action.
+        doing: Doing,
+        /// The abort code.
+        code: AbortCode,
+    },
+    /// The device sent an invalid answer: wrong toggle bit, wrong command, wrong length.
+    Protocol {
+        /// The action.
+        doing: Doing,
+        /// The abort code that was sent to the device.
+        code: AbortCode,
+    },
+    /// 1F57h reports that the bootloader could not carry out a command.
+    Failed {
+        /// The action.
+        doing: Doing,
+        /// The error in 1F57h.
+        error: FlashError,
+        /// The manufacturer's detail of the error.
+        detail: u16,
+        /// The abort code, if the SDO request was refused.
+        code: Option<AbortCode>,
+    },
+    /// 1F57h stays busy.
+    Busy {
+        /// The device.
+        node: NodeId,
+        /// The action.
+        doing: Doing,
+        /// How long the tool has waited.
+        waited: Duration,
+    },
+    /// The file is for another device.
+    WrongTarget {
+        /// The device.
+        node: NodeId,
+        /// The property that differs.
+        what: Mismatch,
+        /// The device's value.
+        device: u32,
+        /// The file's value.
+        file: u32,
+    },
+    /// The device takes sealed images only, and the file is none.
+    SealedOnly {
+        /// The device.
+        node: NodeId,
+        /// The ids of its root keys, as far as it reports them.
+        roots: Vec<u32>,
+    },
+    /// The image cannot be a program of this device.
+    NoProgram {
+        /// The stable error number.
+        number: u32,
+        /// What is wrong with it, as the rest of a sentence that begins with "the image".
+        why: String,
+        /// What to do next.
+        advice: &'static str,
+    },
+    /// The device has the program at another address than the image.
+    OtherRegion {
+        /// The device.
+        node: NodeId,
+        /// The program's number.
+        program: u8,
+        /// First and last address of the image.
+        image: (u32, u32),
+        /// First and last address of the device's program, as 2004h reports it.
+        region: (u32, u32),
+    },
+    /// The program on trial reports another identity than its bootloader.
+    OtherIdentity {
+        /// The device.
+        node: NodeId,
+        /// The property that differs.
+        what: IdentityPart,
+        /// The bootloader's value.
+        bootloader: Option<u32>,
+        /// The value of the program on trial; `None` if it reports none.
+        application: Option<u32>,
+    },
+    /// The application does not return to the bootloader.
+    NoBootloader {
+        /// The device.
+        node: NodeId,
+        /// What runs instead; `None` if nothing answers.
+        running: Option<DeviceType>,
+        /// The abort code, if the application refused.
+        code: Option<AbortCode>,
+        /// Another node that has booted up since the call, if nothing answers.
+        elsewhere: Option<NodeId>,
+    },
+    /// The program in the device is not the program of the file.
+    WrongCrc {
+        /// The value of 1F56h.
+        device: u32,
+        /// The file's value.
+        file: u32,
+    },
+    /// The device's dialect does not support an option.
+    NotInDialect {
+        /// The dialect.
+        dialect: Dialect,
+        /// The missing feature, as a sentence.
+        what: &'static str,
+    },
+    /// The device is locked, and the user gave no password.
+    NoPassword {
+        /// The device.
+        node: NodeId,
+    },
+    /// Another device has the node-ID that the bootloader of this device uses.
+    Occupied {
+        /// The node-ID.
+        node: NodeId,
+    },
+    /// Another tool is using the device.
+    NotAlone {
+        /// The device.
+        node: NodeId,
+        /// How it was noticed.
+        who: Intruder,
+    },
+    /// A layer setting service failed.
+    Lss {
+        /// The master's action.
+        doing: LssDoing,
+        /// The kind of failure.
+        failure: LssFailure,
+    },
+    /// The program on trial did not answer, or could not be called back: it is not released for
+    /// autostart.
+    TrialFailed {
+        /// The device.
+        node: NodeId,
+        /// The kind of failure.
+        how: TrialFailure,
+    },
+    /// The program does not start.
+    StartFailed {
+        /// The device.
+        node: NodeId,
+        /// What answers instead; `None` if nothing answers.
+        running: Option<DeviceType>,
+        /// The status in 1F57h, if it could be read.
+        status: Option<FlashStatus>,
+        /// The state in 2007h, if the device has it.
+        state: Option<BootloaderState>,
+        /// Another node that has booted up since the start, if nothing answers.
+        elsewhere: Option<NodeId>,
+    },
+    /// The program has started, and ended soon after.
+    ProgramEnded {
+        /// The device.
+        node: NodeId,
+        /// Its end.
+        ended: Ended,
+    },
+    /// The bootloader of the device cannot be renewed over the bus.
+    NotRenewable {
+        /// The device.
+        node: NodeId,
+    },
+    /// The new bootloader did not come up, or was not installed: the old one runs.
+    RenewalFailed {
+        /// The device.
+        node: NodeId,
+        /// The end of its trial.
+        end: TrialEnd,
+    },
+    /// Nothing has answered since the new bootloader was started on trial.
+    SilentOnTrial {
+        /// The device.
+        node: NodeId,
+        /// How long the tool has waited.
+        waited: Duration,
+    },
+    /// The new bootloader runs on trial, and cannot be confirmed: it is built without renewal.
+    Unconfirmable {
+        /// The device.
+        node: NodeId,
+    },
+    /// The bootloader of the first device could not be renewed, so that of this one was left alone.
+    FirstFailed {
+        /// The first device.
+        first: NodeId,
+    },
+    /// The program has started and answered, and the device does not answer any more.
+    FellSilent {
+        /// The device.
+        node: NodeId,
+        /// Another node that has booted up since the start.
+        elsewhere: Option<NodeId>,
+    },
+}
+
+/// How the trial of a program failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TrialFailure {
+    /// The program was started, and nothing answers; with another node that has booted up since then.
+    Silent(Option<NodeId>),
+    /// The program has answered, and does not answer any more; with another node that has booted up since
+    /// its start.
+    FellSilent(Option<NodeId>),
+    /// The device stays in its bootloader; with the status in 1F57h and the state in 2007h, if they could
+    /// be read.
+    NotStarted(Option<FlashStatus>, Option<BootloaderState>),
+    /// The program runs and does not return to the bootloader; with the abort code, if it refused.
+    Stays(Option<AbortCode>),
+    /// The program was called back, and nothing answers any more; with another node that has booted up
+    /// since then.
+    Lost(Option<NodeId>),
+    /// The program ran for a while and then ended by a reset.
+    Ended(Ended),
+}
+
+/// The end of a program that ran for a while.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ended {
+    /// The time from its first frame on.
+    pub ran: Duration,
+    /// The reset that ended it, if the device has told it.
+    pub by: Option<ResetCause>,
+}
+
+impl fmt::Display for Ended {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "it ran for {} ms and was reset by ", self.ran.as_millis())?;
+        f.write_str(self.by.map_or("itself or by a watchdog", source))
+    }
+}
+
+/// How the tool noticed another tool.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Intruder {
+    /// Its SDO requests were seen; with the object of the last one, if the request names it.
+    Requests(Option<Address>),
+    /// Another process of this computer has locked the node; with its process id, if it is known.
+    Process(Option<u32>),
+}
+
+/// How a layer setting service failed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssFailure {
+    /// No device answers.
+    NoAnswer,
+    /// The device has no node-ID, and the user has not given one.
+    None,
+    /// The device refuses.
+    Refused {
+        /// The standard's error code; FFh for a manufacturer's code.
+        code: u8,
+        /// The manufacturer's error code.
+        detail: u8,
+    },
+}
+
+/// A part of the identity object, 1018h.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum IdentityPart {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+    /// 1018h/4.
+    SerialNumber,
+}
+
+impl IdentityPart {
+    /// The part at this position among the compared sub-indices.
+    pub(crate) const fn of(sub: usize) -> Self {
+        match sub {
+            1 => Self::VendorId,
+            2 => Self::ProductCode,
+            _ => Self::SerialNumber,
+        }
+    }
+
+    const fn words(self) -> &'static str {
+        match self {
+            Self::VendorId => "vendor-ID",
+            Self::ProductCode => "product code",
+            Self::SerialNumber => "serial number",
+        }
+    }
+}
+
+/// The part of the identity in which file and device differ.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mismatch {
+    /// 1018h/1.
+    VendorId,
+    /// 1018h/2.
+    ProductCode,
+}
+
+impl Mismatch {
+    /// The error that the bootloader reports for it.
+    const fn error(self) -> FlashError {
+        match self {
+            Self::VendorId => FlashError::WrongVendorId,
+            Self::ProductCode => FlashError::WrongProductId,
+        }
+    }
+}
+
+impl From<AdapterError> for Error {
+    fn from(error: AdapterError) -> Self {
+        Self::Adapter(error)
+    }
+}
+
+impl Error {
+    /// The error of a value of another length than its type has.
+    pub(crate) const fn wrong_length(at: Address) -> Self {
+        Self::Protocol { doing: Doing::Read(at), code: AbortCode::LENGTH }
+    }
+
+    /// Whether the device has refused the command at once with an abort, and so has not begun to
+    /// carry it out.
+    #[must_use]
+    pub const fn is_refusal(&self) -> bool {
+        matches!(self, Self::Refused { .. } | Self::Failed { code: Some(_), .. })
+    }
+
+    /// Whether the device has refused block 0 or the first block with data. A device that erases
+    /// when it receives the first good block has then lost nothing.
+    #[must_use]
+    pub fn refuses_first_blocks(&self) -> bool {
+        matches!(
+            self,
+            Self::Refused { doing: Doing::Block(0 | 1), .. }
+                | Self::Failed { doing: Doing::Block(0 | 1), .. }
+        )
+    }
+
+    /// The stable error number: the manual's number (L-1112e_5, table 5, which contains all numbers
+    /// of the newer manual) if there is one, otherwise 60000100h plus the code of 1F57h, 60000200h
+    /// plus the error code of LSS, or 6000030xh for adapters.
+    #[must_use]
+    pub const fn number(&self) -> u32 {
+        match self {
+            Self::Adapter(error) => error.number(),
+            Self::WrongCrc { .. } => 0x6000_0001,
+            Self::Failed { error, .. } => flash_error_number(*error),
+            Self::WrongTarget { what, .. } => flash_error_number(what.error()),
+            // The numbers of the same errors in a firmware file, found without a device.
+            Self::OtherRegion { .. } => 0x6000_0015,
+            Self::NoProgram { number, .. } => *number,
+            Self::SealedOnly { .. } => flash_error_number(FlashError::NoAccess),
+            Self::NoBootloader { .. } => 0x6000_0010,
+            Self::Cancelled => 0x6000_0011,
+            Self::NotAlone { .. } => 0x6000_0012,
+            Self::NoAnswer { .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::NoAnswer, .. } => 0x6000_0013,
+            Self::Lss { failure: LssFailure::None, .. } => 0x6000_0017,
+            Self::NotInDialect { .. } | Self::NoPassword { .. } | Self::NotRenewable { .. } => 0x6000_0018,
+            Self::Occupied { .. } => 0x6000_0010,
+            Self::Lss { failure: LssFailure::Refused { code, .. }, .. } => 0x6000_0200 + *code as u32,
+            Self::TrialFailed { how: TrialFailure::Stays(_) | TrialFailure::Lost(_), .. } => 0x6000_0010,
+            Self::StartFailed { .. }
+            | Self::ProgramEnded { .. }
+            | Self::FellSilent { .. }
+            | Self::TrialFailed { .. }
+            | Self::RenewalFailed { .. }
+            | Self::SilentOnTrial { .. }
+            | Self::FirstFailed { .. }
+            | Self::Unconfirmable { .. }
+            | Self::OtherIdentity { .. } => 0x6000_0014,
+            Self::Busy { .. } => 0x6000_0016,
+            Self::Refused { .. } | Self::Protocol { .. } | Self::ShortAnswer { .. } => 0x6000_0025,
+        }
+    }
+}
+
+/// The manual's number for an error of 1F57h.
+#[must_use]
+pub const fn flash_error_number(error: FlashError) -> u32 {
+    match error {
+        FlashError::NoValidProgram => 0x6000_0001,
+        FlashError::Format => 0x6000_0002,
+        FlashError::Crc => 0x6000_0003,
+        FlashError::NotCleared => 0x6000_0004,
+        FlashError::Write => 0x6000_0005,
+        FlashError::Address => 0x6000_0006,
+        FlashError::Secured => 0x6000_0007,
+        // Newer than the list in the manual.
+        FlashError::NvData
+        | FlashError::WrongVendorId
+        | FlashError::WrongProductId
+        | FlashError::NoAccess
+        | FlashError::Busy
+        | FlashError::Sequence
+        | FlashError::Signature
+        | FlashError::Rollback
+        | FlashError::Key => 0x6000_0100 + error.code() as u32,
+        // "An error that is unknown to the tool", or unspecified.
+        _ => 0x6000_0008,
+    }
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Adapter(error) => error.fmt(f),
+            Self::Cancelled => f.write_str("cancelled"),
+            Self::NoAnswer { node, doing } => write!(f, "node {node} does not answer ({doing})"),
+            Self::ShortAnswer { node, doing, len } => {
+                write!(f, "node {node} answers, but with frames of {len} bytes where SDO has 8 ({doing})")
+            }
+            Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
+            Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
+            Self::Failed { doing, error, detail, code } => {
+                let words = failure_words(*error, *detail);
+                write!(f, "{doing} failed: {words} (1F57h reads {:02X}h", error.code())?;
+                if has_number(Some(*error), *detail) {
+                    write!(f, ", detail {detail:04X}h")?;
+                }
+                match code {
+                    Some(code) => write!(f, ", abort {code})"),
+                    None => f.write_str(")"),
+                }
+            }
+            Self::Busy { node, doing, waited } => {
+                write!(f, "node {node} is still busy {doing} after {:.1} s", waited.as_secs_f64())
+            }
+            Self::WrongTarget { node, what, device, file } => {
+                let what = match what {
+                    Mismatch::VendorId => "vendor-ID",
+                    Mismatch::ProductCode => "product code",
+                };
+                write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
+            }
+            Self::SealedOnly { node, roots } => {
+                write!(f, "node {node} takes sealed images only")?;
+                match roots.as_slice() {
+                    [] => Ok(()),
+                    roots => write!(f, " ({})", roots_words(roots)),
+                }
+            }
+            Self::NoProgram { why, .. } => write!(f, "the image {why}"),
+            Self::OtherRegion { node, program, image: (first, last), region: (from, to) } => {
+                write!(
+                    f,
+                    "the image is for {first:#010x}..={last:#010x}, and node {node} has program {program} at \
+                     {from:#010x}..={to:#010x}"
+                )
+            }
+            Self::OtherIdentity { node, what, bootloader, application } => {
+                let number = |number: &Option<u32>| {
+                    number.map_or("none".to_string(), |number| format!("{number:08X}h"))
+                };
+                let (was, is) = (number(bootloader), number(application));
+                let what = what.words();
+                write!(f, "the program on trial tells {what} {is}, and the bootloader of node {node} {was}")
+            }
+            Self::NoBootloader { node, running, code, elsewhere } => {
+                match running {
+                    Some(running) => write!(f, "node {node} stays in {running}")?,
+                    None => write!(f, "node {node} does not come back in the bootloader")?,
+                }
+                write_elsewhere(f, *elsewhere)?;
+                match code {
+                    Some(code) => write!(f, ": it refuses the call with abort {code}"),
+                    None => Ok(()),
+                }
+            }
+            Self::WrongCrc { device, file } => {
+                write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
+            }
+            Self::NotInDialect { dialect, what } => write!(f, "in the dialect {}: {what}", dialect.name()),
+            Self::NoPassword { node } => write!(f, "node {node} is locked, and no password was given"),
+            Self::Occupied { node } => {
+                write!(f, "another device is in its bootloader and answers as node {node}")
+            }
+            Self::NotAlone { node, who } => match who {
+                Intruder::Requests(None) => {
+                    write!(f, "another tool is using node {node}: it sends SDO requests")
+                }
+                Intruder::Requests(Some(at)) => {
+                    write!(
+                        f,
+                        "another tool is using node {node}: it sends SDO requests, the last one for {at}"
+                    )
+                }
+                Intruder::Process(None) => {
+                    write!(f, "another coflash on this computer is using node {node}")
+                }
+                Intruder::Process(Some(id)) => {
+                    write!(f, "another coflash on this computer, process {id}, is using node {node}")
+                }
+            },
+            Self::Lss { doing, failure: LssFailure::NoAnswer } => {
+                write!(f, "no device answers ({})", doing.words())
+            }
+            Self::Lss { failure: LssFailure::None, .. } => f.write_str("the device has no node-ID"),
+            Self::Lss { doing, failure: LssFailure::Refused { code, detail } } => {
+                write!(f, "the device refuses {}: error {code}", doing.words())?;
+                match detail {
+                    0 => Ok(()),
+                    detail => write!(f, ", manufacturer's code {detail}"),
+                }
+            }
+            Self::TrialFailed { node, how } => {
+                write!(f, "the trial failed, and the program is not released for autostart: ")?;
+                match how {
+                    TrialFailure::Silent(elsewhere) => {
+                        write!(f, "node {node} has not answered since the program was started")?;
+                        write_elsewhere(f, *elsewhere)
+                    }
+                    TrialFailure::FellSilent(elsewhere) => write_silence(f, *node, *elsewhere),
+                    TrialFailure::NotStarted(status, state) => {
+                        write!(f, "it does not start, node {node} stays in the bootloader")?;
+                        match status.and_then(|status| status.error) {
+                            Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                            None => Ok(()),
+                        }?;
+                        write_why(f, *state)
+                    }
+                    TrialFailure::Stays(None) => {
+                        write!(f, "it runs in node {node} and does not return to the bootloader when called")
+                    }
+                    TrialFailure::Stays(Some(code)) => {
+                        write!(f, "it runs in node {node}, and refuses the call to the bootloader with abort {code}")
+                    }
+                    TrialFailure::Lost(elsewhere) => {
+                        write!(f, "node {node} has not answered since the program was called back")?;
+                        write_elsewhere(f, *elsewhere)
+                    }
+                    TrialFailure::Ended(ended) => write!(f, "{ended} (node {node})"),
+                }
+            }
+            Self::ProgramEnded { node, ended } => write!(f, "the program of node {node} has ended: {ended}"),
+            Self::NotRenewable { node } => {
+                write!(f, "the bootloader of node {node} cannot be renewed over the bus")
+            }
+            Self::RenewalFailed { node, end } => {
+                write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
+            }
+            Self::SilentOnTrial { node, waited } => write!(
+                f,
+                "the new bootloader of node {node} was started on trial, and nothing has answered for {} s",
+                waited.as_secs()
+            ),
+            Self::Unconfirmable { node } => write!(
+                f,
+                "the new bootloader of node {node} cannot be confirmed: it is built without renewal; a reset brings \
+                 the old one back"
+            ),
+            Self::FirstFailed { first } => {
+                write!(
+                    f,
+                    "not renewed: the bootloader of node {first} was the first, and could not be renewed"
+                )
+            }
+            Self::FellSilent { node, elsewhere } => {
+                f.write_str("the program does not answer any more: ")?;
+                write_silence(f, *node, *elsewhere)
+            }
+            Self::StartFailed { node, running, status, state, elsewhere } => {
+                match running {
+                    Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
+                    None => write!(f, "the program does not start: node {node} does not answer")?,
+                }
+                write_elsewhere(f, *elsewhere)?;
+                match status.and_then(|status| status.error) {
+                    Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
+                    None => Ok(()),
+                }?;
+                write_why(f, *state)
+            }
+        }
+    }
+}
+
+/// A program that answered once.
+fn write_silence(f: &mut fmt::Formatter<'_>, node: NodeId, elsewhere: Option<NodeId>) -> fmt::Result {
+    write!(f, "it answered after its start, and node {node} is silent since then")?;
+    write_elsewhere(f, elsewhere)
+}
+
+/// A node that may be the device under another node-ID.
+fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt::Result {
+    match elsewhere {
+        Some(other) => write!(f, ", but node {other} has booted up since then"),
+        None => Ok(()),
+    }
+}
+
+/// An error of 1F57h in words, with its detail: for a protected sector that is its number
+/// (docs/protocol.md). Sector 0 belongs to the bootloader on each board, so 0 is none.
+pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
+    match (error, detail) {
+        (FlashError::Secured, 1..) => format!("sector {detail} of the flash is write-protected"),
+        (FlashError::NotCleared, 1..) => {
+            format!("program {detail} reaches into the flash where a new bootloader waits")
+        }
+        (FlashError::NoAccess, LOW_SUPPLY) => {
+            "the supply of the device is too low to write its flash".to_string()
+        }
+        _ => error.to_string(),
+    }
+}
+
+/// The detail of [`FlashError::NoAccess`] for a supply that is too low.
+pub(crate) const LOW_SUPPLY: u16 = SUPPLY_DETAIL as u16;
+
+/// Whether the detail of an error of 1F57h is shown as a number: [`failure_words`] do not have it.
+pub(crate) fn has_number(error: Option<FlashError>, detail: u16) -> bool {
+    let is_in_words = matches!(
+        (error, detail),
+        (Some(FlashError::Secured | FlashError::NotCleared), _) | (Some(FlashError::NoAccess), LOW_SUPPLY)
+    );
+    detail != 0 && !is_in_words
+}
+
+/// Why a device stays in its bootloader, and how its program ended.
+fn write_why(f: &mut fmt::Formatter<'_>, state: Option<BootloaderState>) -> fmt::Result {
+    let Some(state) = state else { return Ok(()) };
+    write!(f, "; {}", reason(state.reason))?;
+    match state.ended_by() {
+        Some(by) => write!(f, "; the program was ended by {}", source(by)),
+        None => Ok(()),
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Self::Adapter(error) => Some(error),
+            _ => None,
+        }
+    }
+}
+
+/// Translates a gateway's error into the error of a transfer over the bus.
+pub(crate) fn of_gateway(error: GatewayError, node: NodeId, doing: Doing) -> Error {
+    match error {
+        GatewayError::Adapter(error) => Error::Adapter(error),
+        GatewayError::NoAnswer => Error::NoAnswer { node, doing },
+        GatewayError::Abort(code) => Error::Refused { node, doing, code },
+        GatewayError::Cancelled => Error::Cancelled,
+    }
+}
+
+/// The ids of root keys in words.
+pub(crate) fn roots_words(roots: &[u32]) -> String {
+    let ids: Vec<String> = roots.iter().map(|id| format!("{id:08X}h")).collect();
+    let noun = if ids.len() == 1 { "root" } else { "roots" };
+    format!("{noun} {}", ids.join(", "))
+}
+
+/// Turns the error "no such object" into `None`.
+pub(crate) fn optional<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(value) => Ok(Some(value)),
+        Err(Error::Refused { code, .. }) if absent(code) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// Turns any refusal, and a value of another length than its type has, into `None`: an object that
+/// a device need not have costs nothing else.
+pub(crate) fn told<T>(read: Result<T, Error>) -> Result<Option<T>, Error> {
+    match read {
+        Ok(value) => Ok(Some(value)),
+        Err(Error::Refused { .. } | Error::Protocol { code: AbortCode::LENGTH, .. }) => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+pub(crate) fn absent(code: AbortCode) -> bool {
+    matches!(
+        code,
+        AbortCode::NO_OBJECT
+            | AbortCode::NO_SUB_INDEX
+            | AbortCode::UNSUPPORTED_ACCESS
+            | AbortCode::WRITE_ONLY
+            | AbortCode::NO_DATA
+    )
+}

@@ -1,0 +1,196 @@
+//! What a session observes besides its transfers: how long its node has been silent, and whether
+//! another tool talks to the node.
+
+use std::time::Duration;
+
+use canopen::emcy::code;
+use canopen::nmt::parse_boot_up;
+use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
+use canopen::{Address, CobId, Frame, NodeId};
+
+use crate::device::doing::Doing;
+use coboot_can::echo::Echoes;
+
+/// A silence of this length is reported while it lasts.
+pub const SILENCE: Duration = Duration::from_secs(2);
+/// The most requests for which an adapter may still return the echo: more than two sub-blocks of a
+/// block download.
+const OWN_MAX: usize = 256;
+
+/// A node that has not answered for a while, while the session waits for it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Silence {
+    /// The node.
+    pub node: NodeId,
+    /// The action that it was asked to do.
+    pub doing: Doing,
+    /// How long it has been silent.
+    pub silent: Duration,
+    /// How long the session waits in total.
+    pub limit: Duration,
+}
+
+/// The observations so far.
+#[derive(Debug, Default)]
+pub(super) struct Watch {
+    /// The time of the node's last frame: an answer, a heartbeat or an emergency.
+    pub(super) heard: Option<Duration>,
+    /// Whether this silence was reported.
+    pub(super) told: bool,
+    /// The session's own requests without an echo, in their order.
+    own: Echoes<OWN_MAX>,
+    /// Whether an echo has arrived since the last answer.
+    echoed: bool,
+    /// The time and the object of the last request of another tool.
+    pub(super) foreign: Option<Foreign>,
+    /// The time of another tool's last request that changes a program.
+    pub(super) commanded: Option<Duration>,
+    /// The time of the node's last boot-up message.
+    pub(super) booted: Option<Duration>,
+    /// The last boot-up message of another node, and its time.
+    pub(super) elsewhere: Option<(Duration, NodeId)>,
+    /// The time of the node's last emergency for its software (6000h).
+    pub(super) failed: Option<Duration>,
+    /// Since when the session hears the bus.
+    pub(super) began: Option<Duration>,
+}
+
+/// The time of the last request of another tool, and its object.
+pub(super) type Foreign = (Duration, Option<Address>);
+
+impl Watch {
+    /// The time of the node's last boot-up message, and the last request of another tool.
+    pub(super) const fn boot_up_and_requests(&self) -> (Option<Duration>, Option<Foreign>) {
+        (self.booted, self.foreign)
+    }
+
+    pub(super) fn sent(&mut self, frame: &Frame, node: NodeId) {
+        if frame.cob_id() == Some(CobId::sdo_request(node)) {
+            self.own.sent(frame);
+        }
+    }
+
+    /// A node has booted up: the session's own, `node`, or another.
+    pub(super) fn heard_boot_up(&mut self, booted: NodeId, node: NodeId, now: Duration) {
+        if booted == node {
+            self.booted = Some(now);
+        } else {
+            self.elsewhere = Some((now, booted));
+        }
+    }
+
+    pub(super) fn received(&mut self, frame: &Frame, node: NodeId, now: Duration) {
+        let Some(id) = frame.cob_id() else { return };
+        if id == CobId::sdo_request(node) {
+            if self.own.takes(frame) {
+                self.echoed = true;
+            } else {
+                self.foreign = Some((now, object_of(frame)));
+                if changes_program(frame) {
+                    self.commanded = Some(now);
+                }
+            }
+            return;
+        }
+        if [CobId::sdo_response(node), CobId::heartbeat(node), CobId::emcy(node)].contains(&id) {
+            (self.heard, self.told) = (Some(now), false);
+        }
+        if let Some(booted) = parse_boot_up(frame) {
+            self.heard_boot_up(booted, node, now);
+        }
+        if is_failure(frame, node) {
+            self.failed = Some(now);
+        }
+        if id == CobId::sdo_response(node) {
+            // A request is on the bus before its answer, so an echo that has not arrived before the
+            // answer will not arrive. If echoes do arrive, echoes of frames sent after that request
+            // may follow.
+            if !self.echoed {
+                self.own.clear();
+            }
+            self.echoed = false;
+        }
+    }
+}
+
+/// The object of a request; none for a segment, which does not name it.
+fn object_of(frame: &Frame) -> Option<Address> {
+    let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
+    let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
+    initiates.then(|| Address::new(u16::from_le_bytes([low, high]), sub))
+}
+
+/// Whether a node reports an error of its software, by an emergency 6000h.
+fn is_failure(frame: &Frame, node: NodeId) -> bool {
+    let is_of_software = |bytes: &[u8; 8]| bytes.starts_with(&code::SOFTWARE.to_le_bytes());
+    frame.cob_id() == Some(CobId::emcy(node)) && frame.exactly().is_some_and(is_of_software)
+}
+
+/// Whether a request begins to write 1F50h or 1F51h, expedited, segmented or as blocks.
+fn changes_program(frame: &Frame) -> bool {
+    let writes = frame.exactly::<8>().is_some_and(|bytes| matches!(bytes[0] >> 5, 1 | 6));
+    let at = object_of(frame).map(|at| at.index);
+    writes && matches!(at, Some(PROGRAM_DATA | PROGRAM_CONTROL))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const READ: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+    const ANSWER: [u8; 8] = [0x43, 0x00, 0x10, 0, 0, 0, 0, 0x10];
+
+    fn node() -> NodeId {
+        NodeId::new(5).unwrap()
+    }
+
+    fn frame(id: u16, data: [u8; 8]) -> Frame {
+        Frame::of(CobId::new(id).unwrap(), &data)
+    }
+
+    /// Sent (true) or received frames; returns the object of the foreign request, if there was one.
+    fn foreign(course: &[(bool, u16, [u8; 8])]) -> Option<Option<Address>> {
+        let mut watch = Watch::default();
+        for (sent, id, data) in course {
+            let frame = frame(*id, *data);
+            if *sent {
+                watch.sent(&frame, node());
+            } else {
+                watch.received(&frame, node(), Duration::ZERO);
+            }
+        }
+        watch.foreign.map(|(_, what)| what)
+    }
+
+    #[test]
+    fn requests_of_others_are_told_from_echoes() {
+        let clear = [0x2F, 0x51, 0x1F, 1, 3, 0, 0, 0];
+        let at = |index, sub| Some(Some(Address::new(index, sub)));
+        // No other tool: without and with echoes; a tool that talks to another node.
+        assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x585, ANSWER)]), None);
+        assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x605, READ), (false, 0x585, ANSWER)]), None);
+        assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x606, READ), (false, 0x585, ANSWER)]), None);
+        // Another tool: another request, the same request after the answer, and the same request
+        // twice.
+        assert_eq!(foreign(&[(true, 0x605, READ), (false, 0x605, clear)]), at(0x1F51, 1));
+        let behind = [(true, 0x605, READ), (false, 0x585, ANSWER), (false, 0x605, READ)];
+        assert_eq!(foreign(&behind), at(0x1000, 0));
+        let twice = [(true, 0x605, READ), (false, 0x605, READ), (false, 0x605, READ)];
+        assert_eq!(foreign(&twice), at(0x1000, 0));
+        // A segment does not name its object.
+        assert_eq!(foreign(&[(false, 0x605, [0x10, 1, 2, 3, 4, 5, 6, 7])]), Some(None));
+    }
+
+    /// A node refuses in the middle of a burst; the echoes of the frames sent after that point
+    /// arrive after its abort.
+    #[test]
+    fn echoes_behind_an_abort_are_still_echoes() {
+        let segment = |number| [number, 1, 2, 3, 4, 5, 6, 7];
+        let sent = (1..=100).map(|number| (true, 0x605, segment(number)));
+        let back =
+            |numbers: std::ops::RangeInclusive<u8>| numbers.map(|number| (false, 0x605, segment(number)));
+        let abort = [(false, 0x585, [0x80, 0x50, 0x1F, 1, 0, 0, 0, 8])];
+        let course: Vec<_> = sent.chain(back(1..=40)).chain(abort).chain(back(41..=100)).collect();
+        assert_eq!(foreign(&course), None);
+    }
+}

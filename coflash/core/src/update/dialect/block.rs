@@ -1,0 +1,467 @@
+//! The dialect `block` of SYS TEC and coboot: a block file, with one SDO download for each block.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use canopen::program::{self, FlashError};
+use canopen::{AbortCode, Address};
+use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
+
+use super::cia302;
+use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::device::partial_download::{partial_download, PartialDownload};
+use crate::device::region::program_region;
+use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
+use crate::file::block_file::{Block as FileBlock, BlockFile, Checksum, FRAMING};
+use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
+use crate::file::judge::Fault;
+use crate::file::sealed::SealedFile;
+use crate::update::content::Content;
+use crate::update::device_after::DeviceState;
+use crate::update::event::{Event, Note, Phase, RepeatReason, Retry, Warning};
+use crate::update::judge::{judge, Judgement};
+use crate::update::options::FlashOptions;
+use crate::update::running::RunningUpdate;
+use crate::update::{steps, trial};
+use coboot_can::adapter::Met;
+
+/// See the [module](self).
+pub(super) struct Block;
+
+const NOT_TOGETHER: Error = Error::NotInDialect {
+    dialect: Dialect::Block,
+    what: "it cannot be updated together with others, which needs a second SDO server (1201h) in its \
+           bootloader and a node-ID of at most 94",
+};
+
+impl Procedure for Block {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        update: &mut RunningUpdate<'_>,
+    ) -> Result<Dialect, Error> {
+        enter_by_call(session, running, Dialect::Block, options, update)
+    }
+
+    /// Erases, sends the blocks, compares the CRC, tries the program and releases it for autostart.
+    /// With `start` off, the program is neither tried nor released. A sealed image is sent in one
+    /// download, unless the user asked for blocks or the device gets it together with others; and it
+    /// needs no release: its signature serves as the release.
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: Content<'_>,
+        options: &FlashOptions,
+        update: &mut RunningUpdate<'_>,
+    ) -> Result<Downloaded, Error> {
+        let (number, crcs) = (options.program, file.program_crcs());
+        let mut in_group = session.join_group()?;
+        if options.together && !in_group {
+            return Err(NOT_TOGETHER);
+        }
+        let (cut, is_sealed);
+        let file = match file {
+            Content::Blocks(file) => {
+                is_sealed = false;
+                file
+            }
+            Content::Sealed(sealed) => {
+                let size = match options.blocks {
+                    None if in_group => DEFAULT_BLOCK_SIZE,
+                    None => return cia302::download(session, sealed.bytes(), crcs, options, update),
+                    Some(size) => size,
+                };
+                is_sealed = true;
+                cut = cut_up(session, sealed, size, number)?;
+                &cut
+            }
+        };
+        let joins = in_group || takes_joined(session, number)?;
+        let most = if in_group { usize::MAX } else { file.program_size() as usize / JOINED_PARTS };
+        let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size.min(most)));
+        let file = Cut { own: file, joined: joined.as_ref() };
+        let sent = send_verified(session, file, crcs, &mut in_group, options, update);
+        if let (Err(error), true) = (&sent, in_group) {
+            leave_after(session, error);
+        }
+        let (repeats, took) = sent?;
+        if is_sealed {
+            update.state = DeviceState::Written;
+            return Ok(Downloaded { repeats, took, released: None });
+        }
+        update.state = DeviceState::Unreleased;
+        if !options.start {
+            update.tell(Phase::NotReleased.into());
+            return Ok(Downloaded { repeats, took, released: Some(false) });
+        }
+        if options.trial_run {
+            trial::run(session, options, update)?;
+        }
+        steps::release(session, number, &mut |event| update.tell(event))?;
+        update.state = DeviceState::Released;
+        Ok(Downloaded { repeats, took, released: Some(true) })
+    }
+}
+
+/// After so many blocks in a row that got through in segments only, block transfer is given up: it is
+/// not a single frame that was damaged.
+const HOPELESS: u32 = 3;
+
+/// A joined block is at most this part of a program: so little more comes twice if an update is cut.
+/// (The device itself keeps its progress in steps of a sixteenth.)
+const JOINED_PARTS: usize = 64;
+
+/// A file and the blocks in which it is sent.
+#[derive(Clone, Copy)]
+struct Cut<'f> {
+    /// The file with its own blocks.
+    own: &'f BlockFile,
+    /// The same with larger blocks, if the device takes them.
+    joined: Option<&'f BlockFile>,
+}
+
+impl<'f> Cut<'f> {
+    /// The file as it is sent.
+    fn file(self) -> &'f BlockFile {
+        self.joined.unwrap_or(self.own)
+    }
+
+    /// Whether this block, as it is sent, has joined several of the file.
+    fn has_joined(self, sent: &FileBlock) -> bool {
+        let is_same = |own: &FileBlock| own.flash_address == sent.flash_address && own.data == sent.data;
+        !self.own.blocks().iter().any(is_same)
+    }
+
+    /// The blocks of the file itself from `refused` on, which has joined some of them. Their numbers
+    /// follow those of the blocks before it.
+    fn own_from(self, refused: &FileBlock) -> Vec<FileBlock> {
+        let rest = self.own.blocks().iter().filter(|block| block.number != NUMBER_CONTROL);
+        let rest = rest.skip_while(|block| block.flash_address != refused.flash_address);
+        let number = |block: &FileBlock, at| if block.number == NUMBER_LAST { NUMBER_LAST } else { at };
+        rest.zip(refused.number..)
+            .map(|(block, at)| FileBlock { number: number(block, at), ..block.clone() })
+            .collect()
+    }
+}
+
+/// Whether the device takes larger blocks than those of a file, or refuses them without harm: a
+/// bootloader of coboot does, which the region of its program shows (2004h).
+fn takes_joined(session: &mut Session<'_>, program: u8) -> Result<bool, Error> {
+    Ok(program_region(session, program)?.is_some())
+}
+
+/// The blocks that carry a sealed image to the program's region of this device.
+fn cut_up(
+    session: &mut Session<'_>,
+    sealed: &SealedFile,
+    block_size: usize,
+    program: u8,
+) -> Result<BlockFile, Error> {
+    let not_cut = |why: &str| Error::NoProgram {
+        number: Fault::NUMBER,
+        why: format!("cannot be sent in blocks: {why}"),
+        advice: "send it in one download: leave out --blocks",
+    };
+    let region = program_region(session, program)?;
+    let region =
+        region.ok_or_else(|| not_cut("the device does not report the start of its program (2004h)"))?;
+    blocks_of_sealed(sealed, region.base, block_size).map_err(|error| not_cut(&error.to_string()))
+}
+
+impl PartialDownload {
+    /// The CRC of the device, if it is the download of this file.
+    fn checksum_of(self, file: &BlockFile) -> Option<Checksum> {
+        let control = &file.blocks()[0];
+        let is_its =
+            |checksum: &Checksum| control.emit_with(*checksum).ends_with(&self.control_crc.to_le_bytes());
+        [file.checksum(), file.checksum().other()].into_iter().find(is_its)
+    }
+
+    /// Whether the device has this block's data.
+    fn has(self, block: &FileBlock) -> bool {
+        let is_data = block.number != NUMBER_CONTROL && block.number != NUMBER_LAST;
+        is_data && block.flash_address + block.data.len() as u32 <= self.end
+    }
+}
+
+/// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off; if the
+/// device's part of it proves to be wrong, everything is sent.
+fn send_verified(
+    session: &mut Session<'_>,
+    file: Cut<'_>,
+    crcs: [u32; 2],
+    in_group: &mut bool,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(u32, Duration), Error> {
+    let number = options.program;
+    let partial = if options.from_start { None } else { partial_download(session, number)? };
+    let partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
+    let mut all = |from, update: &mut RunningUpdate<'_>| {
+        let sent = send(session, file, from, in_group, options, update)?;
+        steps::verify(session, number, crcs, &mut |event| update.tell(event))?;
+        Ok(sent)
+    };
+    match all(partial, update) {
+        Err(error @ (Error::Failed { .. } | Error::WrongCrc { .. } | Error::Refused { .. }))
+            if partial.is_some() =>
+        {
+            update.tell(Warning::BeginsAgain { why: error.to_string() }.into());
+            all(None, update)
+        }
+        result => result,
+    }
+}
+
+/// Steps 4 to 9: erases and sends all blocks, or sends those that are missing after a partial
+/// download; returns the number of repetitions and the duration.
+fn send(
+    session: &mut Session<'_>,
+    file: Cut<'_>,
+    partial: Option<PartialDownload>,
+    in_group: &mut bool,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<(u32, Duration), Error> {
+    let number = options.program;
+    let before = steps::told_before(session, number)?;
+    update.erases(before);
+    if let Some(partial) = partial {
+        let total = file.own.program_size() as usize;
+        let done = partial.end.saturating_sub(file.own.program_start()) as usize;
+        // The record of the old program goes with the first good data.
+        update.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
+        update.tell(Phase::GoingOn { done: done.min(total), total }.into());
+    } else if let Err(error) = steps::erase(session, number, &mut |event| update.tell(event)) {
+        if error.is_refusal() {
+            update.erases_not();
+        }
+        return Err(error);
+    }
+    let began = session.now();
+    let repeats = send_blocks(session, file, partial, in_group, options, update)?;
+    Ok((repeats, session.now().saturating_sub(began)))
+}
+
+/// Steps 6 to 9: sends all blocks that are not in the begun download, those with data together with
+/// the other devices of a group; returns the number of repetitions. If the device refuses a joined
+/// block, the rest goes in the file's own blocks: they need less room, and a damaged frame costs less.
+/// A device that takes block 0 with the other CRC alone gets all blocks with it.
+fn send_blocks(
+    session: &mut Session<'_>,
+    file: Cut<'_>,
+    partial: Option<PartialDownload>,
+    in_group: &mut bool,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<u32, Error> {
+    let begun = partial.and_then(|partial| partial.checksum_of(file.own));
+    let mut checksum = begun.unwrap_or(file.own.checksum());
+    let size = |blocks: &VecDeque<FileBlock>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
+    let mut blocks: VecDeque<FileBlock> = file.file().blocks().iter().cloned().collect();
+    let mut total = size(&blocks);
+    let mut may_split = file.joined.is_some() && !*in_group;
+    let mut done = 0;
+    let mut repeats = 0;
+    let mut in_vain = 0;
+    let (mut together, mut disturbed) = (0, false);
+    update.tell(Event::Progress { done, total });
+    while let Some(block) = blocks.pop_front() {
+        let bytes = file.own.emit_block(&block, checksum);
+        if partial.is_some_and(|partial| partial.has(&block)) {
+            done += bytes.len();
+            continue;
+        }
+        if block.number == NUMBER_LAST && *in_group {
+            session.part_from_group()?;
+            *in_group = false;
+        }
+        let is_control = block.number == NUMBER_CONTROL;
+        let one = One {
+            number: block.number,
+            bytes: &bytes,
+            other_crc: is_control.then(|| file.own.emit_block(&block, checksum.other())),
+            in_group: *in_group && !is_control,
+            may_split: may_split && file.has_joined(&block),
+        };
+        let form = session.transfers();
+        let sent = send_block(session, one, options, &mut |event| match event {
+            Event::Progress { done: part, .. } => update.tell(Event::Progress { done: done + part, total }),
+            Event::Note(Note::Together { devices }) if devices == together => {}
+            Event::Warning(Warning::GroupDisturbed) if disturbed => {}
+            event => {
+                match event {
+                    Event::Note(Note::Together { devices }) => together = devices,
+                    Event::Warning(Warning::GroupDisturbed) => disturbed = true,
+                    _ => {}
+                }
+                update.tell(event);
+            }
+        });
+        // A device that postpones the erase starts it with the first good data: block 0 alone loses
+        // nothing.
+        let is_refused = sent.as_ref().is_err_and(Error::refuses_first_blocks);
+        let is_split = matches!(sent, Ok(Sent { split: true, .. }));
+        update.wrote |= block.number != 0 && !is_refused && !(is_split && block.number == 1);
+        let sent = sent?;
+        update.postponed &= block.number == NUMBER_CONTROL || sent.split;
+        repeats += sent.repeats;
+        if sent.by_other_crc {
+            checksum = checksum.other();
+            update.tell(Note::OtherCrc { crc: checksum }.into());
+            if std::mem::take(in_group) {
+                session.part_from_group()?;
+            }
+        }
+        in_vain = if session.transfers() == form { 0 } else { in_vain + 1 };
+        if session.takes_blocks() && in_vain < HOPELESS {
+            session.transfer_by(form);
+        }
+        if sent.split {
+            may_split = false;
+            blocks = file.own_from(&block).into();
+            total = done + size(&blocks);
+            continue;
+        }
+        done += bytes.len();
+        update.tell(Event::Progress { done, total });
+    }
+    Ok(repeats)
+}
+
+/// Takes a device out of its group after a failure, if it still answers: the downloads of the
+/// others do not concern it any more.
+fn leave_after(session: &mut Session<'_>, error: &Error) {
+    session.leave_group();
+    if !matches!(error, Error::Adapter(_)) {
+        let (node, timing) = (session.node(), Timing { attempts: 1, ..*session.timing() });
+        let mut last = session.with(node, timing);
+        last.cancel_by_nobody();
+        // The failure stays the result.
+        let _ = last.part_from_group();
+    }
+}
+
+/// A block to send.
+struct One<'b> {
+    number: u32,
+    bytes: &'b [u8],
+    /// The same with the other CRC, for block 0: a device says which CRC it has when it takes or
+    /// refuses this block.
+    other_crc: Option<Vec<u8>>,
+    /// It goes to the devices of a group.
+    in_group: bool,
+    /// It has joined several blocks of the file, which can go one by one.
+    may_split: bool,
+}
+
+/// The end of a block that the device has not refused for good.
+#[derive(Default)]
+struct Sent {
+    repeats: u32,
+    /// The device has taken block 0 with the other CRC.
+    by_other_crc: bool,
+    /// The device has not taken it as it is; the blocks that it has joined may get through.
+    split: bool,
+}
+
+/// Steps 7 and 8 for one block, with repetition.
+fn send_block(
+    session: &mut Session<'_>,
+    One { number: block, mut bytes, ref other_crc, in_group, may_split }: One<'_>,
+    options: &FlashOptions,
+    tell: &mut dyn FnMut(Event),
+) -> Result<Sent, Error> {
+    let doing = Doing::Block(block);
+    let at = Address::new(program::PROGRAM_DATA, options.program);
+    let mut repeat = 0;
+    // Whether the result of an earlier transfer is unknown: its block may have arrived.
+    let mut in_doubt = false;
+    let (own, mut by_other_crc) = (bytes, false);
+    loop {
+        let met = if in_group { session.write_together(block, at, bytes)? } else { Met::Alone };
+        let sent = match met {
+            Met::Taken(devices) => {
+                tell(Note::Together { devices }.into());
+                // A block that the device cannot write is reported with the next one.
+                return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
+            }
+            Met::Refused(code) => Err(Error::Refused { node: session.node(), doing, code }),
+            Met::NoAnswer => Err(Error::NoAnswer { node: session.node(), doing }),
+            Met::Alone | Met::Disturbed => {
+                if met == Met::Disturbed {
+                    tell(Warning::GroupDisturbed.into());
+                }
+                let mut progress =
+                    |part: u32| tell(Event::Progress { done: part as usize, total: bytes.len() });
+                session.write(at, bytes, doing, &mut progress)
+            }
+        };
+        if let Err(error @ (Error::Adapter(_) | Error::Cancelled)) = sent {
+            return Err(error);
+        }
+        let status = session.await_idle(options.program, doing)?;
+        // The earlier block had arrived, and the bootloader waits for the next one. If this is
+        // wrong, the next block, or at the latest the program's CRC, shows it.
+        if in_doubt && status.error == Some(FlashError::Sequence) {
+            return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() });
+        }
+        let (why, error) = match judge(sent, status.error.map(|error| (error, status.detail)), doing) {
+            Judgement::Good => return Ok(Sent { repeats: repeat, by_other_crc, ..Sent::default() }),
+            Judgement::Bad { why, error } => (why, error),
+        };
+        if may_split && !in_doubt && is_too_long(&error) {
+            return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
+        }
+        in_doubt |= why == Some(RepeatReason::NoAnswer);
+        match why {
+            Some(why) if repeat < options.repeats => {
+                repeat += 1;
+                // A device or an adapter with problems in block transfer may work with segments.
+                if repeat > 1 && matches!(why, RepeatReason::Broken(_) | RepeatReason::NoAnswer) {
+                    session.transfer_by(Transfers::Segments);
+                }
+                if let (RepeatReason::Crc, Some(other)) = (why, other_crc) {
+                    by_other_crc = !by_other_crc;
+                    bytes = if by_other_crc { other } else { own };
+                }
+                tell(Event::Retry(Retry::block(block, repeat, options.repeats, why)));
+                if repeat > 1 && may_split && !in_doubt {
+                    return Ok(Sent { repeats: repeat, split: true, ..Sent::default() });
+                }
+            }
+            _ => return Err(error),
+        }
+    }
+}
+
+/// Whether the device refuses a block because of its length.
+fn is_too_long(error: &Error) -> bool {
+    let (Error::Refused { code, .. } | Error::Failed { code: Some(code), .. }) = error else { return false };
+    matches!(*code, AbortCode::LENGTH | AbortCode::LENGTH_TOO_HIGH | AbortCode::OUT_OF_MEMORY)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Both files have the same program, and block 0 has its CRC at offset 20.
+    #[test]
+    fn a_begun_download_says_the_crc_of_its_device() {
+        let files = [
+            (Checksum::Crc32, &include_bytes!("../../../tests/data/plain-400.blk")[..]),
+            (Checksum::Crc16, include_bytes!("../../../tests/data/crc16-400.blk")),
+        ];
+        for (_, file) in files {
+            let file = BlockFile::parse(file).unwrap();
+            for (checksum, begun) in files {
+                let control_crc = u32::from_le_bytes(begun[20..24].try_into().unwrap());
+                let partial = PartialDownload { control_crc, end: 0 };
+                assert_eq!(partial.checksum_of(&file), Some(checksum));
+            }
+            assert_eq!(PartialDownload { control_crc: 1, end: 0 }.checksum_of(&file), None);
+        }
+    }
+}

@@ -1,0 +1,198 @@
+//! The events in the form for programs: the names are a contract.
+
+use std::time::Duration;
+
+use canopen::{AbortCode, NodeId};
+use coflash_core::device::{DeviceType, Dialect, Session, Timing};
+use coflash_core::file::block_file::Checksum;
+use coflash_core::file::BlockFile;
+use coflash_core::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
+use coflash_core::update::{flash, Event, FlashOptions, Target};
+use coflash_core::Error;
+use kit::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
+use serde_json::{json, Value};
+
+fn node() -> NodeId {
+    NodeId::new(NODE).unwrap()
+}
+
+/// The lines of an update of this device.
+fn lines(fake: &mut Fake, options: &FlashOptions) -> Vec<Value> {
+    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let mut lines = Vec::new();
+    let mut session = Session::new(fake, node(), Timing::default());
+    let _ = flash(&mut session, &file, options, &mut |event| {
+        let line = serde_json::to_string(&event.line(node())).unwrap();
+        assert!(!line.contains('\n'), "{line}");
+        lines.push(serde_json::from_str(&line).unwrap());
+    });
+    lines
+}
+
+/// The kind of each line, with its phase or note; progress once.
+fn course(lines: &[Value]) -> Vec<String> {
+    let mut course: Vec<String> = Vec::new();
+    for line in lines {
+        let kind = line["event"].as_str().unwrap();
+        let detail = line.get(kind).and_then(Value::as_str).map_or(String::new(), |word| format!(" {word}"));
+        course.push(format!("{kind}{detail}"));
+    }
+    course.dedup();
+    course
+}
+
+#[test]
+fn an_update_tells_its_course_and_ends_with_done() {
+    let mut fake = Fake::new(APPLICATION);
+    let lines = lines(&mut fake, &FlashOptions::default());
+    assert_eq!(
+        course(&lines),
+        [
+            "found",
+            "phase calling_back",
+            "phase in_bootloader",
+            "note dialect",
+            "phase erasing",
+            "phase erased",
+            "progress",
+            "phase verified",
+            "phase trial_starting",
+            "phase trial_passed",
+            "phase released",
+            "phase starting",
+            "phase started",
+            "done"
+        ]
+    );
+    for line in &lines {
+        assert_eq!(line["node"], NODE, "{line}");
+        assert!(line["text"].as_str().is_some_and(|text| !text.is_empty()), "{line}");
+    }
+    // The program is 4001 bytes (see procedure.rs), the file has 6 blocks more than that in framing.
+    let total = data!("identity-110.blk").len();
+    let last = lines.iter().rfind(|line| line["event"] == "progress").unwrap();
+    assert_eq!((&last["done"], &last["total"]), (&json!(total), &json!(total)));
+    let done = lines.last().unwrap();
+    assert_eq!((&done["state"], &done["error"]), (&json!("released"), &Value::Null));
+    assert_eq!(done["report"]["size"], 4001);
+    assert_eq!(done["report"]["running"], APPLICATION);
+}
+
+#[test]
+fn an_update_that_fails_tells_retries_and_ends_with_done_too() {
+    let mut fake = Fake::new(BOOTLOADER);
+    // 1F57h reads 06h, a wrong CRC, after each attempt at block 2.
+    fake.on_block = Box::new(|block| if block == 2 { Outcome::Status(0x06) } else { Outcome::Accept });
+    let lines = lines(&mut fake, &FlashOptions::default().repeats(2));
+    let retries: Vec<&Value> = lines.iter().filter(|line| line["event"] == "retry").collect();
+    assert_eq!(retries.len(), 2);
+    for (line, repeat) in retries.into_iter().zip(1..) {
+        assert_eq!((&line["block"], &line["repeat"], &line["of"]), (&json!(2), &json!(repeat), &json!(2)));
+        assert_eq!((&line["reason"], &line["abort"]), (&json!("crc"), &Value::Null));
+    }
+    let done = lines.last().unwrap();
+    assert_eq!((&done["event"], &done["state"]), (&json!("done"), &json!("erased")));
+    assert_eq!(done["report"], Value::Null);
+    // Table 5 of the manual: a wrong CRC of a block.
+    assert_eq!(done["error"]["number"], "0x60000003");
+    assert!(done["error"]["what"].as_str().unwrap().contains("block 2"), "{done}");
+    assert!(!done["error"]["advice"].as_str().unwrap().is_empty());
+}
+
+/// Every kind of event, with the names on which a program may rely.
+#[test]
+fn the_names_stay() {
+    let of = |number| NodeId::new(number).unwrap();
+    let seconds = Duration::from_micros(1_234_567);
+    let application = DeviceType(0x0002_0192);
+    let cases: Vec<(Event, Value)> = vec![
+        (Event::Found(application), json!({ "event": "found", "device_type": 131_474, "bootloader": false })),
+        (Event::Progress { done: 3, total: 9 }, json!({ "event": "progress", "done": 3, "total": 9 })),
+        (
+            Phase::Searching { reason: "why".into() }.into(),
+            json!({ "event": "phase", "phase": "searching", "reason": "why" }),
+        ),
+        (Phase::CallingBack.into(), json!({ "event": "phase", "phase": "calling_back" })),
+        (Phase::InBootloader.into(), json!({ "event": "phase", "phase": "in_bootloader" })),
+        (Phase::Erasing.into(), json!({ "event": "phase", "phase": "erasing" })),
+        (
+            Phase::Erased { took: seconds }.into(),
+            json!({ "event": "phase", "phase": "erased", "seconds": 1.235 }),
+        ),
+        (Phase::Verified { crc: 7 }.into(), json!({ "event": "phase", "phase": "verified", "crc": 7 })),
+        (Phase::TrialStarting.into(), json!({ "event": "phase", "phase": "trial_starting" })),
+        (
+            Phase::TrialPassed(application).into(),
+            json!({ "event": "phase", "phase": "trial_passed", "device_type": 131_474, "bootloader": false }),
+        ),
+        (Phase::Released.into(), json!({ "event": "phase", "phase": "released" })),
+        (
+            Phase::Renewing { number: 2, from: 1, to: 65_536 }.into(),
+            json!({ "event": "phase", "phase": "renewing", "number": 2, "from": 1, "to": 65_536 }),
+        ),
+        (Phase::Staged.into(), json!({ "event": "phase", "phase": "staged" })),
+        (Phase::OnTrial.into(), json!({ "event": "phase", "phase": "on_trial" })),
+        (
+            Phase::Installed { version: 65_536 }.into(),
+            json!({ "event": "phase", "phase": "installed", "version": 65_536 }),
+        ),
+        (Phase::Starting.into(), json!({ "event": "phase", "phase": "starting" })),
+        (
+            Phase::Started(application).into(),
+            json!({ "event": "phase", "phase": "started", "device_type": 131_474, "bootloader": false }),
+        ),
+        (
+            Phase::VerifiedAgain { crc: 7 }.into(),
+            json!({ "event": "phase", "phase": "verified_again", "crc": 7 }),
+        ),
+        (
+            Event::Retry(Retry::block(2, 1, 3, RepeatReason::Broken(AbortCode(0x0504_0001)))),
+            json!({ "event": "retry", "block": 2, "repeat": 1, "of": 3, "reason": "broken", "abort": 84_148_225 }),
+        ),
+        (
+            Event::Retry(Retry::program(1, 3, RepeatReason::NoAnswer)),
+            json!({ "event": "retry", "block": null, "repeat": 1, "of": 3, "reason": "no_answer", "abort": null }),
+        ),
+        (
+            Note::TargetRight(Target { vendor_id: 63, product_code: 2 }).into(),
+            json!({ "event": "note", "note": "target_right", "vendor_id": 63, "product_code": 2 }),
+        ),
+        (
+            Note::Dialect { dialect: Dialect::EsAcademy }.into(),
+            json!({ "event": "note", "note": "dialect", "dialect": "esacademy" }),
+        ),
+        (
+            Note::OtherCrc { crc: Checksum::Crc16 }.into(),
+            json!({ "event": "note", "note": "other_crc", "crc": "CRC-16" }),
+        ),
+        (Note::Unlocked.into(), json!({ "event": "note", "note": "unlocked" })),
+        (Note::Moved { node: of(126) }.into(), json!({ "event": "note", "note": "moved", "to": 126 })),
+        (
+            Note::MasterTaken { node: of(3) }.into(),
+            json!({ "event": "note", "note": "master_taken", "master": 3 }),
+        ),
+        (
+            Note::MasterBack { node: of(3) }.into(),
+            json!({ "event": "note", "note": "master_back", "master": 3 }),
+        ),
+        (
+            Warning::MasterKept { node: of(3) }.into(),
+            json!({ "event": "warning", "warning": "master_kept", "master": 3 }),
+        ),
+        (Warning::MasterMissing.into(), json!({ "event": "warning", "warning": "master_missing" })),
+    ];
+    for (event, mut form) in cases {
+        assert_eq!(json!(event), form, "{event}");
+        form["node"] = 9.into();
+        form["text"] = event.to_string().into();
+        assert_eq!(json!(event.line(of(9))), form, "{event}");
+    }
+}
+
+#[test]
+fn a_problem_has_its_number_as_the_messages_have_it() {
+    let problem = Problem::of(&Error::NoPassword { node: node() });
+    let form = json!(problem);
+    assert_eq!(form["number"], "0x60000018");
+    assert_eq!(form["what"], problem.what.as_str());
+}

@@ -1,6 +1,0 @@
-//! The command line of coflash.
-#![forbid(unsafe_code)]
-
-fn main() -> std::process::ExitCode {
-    coflash::cli::main()
-}

@@ -1,4 +1,0 @@
-//! Adapters and frames.
-
-mod decode;
-mod gateway;

@@ -1,0 +1,246 @@
+//! The firmware file that the user dropped on the page.
+
+use std::path::Path;
+use std::sync::Arc;
+
+use shared_abi::block_file::ProgramVersion;
+
+use super::state::{Firmware, Notice, Seal, Settings};
+use coflash_core::file::convert::{blocks_of, ConvertError, Options, Region};
+use coflash_core::file::inspect::Inspection;
+use coflash_core::file::judge::{judge, Fault};
+use coflash_core::file::sealed::show::flags;
+use coflash_core::file::sealed::SealedFile;
+use coflash_core::file::{self, label, ram_image, AddressRange, BlockFile, Format};
+use coflash_core::update::{NewBootloader, Program, Target};
+
+/// The most bytes of a file: an ELF file of the largest program with all debug information.
+pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
+/// The longest name that is shown.
+const NAME_MAX: usize = 120;
+
+/// A file that was read, checked and, unless it is sealed, converted into blocks.
+#[derive(Debug)]
+pub(super) struct Loaded {
+    /// The file itself: after a change of the settings it is converted again.
+    pub(super) bytes: Arc<Vec<u8>>,
+    pub(super) program: Program,
+    pub(super) shown: Firmware,
+}
+
+/// Reads a file and converts it into blocks; a sealed image stays unchanged.
+pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
+    let name = printable(name);
+    let bad = |error: &dyn std::fmt::Display| {
+        let advice =
+            "choose the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image; \
+                      a raw binary (.bin) needs a board that says where it belongs";
+        Notice::failed(error.to_string(), advice)
+    };
+    if bytes.len() > FILE_MAX {
+        let words = format!("{name}: {} bytes are more than any program has", bytes.len());
+        return Err(Notice::failed(words, "choose the firmware file itself"));
+    }
+    let region = region(settings)?;
+    let format = Format::of(Path::new(&name), &bytes);
+    if let Some(new) = NewBootloader::in_file(&bytes, format)
+        .map_err(|fault| Notice::failed(format!("{name}: {fault}"), ram_image::Fault::ADVICE))?
+    {
+        return Ok(bootloader(bytes, name, new));
+    }
+    if format == Some(Format::Sealed) {
+        return sealed(bytes, name, settings);
+    }
+    let start = region.map(|region| region.first);
+    if format == Some(Format::Raw) && start.is_none() {
+        let words = format!("{name}: a raw binary does not contain its address");
+        return Err(Notice::failed(words, "choose the board"));
+    }
+    let firmware = file::read(&bytes, format, start).map_err(|error| bad(&error.of(&name)))?;
+    let board = settings.board;
+    let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
+    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
+    let converted = blocks_of(firmware, &options).map_err(|error| match error {
+        ConvertError::File(error) => bad(&error.of(&name)),
+        error => bad(&format!("{name}: {error}")),
+    })?;
+    let blocks = converted.file;
+    // The update itself judges the rest, but does not know the board.
+    if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(&blocks.image(), blocks.program_start(), board)
+    {
+        return Err(Notice::failed(format!("{name}: {fault}"), fault.advice()));
+    }
+    let label = label_of(&blocks);
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: inspection.as_ref().map(Inspection::to_string).unwrap_or_default(),
+        program_size: blocks.program_size(),
+        crc: blocks.program_crc(),
+        vendor_id: label.as_ref().map(|label| label.0),
+        product_code: label.as_ref().map(|label| label.1),
+        version: inspection
+            .and_then(|inspection| inspection.software_version)
+            .or(label.and_then(|label| label.2)),
+        left_out: converted.left_out,
+        seal: None,
+        name,
+    };
+    Ok(Loaded { bytes, program: Arc::new(blocks).into(), shown })
+}
+
+/// A bootloader, which takes the place of that of the device.
+fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
+    let target = new.target();
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: format!(
+            "a bootloader: it renews that of the device, and the program stays ({})",
+            new.version()
+        ),
+        program_size: new.size(),
+        crc: new.crc(),
+        vendor_id: Some(target.vendor_id),
+        product_code: Some(target.product_code),
+        version: Some(new.version().to_string()),
+        left_out: 0,
+        seal: None,
+        name,
+    };
+    Loaded { bytes, program: new.into(), shown }
+}
+
+/// Reads a sealed image. Only the device's keys decrypt it.
+fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
+    let file = SealedFile::for_program(bytes.to_vec(), settings.program);
+    let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
+    let (head, sealed, target) = (file.head(), file.parts(), Target::of_sealed(&file));
+    let shown = Firmware {
+        size: bytes.len(),
+        inspection: sealed.to_string(),
+        program_size: head.size(),
+        crc: head.crc(),
+        vendor_id: Some(target.vendor_id),
+        product_code: Some(target.product_code),
+        version: Some(ProgramVersion(head.version()).to_string()),
+        left_out: 0,
+        seal: Some(Seal {
+            program: head.program(),
+            counter: head.counter(),
+            signed_by: sealed.signers(),
+            opened_by: sealed.recipients().map(|recipient| recipient.key_id()).collect(),
+            flags: flags(head.flags()).collect(),
+        }),
+        name,
+    };
+    Ok(Loaded { bytes, program: Arc::new(file).into(), shown })
+}
+
+/// The target of the program: vendor-ID, product code and version, from block 0 or from the label
+/// after the vectors.
+fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
+    use shared_abi::block_file::Control;
+    match file.control() {
+        Some(Control::Identity(identity)) => Some((identity.vendor_id, identity.product_code, None)),
+        Some(Control::Dated { identity, version, .. }) => {
+            Some((identity.vendor_id, identity.product_code, Some(ProgramVersion(version).to_string())))
+        }
+        None | Some(Control::Plain) => {
+            let label = label::label_of(&file.image(), file.program_start())?;
+            Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
+        }
+    }
+}
+
+/// The region of the program on the selected board, if there is one.
+fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
+    let Some(layout) = settings.board else { return Ok(None) };
+    match layout.program(settings.program) {
+        Some(region) => Ok(Some(region.into())),
+        None => {
+            let words = format!("{} has no program {}", layout.board, settings.program);
+            Err(Notice::failed(words, format!("its programs are 1 to {}", layout.programs.len())))
+        }
+    }
+}
+
+/// A name from outside as safe text: one line of limited length, without control or direction
+/// characters.
+pub(super) fn printable(name: &str) -> String {
+    let base = name.rsplit(['/', '\\']).next().unwrap_or(name);
+    let visible = |c: char| if c.is_alphanumeric() || c.is_ascii_graphic() || c == ' ' { c } else { '_' };
+    let name: String = base.chars().take(NAME_MAX).map(visible).collect();
+    if name.trim().is_empty() {
+        "the file".to_string()
+    } else {
+        name
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn words(bytes: &[u8], name: &str) -> String {
+        match load(Arc::new(bytes.to_vec()), name, &Settings::default()) {
+            Ok(loaded) => format!("{:?}", loaded.shown),
+            Err(notice) => notice.words,
+        }
+    }
+
+    #[test]
+    fn what_is_no_firmware_is_refused_with_its_name() {
+        assert_eq!(words(b"", "a.hex"), "a.hex: is empty");
+        assert!(words(b"<!doctype html><p>404", "app.hex").starts_with("app.hex: is not a firmware file"));
+        assert!(words(&[0; 100], "app.bin").contains("a raw binary does not contain its address"));
+        assert!(words(b":020000040801F1\n", "app.hex").starts_with("app.hex: "));
+    }
+
+    /// Four bytes of Intel HEX at 0802_0000h; the CRC is the output of GNU `gzip` for EFh BEh ADh
+    /// DEh.
+    #[test]
+    fn a_program_is_read_and_a_board_judges_its_place() {
+        let hex = b":020000040802F0\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
+        let loaded = load(Arc::new(hex.clone()), "../x/app.hex", &Settings::default()).unwrap();
+        assert_eq!((loaded.shown.name.as_str(), loaded.shown.program_size), ("app.hex", 4));
+        assert!(loaded.shown.inspection.starts_with("Intel HEX, well-formed"), "{}", loaded.shown.inspection);
+        assert_eq!(loaded.shown.vendor_id, None);
+        let board = Settings { board: Some(shared_abi::layout::DEFAULT), program: 1 };
+        assert!(load(Arc::new(hex), "app.hex", &board).is_ok());
+        let outside = b":020000040800F2\n:04000000EFBEADDEC4\n:00000001FF\n".to_vec();
+        let refused = load(Arc::new(outside), "app.hex", &board).unwrap_err();
+        assert!(refused.words.starts_with("app.hex"), "{}", refused.words);
+        let raw = load(Arc::new(vec![1, 2, 3, 4]), "app.bin", &board).unwrap();
+        assert_eq!(raw.shown.program_size, 4);
+        let two = Settings { program: 9, ..board };
+        assert!(load(Arc::new(vec![1, 2, 3, 4]), "app.bin", &two)
+            .unwrap_err()
+            .words
+            .contains("no program 9"));
+    }
+
+    #[test]
+    fn a_bootloader_is_known_by_its_header() {
+        let mut bytes = b"CBI2".to_vec();
+        for word in [0, 64, 4, 0x2000_0000, 0x2001_FFC0, 1, 0, 7, 1, 2, 0, 0x0001_0003, 0, 0, 0, 5] {
+            bytes.extend(u32::to_le_bytes(word));
+        }
+        let words = words(&bytes, "new.bin");
+        assert!(words.starts_with("new.bin: is a bootloader without a CRC"), "{words}");
+        let crc = coflash_core::file::block_file::CRC.checksum(&bytes[8..]);
+        bytes[4..8].copy_from_slice(&crc.to_le_bytes());
+        let loaded = load(Arc::new(bytes), "new.bin", &Settings::default()).unwrap();
+        assert!(loaded.program.is_bootloader());
+        let Firmware { crc: told, vendor_id, product_code, version, .. } = loaded.shown;
+        assert_eq!((told, vendor_id, product_code), (crc, Some(1), Some(2)));
+        assert_eq!(version.as_deref(), Some("1.3"));
+    }
+
+    #[test]
+    fn a_name_is_one_line_of_text() {
+        assert_eq!(printable("a/b\\c.hex"), "c.hex");
+        assert_eq!(printable("a\n\u{202E}b"), "a__b");
+        assert_eq!(printable("\u{7}").len(), 1);
+        assert_eq!(printable("  "), "the file");
+        assert_eq!(printable(&"x".repeat(500)).len(), NAME_MAX);
+    }
+}

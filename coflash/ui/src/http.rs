@@ -1,0 +1,490 @@
+//! The requests of the page and their answers.
+
+use std::sync::{Arc, Mutex};
+
+use axum::body::{Body, Bytes};
+use axum::extract::{DefaultBodyLimit, Query, State};
+use axum::http::{header, HeaderMap, StatusCode};
+use axum::middleware;
+use axum::response::{IntoResponse, Response};
+use axum::routing::{get, post};
+use axum::Router;
+use canopen::NodeId;
+use serde::de::DeserializeOwned;
+use serde::Deserialize;
+use serde_json::{json, Value};
+use shared_abi::layout::{self, Layout};
+use tokio::sync::Semaphore;
+
+use super::adapters;
+use super::events::{self, Readers};
+use super::firmware::{self, FILE_MAX};
+use super::frames::candump;
+use super::guard::{guard, Guard};
+use super::job::{Job, Step};
+use super::shared::{lock, Order, Refusal, Shared};
+use super::state::{Fits, Notice, Settings};
+use super::upload::{self, Room, Upload};
+
+use coboot_can::Kind;
+use coflash_core::device::lss::{BitRate, LssAddress};
+use coflash_core::file::board;
+use coflash_core::update::FlashOptions;
+
+/// The most bytes of a request without a file.
+const BODY_MAX: usize = 64 * 1024;
+/// The most memory maps that are taken: each stays in memory.
+const BOARDS_MAX: usize = 100;
+
+/// The state that the handlers share.
+#[derive(Clone)]
+pub(super) struct Site {
+    pub(super) shared: Arc<Shared>,
+    pub(super) readers: Readers,
+    /// The kinds of adapters on offer.
+    pub(super) kinds: Vec<Kind>,
+    /// The room for files that are being sent.
+    pub(super) room: Room,
+    /// Only one file is judged at a time: it may be large.
+    pub(super) reading: Arc<Semaphore>,
+    /// The boards of the user's files; the last one can be chosen.
+    pub(super) own_boards: Arc<Mutex<Vec<&'static Layout>>>,
+}
+
+/// An error in place of the requested answer.
+struct Refused(StatusCode, Notice);
+
+impl IntoResponse for Refused {
+    fn into_response(self) -> Response {
+        json_response(self.0, &json!(self.1))
+    }
+}
+
+type Answer = Result<Response, Refused>;
+
+fn json_response(status: StatusCode, value: &Value) -> Response {
+    (status, [(header::CONTENT_TYPE, "application/json")], value.to_string()).into_response()
+}
+
+fn done() -> Answer {
+    Ok(json_response(StatusCode::OK, &json!({})))
+}
+
+fn bad(words: impl Into<String>, advice: &str) -> Refused {
+    Refused(StatusCode::BAD_REQUEST, Notice::failed(words, advice))
+}
+
+impl From<upload::Refused> for Refused {
+    fn from((status, notice): upload::Refused) -> Self {
+        Self(status, notice)
+    }
+}
+
+impl From<Refusal> for Refused {
+    fn from(refusal: Refusal) -> Self {
+        match refusal {
+            Refusal::Busy(words) => Self(
+                StatusCode::CONFLICT,
+                Notice::failed(
+                    format!("another task is running: {words}"),
+                    "wait until it has finished, or cancel it",
+                ),
+            ),
+            Refusal::NotReady(words) => {
+                Self(StatusCode::CONFLICT, Notice::failed(words, "choose an adapter and connect to it first"))
+            }
+        }
+    }
+}
+
+/// The files of the page. They are part of the program, so nothing must be installed or downloaded.
+const FILES: [(&str, &str, &str); 12] = [
+    ("", HTML, include_str!("page/index.html")),
+    ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
+    ("style.css", CSS, include_str!("page/style.css")),
+    ("app.js", SCRIPT, include_str!("page/app.js")),
+    ("api.js", SCRIPT, include_str!("page/api.js")),
+    ("bus.js", SCRIPT, include_str!("page/bus.js")),
+    ("devices.js", SCRIPT, include_str!("page/devices.js")),
+    ("dom.js", SCRIPT, include_str!("page/dom.js")),
+    ("kept.js", SCRIPT, include_str!("page/kept.js")),
+    ("reports.js", SCRIPT, include_str!("page/reports.js")),
+    ("uPlot.css", CSS, include_str!("page/uPlot.min.css")),
+    ("uPlot.js", SCRIPT, include_str!("page/uPlot.iife.min.js")),
+];
+const HTML: &str = "text/html; charset=utf-8";
+const CSS: &str = "text/css; charset=utf-8";
+const SCRIPT: &str = "text/javascript; charset=utf-8";
+
+/// All routes, behind the guard.
+pub(super) fn router(site: Site, who: Guard) -> Router {
+    let at = |name: &str| format!("/{}/{name}", who.token);
+    let mut router = Router::new();
+    for (name, kind, content) in FILES {
+        router =
+            router.route(&at(name), get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }));
+    }
+    router
+        .route(&at("events"), get(take_events))
+        .route(&at("adapters"), get(list))
+        .route(&at("trace"), get(trace))
+        .route(&at("firmware"), post(take_file))
+        .route(&at("readback"), get(readback))
+        .route(&at("open"), post(open))
+        .route(&at("close"), post(close))
+        .route(&at("settings"), post(settings))
+        .route(&at("scan"), post(scan))
+        .route(&at("update"), post(update))
+        .route(&at("step"), post(step))
+        .route(&at("fastscan"), post(fastscan))
+        .route(&at("assign"), post(assign))
+        .route(&at("cancel"), post(cancel))
+        .layer(DefaultBodyLimit::max(BODY_MAX))
+        .layer(middleware::from_fn_with_state(who, guard))
+        .with_state(site)
+}
+
+/// Parses a JSON body. A form of a foreign page cannot send one.
+fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
+    let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    if kind.split(';').next() != Some("application/json") {
+        return Err(Refused(
+            StatusCode::UNSUPPORTED_MEDIA_TYPE,
+            Notice::failed("the request is not JSON", "send it as application/json"),
+        ));
+    }
+    serde_json::from_slice(bytes)
+        .map_err(|error| bad(format!("the request cannot be read: {error}"), "reload the page"))
+}
+
+#[derive(Deserialize)]
+struct Wanted {
+    #[serde(default)]
+    frames: u8,
+}
+
+async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> Answer {
+    match events::stream(site.shared, &site.readers, wanted.frames != 0) {
+        Some(stream) => Ok(stream.into_response()),
+        None => Err(Refused(
+            StatusCode::SERVICE_UNAVAILABLE,
+            Notice::failed("too many pages are open", "close some of them"),
+        )),
+    }
+}
+
+async fn list(State(site): State<Site>) -> Response {
+    let boards: Vec<&str> = boards(&site).iter().map(|layout| layout.board).collect();
+    let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
+    let value = json!({
+        "adapters": found,
+        "boards": boards,
+        "trial": FlashOptions::default().trial_run,
+        "version": env!("CARGO_PKG_VERSION"),
+        "file_max": FILE_MAX,
+    });
+    json_response(StatusCode::OK, &value)
+}
+
+/// A file for the user to save.
+fn download(name: &str, kind: &'static str, content: impl IntoResponse) -> Response {
+    let disposition = format!("attachment; filename=\"{name}\"");
+    ([(header::CONTENT_TYPE, kind.to_string()), (header::CONTENT_DISPOSITION, disposition)], content)
+        .into_response()
+}
+
+async fn trace(State(site): State<Site>) -> Response {
+    let text = tokio::task::spawn_blocking(move || {
+        // Formatted without the lock, so that the bus continues.
+        let (log, forgotten) = lock(&site.shared.frames).log();
+        candump(&log, forgotten)
+    });
+    download("coflash.log", "text/plain; charset=utf-8", text.await.unwrap_or_default())
+}
+
+async fn readback(State(site): State<Site>) -> Answer {
+    let bytes = lock(&site.shared.readback).clone();
+    let shown = site.shared.look(|state| state.readback.clone());
+    let (Some(bytes), Some(shown)) = (bytes, shown) else {
+        return Err(Refused(StatusCode::NOT_FOUND, Notice::failed("no program was read", "read one first")));
+    };
+    let name = format!("node{}-program{}.bin", shown.node, shown.program);
+    Ok(download(&name, "application/octet-stream", bytes.to_vec()))
+}
+
+#[derive(Deserialize)]
+struct Open {
+    url: String,
+}
+
+/// Refuses to change the adapter during a task.
+fn idle(site: &Site) -> Result<(), Refused> {
+    match site.shared.look(|state| state.task.as_ref().map(|task| task.words.clone())) {
+        Some(words) => Err(Refusal::Busy(words).into()),
+        None => Ok(()),
+    }
+}
+
+async fn open(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
+    let Open { url } = body(&headers, &bytes)?;
+    idle(&site)?;
+    site.shared.order(Order::Open(url.trim().to_string()))?;
+    done()
+}
+
+async fn close(State(site): State<Site>) -> Answer {
+    idle(&site)?;
+    site.shared.order(Order::Close)?;
+    done()
+}
+
+#[derive(Deserialize)]
+struct Named {
+    name: String,
+}
+
+async fn take_file(
+    State(site): State<Site>,
+    Query(named): Query<Named>,
+    headers: HeaderMap,
+    body: Body,
+) -> Answer {
+    idle(&site)?;
+    let Upload { bytes, room } = site.room.read(&headers, body).await?;
+    if named.name.to_ascii_lowercase().ends_with(".toml") {
+        return own_board(&site, &named.name, &bytes).await;
+    }
+    let settings = site.shared.look(|state| state.settings.clone());
+    let answer = load(&site, Arc::new(bytes), named.name, settings).await;
+    drop(room);
+    answer
+}
+
+#[derive(Deserialize)]
+struct Choice {
+    board: Option<String>,
+    program: u8,
+}
+
+/// After a change of the settings, the file is converted again.
+async fn settings(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
+    let Choice { board, program } = body(&headers, &bytes)?;
+    idle(&site)?;
+    let board = match board.as_deref().filter(|board| !board.is_empty()) {
+        None => None,
+        Some(name) => match boards(&site).into_iter().find(|layout| layout.board == name) {
+            Some(layout) => Some(layout),
+            None => return Err(bad(format!("there is no board '{name}'"), "reload the page")),
+        },
+    };
+    if !(1..=254).contains(&program) {
+        return Err(bad("programs are 1 to 254", "choose another program"));
+    }
+    choose(&site, Settings { board, program }).await
+}
+
+/// The boards to choose from: that of the user's file, then those that are built in.
+fn boards(site: &Site) -> Vec<&'static Layout> {
+    lock(&site.own_boards).last().copied().into_iter().chain(layout::BOARDS.iter().copied()).collect()
+}
+
+/// Takes the file with the memory map of a board, and chooses that board.
+async fn own_board(site: &Site, name: &str, bytes: &[u8]) -> Answer {
+    let name = firmware::printable(name);
+    let is_full = lock(&site.own_boards).len() >= BOARDS_MAX;
+    if is_full {
+        return Err(bad("this coflash has taken too many memory maps", "start it again"));
+    }
+    let layout = board::parse(&String::from_utf8_lossy(bytes)).map_err(|error| {
+        bad(
+            format!("{name}: {error}"),
+            "choose the file that `cargo xtask layout --toml` wrote for the board",
+        )
+    })?;
+    lock(&site.own_boards).push(layout);
+    let program = site.shared.look(|state| state.settings.program);
+    choose(site, Settings { board: Some(layout), program }).await
+}
+
+/// Applies settings; the firmware file is converted again.
+async fn choose(site: &Site, settings: Settings) -> Answer {
+    site.shared.change(|state| {
+        state.settings = settings.clone();
+        state.judge();
+    });
+    let loaded = lock(&site.shared.firmware).clone();
+    match loaded {
+        Some(loaded) => load(site, loaded.bytes.clone(), loaded.shown.name.clone(), settings).await,
+        None => done(),
+    }
+}
+
+/// Reads a file on a separate thread, so that the pages stay responsive.
+async fn load(site: &Site, bytes: Arc<Vec<u8>>, name: String, settings: Settings) -> Answer {
+    let Ok(_turn) = site.reading.try_acquire() else {
+        return Err(Refusal::Busy("another file is being read".to_string()).into());
+    };
+    let read = tokio::task::spawn_blocking(move || firmware::load(bytes, &name, &settings)).await;
+    let fault = |_| {
+        Notice::failed(
+            "the file cannot be read because of an internal error of coflash",
+            "report it, with the file",
+        )
+    };
+    match read.map_err(fault).and_then(|read| read) {
+        Ok(loaded) => {
+            let shown = loaded.shown.clone();
+            *lock(&site.shared.firmware) = Some(Arc::new(loaded));
+            site.shared.change(|state| {
+                state.firmware = Some(shown);
+                state.judge();
+            });
+            done()
+        }
+        Err(notice) => {
+            // The previous file is no longer the one that the user means.
+            *lock(&site.shared.firmware) = None;
+            site.shared.change(|state| {
+                state.firmware = None;
+                state.judge();
+            });
+            Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice))
+        }
+    }
+}
+
+async fn scan(State(site): State<Site>) -> Answer {
+    site.shared.begin(Job::Scan)?;
+    done()
+}
+
+#[derive(Deserialize)]
+struct Update {
+    nodes: Vec<u8>,
+    trial: bool,
+    start: bool,
+}
+
+fn node_id(number: u8) -> Result<NodeId, Refused> {
+    NodeId::new(number).ok_or_else(|| bad(format!("{number} is not a node-ID"), "node-IDs are 1 to 127"))
+}
+
+async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
+    let Update { nodes, trial, start } = body(&headers, &bytes)?;
+    let Some(file) = lock(&site.shared.firmware).clone() else {
+        return Err(bad("there is no firmware file", "drop one on the page, or choose one"));
+    };
+    let mut wanted: Vec<NodeId> = Vec::new();
+    for node in nodes {
+        let node = node_id(node)?;
+        if !wanted.contains(&node) {
+            wanted.push(node);
+        }
+    }
+    if wanted.is_empty() {
+        return Err(bad("no device is chosen", "choose one in the table"));
+    }
+    let (program, misfit) = site.shared.look(|state| {
+        let devices = state.devices.iter().flat_map(|devices| devices.values());
+        let misfit =
+            devices.filter(|device| wanted.iter().any(|node| node.get() == device.node)).find_map(|device| {
+                let verdict = device.verdict.as_ref().filter(|verdict| verdict.fits == Fits::No)?;
+                Some(format!("the file is not for node {}: {}", device.node, verdict.words))
+            });
+        (state.settings.program, misfit)
+    });
+    if let Some(words) = misfit {
+        let notice =
+            Notice::failed(words, "choose the file that is made for this device; no device was changed");
+        return Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice));
+    }
+    site.shared.begin(Job::Update { nodes: wanted, file, program, trial, start })?;
+    done()
+}
+
+#[derive(Deserialize)]
+struct Single {
+    node: u8,
+    program: u8,
+    step: Name,
+}
+
+/// The name of a step in a request.
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Name {
+    CallBack,
+    Release,
+    Withhold,
+    Erase,
+    Start,
+    ReadBack,
+}
+
+async fn step(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
+    let Single { node, program, step } = body(&headers, &bytes)?;
+    let step = match step {
+        Name::CallBack => Step::CallBack,
+        Name::Release => Step::Release,
+        Name::Withhold => Step::Withhold,
+        Name::Erase => Step::Erase,
+        Name::Start => Step::Start,
+        Name::ReadBack => Step::ReadBack,
+    };
+    if !(1..=254).contains(&program) {
+        return Err(bad("programs are 1 to 254", "choose another program"));
+    }
+    site.shared.begin(Job::Step { node: node_id(node)?, program, step })?;
+    done()
+}
+
+async fn fastscan(State(site): State<Site>) -> Answer {
+    site.shared.begin(Job::Fastscan)?;
+    done()
+}
+
+#[derive(Deserialize)]
+struct Assign {
+    /// Vendor-ID, product code, revision, serial number.
+    address: [u32; 4],
+    node: Option<u8>,
+    /// In kbit/s.
+    bit_rate: Option<u32>,
+    store: bool,
+}
+
+async fn assign(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
+    let Assign { address, node, bit_rate, store } = body(&headers, &bytes)?;
+    let [vendor_id, product_code, revision, serial_number] = address;
+    let address = LssAddress { vendor_id, product_code, revision, serial_number };
+    let node = node.map(node_id).transpose()?;
+    let rate = |kbits: u32| {
+        let known = (0..=8).filter_map(BitRate::from_index);
+        let found = known.into_iter().find(|rate| rate.bits_per_second() == kbits.checked_mul(1000));
+        found.ok_or_else(|| bad(format!("LSS has no bit rate of {kbits} kbit/s"), "choose another"))
+    };
+    let bit_rate = bit_rate.map(rate).transpose()?;
+    if node.is_none() && bit_rate.is_none() {
+        return Err(bad("neither a node-ID nor a bit rate is given", "give one of them"));
+    }
+    if let Some(node) = node {
+        let taken = site.shared.look(|state| {
+            let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get()))?;
+            (device.answers && device.identity != address_of(&address)).then_some(())
+        });
+        if taken.is_some() {
+            return Err(bad(format!("another device already has node-ID {node}"), "choose a free one"));
+        }
+    }
+    site.shared.begin(Job::Assign { address, node, bit_rate, store })?;
+    done()
+}
+
+fn address_of(address: &LssAddress) -> [Option<u32>; 4] {
+    [address.vendor_id, address.product_code, address.revision, address.serial_number].map(Some)
+}
+
+async fn cancel(State(site): State<Site>) -> Answer {
+    site.shared.cancel();
+    done()
+}

@@ -1,0 +1,463 @@
+//! The state that all pages show. Each change is sent to every page.
+
+use std::collections::BTreeMap;
+
+use canopen::program::ProgramState;
+use canopen::NodeId;
+use serde::{Serialize, Serializer};
+use shared_abi::layout::Layout;
+
+use coboot_can::decode::state_words;
+use coflash_core::device::info::{DeviceInfo, ProgramInfo};
+use coflash_core::device::lss::LssAddress;
+use coflash_core::device::scan::Found;
+use coflash_core::device::Error;
+use coflash_core::update::Event;
+
+/// The most reports; the oldest are dropped first.
+const REPORTS: usize = 500;
+/// The most lines of one device's update.
+const LINES: usize = 60;
+
+/// The complete state in the form for the page.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct State {
+    pub(super) adapter: Adapter,
+    /// `None` until the bus was scanned.
+    pub(super) devices: Option<BTreeMap<u8, Device>>,
+    pub(super) settings: Settings,
+    pub(super) firmware: Option<Firmware>,
+    /// The running task; only one runs at a time.
+    pub(super) task: Option<Task>,
+    /// The devices of the running update, or of the last one.
+    pub(super) updates: Vec<Update>,
+    /// The result of the last task, or of the last attempt to open the adapter.
+    pub(super) notice: Option<Notice>,
+    /// The number of notices: distinguishes a new notice with the same text.
+    pub(super) notices: u64,
+    /// The device found by fastscan.
+    pub(super) lss: Option<Lss>,
+    pub(super) readback: Option<Readback>,
+    pub(super) reports: Vec<Report>,
+}
+
+/// The access to the bus.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Adapter {
+    pub(super) url: String,
+    pub(super) state: Connection,
+    /// Why it is lost.
+    pub(super) words: Option<String>,
+    /// A gateway shows no frames.
+    pub(super) gateway: bool,
+    /// In bit/s, if the URL contains it.
+    pub(super) bit_rate: Option<u32>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Connection {
+    #[default]
+    Closed,
+    Opening,
+    Open,
+    /// It was open, and the worker tries to open it again.
+    Lost,
+}
+
+/// The settings for reading files, and the program number.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Settings {
+    /// The board that gives the region of a program: built in, or from a file of the user.
+    #[serde(serialize_with = "name")]
+    pub(super) board: Option<&'static Layout>,
+    /// Sub-index of 1F50h.
+    pub(super) program: u8,
+}
+
+fn name<S: Serializer>(board: &Option<&'static Layout>, to: S) -> Result<S::Ok, S::Error> {
+    board.map(|board| board.board).serialize(to)
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { board: None, program: 1 }
+    }
+}
+
+/// A node that answered or was heard.
+#[derive(Clone, Debug, Default, Serialize)]
+pub(super) struct Device {
+    pub(super) node: u8,
+    pub(super) answers: bool,
+    /// Whether the bootloader runs.
+    pub(super) bootloader: bool,
+    /// The words for what runs.
+    pub(super) runs: String,
+    pub(super) name: Option<String>,
+    pub(super) hardware: Option<String>,
+    pub(super) software: Option<String>,
+    /// 1018h/1 to 4.
+    pub(super) identity: [Option<u32>; 4],
+    /// NMT state of the last heartbeat.
+    pub(super) heartbeat: Option<&'static str>,
+    pub(super) dialect: Option<&'static str>,
+    /// What it reports about sealed images, in words.
+    pub(super) sealed: Option<String>,
+    /// Why it stays in its bootloader, in words (2007h).
+    pub(super) state: Option<String>,
+    pub(super) programs: Vec<Program>,
+    /// The comparison of the firmware file's label with this device.
+    pub(super) verdict: Option<Verdict>,
+}
+
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Program {
+    pub(super) number: u8,
+    pub(super) crc: Option<u32>,
+    /// The state (none, stopped or running) and the flash status.
+    pub(super) words: String,
+}
+
+/// The comparison of a file with a device.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Verdict {
+    pub(super) fits: Fits,
+    pub(super) words: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Fits {
+    Yes,
+    No,
+    /// File or device does not give its identity.
+    Unknown,
+}
+
+/// The chosen firmware file.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Firmware {
+    pub(super) name: String,
+    pub(super) size: usize,
+    /// The output of `inspect`.
+    pub(super) inspection: String,
+    /// Bytes of the program in flash.
+    pub(super) program_size: u32,
+    pub(super) crc: u32,
+    pub(super) vendor_id: Option<u32>,
+    pub(super) product_code: Option<u32>,
+    pub(super) version: Option<String>,
+    /// Bytes that the conversion left out.
+    pub(super) left_out: u64,
+    /// Further properties of a sealed image.
+    pub(super) seal: Option<Seal>,
+}
+
+/// The properties of a sealed image from its manifest; the device checks whether they are valid.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Seal {
+    /// The program's number on the board.
+    pub(super) program: u8,
+    /// The security counter.
+    pub(super) counter: u32,
+    /// The ids of the keys that have signed it.
+    pub(super) signed_by: Vec<u32>,
+    /// The ids of the key-encryption keys that decrypt it; empty if it is not encrypted.
+    pub(super) opened_by: Vec<u32>,
+    /// Its flags in words.
+    pub(super) flags: Vec<&'static str>,
+}
+
+/// The running task.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Task {
+    pub(super) kind: &'static str,
+    pub(super) words: String,
+    pub(super) cancelling: bool,
+    /// In percent, if it is known.
+    pub(super) percent: Option<u32>,
+}
+
+/// The update of one device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Update {
+    pub(super) node: u8,
+    pub(super) phase: Phase,
+    pub(super) done: usize,
+    pub(super) total: usize,
+    /// The last event.
+    pub(super) words: String,
+    pub(super) advice: Option<String>,
+    pub(super) lines: Vec<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Phase {
+    Waiting,
+    Running,
+    Done,
+    Failed,
+}
+
+/// The result of a task.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Notice {
+    pub(super) ok: bool,
+    pub(super) words: String,
+    /// What to do next.
+    pub(super) advice: Option<String>,
+}
+
+/// A device without a node-ID.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub(super) struct Lss {
+    pub(super) vendor_id: u32,
+    pub(super) product_code: u32,
+    pub(super) revision: u32,
+    pub(super) serial_number: u32,
+}
+
+/// A program that was read from a device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Readback {
+    pub(super) node: u8,
+    pub(super) program: u8,
+    pub(super) size: usize,
+}
+
+/// The result of an update of one device, for printing.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Report {
+    pub(super) number: u64,
+    /// The number of the run; the devices of one update have the same number.
+    pub(super) run: u64,
+    /// Seconds since 1970, UTC.
+    pub(super) date: u64,
+    pub(super) node: u8,
+    pub(super) ok: bool,
+    pub(super) words: String,
+    pub(super) device: Option<String>,
+    pub(super) serial_number: Option<u32>,
+    pub(super) file: String,
+    /// The CRC of the program in the device, as the device reports it.
+    pub(super) crc: Option<u32>,
+    /// The CRC of the program in the file.
+    pub(super) file_crc: u32,
+    /// The value of 100Ah after the update.
+    pub(super) version: Option<String>,
+    /// The file's software version.
+    pub(super) file_version: Option<String>,
+    pub(super) seconds: f64,
+    pub(super) adapter: String,
+    pub(super) tool: &'static str,
+}
+
+impl State {
+    /// Replaces the known devices by the result of a scan.
+    pub(super) fn found(&mut self, found: &BTreeMap<NodeId, Found>) {
+        let devices = found.iter().map(|(node, found)| {
+            let device = match &found.info {
+                Some(info) => Device::of(info),
+                None => {
+                    let no_answer = || "no answer by SDO".to_string();
+                    let runs = found.but.as_ref().map_or_else(no_answer, |but| format!("answers, but {but}"));
+                    Device { node: node.get(), runs, ..Device::default() }
+                }
+            };
+            (node.get(), Device { heartbeat: found.state.map(state_words), ..device })
+        });
+        self.devices = Some(devices.collect());
+        self.judge();
+    }
+
+    /// Updates one device.
+    pub(super) fn told(&mut self, info: &DeviceInfo) {
+        let devices = self.devices.get_or_insert_default();
+        let heartbeat = devices.get(&info.node.get()).and_then(|device| device.heartbeat);
+        devices.insert(info.node.get(), Device { heartbeat, ..Device::of(info) });
+        self.judge();
+    }
+
+    /// Marks a device that no longer answers, or has a new node-ID.
+    pub(super) fn silent(&mut self, node: NodeId) {
+        if let Some(device) = self.devices.as_mut().and_then(|devices| devices.get_mut(&node.get())) {
+            device.answers = false;
+            device.runs = "no answer by SDO".to_string();
+        }
+    }
+
+    /// Compares the file with each device.
+    pub(super) fn judge(&mut self) {
+        let number = self.settings.program;
+        for device in self.devices.iter_mut().flat_map(BTreeMap::values_mut) {
+            device.verdict = self.firmware.as_ref().map(|file| file.against(device, number));
+        }
+    }
+
+    pub(super) fn notice(&mut self, notice: Notice) {
+        self.notices += 1;
+        self.notice = Some(notice);
+    }
+
+    pub(super) fn report(&mut self, report: Report) {
+        if self.reports.len() >= REPORTS {
+            self.reports.remove(0);
+        }
+        self.reports.push(report);
+    }
+
+    /// The number of the next run.
+    pub(super) fn next_run(&self) -> u64 {
+        self.reports.last().map_or(1, |report| report.run + 1)
+    }
+}
+
+impl Device {
+    fn of(info: &DeviceInfo) -> Self {
+        Self {
+            node: info.node.get(),
+            answers: true,
+            bootloader: info.device_type.is_bootloader(),
+            runs: if info.device_type.is_bootloader() { "bootloader" } else { "application" }.to_string(),
+            name: info.name.clone(),
+            hardware: info.hardware_version.clone(),
+            software: info.software_version.clone(),
+            identity: info.identity,
+            heartbeat: None,
+            dialect: info.dialect.map(|dialect| dialect.name()),
+            sealed: info.security.as_ref().map(ToString::to_string),
+            state: info.state.map(|state| state.to_string()),
+            programs: info.programs.iter().map(Program::of).collect(),
+            verdict: None,
+        }
+    }
+
+    /// The values of 1018h/1 and 1018h/2, if they are not 0.
+    pub(super) fn product(&self) -> Option<(u32, u32)> {
+        match (self.identity[0], self.identity[1]) {
+            (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
+            _ => None,
+        }
+    }
+
+    /// The CRC of one of its programs.
+    pub(super) fn crc(&self, number: u8) -> Option<u32> {
+        self.programs.iter().find(|program| program.number == number).and_then(|program| program.crc)
+    }
+}
+
+impl Program {
+    fn of(info: &ProgramInfo) -> Self {
+        const STOPPED: u32 = ProgramState::Stopped as u32;
+        const RUNNING: u32 = ProgramState::Running as u32;
+        const ABSENT: u32 = ProgramState::Absent as u32;
+        let mut words = match info.control {
+            // 1F56h reads 0 if there is no program.
+            Some(STOPPED) if info.crc == Some(0) => "none".to_string(),
+            Some(STOPPED) => "stopped".to_string(),
+            Some(RUNNING) => "running".to_string(),
+            Some(ABSENT) => "none".to_string(),
+            Some(other) => format!("state {other:02X}h"),
+            None => "not reported".to_string(),
+        };
+        match info.status {
+            Some(status) if status.busy => words += ", busy",
+            Some(status) => {
+                if let Some(error) = status.error {
+                    words += &format!(", {error} ({:02X}h)", error.code());
+                }
+            }
+            None => {}
+        }
+        if let Some(version) = info.release() {
+            words += &format!(", {version}");
+        }
+        Self { number: info.number, crc: info.crc, words }
+    }
+}
+
+impl Firmware {
+    /// Compares the file with a device.
+    fn against(&self, device: &Device, number: u8) -> Verdict {
+        let verdict = |fits, words: String| Verdict { fits, words };
+        let told = match (self.vendor_id, self.product_code) {
+            (Some(vendor), Some(product)) if vendor != 0 || product != 0 => Some((vendor, product)),
+            _ => None,
+        };
+        match (told, device.product()) {
+            (Some((file, _)), Some((own, _))) if file != own => {
+                verdict(Fits::No, format!("made for vendor-ID {file:08X}h, this device has {own:08X}h"))
+            }
+            (Some((_, file)), Some((_, own))) if file != own => {
+                verdict(Fits::No, format!("made for product code {file:08X}h, this device has {own:08X}h"))
+            }
+            _ if device.crc(number) == Some(self.crc) => {
+                verdict(Fits::Yes, "in the device already (same CRC)".to_string())
+            }
+            (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
+            (None, _) => verdict(Fits::Unknown, "the file does not name its target device".to_string()),
+            (_, None) => verdict(Fits::Unknown, "the device does not report its product".to_string()),
+        }
+    }
+}
+
+impl Update {
+    pub(super) fn waiting(node: NodeId) -> Self {
+        Self {
+            node: node.get(),
+            phase: Phase::Waiting,
+            done: 0,
+            total: 0,
+            words: "waiting for its turn".to_string(),
+            advice: None,
+            lines: Vec::new(),
+        }
+    }
+
+    /// Records an event.
+    pub(super) fn event(&mut self, event: &Event) {
+        self.phase = Phase::Running;
+        if let Event::Progress { done, total } = *event {
+            (self.done, self.total) = (done, total);
+            self.words = "sending the program".to_string();
+            return;
+        }
+        // The result reports it, together with the state of the device.
+        if let Event::Done(_) = event {
+            return;
+        }
+        self.words = event.to_string();
+        if self.lines.len() < LINES {
+            self.lines.push(self.words.clone());
+        }
+    }
+
+    pub(super) fn failed(&mut self, error: &Error, left: &str) {
+        self.phase = Phase::Failed;
+        self.words = format!("{error}. The device: {left}.");
+        self.advice = Some(error.advice());
+    }
+}
+
+impl Notice {
+    pub(super) fn done(words: impl Into<String>) -> Self {
+        Self { ok: true, words: words.into(), advice: None }
+    }
+
+    pub(super) fn failed(words: impl Into<String>, advice: impl Into<String>) -> Self {
+        Self { ok: false, words: words.into(), advice: Some(advice.into()) }
+    }
+
+    pub(super) fn error(error: &Error) -> Self {
+        Self::failed(error.to_string(), error.advice())
+    }
+}
+
+impl From<LssAddress> for Lss {
+    fn from(address: LssAddress) -> Self {
+        let LssAddress { vendor_id, product_code, revision, serial_number } = address;
+        Self { vendor_id, product_code, revision, serial_number }
+    }
+}
