@@ -107,7 +107,7 @@ mod tests {
             file("core/canopen/src/b/c.rs", 30, 21),
             file("core/canopen/tests/d.rs", 100, 100),
             file("/y/core/seal/src/lib.rs", 50, 50),
-            file("coflash/src/main.rs", 70, 0),
+            file("coflash/cli/src/main.rs", 70, 0),
         ];
         let report = json!({"data": [{"files": files}]});
         let expected = json!({"crate": "core/canopen", "lines": 40, "reached": 30, "percent": 75.0});
