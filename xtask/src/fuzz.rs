@@ -10,7 +10,7 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, files, process, setup, test, workspace, Outcome};
+use crate::{corpus, evidence, files, process, setup, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
@@ -60,7 +60,7 @@ fn longest_commands(target: &str) -> Option<u32> {
 /// nothing of others is compiled again.
 fn replay_all(targets: &[String]) -> Outcome {
     let mut build = process::cargo("build");
-    build.current_dir(workspace::root()).args(test::on_host());
+    build.current_dir(workspace::root()).args(workspace::on_host());
     process::run(build.args(targets.iter().map(|target| format!("--bin={target}"))))?;
     for target in targets {
         let mut program = Command::new(workspace::target_dir().join("debug").join(target));

@@ -68,6 +68,18 @@ pub fn shown(path: &Path) -> String {
     path.strip_prefix(root()).unwrap_or(path).display().to_string()
 }
 
+/// The packages that are built for a chip, or by another tool.
+pub const NOT_ON_HOST: [&str; 6] =
+    ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
+
+/// Selects the packages that are built for this machine. What cargo builds at one time has the features
+/// of all selected packages: calls that select the same build the crates of others once.
+pub fn on_host() -> Vec<String> {
+    let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]);
+    let without = without.flat_map(|package| ["--exclude", package]).map(str::to_owned);
+    ["--workspace".to_owned()].into_iter().chain(without).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use shared_abi::layout::nucleo_f446re::LAYOUT;

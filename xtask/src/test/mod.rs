@@ -206,23 +206,11 @@ fn room() -> Outcome {
     }
 }
 
-/// The packages that are built for a chip, or by another tool.
-const NOT_ON_HOST: [&str; 6] =
-    ["bsp", "bootloader", "app-template", "app-template-v2", "test-app", "coflash-python"];
-
-/// Selects the packages that are built for this machine. What cargo builds at one time has the features
-/// of all selected packages: calls that select the same build the crates of others once.
-pub fn on_host() -> Vec<String> {
-    let without = NOT_ON_HOST.iter().chain(&["xtask", "coboot-zencan"]);
-    let without = without.flat_map(|package| ["--exclude", package]).map(str::to_owned);
-    ["--workspace".to_owned()].into_iter().chain(without).collect()
-}
-
 /// The test programs, those with firmware for the default board; and the programs that tests start, the
 /// host tool and the node, which cargo builds for their tests. The jobs of the repository are tested in
 /// .ci/run.
 fn test_programs() -> Outcome<Vec<Program>> {
-    programs::build(&[&build::board_args(DEFAULT)[..], &on_host()].concat())
+    programs::build(&[&build::board_args(DEFAULT)[..], &workspace::on_host()].concat())
 }
 
 /// The test programs that run the firmware of a board, up to a tier.
@@ -230,13 +218,13 @@ fn board_programs(board: &Layout, tier: Tier) -> Outcome<Vec<Program>> {
     let all = ["device", "update", "sealed", "foreign", "port"].into_iter();
     let tests = all.filter(|name| tier == Tier::All || OF_EACH_CHIP.iter().any(|(of, _)| of == name));
     let tests: Vec<_> = tests.map(|name| format!("--test={name}")).collect();
-    programs::build(&[&build::board_args(board)[..], &on_host(), &tests].concat())
+    programs::build(&[&build::board_args(board)[..], &workspace::on_host(), &tests].concat())
 }
 
 /// Builds the programs that tests start, for tests that are chosen by words.
 fn programs_of_ours() -> Outcome {
     let mut cargo = process::cargo("build");
-    cargo.current_dir(workspace::root()).args(on_host());
+    cargo.current_dir(workspace::root()).args(workspace::on_host());
     process::run(cargo.args(["--bin=coflash", "--bin=coboot-node", "--bin=emulate"]))
 }
 
@@ -316,7 +304,7 @@ fn ci(summary: &mut Summary) -> Outcome {
     build_images(Tier::Ci)?;
     runner::run(later(Tier::Ci, summary)?, summary);
     let mut doc = process::cargo("test");
-    let without = NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
+    let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
     doc.current_dir(workspace::root()).args(["--doc", "--workspace", "--quiet"]).args(without);
     runner::count("documentation", process::run(&mut doc), summary);
     other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
