@@ -3,13 +3,15 @@
 use super::adapter::{Adapter, AdapterError};
 use super::found::{Found, Kind, Missing};
 
+type Opened = Result<Box<dyn Adapter + Send>, AdapterError>;
+
 /// What an adapter takes of a URL, what opens it, and what finds it.
 pub(super) struct Row {
     kind: Kind,
     /// Checks what the URL has after the scheme, and the bit rate, if it has one.
     pub(super) check: fn(&str, Option<u32>) -> Result<(), &'static str>,
     /// Opens what was checked, at a bit rate in bit/s.
-    pub(super) open: fn(&str, u32) -> Result<Box<dyn Adapter + Send>, AdapterError>,
+    pub(super) open: fn(&str, u32) -> Opened,
     /// Lists those of this computer.
     pub(super) list: fn() -> Result<Vec<Found>, Missing>,
 }

@@ -3,7 +3,7 @@
 //! A gateway takes requests such as "read this object of that node" and does the transfer on its
 //! bus by itself. The tool sees no frames: commands that listen to the bus (scan, monitor, LSS)
 //! need an [`Adapter`](super::Adapter). Commands that read and write objects, the update among
-//! them, work with both, because a [`Session`](crate::Session) hides the difference.
+//! them, work with both, because a `Session` of `coflash-core` hides the difference.
 //!
 //! To add a gateway, add one file beside [`cia309`](super::cia309) and one line to
 //! [`Link::open`](super::Link::open).

@@ -7,7 +7,7 @@ use super::gateway::Gateway;
 use super::{cia309, open};
 
 /// Access to devices. Commands that need frames use the bus; commands that need objects use a
-/// [`Session`](crate::Session::on).
+/// `Session` of `coflash-core`.
 pub enum Link {
     /// A CAN bus.
     Bus(Box<dyn Adapter + Send>),

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
-use coboot_fuzz::Input;
 use coboot_can::{Adapter, AdapterError};
+use coboot_fuzz::Input;
 use coflash_conform::{checks, run, Means, Outcome};
 use coflash_core::file::convert::{blocks_of, Options, Region};
 use coflash_core::update::Program;

@@ -9,9 +9,9 @@ use std::io::{self, Read, Write};
 use std::time::Duration;
 
 use canopen::Frame;
-use coboot_fuzz::Input;
 use coboot_can::socketcand::{frame_message, parse_frame, parse_send, send_message, Messages};
 use coboot_can::{Adapter, Line, Slcan};
+use coboot_fuzz::Input;
 use embedded_can::Frame as _;
 
 /// A line that gives this text in pieces and then ends; with `echo`, it returns the written text.
