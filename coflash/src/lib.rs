@@ -7,7 +7,7 @@
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
 //! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `bus`, `device`, `file`, `update` |
-//! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device` |
+//! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device`, `file`, `update` |
 //! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
 //!
 //! The command line (`src/cli`, feature `cli`) is an ordinary user of this library: decisions are
@@ -17,19 +17,19 @@
 //!
 //! ```no_run
 //! use coflash::device::{Session, Timing};
-//! use coflash::file::convert::{blocks_of, Options, Region};
+//! use coflash::file::convert::{program_of, Options, Region};
 //! use coflash::update::{flash, FlashOptions};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let layout = shared_abi::layout::by_name("stm32f407g-disc1").ok_or("unknown board")?;
 //! let options = Options::default().region(Region::Strict(layout.programs[0].into()));
 //! let firmware = coflash::file::load("app.elf".as_ref(), None, None)?;
-//! let blocks = blocks_of(firmware, &options)?.file;
+//! let program = program_of(firmware, &options)?.program;
 //!
 //! let mut bus = coflash::bus::open("socketcand://127.0.0.1:29536/can0")?;
 //! let node = canopen::NodeId::new(1).ok_or("no such node-ID")?;
 //! let mut session = Session::new(&mut bus, node, Timing::default());
-//! flash(&mut session, &blocks, &FlashOptions::default(), &mut |event| println!("{event}"))?;
+//! flash(&mut session, &program, &FlashOptions::default(), &mut |event| println!("{event}"))?;
 //! # Ok(())
 //! # }
 //! ```

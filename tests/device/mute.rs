@@ -8,9 +8,9 @@ use coboot_tests::firmware;
 use coflash::bus::{Adapter, AdapterError};
 use coflash::device::error::TrialFailure;
 use coflash::device::{Session, Timing};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options};
+use coflash::file::convert::{program_of, Options};
 use coflash::file::read::{read, Format};
+use coflash::file::Program;
 use coflash::update::{
     catch, flash, CatchOptions, Caught, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions,
 };
@@ -22,14 +22,14 @@ const HERE: [u8; 2] = [0xFE, 0xE7];
 const DARK: Duration = Duration::from_millis(2345);
 
 /// A vector table, and a reset handler with an endless loop.
-fn mute() -> BlockFile {
+fn mute() -> Program {
     let program = firmware::board().programs[0].base;
     let mut image = vec![0; 0x400];
     image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
     image[4..8].copy_from_slice(&((program + 0x200) | 1).to_le_bytes());
     image[0x200..0x202].copy_from_slice(&HERE);
     let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
-    blocks_of(image, &Options::default()).unwrap().file
+    program_of(image, &Options::default()).unwrap().program
 }
 
 fn board() -> Bench {

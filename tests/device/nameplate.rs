@@ -7,9 +7,9 @@ use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
 use coflash::bus::SdoIds;
 use coflash::device::{Doing, Session, Timing};
-use coflash::file::block_file::BlockFile;
-use coflash::file::convert::{blocks_of, Options, Region};
+use coflash::file::convert::{program_of, Options, Region};
 use coflash::file::read::{read, Format};
+use coflash::file::Program;
 use coflash::update::{flash, FlashOptions};
 use coflash::Error;
 use shared_abi::label::Label;
@@ -91,10 +91,10 @@ fn program(image: &str, vendor_id: u32, product_code: u32) -> Vec<u8> {
 }
 
 /// It as the blocks that the tool sends; block 0 has what the label has.
-fn blocks(bytes: &[u8]) -> BlockFile {
+fn blocks(bytes: &[u8]) -> Program {
     let place = firmware::board().programs[0];
     let file = read(bytes, Some(Format::Raw), Some(place.base)).unwrap();
-    blocks_of(file, &Options::default().region(Region::Strict(place.into()))).unwrap().file
+    program_of(file, &Options::default().region(Region::Strict(place.into()))).unwrap().program
 }
 
 #[test]

@@ -14,6 +14,7 @@ use coboot_tests::serial::SerialLine;
 use coflash::bus::slcan::Slcan;
 use coflash::bus::Adapter;
 use coflash::device::{Session, Timing};
+use coflash::file::block_file::emit;
 use coflash::update::{flash, FlashOptions};
 
 /// A board in its bootloader, with no program installed.
@@ -202,7 +203,7 @@ fn python_canopen_flashes_the_device_through_its_serial_port() {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
     let folder = kit::folder!("virtual-can");
-    let file = folder.write("program.blk", firmware::blocks(firmware::APP_VIRTUAL_CAN).emit());
+    let file = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_VIRTUAL_CAN)));
     let mut endpoint = Endpoint::serial(empty_board());
     let port = endpoint.url().replace("@125k", "");
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/python/canopen_client.py");

@@ -54,7 +54,7 @@ const COFLASH: &[Rule] = &[
     ("device", "bus canopen json setters shared_abi unicode"),
     ("update", "bus canopen device file json setters shared_abi"),
     ("agent", "bus canopen device file shared_abi update"),
-    ("conform", "bus canopen device shared_abi update"),
+    ("conform", "bus canopen device file shared_abi update"),
     ("cli", "agent bus canopen conform device file shared_abi ui update"),
     ("ui", "bus canopen device file shared_abi update"),
 ];

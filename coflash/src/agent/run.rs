@@ -18,7 +18,7 @@ use super::firmware;
 use super::http::{Client, Limits};
 use super::record::{Record, Store};
 use crate::file::limit::MAX_FILE_SIZE;
-use crate::update::Program;
+use crate::update::Payload;
 
 /// What an agent does with its devices.
 pub trait Devices: Sync {
@@ -39,7 +39,7 @@ pub struct Order<'o> {
     /// The device.
     pub device: &'o Device,
     /// The program: fetched, checked and judged.
-    pub program: Program,
+    pub program: Payload,
     /// Whether an earlier agent has seen that the device keeps this program. If it runs, the order
     /// is carried out already.
     pub kept: bool,

@@ -15,8 +15,9 @@ use super::state::{Notice, Phase, Readback, Report};
 use crate::bus::Link;
 use crate::device::lss::{self, BitRate, LssAddress, Master};
 use crate::device::{info, scan, Error, ScanOptions, Session, Timing};
+use crate::file::Target;
 use crate::update::many::{Failed, Job as One};
-use crate::update::{self, steps, Event, FlashOptions, ManyOptions, Target};
+use crate::update::{self, steps, Event, FlashOptions, ManyOptions};
 
 /// The most devices in an update at the same time.
 const AT_ONCE: usize = 8;

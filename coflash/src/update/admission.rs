@@ -8,16 +8,15 @@ use shared_abi::layout;
 
 use super::content::{refusal_number, Content};
 use super::dialect::is_data;
-use super::options::{FlashOptions, Target};
+use super::options::FlashOptions;
 use super::steps::compare_target;
 use crate::device::access::{security_of, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
-use crate::file::image::Image;
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
 use crate::file::sealed::{Refusal, SealedFile};
-use crate::file::{AddressRange, BlockFile};
+use crate::file::{AddressRange, Program};
 
 /// Checks a file for a device with this dialect. Returns whether the check is complete: an
 /// application may not know its region, and then the bootloader is asked later.
@@ -34,21 +33,21 @@ pub(super) fn admit(
     if options.force {
         return Ok(true);
     }
-    let file = match file {
-        Content::Blocks(file) => file,
+    let program = match file {
+        Content::Program(program) => program,
         Content::Sealed(file) => return admit_sealed(session, file, options.program),
     };
     let says = admit_open(session)?;
-    let image = file.image();
     let mut is_judged = true;
     if !is_data(dialect, options.program) {
-        judge(&image, file.program_start(), None).map_err(no_program)?;
-        is_judged = admit_stack(session, file, &image)?;
-        for target in [Target::of_control(file), Target::of_label(&image, file.program_start())] {
-            check_identity(session, target)?;
+        judge(program.image(), program.start(), None).map_err(no_program)?;
+        is_judged = admit_stack(session, program)?;
+        // A value that the device does not report cannot differ.
+        for target in program.targets().into_iter().flatten() {
+            compare_target(session, target, |session, at| told(session.read_number(at)))?;
         }
     }
-    Ok(admit_place(session, file, &image, dialect, options.program)? && is_judged && says)
+    Ok(admit_place(session, program, dialect, options.program)? && is_judged && says)
 }
 
 /// Checks what an application may not know: the stack, the region, and which images the device takes;
@@ -64,13 +63,12 @@ pub(super) fn admit_to_bootloader(
 ) -> Result<bool, Error> {
     match file {
         _ if options.force => Ok(true),
-        Content::Blocks(file) => {
+        Content::Program(program) => {
             admit_open(session)?;
-            let image = file.image();
             if !is_data(dialect, options.program) {
-                admit_stack(session, file, &image)?;
+                admit_stack(session, program)?;
             }
-            admit_place(session, file, &image, dialect, options.program)
+            admit_place(session, program, dialect, options.program)
         }
         Content::Sealed(file) => admit_capable(session, file, options.program),
     }
@@ -156,8 +154,8 @@ fn refused(refusal: &Refusal) -> Error {
 /// Checks a stack that begins at the end of a chip's SRAM: whether the handoff is there depends on the
 /// board, which the device's name (1008h) gives. Returns whether the device has told its name, or need
 /// not.
-fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Result<bool, Error> {
-    let start = file.program_start();
+fn admit_stack(session: &mut Session<'_>, program: &Program) -> Result<bool, Error> {
+    let (image, start) = (program.image(), program.start());
     if StackAtEnd::of(image, start).is_none() {
         return Ok(true);
     }
@@ -169,25 +167,24 @@ fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Re
 
 fn admit_place(
     session: &mut Session<'_>,
-    file: &BlockFile,
-    image: &Image,
+    program: &Program,
     dialect: Dialect,
-    program: u8,
+    number: u8,
 ) -> Result<bool, Error> {
-    let Some(told) = program_region(session, program)? else { return Ok(false) };
+    let Some(told) = program_region(session, number)? else { return Ok(false) };
     let region = AddressRange { first: told.base, last: told.last() };
-    let (start, size) = (file.program_start(), u64::from(file.program_size()));
+    let (image, start, size) = (program.image(), program.start(), u64::from(program.size()));
     let fits = match dialect {
         // The CRC of the program counts from the region's start.
-        Dialect::Block => file.check_region(region).is_ok(),
-        Dialect::Hex | Dialect::EsAcademy if region.contains(&file.span()) => {
+        Dialect::Block => program.check_region(region).is_ok(),
+        Dialect::Hex | Dialect::EsAcademy if region.contains(&program.span()) => {
             // The data go to their own addresses: the vectors must be there.
             judge(image, region.first, None).map_err(no_program)?;
             true
         }
         Dialect::Hex | Dialect::EsAcademy => false,
         Dialect::Raw | Dialect::Lift if start == 0 => {
-            if !is_data(dialect, program) {
+            if !is_data(dialect, number) {
                 judge_place(image, region).map_err(no_program)?;
             }
             size <= region.len()
@@ -201,19 +198,10 @@ fn admit_place(
     let last = u64::from(start) + size.saturating_sub(1);
     Err(Error::OtherRegion {
         node: session.node(),
-        program,
+        program: number,
         image: (start, u32::try_from(last).unwrap_or(u32::MAX)),
         region: (first, region.last),
     })
-}
-
-/// Compares the identity in the file with 1018h, by the rule of the bootloader. A value that the device
-/// does not report cannot differ.
-fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
-    match target {
-        Some(target) => compare_target(session, target, |session, at| told(session.read_number(at))),
-        None => Ok(()),
-    }
 }
 
 fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {

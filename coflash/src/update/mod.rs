@@ -31,13 +31,13 @@ mod watch;
 
 pub use self::catch::{catch, CatchOptions, Caught};
 pub use self::comparison::{compare_sealed, Comparison, Difference, Part};
-pub use self::content::{refusal_number, Program};
+pub use self::content::{refusal_number, Payload};
 pub use self::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState, Seen};
 pub use self::event::{Event, Report};
 pub use self::flash::{flash, flash_program, flash_sealed};
 pub use self::many::{flash_in_turn, flash_many, ManyOptions};
 pub use self::new_bootloader::NewBootloader;
-pub use self::options::{FlashOptions, Target, JOINED_BLOCKS};
+pub use self::options::{FlashOptions, JOINED_BLOCKS};
 pub use self::password::Password;
 pub use self::renew::renew;
 pub use self::renewal::Renewal;

@@ -112,7 +112,7 @@ fn start_again(
 /// Checks that the dialect supports the way in which the file is to be sent.
 fn check_way(file: Content<'_>, dialect: Dialect, options: &FlashOptions) -> Result<(), Error> {
     match (file, dialect) {
-        (Content::Sealed(_), Dialect::Block) | (Content::Blocks(_), _) => Ok(()),
+        (Content::Sealed(_), Dialect::Block) | (Content::Program(_), _) => Ok(()),
         (Content::Sealed(_), _) if options.blocks.is_none() => Ok(()),
         (Content::Sealed(_), dialect) => Err(Error::NotInDialect {
             dialect,

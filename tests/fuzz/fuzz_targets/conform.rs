@@ -15,8 +15,8 @@ use canopen::{CobId, Frame};
 use coboot_fuzz::Input;
 use coflash::bus::{Adapter, AdapterError};
 use coflash::conform::{checks, run, Means, Outcome};
-use coflash::file::convert::{blocks_of, Options, Region};
-use coflash::update::Program;
+use coflash::file::convert::{program_of, Options, Region};
+use coflash::update::Payload;
 use embedded_can::Frame as _;
 use kit::bus::{at, node, Device};
 
@@ -135,13 +135,13 @@ impl Adapter for Hostile<'_> {
 
 /// A program of some bytes, for the checks that install one.
 fn program() -> Program {
-    static PROGRAM: OnceLock<Program> = OnceLock::new();
+    static PROGRAM: OnceLock<Payload> = OnceLock::new();
     PROGRAM
         .get_or_init(|| {
             let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n";
             let firmware = coflash::file::read(hex, None, None).expect("Intel HEX");
             let options = Options::default().region(Region::Unknown);
-            Arc::new(blocks_of(firmware, &options).expect("a program").file).into()
+            Arc::new(program_of(firmware, &options).expect("a program").program).into()
         })
         .clone()
 }

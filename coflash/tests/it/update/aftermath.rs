@@ -7,7 +7,7 @@ use canopen::{CobId, Frame, NodeId};
 use coflash::bus::AdapterError;
 use coflash::device::error::Intruder;
 use coflash::device::{Dialect, Session, Timing};
-use coflash::file::block_file::BlockFile;
+use coflash::file::block_file;
 use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceAfterUpdate, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash::{Adapter, Error};
@@ -18,7 +18,7 @@ const CLEAR: u8 = 0x03;
 const CALL: u8 = 0x80;
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| events.push(event));
@@ -247,7 +247,7 @@ fn a_program_that_does_not_answer_is_told_with_its_release() {
     let written = |fake: &mut Fake| {
         fake.starts = None;
         fake.on_block = Box::new(|_| Outcome::Ignore);
-        fake.crc = Some(BlockFile::parse(data!("identity-110.blk")).unwrap().program_crc());
+        fake.crc = Some(block_file::read(data!("identity-110.blk")).unwrap().crc());
     };
     let raw = left(BOOTLOADER, &written, dialect(Dialect::Raw));
     assert_eq!((raw.state, raw.answer), (DeviceState::Written, DeviceAnswer::Silent));

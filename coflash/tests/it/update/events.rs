@@ -5,10 +5,10 @@ use std::time::Duration;
 use crate::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use canopen::{AbortCode, NodeId};
 use coflash::device::{DeviceType, Dialect, Session, Timing};
-use coflash::file::block_file::Checksum;
-use coflash::file::BlockFile;
+use coflash::file::checksum::Checksum;
+use coflash::file::{block_file, Target};
 use coflash::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
-use coflash::update::{flash, Event, FlashOptions, Target};
+use coflash::update::{flash, Event, FlashOptions};
 use coflash::Error;
 use serde_json::{json, Value};
 
@@ -18,7 +18,7 @@ fn node() -> NodeId {
 
 /// The lines of an update of this device.
 fn lines(fake: &mut Fake, options: &FlashOptions) -> Vec<Value> {
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let mut lines = Vec::new();
     let mut session = Session::new(fake, node(), Timing::default());
     let _ = flash(&mut session, &file, options, &mut |event| {

@@ -8,7 +8,7 @@ use crate::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 use canopen::{CobId, Frame, NodeId};
 use coflash::bus::hub::{self, Act, Conversation, Terms};
 use coflash::device::Transfers;
-use coflash::file::block_file::BlockFile;
+use coflash::file::block_file;
 use coflash::update::event::Phase;
 use coflash::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash::update::{DeviceState, Event, FlashOptions, Report};
@@ -30,7 +30,7 @@ fn devices(nodes: impl IntoIterator<Item = u8>) -> Bus {
 }
 
 fn jobs(nodes: impl IntoIterator<Item = u8>) -> Vec<Job> {
-    let file = Arc::new(BlockFile::parse(FILE).unwrap());
+    let file = Arc::new(block_file::read(FILE).unwrap());
     let job = |node| Job::new(NodeId::new(node).unwrap(), file.clone(), FlashOptions::default());
     nodes.into_iter().map(job).collect()
 }

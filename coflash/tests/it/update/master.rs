@@ -7,7 +7,7 @@ use std::time::Duration;
 use canopen::{CobId, Frame, NodeId};
 use coflash::bus::AdapterError;
 use coflash::device::{Session, Timing};
-use coflash::file::BlockFile;
+use coflash::file::block_file;
 use coflash::update::event::Phase;
 use coflash::update::{flash, DeviceState, Event, FlashOptions, Report};
 use coflash::{Adapter, Error};
@@ -91,7 +91,7 @@ impl Adapter for Beside {
 }
 
 fn run(adapter: &mut dyn Adapter) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
@@ -191,7 +191,7 @@ fn listening_takes_no_time_of_its_own() {
     let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
     // The session has listened for a while when the update begins.
     session.wait(ms(200)).unwrap();
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
     let requests =
         || fake.sent.iter().zip(&fake.sent_at).filter_map(|(sent, at)| Some((sent.exactly::<8>()?, *at)));

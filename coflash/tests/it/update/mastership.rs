@@ -7,7 +7,7 @@ use std::time::Duration;
 use canopen::{CobId, Frame, NodeId};
 use coflash::bus::AdapterError;
 use coflash::device::{Dialect, Session, Timing};
-use coflash::file::block_file::BlockFile;
+use coflash::file::block_file;
 use coflash::update::event::{Note, Warning};
 use coflash::update::{flash, Event, FlashOptions, Password, Report};
 use coflash::Adapter;
@@ -63,7 +63,7 @@ fn lift() -> Fake {
 }
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let file = block_file::read(data!("plain-400.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| {
