@@ -4,13 +4,15 @@
 //! Step 1, making the program, is [`convert`](mod@crate::file::convert); the dialect cuts it in blocks. All checks that are
 //! possible before the device is changed are made there and in `admission`.
 
+use super::admission::admit;
 use super::aftermath::look;
 use super::content::{Content, Payload};
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
+use super::entry::enter;
 use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
-use super::reach::reach;
+use super::reach::{find, reach};
 use super::renew;
 use super::running::{give_back, telling_silence, RunningUpdate};
 use super::steps::compare_crc;
@@ -104,7 +106,11 @@ fn procedure(
 ) -> Result<Report, Error> {
     let began = session.now();
     let original = session.node();
-    let dialect = reach(session, file, options, update)?;
+    let dialect = reach(session, options, update, |session, update| {
+        let found = find(session, options, update)?;
+        let admission = admit(session, file, found.dialect, options)?;
+        enter(session, found, admission, options, update)
+    })?;
     let its = dialect::of(dialect);
     if dialect != Dialect::Block {
         session.leave_group();

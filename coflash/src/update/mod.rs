@@ -9,6 +9,7 @@ pub mod config;
 mod content;
 mod device_after;
 pub mod dialect;
+mod entry;
 pub mod event;
 mod flash;
 pub mod job;
