@@ -169,7 +169,7 @@ fn the_software_version_is_found_in_every_format() {
     assert_eq!(raw(text).software_version(), found);
     // It may lie across two blocks.
     let options = Options::default().block_size(24);
-    let file = convert(raw.clone()(text), &options).unwrap().program;
+    let file = convert(raw(text), &options).unwrap().program;
     assert_eq!(file.image().software_version(), found);
     assert_eq!(raw(&text[..4]).software_version(), None);
     assert_eq!(raw(&text[..27]).software_version(), None, "the mark's final zero is missing");
