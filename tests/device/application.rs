@@ -10,10 +10,10 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{dead_crystal, firmware};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::label::label_of;
 use coflash_core::file::read::{read, Firmware};
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use kit::folder::Alone;
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
@@ -76,9 +76,11 @@ fn build(folder: &Path, program: &str, _: &Alone) -> Option<Vec<u8>> {
     Some(fs::read(target.join("thumbv7em-none-eabihf/release").join(program)).expect("it was built"))
 }
 
-fn blocks(elf: &[u8]) -> BlockFile {
+fn blocks(elf: &[u8]) -> Program {
     let options = Options::default().region(Region::Strict(LAYOUT.programs[0].into()));
-    blocks_of(read(elf, None, None).expect("an ELF"), &options).expect("it lies in the program's flash").file
+    program_of(read(elf, None, None).expect("an ELF"), &options)
+        .expect("it lies in the program's flash")
+        .program
 }
 
 fn board() -> Bench {
@@ -120,7 +122,7 @@ fn it_is_updated_twice_and_answers_what_a_host_asks() {
         flash(&mut bench.session(), &blocks, &FlashOptions::default().force(true), &mut |_| {}).unwrap();
         assert!(!bench.is_bootloader(NODE));
         assert_eq!(number(&mut bench, 0x1F51, 1), 1);
-        assert_eq!(number(&mut bench, 0x1F56, 1), blocks.program_crc());
+        assert_eq!(number(&mut bench, 0x1F56, 1), blocks.crc());
         assert_eq!(number(&mut bench, 0x1F57, 1), 0);
         assert_eq!(number(&mut bench, 0x1018, 2), bsp::IDENTITY.product_code);
         // The label's version is 1.

@@ -3,16 +3,16 @@
 use canopen::program::ProgramControl;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::Options as ChipOptions;
 use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::{Span, Time};
 
 /// The application, followed by other data up to 400 KiB.
-fn large_program() -> BlockFile {
+fn large_program() -> Program {
     const SIZE: u32 = 400 * 1024;
     let base = firmware::board().programs[0].base;
     let Firmware::Image(image) = read(&firmware::elf(firmware::APP_V1), None, None).expect("an ELF of ours")
@@ -27,7 +27,7 @@ fn large_program() -> BlockFile {
     let large = read(&bytes, Some(Format::Raw), Some(base)).expect("a raw image");
     let options =
         Options::default().region(Region::Strict(firmware::board().programs[0].into())).block_size(16_384);
-    blocks_of(large, &options).expect("it fits").file
+    program_of(large, &options).expect("it fits").program
 }
 
 /// The budget of the design: 5 ms, with a CRC of the whole confirmed program of 400 KiB.

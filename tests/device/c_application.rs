@@ -9,7 +9,7 @@ use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::{call_back, firmware, renewal};
 use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::file::convert::{self, blocks_of, Options};
+use coflash_core::file::convert::{self, program_of, Options};
 use coflash_core::file::read::read;
 use coflash_core::update::{flash, FlashOptions, Report};
 use coflash_core::Error;
@@ -602,14 +602,14 @@ fn the_other_program_and_a_program_for_the_other_place() {
 
     // coflash sees it before anything is sent.
     let options = Options::default().region(strict(1));
-    let refused = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap_err().to_string();
+    let refused = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap_err().to_string();
     assert!(refused.contains("0x08080000"), "{refused}");
 
     let mut bench = Bench::of_image(&image(firmware::BOOTLOADER));
     bench.power_on();
     bench.await_boot_up(100);
     // A host that does not know the board asks the device, and sends nothing.
-    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &Options::default()).unwrap().file;
+    let blocks = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &Options::default()).unwrap().program;
     let refused = flash(&mut bench.session(), &blocks, &FlashOptions::default(), &mut |_| {}).unwrap_err();
     assert!(matches!(refused, Error::OtherRegion { .. }), "{refused}");
     assert_eq!(number(&mut bench, Address::new(0x1F57, 1)), 0, "untouched");
@@ -623,7 +623,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     // its vectors point to the second.
     let moved = layout.programs[0].base.wrapping_sub(layout.programs[1].base);
     let options = Options::default().region(strict(1)).adjust_start(moved);
-    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().file;
+    let blocks = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().program;
     let refused = flash(&mut bench.session(), &blocks, &once, &mut |_| {}).unwrap_err();
     println!("{refused}");
     let status = number(&mut bench, Address::new(0x1F57, 1));
@@ -635,7 +635,8 @@ fn the_other_program_and_a_program_for_the_other_place() {
     assert!(bench.is_bootloader(NODE));
 
     // And the right ones.
-    let blocks = blocks_of(elf(firmware::APP_C_PROBE), &Options::default().region(strict(1))).unwrap().file;
+    let blocks =
+        program_of(elf(firmware::APP_C_PROBE), &Options::default().region(strict(1))).unwrap().program;
     flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {}).unwrap();
     assert_eq!(call(&mut bench, PROGRAM_INFO, [2, 9, 9, 9, 9]).words, [2, 0, 0, 0, 0]);
     for selector in [CONFIRM, INVALIDATE] {
@@ -644,7 +645,7 @@ fn the_other_program_and_a_program_for_the_other_place() {
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     let options = Options::default().region(strict(2));
-    let blocks = blocks_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().file;
+    let blocks = program_of(elf(firmware::APP_C_PROBE_PROGRAM_2), &options).unwrap().program;
     let second = FlashOptions::default().program(2).trial_run(false);
     let report = flash(&mut bench.session(), &blocks, &second, &mut |_| {}).unwrap();
     assert_eq!(number(&mut bench, Address::new(0x1F56, 2)), report.program_crc, "its own");

@@ -382,7 +382,7 @@ fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
     bench.machine().write_ram(layout.ram.base + 0x400, &garbage[0x400..]).unwrap();
     bench.await_boot_up(1000);
     assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
-    assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc());
+    assert_eq!(crc, firmware::blocks(firmware::APP_V1).crc());
 }
 
 /// The proof of the test above: with eight bytes of code left in flash it fails. The CAN interrupt

@@ -8,7 +8,7 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, RESCUE_WINDOW_MS};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::steps::release;
 use coflash_core::update::{flash, FlashOptions};
@@ -126,7 +126,7 @@ fn the_application_finds_the_chip_as_after_a_reset() {
     image[4..8].copy_from_slice(&(first | 1).to_le_bytes());
     image[0x200..0x202].copy_from_slice(&HERE);
     let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
-    let blocks = blocks_of(image, &Options::default()).unwrap().file;
+    let blocks = program_of(image, &Options::default()).unwrap().program;
 
     let mut bench = Bench::new();
     bench.power_on();

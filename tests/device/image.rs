@@ -348,7 +348,7 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
         assert_eq!(cell(&bench), Some((DAMAGED, damage)), "{what}");
         // The application reads it through the callgate.
         let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
-        assert_eq!(crc, firmware::blocks(firmware::APP_V1).program_crc(), "{what}");
+        assert_eq!(crc, firmware::blocks(firmware::APP_V1).crc(), "{what}");
         // It starts as before, with the cell consumed.
         bench.machine().reset_pin();
         bench.await_boot_up(1000);

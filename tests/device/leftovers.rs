@@ -4,7 +4,7 @@ use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::Doing;
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
@@ -202,7 +202,7 @@ fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
         bench.await_boot_up(100);
         let base = firmware::board().programs[0].base;
         let image = read(&scripted_program(wrong), Some(Format::Raw), Some(base)).unwrap();
-        let blocks = blocks_of(image, &Options::default()).unwrap().file;
+        let blocks = program_of(image, &Options::default()).unwrap().program;
         flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
         bench.run_ms(100);
         bench.events();
@@ -232,7 +232,7 @@ fn a_foreign_program_that_jumps_with_everything_wrong_does_no_harm() {
     bench.power_on();
     bench.await_boot_up(100);
     let image = read(&image_of(CODE), Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap();
-    let blocks = blocks_of(image, &Options::default()).unwrap().file;
+    let blocks = program_of(image, &Options::default()).unwrap().program;
     flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     bench.run_ms(100);
     bench.events();

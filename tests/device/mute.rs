@@ -4,13 +4,14 @@
 use std::time::Duration;
 
 use coboot_can::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::device::error::TrialFailure;
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
+use coflash_core::file::Program;
 use coflash_core::update::{
     catch, flash, CatchOptions, Caught, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions,
 };
@@ -22,14 +23,14 @@ const HERE: [u8; 2] = [0xFE, 0xE7];
 const DARK: Duration = Duration::from_millis(2345);
 
 /// A vector table, and a reset handler with an endless loop.
-fn mute() -> BlockFile {
+fn mute() -> Program {
     let program = firmware::board().programs[0].base;
     let mut image = vec![0; 0x400];
     image[..4].copy_from_slice(&firmware::board().ram.end().to_le_bytes());
     image[4..8].copy_from_slice(&((program + 0x200) | 1).to_le_bytes());
     image[0x200..0x202].copy_from_slice(&HERE);
     let image = read(&image, Some(Format::Raw), Some(program)).unwrap();
-    blocks_of(image, &Options::default()).unwrap().file
+    program_of(image, &Options::default()).unwrap().program
 }
 
 fn board() -> Bench {

@@ -4,12 +4,13 @@
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::SdoIds;
+use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
 use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Format};
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use shared_abi::label::Label;
@@ -91,10 +92,10 @@ fn program(image: &str, vendor_id: u32, product_code: u32) -> Vec<u8> {
 }
 
 /// It as the blocks that the tool sends; block 0 has what the label has.
-fn blocks(bytes: &[u8]) -> BlockFile {
+fn blocks(bytes: &[u8]) -> Program {
     let place = firmware::board().programs[0];
     let file = read(bytes, Some(Format::Raw), Some(place.base)).unwrap();
-    blocks_of(file, &Options::default().region(Region::Strict(place.into()))).unwrap().file
+    program_of(file, &Options::default().region(Region::Strict(place.into()))).unwrap().program
 }
 
 #[test]

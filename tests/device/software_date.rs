@@ -5,8 +5,8 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Label, Options};
+use coflash_core::file::convert::{program_of, Label, Options};
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 
 /// 2026-11-27 18:30:15 UTC, by GNU date; and the days and milliseconds of a calendar.
@@ -15,13 +15,13 @@ const DATE: (u64, [u32; 2]) = (1_795_804_215, [15_671, 66_615_000]);
 const LEAP_DAY: (u64, [u32; 2]) = (951_825_600, [5903, 43_200_000]);
 
 /// An application whose block 0 has this date.
-fn dated(image: &str, date: u64) -> BlockFile {
+fn dated(image: &str, date: u64) -> Program {
     let elf =
         coflash_core::file::read::load(&firmware::dir().join(image), None, None).expect("an ELF of ours");
     let options = Options::default()
         .region(coflash_core::file::convert::Region::Strict(firmware::board().programs[0].into()))
         .label(Label::OfImage { date });
-    blocks_of(elf, &options).expect("it lies in the program's flash").file
+    program_of(elf, &options).expect("it lies in the program's flash").program
 }
 
 fn date(bench: &mut Bench) -> [u32; 2] {

@@ -8,12 +8,15 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
 use coboot_can::slcan::Slcan;
+use coboot_can::slcan::Slcan;
+use coboot_can::Adapter;
 use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;
 use coflash_core::device::{Session, Timing};
+use coflash_core::file::block_file::emit;
 use coflash_core::update::{flash, FlashOptions};
 
 /// A board in its bootloader, with no program installed.
@@ -202,7 +205,7 @@ fn python_canopen_flashes_the_device_through_its_serial_port() {
     let python = env::var_os("COBOOT_PYTHON")
         .unwrap_or_else(|| panic!("COBOOT_PYTHON is not set: run the tests by `cargo xtask test`"));
     let folder = kit::folder!("virtual-can");
-    let file = folder.write("program.blk", firmware::blocks(firmware::APP_VIRTUAL_CAN).emit());
+    let file = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_VIRTUAL_CAN)));
     let mut endpoint = Endpoint::serial(empty_board());
     let port = endpoint.url().replace("@125k", "");
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/python/canopen_client.py");

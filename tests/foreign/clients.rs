@@ -9,6 +9,7 @@ use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
+use coflash_core::file::block_file::emit;
 
 const VERSION: Address = Address::new(0x100A, 0);
 
@@ -38,7 +39,7 @@ pub fn script(name: &str) -> PathBuf {
 fn python_canopen_identifies_flashes_and_starts_the_device() {
     let mut endpoint = endpoint();
     let folder = kit::folder!("clients");
-    let file = folder.write("program.blk", firmware::blocks(firmware::APP_V1).emit());
+    let file = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_V1)));
     let mut python = python();
     python.arg(script("canopen_client.py")).arg(endpoint.address()).arg(file);
     let output = endpoint.run(&mut python);
@@ -130,7 +131,7 @@ fn the_coflash_command_does_the_main_job_through_a_socket() {
 fn a_bad_file_touches_no_device() {
     let mut endpoint = endpoint();
     let elf = firmware::elf(firmware::APP_V1);
-    let mut damaged = firmware::blocks(firmware::APP_V1).emit();
+    let mut damaged = emit(&firmware::blocks(firmware::APP_V1));
     damaged[100] ^= 1;
     let (_, resident) = firmware::section(&firmware::elf(firmware::BOOTLOADER), ".resident");
     let folder = kit::folder!("bad-files");

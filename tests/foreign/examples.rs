@@ -327,7 +327,7 @@ fn a_program_that_sets_vtor_wrong_ends_in_the_bootloader() {
     assert!(matches!(refused, Error::StartFailed { .. }), "{refused}");
     bench.run_ms(3000);
     assert!(bench.is_bootloader(NODE), "it has kept the device");
-    assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.program_crc(), "it is still there");
+    assert_eq!(bench.session().read_number(CRC).unwrap(), blocks.crc(), "it is still there");
 }
 
 /// Each example in Rust can take the memory map of a board of one's own, as its page says: its

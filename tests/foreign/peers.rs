@@ -9,6 +9,7 @@ use canopen::{Address, BitRate};
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
+use coflash_core::file::block_file::emit;
 use emulator::bus::Outcome;
 
 const NODES: [u8; 3] = [10, 11, 12];
@@ -57,7 +58,7 @@ fn python_canopen_commissions_three_devices_and_works_with_them() {
     bench.power_on();
     bench.run_ms(100);
     let folder = kit::folder!("peers");
-    let path = folder.write("program.blk", firmware::blocks(firmware::APP_V1).emit());
+    let path = folder.write("program.blk", emit(&firmware::blocks(firmware::APP_V1)));
     let path = path.to_str().expect("a path of this repository");
     master(&mut endpoint, &["use", "--device-name", bsp::IDENTITY.device_name, path]);
 

@@ -4,9 +4,9 @@ use canopen::program::ProgramControl;
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::firmware;
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::read;
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::peripheral::Peripheral;
 use shared_abi::layout::stm32f407g_disc1_can2::LAYOUT;
@@ -24,10 +24,10 @@ fn bench_at(controller: u8) -> Bench {
     Bench::of_image_at(&firmware::of_board(LAYOUT.board, firmware::BOOTLOADER), controller)
 }
 
-fn blocks(image: &str) -> BlockFile {
+fn blocks(image: &str) -> Program {
     let elf = firmware::elf(&firmware::of_board(LAYOUT.board, image));
     let options = Options::default().region(Region::Strict(LAYOUT.programs[0].into()));
-    blocks_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").file
+    program_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").program
 }
 
 fn version(bench: &mut Bench) -> String {

@@ -10,7 +10,7 @@ use coboot_tests::script::{play_on, Wire};
 use coboot_tests::serial::TextBus;
 use coboot_tests::{firmware, script};
 use coflash_core::device::{Doing, Session};
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::read;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
@@ -216,13 +216,13 @@ fn a_bootloader_with_the_debugger_takes_hex() {
 /// program.
 #[test]
 fn a_product_with_crc_16_is_updated_by_block_file() {
-    use coflash_core::file::block_file::Checksum;
+    use coflash_core::file::checksum::Checksum;
 
     let Some(mut bench) = board("bootloader-crc-16") else { return };
     let file = |checksum| {
         let firmware = read(&firmware::elf(&image(firmware::APP_V1)), None, None).unwrap();
         let region = Region::Strict(LAYOUT.programs[0].into());
-        blocks_of(firmware, &Options::default().region(region).checksum(checksum)).unwrap().file
+        program_of(firmware, &Options::default().region(region).checksum(checksum)).unwrap().program
     };
     let options = FlashOptions::default().start(false).repeats(0).verify(true);
     let refused = flash(&mut bench.session(), &file(Checksum::Crc32), &options, &mut |_| {});
@@ -231,7 +231,7 @@ fn a_product_with_crc_16_is_updated_by_block_file() {
 
     let file = file(Checksum::Crc16);
     let crc = firmware::raw_from(LAYOUT.programs[0].base, &image(firmware::APP_V1));
-    let crc = crc16(&crc[..file.program_size() as usize]);
+    let crc = crc16(&crc[..file.size() as usize]);
     flash(&mut bench.session(), &file, &options, &mut |_| {}).unwrap();
     let mut session = bench.session();
     coflash_core::update::steps::release(&mut session, 1, &mut |_| {}).unwrap();

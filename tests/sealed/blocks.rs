@@ -10,6 +10,7 @@ use coboot_tests::firmware;
 use coboot_tests::fleet::Fleet;
 use coboot_tests::sealed_board::{board, keys, release, sealer, status, write, COUNTER, KEKS};
 use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::convert::blocks_of_sealed;
 use coflash_core::file::sealed::{SealedFile, Sealer};
 use coflash_core::update::event::{Note, Phase};
@@ -156,6 +157,7 @@ fn what_is_not_authentic_costs_nothing() {
         assert_runs(&mut bench, "1.0.0", what);
     }
     let unsealed = firmware::blocks(firmware::APP_V2);
+    let unsealed = BlockFile::of(&unsealed);
     let unsealed: Vec<_> =
         unsealed.blocks().iter().map(|block| block.emit_with(unsealed.checksum())).collect();
     assert_eq!(send_all(&mut bench, &unsealed), status::NO_ACCESS);

@@ -17,6 +17,7 @@ use coboot_tests::sealed_board::{
 use coflash_core::device::access::{ask, challenge, events};
 use coflash_core::device::debugger::Debugger;
 use coflash_core::device::{Doing, Transfers};
+use coflash_core::file::block_file::emit;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
 use seal::access::{event, right};
 
@@ -189,7 +190,7 @@ fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
         ),
         ("cut off behind the head", genuine[..first_chunk].to_vec(), status::FORMAT),
         ("a raw image", image.clone(), status::NO_ACCESS),
-        ("a block file in one transfer", firmware::blocks(firmware::APP_V2).emit(), status::FORMAT),
+        ("a block file in one transfer", emit(&firmware::blocks(firmware::APP_V2)), status::FORMAT),
     ] {
         for transfers in [Transfers::Segments, Transfers::Blocks] {
             let before = bench.machine().flash().to_vec();

@@ -2,7 +2,7 @@
 //! not tolerate, and must not wait for the crystal, or the device could not be reached any more.
 
 use canopen::Address;
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
@@ -22,7 +22,7 @@ const INTERNAL: u32 = 2;
 const THREE_STARTS_MS: u64 = 3_000;
 
 /// The cells of a flash with the bootloader and this program, which starts by itself.
-fn installed(program: &BlockFile) -> Vec<u8> {
+fn installed(program: &Program) -> Vec<u8> {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
@@ -45,7 +45,7 @@ fn board(cells: &[u8], options: Options) -> Bench {
 ///
 /// # Panics
 /// If it does not.
-pub fn brings_the_bootloader(program: &BlockFile) {
+pub fn brings_the_bootloader(program: &Program) {
     let cells = installed(program);
     // 3 % is within HSI's range (DS8626 table 41), and more than any bit timing of CAN tolerates.
     for hsi_hz in [16_480_000, 16_000_000] {

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::{env, fs};
 
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Firmware};
+use coflash_core::file::Program;
 use coflash_core::update::JOINED_BLOCKS;
 use object::read::elf::ElfFile32;
 use object::{Endianness, Object, ObjectSection};
@@ -105,7 +105,7 @@ pub fn dir() -> PathBuf {
 /// # Panics
 /// If it was not built, or does not match the board.
 #[must_use]
-pub fn blocks(name: &str) -> BlockFile {
+pub fn blocks(name: &str) -> Program {
     let _ = elf(name);
     blocks_of_file(&dir().join(name))
 }
@@ -115,7 +115,7 @@ pub fn blocks(name: &str) -> BlockFile {
 /// # Panics
 /// As [`blocks`].
 #[must_use]
-pub fn large_blocks(name: &str) -> BlockFile {
+pub fn large_blocks(name: &str) -> Program {
     let _ = elf(name);
     blocks_with(&dir().join(name), Options::default().block_size(JOINED_BLOCKS))
 }
@@ -125,14 +125,14 @@ pub fn large_blocks(name: &str) -> BlockFile {
 /// # Panics
 /// If it is none, or does not fit the board.
 #[must_use]
-pub fn blocks_of_file(elf: &Path) -> BlockFile {
+pub fn blocks_of_file(elf: &Path) -> Program {
     blocks_with(elf, Options::default())
 }
 
-fn blocks_with(elf: &Path, options: Options) -> BlockFile {
+fn blocks_with(elf: &Path, options: Options) -> Program {
     let image = coflash_core::file::read::load(elf, None, None).expect("an ELF of ours");
     let options = options.region(Region::Strict(board().programs[0].into()));
-    blocks_of(image, &options).expect("it lies in the program's flash").file
+    program_of(image, &options).expect("it lies in the program's flash").program
 }
 
 /// An application as a raw image: its bytes from the start of the first program; gaps are FFh.

@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use canopen::{BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
-use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::convert::DEFAULT_BLOCK_SIZE;
 use coflash_core::file::sealed::SealedFile;
+use coflash_core::file::Program;
 use coflash_core::update::many::{flash_many, Failed, Job, ManyOptions};
-use coflash_core::update::{Event, FlashOptions, Program, Report, JOINED_BLOCKS};
+use coflash_core::update::{Event, FlashOptions, Payload, Report, JOINED_BLOCKS};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 
 use crate::bench::Bench;
@@ -105,7 +105,7 @@ impl Fleet {
     ///
     /// # Panics
     /// If a thread of the update panics.
-    pub fn update(&mut self, devices: u8, file: &Arc<BlockFile>, options: &ManyOptions) -> Update {
+    pub fn update(&mut self, devices: u8, file: &Arc<Program>, options: &ManyOptions) -> Update {
         self.update_while(devices, file, options, &mut |_| {})
     }
 
@@ -116,11 +116,11 @@ impl Fleet {
     pub fn update_while(
         &mut self,
         devices: u8,
-        file: &Arc<BlockFile>,
+        file: &Arc<Program>,
         options: &ManyOptions,
         happens: Happens<'_>,
     ) -> Update {
-        let program = Program::Blocks(file.clone());
+        let program = Payload::Program(file.clone());
         self.update_as(devices, &program, &unwatched(), options, happens)
     }
 
@@ -129,7 +129,7 @@ impl Fleet {
     /// # Panics
     /// As [`update`](Self::update).
     pub fn update_sealed(&mut self, devices: u8, file: &Arc<SealedFile>) -> Update {
-        let program = Program::Sealed(file.clone());
+        let program = Payload::Sealed(file.clone());
         let (each, options) = (unwatched(), ManyOptions::default());
         self.update_as(devices, &program, &each, &options, &mut |_| {})
     }
@@ -137,7 +137,7 @@ impl Fleet {
     fn update_as(
         &mut self,
         devices: u8,
-        file: &Program,
+        file: &Payload,
         each: &FlashOptions,
         options: &ManyOptions,
         happens: Happens<'_>,
@@ -159,7 +159,7 @@ impl Fleet {
 
 /// The application, extended to so many KiB, in blocks of the default size.
 #[must_use]
-pub fn file(kib: u32) -> Arc<BlockFile> {
+pub fn file(kib: u32) -> Arc<Program> {
     Arc::new(blocks(&program(kib), DEFAULT_BLOCK_SIZE))
 }
 
@@ -217,7 +217,7 @@ pub fn measure(mut row: impl FnMut(Measurement)) {
         }
         let options = ManyOptions::default().together(way == Way::Together);
         let each = unwatched().joined_blocks(Some(block_size));
-        let update = fleet.update_as(boards, &Program::Blocks(file.clone()), &each, &options, &mut |_| {});
+        let update = fleet.update_as(boards, &Payload::Program(file.clone()), &each, &options, &mut |_| {});
         assert_eq!(update.done(), usize::from(boards), "{way:?}, one of {lost_one_in} lost");
         let (took, one) = (update.took, *one.get_or_insert(update.took));
         row(Measurement { boards, way, block_size, lost_one_in, took, one });

@@ -11,6 +11,7 @@ use canopen::{Address, Frame, NodeId};
 use coboot_can::Adapter;
 use coflash_core::device::{Doing, Session, Timing, Transfers};
 use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::Program;
 use embedded_can::{Frame as _, StandardId};
 
 /// The values of 1F51h (CiA 302-3; 80h is Zephyr's).
@@ -195,11 +196,11 @@ fn idle(master: &mut Master<'_>, program: u8) -> Result<(), String> {
 ///
 /// # Errors
 /// The first step that fails.
-pub fn systec(bus: &mut dyn Adapter, node: u8, program: u8, file: &BlockFile) -> Result<(), String> {
+pub fn systec(bus: &mut dyn Adapter, node: u8, program: u8, file: &Program) -> Result<(), String> {
     let mut master = Master::new(bus, node, Duration::from_millis(500));
     master.control(program, CLEAR)?;
     idle(&mut master, program)?;
-    for block in file.blocks() {
+    for block in BlockFile::of(file).blocks() {
         master.download(program, &block.emit(), Transfers::Segments)?;
         idle(&mut master, program)?;
     }

@@ -7,9 +7,10 @@ use canopen::sdo::wire::{BlockAck, BlockEnd, Request, Response};
 use canopen::{Address, BitRate, NodeId};
 use coflash_core::device::{Doing, Session, Timing, Transfers};
 use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Label, Options, Region};
+use coflash_core::file::convert::{program_of, Label, Options, Region};
 use coflash_core::file::read::{read, Format};
 use coflash_core::file::sealed::Sealer;
+use coflash_core::file::Program;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{flash, Event, FlashOptions};
 use emulator::frame::Frame;
@@ -73,7 +74,7 @@ pub fn measure(rate: BitRate, kib: u32) -> Measurement {
     let poll = Timing::default().poll_first(Duration::from_millis(2)).poll_most(Duration::from_millis(10));
     let mut session = Session::new(&mut bench, NodeId::new(NODE).expect("1 to 127"), poll);
     session.command(1, ProgramControl::Clear).expect("CLEAR");
-    for block in file.blocks() {
+    for block in BlockFile::of(&file).blocks() {
         session.write(DATA, &block.emit(), Doing::Block(block.number), &mut |_| {}).expect("a good block");
         let status = session.await_idle(1, Doing::Read(STATUS)).expect("the status");
         assert_eq!(status.to_word(), 0, "behind block {}", block.number);
@@ -252,7 +253,7 @@ pub fn program(kib: u32) -> Vec<u8> {
     bytes
 }
 
-pub(crate) fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
+pub(crate) fn blocks(bytes: &[u8], block_size: usize) -> Program {
     let region = firmware::board().programs[0];
     let image = read(bytes, Some(Format::Raw), Some(region.base)).expect("a raw image");
     let options = Options::default()
@@ -263,7 +264,7 @@ pub(crate) fn blocks(bytes: &[u8], block_size: usize) -> BlockFile {
             vendor_id: bsp::IDENTITY.vendor_id,
             product_code: bsp::IDENTITY.product_code,
         });
-    blocks_of(image, &options).expect("it fits").file
+    program_of(image, &options).expect("it fits").program
 }
 
 /// The duration of one block transfer in us, each frame with its stuff bits and the following

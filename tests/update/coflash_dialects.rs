@@ -8,10 +8,10 @@ use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::version as version_of;
 use coflash_core::device::{recognise, Dialect, Doing};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::read::{read, Firmware, Format};
+use coflash_core::file::Program;
 use coflash_core::update::dialect::read_locked;
 use coflash_core::update::event::{Note, Phase};
 use coflash_core::update::{flash, renew, DeviceState, Event, FlashOptions, NewBootloader, Password, Report};
@@ -39,7 +39,7 @@ const PENALTY_MS: u64 = 600;
 fn update(
     bench: &mut Bench,
     node: u8,
-    blocks: &BlockFile,
+    blocks: &Program,
     options: &FlashOptions,
 ) -> (Result<Report, Error>, Vec<Event>) {
     let mut events = Vec::new();
@@ -71,12 +71,12 @@ fn images_and_intel_hex_update_the_standard_firmware() {
             let (result, events) = update(&mut bench, NODE, &blocks, &options);
             let report = result.unwrap();
             assert_eq!((report.dialect, report.repeats), (dialect, 0));
-            assert!(events.contains(&Phase::Verified { crc: blocks.program_crc() }.into()), "{events:?}");
+            assert!(events.contains(&Phase::Verified { crc: blocks.crc() }.into()), "{events:?}");
             assert!(!events.contains(&Phase::Released.into()), "{events:?}");
             assert_eq!(version(&mut bench, NODE), expected);
             let program = firmware::board().programs[0].base - firmware::board().chip.flash.base;
             let stored = &bench.machine().flash()[program as usize..][..report.program_size as usize];
-            assert_eq!(stored, blocks.flash_image());
+            assert_eq!(stored, &*blocks.flash_image());
         }
         power_cycle(&mut bench, NODE);
         assert_eq!(version(&mut bench, NODE), "2.0.0", "it is valid without a signature");
@@ -121,7 +121,7 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
     let blocks = |name: &str| {
         let elf = firmware::elf(&firmware::of_board(layout.board, name));
         let options = Options::default().region(Region::Strict(layout.programs[0].into()));
-        blocks_of(read(&elf, None, None).unwrap(), &options).unwrap().file
+        program_of(read(&elf, None, None).unwrap(), &options).unwrap().program
     };
     let mut bench = Bench::of_image(&firmware::of_board(layout.board, LIFT));
     bench.power_on();
@@ -141,14 +141,14 @@ fn the_profile_of_lifts_is_recognised_updated_and_read_back() {
 
     let program = Address::new(0x1F50, 1);
     let stored = read_locked(&mut session, program, None, Password::new(PASSWORD), &mut |_| {}).unwrap();
-    assert_eq!(stored, blocks(APP_LIFT_V2).flash_image());
+    assert_eq!(stored, &*blocks(APP_LIFT_V2).flash_image());
     bench.await_boot_up(2000);
     assert!(version(&mut bench, NODE).contains("2.0.0"), "it runs again");
 
     // Its set of parameters (CiA 814-1 clause 6.4): any bytes, stored and read back.
     let set: Vec<u8> = (0..3001_u32).map(|i| (i * i / 7) as u8).collect();
     let raw = read(&set, Some(Format::Raw), Some(layout.programs[1].base)).unwrap();
-    let blocks_of_set = blocks_of(raw, &Options::default()).unwrap().file;
+    let blocks_of_set = program_of(raw, &Options::default()).unwrap().program;
     let second = options.program(2);
     update(&mut bench, NODE, &blocks_of_set, &second).0.unwrap();
     assert!(version(&mut bench, NODE).contains("2.0.0"), "the program continues");

@@ -87,7 +87,7 @@ fn with_a_program(
     bench.power_on();
     bench.await_boot_up(100);
     let program = Arc::new(firmware::blocks(firmware::APP_V1));
-    let crc = program.program_crc();
+    let crc = program.crc();
     let installing: Vec<_> = checks().into_iter().filter(|check| check.installs).collect();
     let power = Rc::new(Cell::new(None));
     let switch = Rc::clone(&power);

@@ -8,13 +8,14 @@ use std::time::Duration;
 use canopen::program::{FlashError, DEVICE_STATE, PROGRAM_ID, STATE_RENEWAL};
 use canopen::{Address, BitRate};
 use coboot_can::Adapter as _;
+use coboot_can::Adapter as _;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coboot_tests::fleet::{file, Fleet, Update};
 use coboot_tests::renewal::{crc_of, image_of, number};
 use coflash_core::device::Doing;
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::Program;
 use coflash_core::update::event::{Note, Warning};
 use coflash_core::update::many::ManyOptions;
 use coflash_core::update::Event;
@@ -64,7 +65,7 @@ fn together_takes_little_longer_than_one_and_one_by_one_much() {
     assert_eq!((all.done(), warnings(&all)), (4, vec![]));
     assert!((0..4).all(|device| together(&all, device) == Some(4)));
     assert!(all.took * 100 <= one * 115, "{:?} for four, {one:?} for one", all.took);
-    assert_all_have(&mut fleet, 4, file.program_crc());
+    assert_all_have(&mut fleet, 4, file.crc());
     let apart = fleet.update(4, &file, &one_by_one());
     assert_eq!((apart.done(), warnings(&apart)), (4, vec![]));
     assert!((0..4).all(|device| together(&apart, device).is_none()));
@@ -91,7 +92,7 @@ fn lost_repeated_and_late_frames_cost_time_and_nothing_else() {
     let all = fleet.update(4, &file, &ManyOptions::default());
     assert_eq!(all.done(), 4);
     assert!(all.took * 2 <= one * 3, "{:?} for four with lost frames, {one:?} for one without", all.took);
-    assert_all_have(&mut fleet, 4, file.program_crc());
+    assert_all_have(&mut fleet, 4, file.crc());
     for (frames, seed, action) in [
         (300, 4, FaultAction::Duplicate),
         (300, 5, FaultAction::Delay(Span::from_millis(3))),
@@ -102,7 +103,7 @@ fn lost_repeated_and_late_frames_cost_time_and_nothing_else() {
         let all = fleet.update(3, &file, &ManyOptions::default());
         assert_eq!(all.done(), 3, "{action:?}: {:?}", warnings(&all));
         fleet.bench.world.clear_faults();
-        assert_all_have(&mut fleet, 3, file.program_crc());
+        assert_all_have(&mut fleet, 3, file.crc());
     }
 }
 
@@ -113,7 +114,7 @@ fn a_slow_bus_is_no_obstacle() {
     let mut fleet = Fleet::new(3, BitRate::K125);
     let all = fleet.update(3, &file, &ManyOptions::default());
     assert_eq!((all.done(), warnings(&all)), (3, vec![]));
-    assert_all_have(&mut fleet, 3, file.program_crc());
+    assert_all_have(&mut fleet, 3, file.crc());
 }
 
 /// One device loses its power for a moment in the middle: the others go on, and it is finished
@@ -140,7 +141,7 @@ fn a_device_that_falls_out_is_finished_afterwards() {
         *device == 1 && matches!(event, Event::Warning(Warning::Apart { .. }))
     };
     assert_eq!(update.events.iter().filter(apart).count(), 1, "{:?}", update.events);
-    assert_all_have(&mut fleet, 3, file.program_crc());
+    assert_all_have(&mut fleet, 3, file.crc());
 }
 
 /// A device without power from the middle on: its outcome is reported, and the others have theirs.
@@ -164,7 +165,7 @@ fn a_device_that_stays_away_costs_the_others_nothing() {
     // Its half program is not started, and the next update goes on with it.
     assert!(fleet.bench.is_bootloader(1));
     assert_eq!(fleet.update(1, &file, &ManyOptions::default()).done(), 1);
-    assert_all_have(&mut fleet, 3, file.program_crc());
+    assert_all_have(&mut fleet, 3, file.crc());
 }
 
 /// Another node uses the COB-ID of the group's requests, or of an answer: before the group's first
@@ -190,7 +191,7 @@ fn a_cob_id_that_somebody_else_uses_ends_the_group() {
         assert_eq!(update.done(), 3, "{id:X}h after {after} ms: {:?}", warnings(&update));
         let told = |(_, event): &&(usize, Event)| matches!(event, Event::Warning(Warning::GroupDisturbed));
         assert_eq!(update.events.iter().filter(told).count(), 3, "{id:X}h after {after} ms");
-        assert_all_have(&mut fleet, 3, file.program_crc());
+        assert_all_have(&mut fleet, 3, file.crc());
     }
 }
 
@@ -219,11 +220,11 @@ fn a_cancelled_group_goes_on_later() {
     let rest = fleet.update(3, &file, &ManyOptions::default());
     assert_eq!(rest.done(), 3, "{:?}", warnings(&rest));
     assert!(rest.took * 10 < usual * 9, "{:?} for the rest, {usual:?} for all", rest.took);
-    assert_all_have(&mut fleet, 3, file.program_crc());
+    assert_all_have(&mut fleet, 3, file.crc());
 }
 
 /// One of three boards cannot take the program: the error is its own, and the others have theirs.
-fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<BlockFile>) -> Error {
+fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<Program>) -> Error {
     let mut fleet = Fleet::new(3, BitRate::K1000);
     let board = fleet.bench.boards()[1];
     fleet.bench.world.power_off(board);
@@ -233,7 +234,7 @@ fn assert_refuses_alone(prepare: impl FnOnce(&mut Machine), file: &Arc<BlockFile
     let mut update = fleet.update(3, file, &ManyOptions::default());
     assert_eq!(update.done(), 2, "{:?}", update.results);
     assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
-    let crc = file.program_crc();
+    let crc = file.crc();
     for node in [1, 3] {
         let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
         assert_eq!(told.unwrap(), crc, "node {node}");
@@ -258,8 +259,8 @@ fn a_device_with_another_checksum_is_updated_alone() {
     let update = fleet.update(3, &file, &ManyOptions::default());
     assert_eq!(update.done(), 3, "{:?}", update.results);
     assert!([0, 2].map(|device| together(&update, device)).into_iter().all(|devices| devices >= Some(2)));
-    let program: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes).collect();
-    for (node, crc) in [(1, file.program_crc()), (2, kit::bench::crc16(&program)), (3, file.program_crc())] {
+    let program: Vec<u8> = file.image().segments().flat_map(|(_, bytes)| bytes.into_owned()).collect();
+    for (node, crc) in [(1, file.crc()), (2, kit::bench::crc16(&program)), (3, file.crc())] {
         assert!(!fleet.bench.is_bootloader(node), "node {node}");
         let told = fleet.bench.session_with(node).read_number(Address::new(PROGRAM_ID, 1));
         assert_eq!(told.unwrap(), crc, "node {node}");

@@ -11,7 +11,7 @@ use coboot_tests::firmware;
 use coboot_tests::masters::{confirm, lely, systec, zephyr, Master};
 use coboot_tests::node::NodeBus;
 use coboot_tests::renewal::{crc_of, identification, number, progress, running, version};
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::{flash, FlashOptions};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
@@ -215,9 +215,9 @@ fn zephyrs_runner_renews_a_bootloader_with_one_request_more() {
 fn systecs_order_renews_a_bootloader_with_a_second_83h() {
     let image = version(firmware::BOOTLOADER, NEW);
     let home = firmware::board().home.unwrap().base;
-    let file = blocks_of(read(&image, Some(Format::Raw), Some(home)).unwrap(), &Options::default());
+    let file = program_of(read(&image, Some(Format::Raw), Some(home)).unwrap(), &Options::default());
     let mut bench = called_back();
-    systec(&mut bench, NODE, number(), &file.unwrap().file).unwrap();
+    systec(&mut bench, NODE, number(), &file.unwrap().program).unwrap();
     assert_on_trial(&mut bench);
     confirm(&mut bench, NODE, number()).unwrap();
     assert_renewed(&mut bench, &image);

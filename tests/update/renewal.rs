@@ -148,12 +148,12 @@ fn a_program_that_reaches_into_staging_is_named() {
     let staging = firmware::board().staging.unwrap();
     let large =
         firmware::made_up((staging.base - firmware::board().programs[0].base) as usize + 64, |at| at as u8);
-    let blocks = coflash_core::file::convert::blocks_of(
+    let blocks = coflash_core::file::convert::program_of(
         read(&large, Some(Format::Raw), Some(firmware::board().programs[0].base)).unwrap(),
         &coflash_core::file::convert::Options::default(),
     );
     let options = FlashOptions::default().trial_run(false).start(false).force(true);
-    flash(&mut bench.session(), &blocks.unwrap().file, &options, &mut |_| {}).unwrap();
+    flash(&mut bench.session(), &blocks.unwrap().program, &options, &mut |_| {}).unwrap();
     let (result, _) = renewed(&mut bench, &plain(&version(firmware::BOOTLOADER, NEW)));
     let Err(error @ Error::Failed { error: FlashError::NotCleared, detail: 1, .. }) = result else {
         panic!("{result:?}")

@@ -7,11 +7,12 @@ use std::time::Duration;
 use canopen::program::PROGRAM_ID;
 use canopen::{Address, BitRate};
 use coboot_can::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::file;
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::Program;
 use coflash_core::update::event::{Phase, Warning};
 use coflash_core::update::{flash, Event, FlashOptions, Report};
 use coflash_core::Error;
@@ -92,7 +93,7 @@ impl Ended {
     }
 }
 
-fn update(bench: &mut Bench, file: &BlockFile, stops_at: Option<usize>) -> Ended {
+fn update(bench: &mut Bench, file: &Program, stops_at: Option<usize>) -> Ended {
     let mut host = Host { bench, sent: 0, stops_at };
     let mut events = Vec::new();
     let node = canopen::NodeId::new(NODE).expect("a node-ID");
@@ -126,20 +127,20 @@ fn operations(bench: &mut Bench) -> u64 {
 }
 
 /// The first bytes of the program that are in flash.
-fn in_flash(bench: &mut Bench, file: &BlockFile) -> usize {
+fn in_flash(bench: &mut Bench, file: &Program) -> usize {
     let board = firmware::board();
     let start = (board.programs[0].base - board.chip.flash.base) as usize;
-    let both = bench.machine().flash()[start..].iter().zip(file.flash_image());
+    let both = bench.machine().flash()[start..].iter().zip(file.flash_image().into_owned());
     both.take_while(|(cell, byte)| **cell == *byte).count()
 }
 
 /// The device stores its progress in steps of this many bytes, at the end of a block.
-fn step(file: &BlockFile) -> usize {
-    BLOCK + (file.program_size() as usize / 16).max(1024)
+fn step(file: &Program) -> usize {
+    BLOCK + (file.size() as usize / 16).max(1024)
 }
 
 /// Cuts updates with this file in all ways; returns how many went on.
-fn cut_updates(rate: BitRate, file: &BlockFile, seeds: std::ops::Range<u64>) -> usize {
+fn cut_updates(rate: BitRate, file: &Program, seeds: std::ops::Range<u64>) -> usize {
     let mut bench = board(rate, None);
     update(&mut bench, &firmware::blocks(firmware::APP_V2), None).result.expect("the old program");
     bench.power_off();
@@ -187,7 +188,7 @@ fn cut_updates(rate: BitRate, file: &BlockFile, seeds: std::ops::Range<u64>) -> 
         assert!(!second.began_again(), "{told}");
         // Nothing is on record before the first step, and a program that is complete comes
         // once more as a whole, or not at all.
-        if in_flash > step(file) && first.arrived() < file.program_size() as usize {
+        if in_flash > step(file) && first.arrived() < file.size() as usize {
             assert!(first.result.is_err(), "{told}");
             let done = second.went_on().unwrap_or_else(|| panic!("from the start, {told}"));
             going_on += 1;
@@ -204,7 +205,7 @@ fn cut_updates(rate: BitRate, file: &BlockFile, seeds: std::ops::Range<u64>) -> 
         }
         assert!(!bench.is_bootloader(NODE), "{told}");
         let crc = bench.session().read_number(Address::new(PROGRAM_ID, 1)).unwrap();
-        assert_eq!(crc, file.program_crc(), "{told}");
+        assert_eq!(crc, file.crc(), "{told}");
         bench.assert_nothing_unmodelled();
     }
     going_on

@@ -6,9 +6,9 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::device::{Doing, Transfers};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::read;
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use coflash_core::Error;
 use emulator::time::Span;
@@ -30,13 +30,13 @@ fn identification(bench: &mut Bench, program: u8) -> u32 {
     u32::from_le_bytes([answer[4], answer[5], answer[6], answer[7]])
 }
 
-fn blocks(image: &str, program: usize) -> BlockFile {
+fn blocks(image: &str, program: usize) -> Program {
     let elf = firmware::elf(&firmware::of_board(LAYOUT.board, image));
     let options = Options::default().region(Region::Strict(LAYOUT.programs[program - 1].into()));
-    blocks_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").file
+    program_of(read(&elf, None, None).expect("an ELF of ours"), &options).expect("it fits").program
 }
 
-fn install(bench: &mut Bench, program: u8, file: &BlockFile) {
+fn install(bench: &mut Bench, program: u8, file: &Program) {
     let options = FlashOptions::default().program(program).start(false);
     flash(&mut bench.session(), file, &options, &mut |_| {}).unwrap();
     coflash_core::update::steps::release(&mut bench.session(), program, &mut |_| {}).unwrap();
@@ -77,7 +77,7 @@ fn two_programs_are_installed_started_and_erased_each_by_itself() {
     assert_eq!(start, 0x0201_0000);
     restart(&mut bench);
     assert_eq!((identification(&mut bench, 1), version(&mut bench).as_str()), (0, "2.0.0"));
-    assert_eq!(identification(&mut bench, 2), second.program_crc());
+    assert_eq!(identification(&mut bench, 2), second.crc());
 
     install(&mut bench, 1, &first);
     restart(&mut bench);
@@ -152,7 +152,7 @@ fn a_second_program_is_written_to_a_running_device() {
             assert_eq!(read(&mut bench, index, 0), [0x4F, index, 0x1F, 0, 3, 0, 0, 0]);
             assert_eq!(read(&mut bench, index, 4), [0x80, index, 0x1F, 4, 0x11, 0, 0x09, 0x06]);
         }
-        assert_eq!(identification(&mut bench, 1), one.program_crc(), "{first}");
+        assert_eq!(identification(&mut bench, 1), one.crc(), "{first}");
         assert_eq!(identification(&mut bench, 2), 0, "{first}");
         // START of the running program changes nothing. START of another program, and all other
         // commands for it, are left to the bootloader (08000022h). A program that does not exist
@@ -171,8 +171,8 @@ fn a_second_program_is_written_to_a_running_device() {
         // The second program runs now; the first one is installed and stopped.
         assert_eq!(read(&mut bench, 0x51, 1), [0x4F, 0x51, 0x1F, 1, 0, 0, 0, 0]);
         assert_eq!(read(&mut bench, 0x51, 2), [0x4F, 0x51, 0x1F, 2, 1, 0, 0, 0]);
-        assert_eq!(identification(&mut bench, 1), one.program_crc(), "{second}");
-        assert_eq!(identification(&mut bench, 2), two.program_crc(), "{second}");
+        assert_eq!(identification(&mut bench, 1), one.crc(), "{second}");
+        assert_eq!(identification(&mut bench, 2), two.crc(), "{second}");
         // The update of the first program starts in the second one.
         let options = FlashOptions::default().verify(true);
         flash(&mut bench.session(), &one, &options, &mut |_| {}).unwrap();

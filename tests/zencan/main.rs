@@ -7,8 +7,10 @@
 use std::time::Duration;
 
 use coboot_can::Adapter;
+use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
+use coflash_core::file::block_file::BlockFile;
 use embedded_can::{Frame, Id};
 use emulator::world::MachineId;
 use tokio::sync::mpsc::{unbounded_channel, UnboundedReceiver, UnboundedSender};
@@ -134,7 +136,7 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
     bench.power_on();
     bench.await_boot_up(100);
     let file = firmware::blocks(firmware::APP_V1);
-    let blocks: Vec<Vec<u8>> = file.blocks().iter().map(|block| block.emit()).collect();
+    let blocks: Vec<Vec<u8>> = BlockFile::of(&file).blocks().iter().map(|block| block.emit()).collect();
     assert!(blocks.len() >= 3);
     on(&mut bench, async |sender, receiver| {
         let client = &mut SdoClient::new_std(NODE, sender, receiver);
@@ -176,7 +178,7 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
             client.block_download(0x1F50, 1, block).await.unwrap();
             assert_eq!(status(client).await, 0);
         }
-        assert_eq!(client.read_u32(0x1F56, 1).await, Ok(file.program_crc()));
+        assert_eq!(client.read_u32(0x1F56, 1).await, Ok(file.crc()));
         command(client, 0x83).await;
         client.write_u8(0x1F51, 1, 0x01).await.unwrap();
     });
@@ -185,7 +187,7 @@ fn as_sdo_client_it_reads_downloads_by_blocks_and_by_segments_and_starts_the_pro
         let client = &mut SdoClient::new_std(NODE, sender, receiver);
         assert_eq!(client.read_software_version().await.as_deref(), Ok("1.0.0"));
         assert_eq!(client.read_device_name().await.as_deref(), Ok(bsp::IDENTITY.device_name));
-        assert_eq!(client.read_u32(0x1F56, 1).await, Ok(file.program_crc()));
+        assert_eq!(client.read_u32(0x1F56, 1).await, Ok(file.crc()));
     });
     bench.assert_nothing_unmodelled();
 }

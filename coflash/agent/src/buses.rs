@@ -22,7 +22,7 @@ use coflash_core::device::state::{reason, source, supply};
 use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
 use coflash_core::update::event::Phase;
 use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
-use coflash_core::update::{DeviceState, Event, FlashOptions, Program, Report};
+use coflash_core::update::{DeviceState, Event, FlashOptions, Payload, Report};
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
@@ -124,7 +124,7 @@ impl Buses<'_> {
         let program = job.options.program;
         let mut number = |index| session.read_number(Address::new(index, program)).ok();
         number(PROGRAM_CONTROL) == Some(ProgramState::Running as u32)
-            && number(PROGRAM_ID).is_some_and(|crc| job.file.program_crcs().contains(&crc))
+            && number(PROGRAM_ID).is_some_and(|crc| job.file.crcs().contains(&crc))
     }
 }
 
@@ -166,9 +166,9 @@ impl Devices for Buses<'_> {
 }
 
 /// A program in words.
-fn of(program: &Program) -> String {
+fn of(program: &Payload) -> String {
     let kind = if program.is_bootloader() { "bootloader" } else { "program" };
-    format!("{kind} of {} bytes, CRC {:08X}h", program.program_size(), program.program_crc())
+    format!("{kind} of {} bytes, CRC {:08X}h", program.size(), program.crc())
 }
 
 /// The news in an event of an update.

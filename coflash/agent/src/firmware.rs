@@ -4,18 +4,18 @@ use std::path::Path;
 use std::sync::Arc;
 
 use super::config::Device;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::judge::judge;
 use coflash_core::file::ram_image::Fault;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{self, AddressRange, Format};
-use coflash_core::update::{NewBootloader, Program};
+use coflash_core::update::{NewBootloader, Payload};
 
 /// Reads and judges a firmware file, as `coflash flash` does, without the device.
 ///
 /// # Errors
 /// The lines for the server: what is wrong, and what to do.
-pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Program, Vec<String>> {
+pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Payload, Vec<String>> {
     let lines = |what: String, advice: &str| vec![what, format!("what to do: {advice}")];
     let anew = "deploy the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image";
     let format = Format::of(Path::new(name), bytes);
@@ -38,8 +38,9 @@ pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Progr
     let firmware =
         file::read(bytes, format, place).map_err(|error| lines(error.of(name).to_string(), anew))?;
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
-    let blocks = blocks_of(firmware, &options).map_err(|error| lines(format!("{name}: {error}"), anew))?.file;
-    judge(&blocks.image(), blocks.program_start(), device.board)
+    let converted = program_of(firmware, &options);
+    let program = converted.map_err(|error| lines(format!("{name}: {error}"), anew))?.program;
+    judge(program.image(), program.start(), device.board)
         .map_err(|fault| lines(format!("{name}: {fault}"), fault.advice()))?;
-    Ok(Arc::new(blocks).into())
+    Ok(Arc::new(program).into())
 }

@@ -18,7 +18,7 @@ use super::firmware;
 use super::http::{Client, Limits};
 use super::record::{Record, Store};
 use coflash_core::file::limit::MAX_FILE_SIZE;
-use coflash_core::update::Program;
+use coflash_core::update::Payload;
 
 /// What an agent does with its devices.
 pub trait Devices: Sync {
@@ -39,7 +39,7 @@ pub struct Order<'o> {
     /// The device.
     pub device: &'o Device,
     /// The program: fetched, checked and judged.
-    pub program: Program,
+    pub program: Payload,
     /// Whether an earlier agent has seen that the device keeps this program. If it runs, the order
     /// is carried out already.
     pub kept: bool,

@@ -13,7 +13,7 @@ use coflash_core::device::option_bytes::OptionBytes;
 use coflash_core::device::read_state::read_state;
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::convert::Label;
-use coflash_core::update::Program;
+use coflash_core::update::Payload;
 use serde_json::json;
 
 use super::context::Context;
@@ -126,12 +126,12 @@ impl Conform {
         }
     }
 
-    /// The program of --image, as blocks.
-    fn image(&self, context: &Context) -> Result<Option<Program>, Failure> {
+    /// The program of --image.
+    fn image(&self, context: &Context) -> Result<Option<Payload>, Failure> {
         let Some(path) = &self.image else { return Ok(None) };
-        let done = self.source.blocks(path, 1, Label::OfImage { date: 0 })?;
+        let done = self.source.program(path, 1, Label::OfImage { date: 0 })?;
         warn(context, path, &done);
-        Ok(Some(Arc::new(done.file).into()))
+        Ok(Some(Arc::new(done.program).into()))
     }
 
     /// What a product needs beside a device that conforms: the option bytes of its chip.

@@ -5,19 +5,19 @@ use std::time::SystemTime;
 
 use ::seal::wire::CERTIFICATE;
 use clap::Args;
-use coflash_core::file::block_file::{BlockFile, FRAMING};
+use coflash_core::file::block_file::{self, BlockFile, FRAMING};
 use coflash_core::file::convert::{Converted, Label};
 use coflash_core::file::judge::{judge, StackAtEnd};
 use coflash_core::file::read::Firmware;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
+use coflash_core::file::{Program, Target};
 use serde_json::json;
-use shared_abi::block_file::{Control, Identity, ProgramVersion};
 
 use super::context::Context;
 use super::file::{warn, Input, Source};
 use super::keys::{self, value_of_128_bits};
 use super::output::Failure;
-use super::seal::{self, Form, Program};
+use super::seal::{self, Form, ToSeal};
 use super::values::{number, program_number};
 
 /// Converts a firmware file into a block file, ready for 1F50h.
@@ -164,9 +164,9 @@ impl Convert {
         }
         let (firmware, _) = self.source.load(input, self.program)?;
         let of_image = self.labels.vid.is_none() && matches!(firmware, Firmware::Image(_));
-        if let Firmware::Blocks(blocks) = &firmware {
+        if let Firmware::Blocks(program) = &firmware {
             // Blocks are copied unchanged, including their CRC.
-            let (file, kept) = (input.display(), blocks.checksum());
+            let (file, kept) = (input.display(), program.checksum());
             context.out.say(format_args!("{file}: this is already a block file; it keeps its {kept}"));
             if self.source.wants(kept) || self.labels.vid.is_some() {
                 let advice = "convert the original firmware instead";
@@ -177,31 +177,32 @@ impl Convert {
         }
         let done = self.source.convert(firmware, input, self.program, self.labels.label(input)?)?;
         warn(context, input, &done);
-        let (image, start) = (done.file.image(), done.file.program_start());
-        match (self.source.layout()?, StackAtEnd::of(&image, start)) {
+        let program = &done.program;
+        let (image, start) = (program.image(), program.start());
+        match (self.source.layout()?, StackAtEnd::of(image, start)) {
             (None, Some(stack)) => context.out.warn(format_args!("{}: {stack}", input.display())),
             (None, None) => {}
-            (board, _) => judge(&image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
+            (board, _) => judge(image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
         }
         if sealing.is_none() {
-            write(&output, &done.file.emit())?;
+            write(&output, &block_file::emit(program))?;
         }
         if self.temp {
             let name = output.with_extension("tmp");
             let flash = PathBuf::from(name.file_name().unwrap_or_default());
-            write(&flash, &done.file.flash_image())?;
+            write(&flash, &program.flash_image())?;
             context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
         }
         if let Some(sealing) = sealing {
-            return self.seal(context, &output, &done.file, &sealing);
+            return self.seal(context, &output, program, &sealing);
         }
-        if let (true, Some(Control::Dated { identity, version, .. })) = (of_image, done.file.control()) {
-            let Identity { vendor_id, product_code, .. } = identity;
+        if let (true, [Some(target), _], Some(release)) = (of_image, program.targets(), program.release()) {
+            let Target { vendor_id, product_code } = target;
             let output = output.display();
             context.out.say(format_args!(
                 "{output}: for vendor-ID {vendor_id:08X}h, product code {product_code:08X}h, version {}, \
                  as its label says",
-                ProgramVersion(version)
+                release.version
             ));
         }
         self.tell(context, &output, &done);
@@ -213,13 +214,14 @@ impl Convert {
         &self,
         context: &Context,
         output: &Path,
-        blocks: &BlockFile,
+        program: &Program,
         sealing: &Sealing,
     ) -> Result<(), Failure> {
         let Labels { vid, pid, ver, date, .. } = self.labels;
-        let program = Program {
+        let start = program.start();
+        let program = ToSeal {
             path: self.input.path(),
-            blocks,
+            program,
             board: self.source.layout()?,
             identity: (vid, pid),
             options: ("--vid and --pid", "--vid and --pid"),
@@ -238,7 +240,7 @@ impl Convert {
         let is_plain = output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cbs"));
         let form = match is_plain {
             true => Form::Plain,
-            false => Form::Blocks { start: blocks.program_start(), size: self.source.block_size() },
+            false => Form::Blocks { start, size: self.source.block_size() },
         };
         if self.encryption.add.is_some_and(|add| add != 0) {
             context.out.warn("--add has no effect: every sealed image has its own nonce");
@@ -249,8 +251,9 @@ impl Convert {
     }
 
     fn tell(&self, context: &Context, output: &Path, done: &Converted) {
-        let Converted { file, left_out, .. } = done;
-        let (start, size, crc) = (file.program_start(), file.program_size(), file.program_crc());
+        let Converted { program, left_out, .. } = done;
+        let (start, size, crc) = (program.start(), program.size(), program.crc());
+        let file = BlockFile::of(program);
         let count = file.blocks().len();
         let largest = file.blocks().iter().map(|block| block.data.len() + FRAMING).max();
         context.out.detail(format_args!(

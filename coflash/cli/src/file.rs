@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
 use clap::{Args, ValueEnum};
-use coflash_core::file::block_file::{Checksum, LastBlock};
+use coflash_core::file::checksum::Checksum;
 use coflash_core::file::convert::{
-    blocks_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE,
+    program_of, Converted, GapFill, Label, Options, Region, DEFAULT_BLOCK_SIZE,
 };
+use coflash_core::file::program::LastBlock;
 use coflash_core::file::read::{self, Firmware, Format};
 use coflash_core::file::{self, limit, AddressRange};
 use coflash_core::update::JOINED_BLOCKS;
@@ -133,8 +134,8 @@ impl From<FormatName> for Format {
 }
 
 impl Source {
-    /// Reads `file` for program `number` and converts it into blocks, without access to a device.
-    pub(super) fn blocks(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
+    /// Reads `file` for program `number` and makes a program of it, without access to a device.
+    pub(super) fn program(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
         let (firmware, _) = self.load(file, program)?;
         self.convert(firmware, file, program, label)
     }
@@ -144,7 +145,7 @@ impl Source {
         self.place.load(file, program)
     }
 
-    /// Converts a file that was read into blocks.
+    /// Makes a program of a file that was read.
     pub(super) fn convert(
         &self,
         firmware: Firmware,
@@ -161,7 +162,7 @@ impl Source {
             .checksum(if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 })
             .max_gap(self.block_max_gap)
             .last_block(if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 });
-        blocks_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+        program_of(firmware, &options).map_err(|error| Failure::convert(error, file))
     }
 
     /// The same options for another board.
@@ -272,8 +273,8 @@ pub(super) fn base(path: &Path) -> Result<Vec<u8>, Failure> {
         return Ok(bytes);
     }
     let firmware = read::read(&bytes, None, None).map_err(|error| error.of(path.display()))?;
-    let done = blocks_of(firmware, &Options::default()).map_err(|error| Failure::convert(error, path))?;
-    Ok(done.file.flash_image())
+    let done = program_of(firmware, &Options::default()).map_err(|error| Failure::convert(error, path))?;
+    Ok(done.program.flash_image().into_owned())
 }
 
 /// A firmware file as a positional argument.

@@ -10,16 +10,16 @@ use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::lss::{ensure_node_id, LssAddress};
 use coflash_core::device::Dialect;
-use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::convert::{blocks_of_sealed, Label};
 use coflash_core::file::judge::judge;
 use coflash_core::file::limit::read_text;
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
+use coflash_core::file::Program;
 use coflash_core::update::dialect::is_data;
 use coflash_core::update::job::{self, Entry, Settings};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash_core::update::{flash_program, Event, FlashOptions, Program};
+use coflash_core::update::{flash_program, Event, FlashOptions, Payload};
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -179,7 +179,7 @@ struct Assignment {
     node: Option<NodeId>,
     address: Option<LssAddress>,
     image: PathBuf,
-    file: Program,
+    file: Payload,
     options: FlashOptions,
 }
 
@@ -210,7 +210,7 @@ impl Flash {
 
     /// Whether the manual's words leave the trial of this file out. DotNetFlashtool knows neither job
     /// files nor new bootloaders, and a bootloader is never installed without its trial.
-    fn is_untried(&self, file: &Program) -> bool {
+    fn is_untried(&self, file: &Payload) -> bool {
         self.legacy.makes_no_trial() && self.job.is_none() && !file.is_bootloader()
     }
 
@@ -237,15 +237,15 @@ impl Flash {
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
         let image = self.file.as_deref().or(self.legacy.file()).ok_or_else(unnamed)?;
-        let file = self.program(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
+        let file = self.payload(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
         let options = self.options(&file, &Settings::default())?;
         match &file {
-            Program::Blocks(file) => {
-                let (size, crc) = (file.program_size(), file.program_crc());
+            Payload::Program(program) => {
+                let (size, crc) = (program.size(), program.crc());
                 context.out.say(format_args!("{}: program of {size} bytes, CRC {crc:08X}h", image.display()));
             }
-            Program::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
-            Program::Bootloader(new) => {
+            Payload::Sealed(file) => context.out.say(format_args!("{}: {}", image.display(), brief(file))),
+            Payload::Bootloader(new) => {
                 let (version, size, crc) = (new.version(), new.size(), new.crc());
                 let image = image.display();
                 context
@@ -277,7 +277,7 @@ impl Flash {
     /// The devices of a job file. Every image is read and checked before any device is changed.
     fn devices_of_job(&self, context: &Context, job: &Path) -> Result<Vec<Assignment>, Failure> {
         // Devices with the same image share it.
-        let mut known: Vec<(PathBuf, Option<String>, u8, Program)> = Vec::new();
+        let mut known: Vec<(PathBuf, Option<String>, u8, Payload)> = Vec::new();
         let mut devices = Vec::new();
         let text = read_text(job).map_err(|error| Failure::unreadable(job, &error))?;
         let entries = job::parse(&text, job.parent().unwrap_or(Path::new("")));
@@ -295,7 +295,7 @@ impl Flash {
                         Some(board) => self.source().for_board(board),
                         None => self.source(),
                     };
-                    let file = self.program(context, &image, program, &source, Label::default())?;
+                    let file = self.payload(context, &image, program, &source, Label::default())?;
                     known.push((image.clone(), settings.board.clone(), program, file.clone()));
                     file
                 }
@@ -306,15 +306,15 @@ impl Flash {
         Ok(devices)
     }
 
-    /// Reads and checks the program for a device.
-    fn program(
+    /// Reads and checks what a device is to get.
+    fn payload(
         &self,
         context: &Context,
         path: &Path,
         program: u8,
         source: &Source,
         label: Label,
-    ) -> Result<Program, Failure> {
+    ) -> Result<Payload, Failure> {
         if let Some(new) = bootloader_in(path, source.format())? {
             return Ok(new.into());
         }
@@ -333,25 +333,25 @@ impl Flash {
             }
             return Ok(Arc::new(file).into());
         }
-        let done = source.blocks(path, program, label)?;
+        let done = source.program(path, program, label)?;
         warn(context, path, &done);
-        self.judge(path, &done.file, program, source)?;
-        Ok(Arc::new(done.file).into())
+        self.judge(path, &done.program, program, source)?;
+        Ok(Arc::new(done.program).into())
     }
 
     /// Refuses a file that cannot be a program, before any request to a device. For a possible lift
     /// device, the meaning of a program number above 1 is not known without the device.
-    fn judge(&self, path: &Path, file: &BlockFile, program: u8, source: &Source) -> Result<(), Failure> {
+    fn judge(&self, path: &Path, program: &Program, number: u8, source: &Source) -> Result<(), Failure> {
         let dialect = self.access.dialect();
-        if self.force || is_data(dialect.unwrap_or(Dialect::Lift), program) {
+        if self.force || is_data(dialect.unwrap_or(Dialect::Lift), number) {
             return Ok(());
         }
         let board = source.layout()?;
-        judge(&file.image(), file.program_start(), board).map_err(|fault| Failure::no_program(path, fault))
+        judge(program.image(), program.start(), board).map_err(|fault| Failure::no_program(path, fault))
     }
 
     /// The options of the command line, unless the device's own settings replace them.
-    fn options(&self, file: &Program, settings: &Settings) -> Result<FlashOptions, Failure> {
+    fn options(&self, file: &Payload, settings: &Settings) -> Result<FlashOptions, Failure> {
         let check = settings.check_target.unwrap_or(self.check_target || self.legacy.check_target());
         let advice = "convert it with --vid and --pid, or give these options here";
         let unnamed = || Failure::usage("the file does not name its target device", advice);

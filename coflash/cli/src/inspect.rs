@@ -43,7 +43,7 @@ impl Inspect {
         let mut start = None;
         if self.source.has_region() || matches!(firmware, Firmware::Blocks(_)) {
             let done = self.source.convert(firmware.clone(), path, self.program, Default::default())?;
-            start = Some(done.file.program_start());
+            start = Some(done.program.start());
         }
         let inspection = Inspection::of(&firmware, format, start, self.source.layout()?);
         context.out.result(format_args!("{}: {inspection}", path.display()), || value(&inspection));

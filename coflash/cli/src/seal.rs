@@ -3,15 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, blocks_of_sealed, DEFAULT_BLOCK_SIZE};
+use coflash_core::file::convert::{blocks_of_sealed, program_of, DEFAULT_BLOCK_SIZE};
 use coflash_core::file::judge::judge;
-use coflash_core::file::label::label_of;
 use coflash_core::file::limit;
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::read;
 use coflash_core::file::sealed::sealer::CHUNK;
 use coflash_core::file::sealed::{hash, Kek, SealFault, SealedFile, Sealer, SigningKey, Unsigned};
+use coflash_core::file::Program;
 use seal::wire::{flag, BOOTLOADER, MAX_CHUNK, MIN_CHUNK};
 use shared_abi::block_file::ProgramVersion;
 use shared_abi::layout::Layout;
@@ -158,11 +157,11 @@ fn chunk(text: &str) -> Result<u8, String> {
 }
 
 /// A program to seal, and the options for it.
-pub(super) struct Program<'p> {
+pub(super) struct ToSeal<'p> {
     /// Its file.
     pub(super) path: &'p Path,
-    /// Its blocks.
-    pub(super) blocks: &'p BlockFile,
+    /// What is in it.
+    pub(super) program: &'p Program,
     /// The memory map of its device, if it is known.
     pub(super) board: Option<&'static Layout>,
     /// Vendor-ID and product code; if absent, those of its label.
@@ -173,16 +172,16 @@ pub(super) struct Program<'p> {
     pub(super) version: Option<u32>,
 }
 
-impl Program<'_> {
+impl ToSeal<'_> {
     /// Refuses a file that cannot be a program, like `flash`.
     pub(super) fn judge(&self) -> Result<(), Failure> {
-        let (image, start) = (self.blocks.image(), self.blocks.program_start());
-        judge(&image, start, self.board).map_err(|fault| Failure::no_program(self.path, fault))
+        judge(self.program.image(), self.program.start(), self.board)
+            .map_err(|fault| Failure::no_program(self.path, fault))
     }
 
     /// Adds the program's identity and version to the parameters in `sealer`.
     pub(super) fn sealer<'s>(&self, sealer: Sealer<'s>) -> Result<Sealer<'s>, Failure> {
-        let label = label_of(&self.blocks.image(), self.blocks.program_start());
+        let label = self.program.label();
         let unnamed = |what: &str, option: &str| {
             let what = format!("{}: the program has no {what} of its target device", self.path.display());
             Failure::usage(what, format!("give {option}"))
@@ -199,7 +198,7 @@ impl Program<'_> {
 
     /// Seals the program as it lies in flash with this key.
     pub(super) fn seal(&self, sealer: &Sealer<'_>, key: &SigningKey) -> Result<Vec<u8>, Failure> {
-        sealer.seal(&self.blocks.flash_image(), key).map_err(|fault| self.fault(&fault))
+        sealer.seal(&self.program.flash_image(), key).map_err(|fault| self.fault(&fault))
     }
 
     fn fault(&self, fault: &SealFault) -> Failure {
@@ -274,23 +273,23 @@ impl Seal {
             return self.seal_bootloader(context, path, &output);
         }
         let (firmware, _) = self.place.load(path, self.program)?;
-        let done = blocks_of(firmware, &self.place.options(self.program)?);
+        let done = program_of(firmware, &self.place.options(self.program)?);
         let done = done.map_err(|error| Failure::convert(error, path))?;
         super::file::warn(context, path, &done);
-        let program = Program {
+        let to_seal = ToSeal {
             path,
-            blocks: &done.file,
+            program: &done.program,
             board: self.place.layout()?,
             identity: (self.vendor, self.product),
             options: ("--vendor", "--product"),
             version: self.ver,
         };
         if !self.data && !self.force {
-            program.judge()?;
+            to_seal.judge()?;
         }
         let encrypt_for = keys::keks(&self.encrypt)?;
         let base = self.base.as_deref().map(base).transpose()?;
-        let sealer = program.sealer(Sealer {
+        let sealer = to_seal.sealer(Sealer {
             // clap requires the option in every case that reaches this line.
             counter: self.counter.unwrap_or(0),
             program: self.program,
@@ -301,16 +300,16 @@ impl Seal {
             ..self.sealer(&encrypt_for)?
         })?;
         let image = match &self.tbs {
-            None => program.seal(&sealer, &keys::signing_key(&self.key)?)?,
+            None => to_seal.seal(&sealer, &keys::signing_key(&self.key)?)?,
             Some(tbs) => {
                 let key = keys::public_key(&self.key)?;
-                let unsigned = sealer.for_module(&program.blocks.flash_image(), key);
-                let unsigned = unsigned.map_err(|fault| program.fault(&fault))?;
+                let unsigned = sealer.for_module(&done.program.flash_image(), key);
+                let unsigned = unsigned.map_err(|fault| to_seal.fault(&fault))?;
                 write(tbs, &unsigned.tbs())?;
                 unsigned.file().to_vec()
             }
         };
-        let file = put(&output, image, self.form(|| Ok(program.blocks.program_start()))?)?;
+        let file = put(&output, image, self.form(|| Ok(done.program.start()))?)?;
         tell(context, "seal", &output, &file, self.tbs.is_none());
         Ok(())
     }

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::sealed::open::Closed;
 use coflash_core::file::sealed::show::{digits, flags, text};
 use coflash_core::file::sealed::{blocks, carried, verify, Carried, Device, Opened, SealedFile};
@@ -147,18 +148,18 @@ impl Show {
 pub(super) fn show(context: &Context, command: &str, path: &Path) -> Result<(), Failure> {
     let Carried { image, blocks } = read(path)?;
     let file = SealedFile::parse(image).map_err(|refusal| Failure::sealed(path, &refusal))?;
-    let carrier = blocks.as_ref().map_or_else(String::new, |blocks| {
-        let (count, start) = (blocks.blocks().len(), blocks.program_start());
+    let carrier = blocks.as_ref().map_or_else(String::new, |program| {
+        let (count, start) = (BlockFile::of(program).blocks().len(), program.start());
         format!("block file, {count} blocks, from {start:#010x} on; in it: ")
     });
     context.out.result(format_args!("{}: {carrier}{}", path.display(), file.parts()), || {
         let mut value = value(&file);
         value["command"] = command.into();
-        value["blocks"] = json!(blocks.as_ref().map(|blocks| json!({
-            "count": blocks.blocks().len(),
-            "start": blocks.program_start(),
-            "size": blocks.program_size(),
-            "crc": blocks.program_crc(),
+        value["blocks"] = json!(blocks.as_ref().map(|program| json!({
+            "count": BlockFile::of(program).blocks().len(),
+            "start": program.start(),
+            "size": program.size(),
+            "crc": program.crc(),
         })));
         value
     });

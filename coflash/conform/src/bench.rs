@@ -9,7 +9,7 @@ use canopen::{CobId, Frame, NodeId};
 
 use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::{Error, Session, Timing};
-use coflash_core::update::Program;
+use coflash_core::update::Payload;
 
 /// Switches the power of the device on or off.
 pub type Power<'p> = Box<dyn FnMut(bool) -> Result<(), String> + 'p>;
@@ -19,7 +19,7 @@ pub struct Means<'p> {
     /// The longest time for an answer of the device.
     pub answer: Duration,
     /// The program for the checks that install one.
-    pub image: Option<Program>,
+    pub image: Option<Payload>,
     /// The power of the device.
     pub power: Option<Power<'p>>,
 }
@@ -118,7 +118,7 @@ impl<'a> Bench<'a> {
     }
 
     /// The program to install.
-    pub(super) fn image(&self) -> Result<&Program, Stop> {
+    pub(super) fn image(&self) -> Result<&Payload, Stop> {
         self.means.image.as_ref().ok_or_else(|| Stop::Skipped("no program is given".to_string()))
     }
 

@@ -10,7 +10,8 @@ use canopen::Address;
 use super::bench::{failed, request, skipped, Bench, Stop};
 use super::check::Check;
 use coflash_core::device::{DeviceType, Doing, Error, Session};
-use coflash_core::update::{flash_program, steps, FlashOptions, Program};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::update::{flash_program, steps, FlashOptions, Payload};
 
 const PROCEDURE: &str = "L-1112, procedure in principle";
 const COMMANDS: &str = "L-1112, table 2";
@@ -60,7 +61,7 @@ pub(super) const CHECKS: &[Check] = &[
             }
         }
         match b.value(0x1F56, NUMBER, 4)? {
-            crc if program.program_crcs().contains(&crc) => failed("the program is still there"),
+            crc if program.crcs().contains(&crc) => failed("the program is still there"),
             _ => Ok(()),
         }
     }),
@@ -181,7 +182,7 @@ fn running(b: &mut Bench<'_>) -> Result<(), Stop> {
 }
 
 fn has_image(b: &mut Bench<'_>) -> Result<(), Stop> {
-    let crcs = b.image()?.program_crcs();
+    let crcs = b.image()?.crcs();
     match b.with(|session| session.read_number(Address::new(PROGRAM_ID, NUMBER)))? {
         told if crcs.contains(&told) => Ok(()),
         told => failed(format!("1F56h/1 is {told:08X}h in place of {:08X}h", crcs[0])),
@@ -191,7 +192,10 @@ fn has_image(b: &mut Bench<'_>) -> Result<(), Stop> {
 /// CLEAR and block 0; returns all blocks, with the CRC of the file or with the other one: a product has
 /// one of the two, and refuses block 0 with the other.
 fn begin(b: &mut Bench<'_>) -> Result<Vec<Vec<u8>>, Stop> {
-    let Program::Blocks(file) = b.image()?.clone() else { return skipped("a sealed image has no blocks") };
+    let Payload::Program(program) = b.image()?.clone() else {
+        return skipped("a sealed image has no blocks");
+    };
+    let file = BlockFile::of(&program);
     in_bootloader(b)?;
     b.with(|session| steps::erase(session, NUMBER, &mut |_| {}))?;
     let with = |checksum| -> Vec<Vec<u8>> {

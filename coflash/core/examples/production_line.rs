@@ -22,8 +22,8 @@ use canopen::NodeId;
 use coboot_can::Adapter;
 use coflash_core::device::lss::{ensure_node_id, Master, ANSWER};
 use coflash_core::device::{info, Error, Session, Timing};
-use coflash_core::file::convert::{blocks_of, Options, Region};
-use coflash_core::file::{self, BlockFile};
+use coflash_core::file::convert::{program_of, Options, Region};
+use coflash_core::file::{self, Program};
 use coflash_core::update::event::Problem;
 use coflash_core::update::{flash, FlashOptions};
 use serde_json::json;
@@ -53,7 +53,7 @@ struct Order {
     node: NodeId,
     /// Whether the device must get its node-ID first.
     lss: bool,
-    program: BlockFile,
+    program: Program,
 }
 
 impl Order {
@@ -71,8 +71,8 @@ impl Order {
         let layout = file::board::named(board).map_err(|error| station(error.to_string()))?;
         let region = Region::Strict(layout.programs[0].into());
         let firmware = file::load(Path::new(path), None, None).map_err(|error| station(error.to_string()))?;
-        let blocks = blocks_of(firmware, &Options::default().region(region));
-        let program = blocks.map_err(|error| station(format!("{path}: {error}")))?.file;
+        let converted = program_of(firmware, &Options::default().region(region));
+        let program = converted.map_err(|error| station(format!("{path}: {error}")))?.program;
         Ok(Self { bus: bus.clone(), node, lss, program })
     }
 

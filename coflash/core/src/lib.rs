@@ -15,19 +15,19 @@
 //!
 //! ```no_run
 //! use coflash_core::device::{Session, Timing};
-//! use coflash_core::file::convert::{blocks_of, Options, Region};
+//! use coflash_core::file::convert::{program_of, Options, Region};
 //! use coflash_core::update::{flash, FlashOptions};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let layout = shared_abi::layout::by_name("stm32f407g-disc1").ok_or("unknown board")?;
 //! let options = Options::default().region(Region::Strict(layout.programs[0].into()));
 //! let firmware = coflash_core::file::load("app.elf".as_ref(), None, None)?;
-//! let blocks = blocks_of(firmware, &options)?.file;
+//! let program = program_of(firmware, &options)?.program;
 //!
 //! let mut bus = coboot_can::open("socketcand://127.0.0.1:29536/can0")?;
 //! let node = canopen::NodeId::new(1).ok_or("no such node-ID")?;
 //! let mut session = Session::new(&mut bus, node, Timing::default());
-//! flash(&mut session, &blocks, &FlashOptions::default(), &mut |event| println!("{event}"))?;
+//! flash(&mut session, &program, &FlashOptions::default(), &mut |event| println!("{event}"))?;
 //! # Ok(())
 //! # }
 //! ```

@@ -14,10 +14,10 @@ use canopen::NodeId;
 use coboot_can::decode::state_words;
 use coboot_can::Link;
 use coflash_core::device::{self, Dialect, ScanOptions, Session, Timing};
-use coflash_core::file::convert::{blocks_of, ConvertError, Options, Region};
+use coflash_core::file::convert::{program_of, ConvertError, Options, Region};
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{self, limit, Format};
-use coflash_core::update::{self, FlashOptions, NewBootloader, Password, Program};
+use coflash_core::update::{self, FlashOptions, NewBootloader, Password, Payload};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -79,7 +79,7 @@ fn flash<'py>(
     if !(1..=254).contains(&program) {
         return Err(PyValueError::new_err("programs are 1 to 254"));
     }
-    let content = program_of(&file, board.as_deref(), address, program).map_err(|fault| fault.raise(py))?;
+    let content = payload_of(&file, board.as_deref(), address, program).map_err(|fault| fault.raise(py))?;
     let target = match check_target {
         false => None,
         true => Some(content.target().ok_or_else(|| {
@@ -202,14 +202,14 @@ fn object<'py>(py: Python<'py>, value: &impl Serialize) -> PyResult<Bound<'py, P
     Ok(pythonize::pythonize(py, value)?)
 }
 
-/// A bootloader, a sealed image unchanged, or the blocks of any other file, for this board if one is named; a raw
+/// A bootloader, a sealed image unchanged, or the program of any other file, for this board if one is named; a raw
 /// binary gets its address.
-fn program_of(
+fn payload_of(
     path: &std::path::Path,
     board: Option<&str>,
     address: Option<u32>,
     program: u8,
-) -> Result<Program, Fault> {
+) -> Result<Payload, Fault> {
     let region = match board {
         None => Region::Unknown,
         Some(name) => {
@@ -233,8 +233,8 @@ fn program_of(
     }
     let format = address.map(|_| Format::Raw);
     let firmware = file::read(&bytes, format, address).map_err(fault)?;
-    match blocks_of(firmware, &Options::default().region(region)) {
-        Ok(converted) => Ok(Arc::new(converted.file).into()),
+    match program_of(firmware, &Options::default().region(region)) {
+        Ok(converted) => Ok(Arc::new(converted.program).into()),
         Err(ConvertError::File(error)) => Err(fault(error)),
         Err(error) => Err(Fault::Value(error.to_string())),
     }

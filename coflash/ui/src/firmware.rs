@@ -6,29 +6,29 @@ use std::sync::Arc;
 use shared_abi::block_file::ProgramVersion;
 
 use super::state::{Firmware, Notice, Seal, Settings};
-use coflash_core::file::convert::{blocks_of, ConvertError, Options, Region};
+use coflash_core::file::convert::{program_of, ConvertError, Options, Region};
 use coflash_core::file::inspect::Inspection;
 use coflash_core::file::judge::{judge, Fault};
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
-use coflash_core::file::{self, label, ram_image, AddressRange, BlockFile, Format};
-use coflash_core::update::{NewBootloader, Program, Target};
+use coflash_core::file::{self, ram_image, AddressRange, Format, Program, Target};
+use coflash_core::update::{NewBootloader, Payload};
 
 /// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
 /// The longest name that is shown.
 const NAME_MAX: usize = 120;
 
-/// A file that was read, checked and, unless it is sealed, converted into blocks.
+/// A file that was read and checked.
 #[derive(Debug)]
 pub(super) struct Loaded {
     /// The file itself: after a change of the settings it is converted again.
     pub(super) bytes: Arc<Vec<u8>>,
-    pub(super) program: Program,
+    pub(super) program: Payload,
     pub(super) shown: Firmware,
 }
 
-/// Reads a file and converts it into blocks; a sealed image stays unchanged.
+/// Reads a file and makes a program of it; a sealed image stays unchanged.
 pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
     let name = printable(name);
     let bad = |error: &dyn std::fmt::Display| {
@@ -60,22 +60,21 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
     let board = settings.board;
     let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
-    let converted = blocks_of(firmware, &options).map_err(|error| match error {
+    let converted = program_of(firmware, &options).map_err(|error| match error {
         ConvertError::File(error) => bad(&error.of(&name)),
         error => bad(&format!("{name}: {error}")),
     })?;
-    let blocks = converted.file;
+    let program = converted.program;
     // The update itself judges the rest, but does not know the board.
-    if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(&blocks.image(), blocks.program_start(), board)
-    {
+    if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(program.image(), program.start(), board) {
         return Err(Notice::failed(format!("{name}: {fault}"), fault.advice()));
     }
-    let label = label_of(&blocks);
+    let label = label_of(&program);
     let shown = Firmware {
         size: bytes.len(),
         inspection: inspection.as_ref().map(Inspection::to_string).unwrap_or_default(),
-        program_size: blocks.program_size(),
-        crc: blocks.program_crc(),
+        program_size: program.size(),
+        crc: program.crc(),
         vendor_id: label.as_ref().map(|label| label.0),
         product_code: label.as_ref().map(|label| label.1),
         version: inspection
@@ -85,7 +84,7 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         seal: None,
         name,
     };
-    Ok(Loaded { bytes, program: Arc::new(blocks).into(), shown })
+    Ok(Loaded { bytes, program: Arc::new(program).into(), shown })
 }
 
 /// A bootloader, which takes the place of that of the device.
@@ -113,7 +112,7 @@ fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
 fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
     let file = SealedFile::for_program(bytes.to_vec(), settings.program);
     let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
-    let (head, sealed, target) = (file.head(), file.parts(), Target::of_sealed(&file));
+    let (head, sealed, target) = (file.head(), file.parts(), file.target());
     let shown = Firmware {
         size: bytes.len(),
         inspection: sealed.to_string(),
@@ -135,20 +134,14 @@ fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Load
     Ok(Loaded { bytes, program: Arc::new(file).into(), shown })
 }
 
-/// The target of the program: vendor-ID, product code and version, from block 0 or from the label
+/// The target of the program: vendor-ID, product code and version, from the file or from the label
 /// after the vectors.
-fn label_of(file: &BlockFile) -> Option<(u32, u32, Option<String>)> {
-    use shared_abi::block_file::Control;
-    match file.control() {
-        Some(Control::Identity(identity)) => Some((identity.vendor_id, identity.product_code, None)),
-        Some(Control::Dated { identity, version, .. }) => {
-            Some((identity.vendor_id, identity.product_code, Some(ProgramVersion(version).to_string())))
-        }
-        None | Some(Control::Plain) => {
-            let label = label::label_of(&file.image(), file.program_start())?;
-            Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
-        }
+fn label_of(program: &Program) -> Option<(u32, u32, Option<String>)> {
+    if let [Some(Target { vendor_id, product_code }), _] = program.targets() {
+        return Some((vendor_id, product_code, program.release().map(|release| release.version.to_string())));
     }
+    let label = program.label()?;
+    Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
 }
 
 /// The region of the program on the selected board, if there is one.
@@ -226,7 +219,7 @@ mod tests {
         }
         let words = words(&bytes, "new.bin");
         assert!(words.starts_with("new.bin: is a bootloader without a CRC"), "{words}");
-        let crc = coflash_core::file::block_file::CRC.checksum(&bytes[8..]);
+        let crc = coflash_core::file::checksum::CRC.checksum(&bytes[8..]);
         bytes[4..8].copy_from_slice(&crc.to_le_bytes());
         let loaded = load(Arc::new(bytes), "new.bin", &Settings::default()).unwrap();
         assert!(loaded.program.is_bootloader());

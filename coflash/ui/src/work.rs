@@ -15,8 +15,9 @@ use super::state::{Notice, Phase, Readback, Report};
 use coboot_can::Link;
 use coflash_core::device::lss::{self, BitRate, LssAddress, Master};
 use coflash_core::device::{info, scan, Error, ScanOptions, Session, Timing};
+use coflash_core::file::Target;
 use coflash_core::update::many::{Failed, Job as One};
-use coflash_core::update::{self, steps, Event, FlashOptions, ManyOptions, Target};
+use coflash_core::update::{self, steps, Event, FlashOptions, ManyOptions};
 
 /// The most devices in an update at the same time.
 const AT_ONCE: usize = 8;

@@ -14,9 +14,9 @@ use std::{env, fs};
 use boot_core::canopen::{Frame, NodeId};
 use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::{Session, Timing, Transfers};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::{read, Format};
+use coflash_core::file::Program;
 use coflash_core::update::{flash, FlashOptions};
 use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 
@@ -143,7 +143,7 @@ fn processor_time() -> Option<Duration> {
 }
 
 /// A program's bytes, with vectors that a bootloader accepts.
-fn program(kib: u32) -> Result<BlockFile, Box<dyn Error>> {
+fn program(kib: u32) -> Result<Program, Box<dyn Error>> {
     let region = LAYOUT.programs[0];
     let mut bytes: Vec<u8> =
         (0..kib * 1024).map(|i| (i.wrapping_mul(2_654_435_761).rotate_left(9) >> 24) as u8).collect();
@@ -151,5 +151,5 @@ fn program(kib: u32) -> Result<BlockFile, Box<dyn Error>> {
     bytes[4..8].copy_from_slice(&(region.base + 0x201).to_le_bytes());
     let image = read(&bytes, Some(Format::Raw), Some(region.base)).map_err(|error| format!("{error:?}"))?;
     let options = Options::default().region(Region::Strict(region.into()));
-    Ok(blocks_of(image, &options)?.file)
+    Ok(program_of(image, &options)?.program)
 }

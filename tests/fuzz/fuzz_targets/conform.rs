@@ -13,10 +13,11 @@ use std::time::Duration;
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
 use coboot_can::{Adapter, AdapterError};
+use coboot_can::{Adapter, AdapterError};
 use coboot_fuzz::Input;
 use coflash_conform::{checks, run, Means, Outcome};
-use coflash_core::file::convert::{blocks_of, Options, Region};
-use coflash_core::update::Program;
+use coflash_core::file::convert::{program_of, Options, Region};
+use coflash_core::update::Payload;
 use embedded_can::Frame as _;
 use kit::bus::{at, node, Device};
 
@@ -134,14 +135,14 @@ impl Adapter for Hostile<'_> {
 }
 
 /// A program of some bytes, for the checks that install one.
-fn program() -> Program {
-    static PROGRAM: OnceLock<Program> = OnceLock::new();
+fn program() -> Payload {
+    static PROGRAM: OnceLock<Payload> = OnceLock::new();
     PROGRAM
         .get_or_init(|| {
             let hex = b":020000040801F1\n:04000000EFBEADDEC4\n:00000001FF\n";
             let firmware = coflash_core::file::read(hex, None, None).expect("Intel HEX");
             let options = Options::default().region(Region::Unknown);
-            Arc::new(blocks_of(firmware, &options).expect("a program").file).into()
+            Arc::new(program_of(firmware, &options).expect("a program").program).into()
         })
         .clone()
 }

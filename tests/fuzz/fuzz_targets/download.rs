@@ -10,7 +10,8 @@ use boot_core::control::{Downloader, Policy, Room, Step};
 use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::Input;
-use coflash_core::file::block_file::{Block, CRC};
+use coflash_core::file::block_file::Block;
+use coflash_core::file::checksum::CRC;
 use kit::model::{ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::layout::Layout;
 
@@ -47,7 +48,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
                     _ => 0x0800_0800 + u32::from(place) * 4,
                 };
                 let data = input.take(usize::from(len)).to_vec();
-                let mut block = Block { number, flash_address: address, data }.emit();
+                let mut block = Block { number, flash_address: address, data: data.into() }.emit();
                 if how & 0x10 != 0 {
                     let middle = block.len() / 2;
                     block[middle] ^= 1 << (how >> 5);
@@ -123,7 +124,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     last.extend(crc.to_le_bytes());
     let good = [(0, 0, vec![0; 8]), (1, 0x0800_0800, program), (LAST, 0, last)];
     for (number, flash_address, data) in good {
-        let block = Block { number, flash_address, data }.emit();
+        let block = Block { number, flash_address, data: data.into() }.emit();
         assert_eq!(send(&mut device, &flash, &block), Ok(()), "block {number}");
         settle(&mut device, &mut flash);
         assert_eq!(device.status(1), FlashStatus::OK, "block {number}");

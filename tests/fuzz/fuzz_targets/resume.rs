@@ -21,7 +21,8 @@ use canopen::sdo::client::{Block as Blocks, Config as ClientConfig, Download, St
 use canopen::slave::{self, Output, Slave};
 use canopen::{Address, BitRate, CobId, Frame, Instant, NodeId};
 use coboot_fuzz::{is_eighth, Input};
-use coflash_core::file::block_file::{Block, CRC};
+use coflash_core::file::block_file::Block;
+use coflash_core::file::checksum::CRC;
 use kit::boot::Boot;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use shared_abi::geometry::Region;
@@ -86,13 +87,13 @@ impl File {
         image[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
         // Block 0 with an identity: reserved word, vendor-ID, product code (L-1112d_10, figure 13).
         let identity = [len as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
-        let mut blocks = vec![Block { number: 0, flash_address: 0, data: identity }.emit()];
+        let mut blocks = vec![Block { number: 0, flash_address: 0, data: identity.into() }.emit()];
         for (number, data) in (0..).zip(image.chunks(CHUNK)) {
             let flash_address = PROGRAM.base + number * CHUNK as u32;
-            blocks.push(Block { number: number + 1, flash_address, data: data.to_vec() }.emit());
+            blocks.push(Block { number: number + 1, flash_address, data: data.into() }.emit());
         }
         let last = [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
-        blocks.push(Block { number: u32::MAX, flash_address: 0, data: last }.emit());
+        blocks.push(Block { number: u32::MAX, flash_address: 0, data: last.into() }.emit());
         Self { image, blocks }
     }
 

@@ -2,7 +2,8 @@
 
 use boot_core::profile::Profile;
 use bsp::NODE_ID;
-use coflash_core::file::convert::{blocks_of, Options, Region};
+use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::convert::{program_of, Options, Region};
 use coflash_core::file::read::read;
 use coflash_core::file::sealed::Sealer;
 use shared_abi::layout::stm32f407g_disc1_two::LAYOUT;
@@ -70,14 +71,14 @@ impl Image {
         let region = LAYOUT.programs[usize::from(program) - 1];
         // Smaller blocks than the default: there is more between them.
         let options = Options::default().region(Region::Strict(region.into())).block_size(2048);
-        let file = blocks_of(read(&firmware::elf(&name), None, None).expect("an ELF of ours"), &options);
-        let file = file.expect("it fits").file;
+        let file = program_of(read(&firmware::elf(&name), None, None).expect("an ELF of ours"), &options);
+        let file = file.expect("it fits").program;
         let raw = firmware::raw_from(region.base, &name);
         Self {
             program,
-            crcs: vec![file.program_crc(), crate::sealed::crc32(&raw)],
+            crcs: vec![file.crc(), crate::sealed::crc32(&raw)],
             whole: raw,
-            blocks: file.blocks().iter().map(|block| block.emit()).collect(),
+            blocks: BlockFile::of(&file).blocks().iter().map(|block| block.emit()).collect(),
         }
     }
 

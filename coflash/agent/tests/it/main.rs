@@ -16,9 +16,10 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use crate::tool::folder;
 use coflash_agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
-use coflash_core::file::BlockFile;
-use coflash_core::update::Program;
+use coflash_core::file::block_file;
+use coflash_core::update::Payload;
 use kit::folder::Folder;
 use kit::hawkbit::{sha256, Action, Fault, File, Server};
 
@@ -51,8 +52,8 @@ impl Devices for Fake {
     }
 
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
-        let Program::Blocks(file) = &order.program else { panic!("a block file") };
-        self.given.lock().unwrap().push((order.device.controller.clone(), file.program_crc()));
+        let Payload::Program(file) = &order.program else { panic!("a block file") };
+        self.given.lock().unwrap().push((order.device.controller.clone(), file.crc()));
         let _ = news.send(News::Percent(40));
         while self.busy.as_ref().is_some_and(|busy| busy.load(Ordering::Relaxed)) {
             thread::sleep(Duration::from_millis(5));
@@ -75,7 +76,7 @@ fn file() -> File {
 }
 
 fn crc() -> u32 {
-    BlockFile::parse(PROGRAM).unwrap().program_crc()
+    block_file::read(PROGRAM).unwrap().crc()
 }
 
 fn config(server: &Server, folder: &Folder, ids: &[&str]) -> Config {

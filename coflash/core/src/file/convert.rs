@@ -1,16 +1,15 @@
-//! Converts the memory contents of a program into a block file for a bootloader.
+//! Makes a program for a device of the contents of a firmware file.
 
-use std::borrow::Cow;
+use shared_abi::block_file::{Last, ProgramVersion};
 
-use shared_abi::block_file::{Control, Identity};
-
-use super::block_file::{BlockFile, Checksum, LastBlock, FRAMING, MAX_BLOCK_SIZE, MAX_PROGRAM_SIZE};
+use super::block_file::{control_size, BlockFile, FRAMING, MAX_BLOCK_SIZE};
+use super::checksum::Checksum;
 use super::fault::{Cause, Place, ReadError};
-use super::image::Image;
+use super::image::{Image, Piece, Pieces};
 use super::label::label_of;
 use super::note::Note;
+use super::program::{Cut, LastBlock, Program, Release, Target, MAX_PROGRAM_SIZE};
 use super::range::AddressRange;
-use super::raw;
 use super::read::Firmware;
 use super::sealed::SealedFile;
 
@@ -65,7 +64,7 @@ impl Default for GapFill {
     }
 }
 
-/// The target and the version of a program: the contents of block 0.
+/// The target and the release of a program, which block 0 has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Label {
     /// The contents of the image's label, if it has one; otherwise nothing.
@@ -102,33 +101,20 @@ impl Default for Label {
 }
 
 impl Label {
-    /// The label for a program that starts at `start`.
-    fn resolved(self, image: &Image, start: u32) -> Self {
-        let Self::OfImage { date } = self else { return self };
-        label_of(image, start).map_or(Self::None, |label| Self::Release {
-            vendor_id: label.vendor_id,
-            product_code: label.product_code,
-            version: label.version,
-            date: if date == 0 { label.date.into() } else { date },
-        })
-    }
-
-    fn control(self, app_size: u32) -> Control {
+    /// Target and release of a program that starts at `start`.
+    fn of(self, image: &Image, start: u32) -> (Option<Target>, Option<Release>) {
+        let release = |version, date| Some(Release { version: ProgramVersion(version), date });
         match self {
-            Self::OfImage { .. } | Self::None => Control::Plain,
-            Self::Device { vendor_id, product_code } => {
-                Control::Identity(Identity { app_size, vendor_id, product_code })
-            }
+            Self::None => (None, None),
+            Self::Device { vendor_id, product_code } => (Some(Target { vendor_id, product_code }), None),
             Self::Release { vendor_id, product_code, version, date } => {
-                let identity = Identity { app_size, vendor_id, product_code };
-                Control::Dated { identity, version, date }
+                (Some(Target { vendor_id, product_code }), release(version, date))
             }
+            Self::OfImage { date } => label_of(image, start).map_or((None, None), |label| {
+                let target = Target { vendor_id: label.vendor_id, product_code: label.product_code };
+                (Some(target), release(label.version, if date == 0 { label.date.into() } else { date }))
+            }),
         }
-    }
-
-    /// The size of block 0 with framing.
-    fn block_size(self) -> usize {
-        self.control(0).emit().1 + FRAMING
     }
 }
 
@@ -219,58 +205,57 @@ pub enum ConvertError {
 /// The result of a conversion.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Converted {
-    /// The blocks.
-    pub file: BlockFile,
+    /// The program.
+    pub program: Program,
     /// Bytes of the input that [`Region::Cut`] left out.
     pub left_out: u64,
     /// What is odd about the input.
     pub notes: Vec<Note>,
 }
 
-/// Makes blocks from a program.
+/// Makes a program of the memory contents in a file.
 ///
-/// A block starts at the first byte that is not yet in a block, rounded down to a word. Gaps inside
-/// a block are filled; gaps between blocks stay erased flash. The same input gives the same blocks.
+/// Its blocks show what is filled: a block starts at the first byte that is not yet in a block, rounded
+/// down to a word. Gaps inside a block are filled; gaps between blocks stay erased flash. The same input
+/// gives the same program.
 ///
 /// # Errors
 /// See [`ConvertError`].
-pub fn convert(image: &Image, options: &Options) -> Result<Converted, ConvertError> {
+pub fn convert(image: Image, options: &Options) -> Result<Converted, ConvertError> {
     let (image, start, left_out) = place(image, options)?;
-    let label = options.label.resolved(&image, start);
-    let payload = payload(options.block_size, label)?;
-    if !start.is_multiple_of(WORD) {
-        return Err(ConvertError::Start(start));
-    }
-    let last = image.span().last;
-    if last - start >= MAX_PROGRAM_SIZE {
-        return Err(Place::File.fault(Cause::TooSparse { first: start, last }).into());
-    }
-    let blocks = blocks(&image, payload, options);
-    let control = |app_size| label.control(app_size);
-    let file = BlockFile::new(start, blocks, control, options.checksum, options.last_block);
-    Ok(Converted { file, left_out, notes: image.notes().to_vec() })
+    let (target, release) = options.label.of(&image, start);
+    let payload = payload(options.block_size, target, release)?;
+    check_extent(start, image.span().last)?;
+    let (image, notes) = filled(image, payload, options);
+    let (span, checksum) = (image.span(), options.checksum);
+    let program_size = span.last - start + 1;
+    let program_crc = checksum.of_flash(start, program_size, image.runs());
+    let last = Last { program_size, program_crc };
+    let cut = Cut::Even { payload, last_block: options.last_block };
+    let program = Program { image, start, last, checksum, target, release, cut };
+    Ok(Converted { program, left_out, notes })
 }
 
-/// Makes the blocks of any firmware file: an image is [converted](convert); blocks are checked
-/// against a strict region and used unchanged.
+/// Makes a program of any firmware file: an image is [converted](convert); that of a block file is
+/// checked against a strict region and used unchanged.
 ///
 /// # Errors
 /// See [`ConvertError`].
-pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, ConvertError> {
+pub fn program_of(firmware: Firmware, options: &Options) -> Result<Converted, ConvertError> {
     match firmware {
-        Firmware::Image(image) => convert(&image, options),
+        Firmware::Image(image) => convert(image, options),
         Firmware::Blocks(_) if options.adjust_start != 0 => {
             Err(ConvertError::Blocks("another start address"))
         }
-        Firmware::Blocks(file) => {
+        Firmware::Blocks(program) => {
             match options.region {
                 Region::Unknown => {}
-                Region::Strict(region) | Region::Cut(region) => file.check_region(region)?,
+                Region::Strict(region) | Region::Cut(region) => program.check_region(region)?,
                 Region::CutBehind(last) => {
-                    file.check_region(AddressRange { first: file.program_start(), last })?;
+                    program.check_region(AddressRange { first: program.start(), last })?;
                 }
             }
-            Ok(Converted { file, left_out: 0, notes: Vec::new() })
+            Ok(Converted { program, left_out: 0, notes: Vec::new() })
         }
     }
 }
@@ -281,22 +266,37 @@ pub fn blocks_of(firmware: Firmware, options: &Options) -> Result<Converted, Con
 /// # Errors
 /// [`ConvertError::BlockSize`], [`ConvertError::Start`], and [`ConvertError::File`] if the image
 /// exceeds the address space.
-pub fn blocks_of_sealed(file: &SealedFile, start: u32, block_size: usize) -> Result<BlockFile, ConvertError> {
-    let head = file.head();
-    let label = Label::Release {
-        vendor_id: head.vendor_id(),
-        product_code: head.product_code(),
-        version: head.version(),
-        date: head.created(),
+pub fn blocks_of_sealed(
+    file: &SealedFile,
+    start: u32,
+    block_size: usize,
+) -> Result<BlockFile<'_>, ConvertError> {
+    let (head, target, bytes) = (file.head(), file.target(), file.bytes());
+    let release = Release { version: ProgramVersion(head.version()), date: head.created() };
+    let Some(last) = u32::try_from(bytes.len() - 1).ok().and_then(|last| start.checked_add(last)) else {
+        let cause = Cause::AddressOverflow { address: start, what: "the address space" };
+        return Err(Place::File.fault(cause).into());
     };
-    let bytes = raw::read(file.bytes(), Some(start))?;
-    Ok(convert(&bytes, &Options::default().block_size(block_size).label(label))?.file)
+    let payload = payload(block_size, Some(target), Some(release))?;
+    check_extent(start, last)?;
+    Ok(BlockFile::of_sealed(bytes, start, payload, target, release))
+}
+
+/// Checks the place of a program: from `start` to its last byte.
+fn check_extent(start: u32, last: u32) -> Result<(), ConvertError> {
+    if !start.is_multiple_of(WORD) {
+        return Err(ConvertError::Start(start));
+    }
+    if last - start >= MAX_PROGRAM_SIZE {
+        return Err(Place::File.fault(Cause::TooSparse { first: start, last }).into());
+    }
+    Ok(())
 }
 
 /// The data bytes of the largest block, a multiple of a word.
-fn payload(given: usize, label: Label) -> Result<usize, ConvertError> {
+fn payload(given: usize, target: Option<Target>, release: Option<Release>) -> Result<usize, ConvertError> {
     // The last block has 8 data bytes, block 0 at least as many.
-    let (min, max) = (label.block_size(), MAX_BLOCK_SIZE);
+    let (min, max) = (control_size(target, release), MAX_BLOCK_SIZE);
     if !(min..=max).contains(&given) {
         return Err(ConvertError::BlockSize { given, min, max });
     }
@@ -306,18 +306,18 @@ fn payload(given: usize, label: Label) -> Result<usize, ConvertError> {
 
 /// The part of the image that belongs to the program, the program's start address, and the number
 /// of bytes outside it.
-fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32, u64), ConvertError> {
+fn place(image: Image, options: &Options) -> Result<(Image, u32, u64), ConvertError> {
     let offset = options.adjust_start;
-    let adjusted = |image: Cow<'i, Image>| match offset {
+    let adjusted = |image: Image| match offset {
         0 => Ok(image),
-        _ => image.moved(offset).map(Cow::Owned).ok_or(ConvertError::Adjust(offset)),
+        _ => image.moved(offset).ok_or(ConvertError::Adjust(offset)),
     };
     let inside = |range| image.part(range).ok_or(Place::File.fault(Cause::NothingInside(range)));
     let left_out = |part: &Image| image.byte_count() - part.byte_count();
     let start = |image: &Image| image.span().first & !(WORD - 1);
     match options.region {
         Region::Unknown => {
-            let image = adjusted(Cow::Borrowed(image))?;
+            let image = adjusted(image)?;
             image.check_areas()?;
             let start = start(&image);
             Ok((image, start, 0))
@@ -325,13 +325,13 @@ fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32
         Region::CutBehind(last) => {
             let part = inside(AddressRange { first: 0, last })?;
             let left_out = left_out(&part);
-            let part = adjusted(Cow::Owned(part))?;
+            let part = adjusted(part)?;
             let start = start(&part);
             Ok((part, start, left_out))
         }
         Region::Strict(range) => {
             check_range(range)?;
-            let image = adjusted(Cow::Borrowed(image))?;
+            let image = adjusted(image)?;
             image.check_inside(range)?;
             Ok((image, range.first, 0))
         }
@@ -340,7 +340,7 @@ fn place<'i>(image: &'i Image, options: &Options) -> Result<(Cow<'i, Image>, u32
             let part = inside(range)?;
             let left_out = left_out(&part);
             let start = range.first.wrapping_add(offset);
-            let part = adjusted(Cow::Owned(part))?;
+            let part = adjusted(part)?;
             if part.span().first < start {
                 return Err(ConvertError::Adjust(offset));
             }
@@ -356,32 +356,42 @@ fn check_range(range: AddressRange) -> Result<(), ConvertError> {
     Ok(())
 }
 
-/// Address and data of each block.
-fn blocks(image: &Image, payload: usize, options: &Options) -> Vec<(u32, Vec<u8>)> {
-    let mut blocks: Vec<(u32, Vec<u8>)> = Vec::new();
-    for piece in image.pieces() {
-        let (mut address, mut data) = (u64::from(piece.address), piece.data.as_slice());
-        while !data.is_empty() {
-            // Continue the current block if it reaches this far, otherwise start a new one.
-            let reaches = |(start, data): &(u32, Vec<u8>)| {
-                let end = u64::from(*start) + data.len() as u64;
-                // A word that a block has begun belongs to it: no word lies in two blocks.
-                let same_word = address < end.next_multiple_of(WORD.into());
-                let near = options.max_gap.is_none_or(|most| address - end <= most.into());
-                address < u64::from(*start) + payload as u64 && (near || same_word)
-            };
-            if !blocks.last().is_some_and(reaches) {
-                // `address` is the address of a byte, so it fits.
-                blocks.push((address as u32 & !(WORD - 1), Vec::with_capacity(payload)));
+/// The image as it lies in flash, in whole words and with the gaps inside its blocks filled; and what is
+/// odd about its file. The bytes of a piece that fills no gap are moved, not copied.
+fn filled(image: Image, payload: usize, options: &Options) -> (Image, Vec<Note>) {
+    let (pieces, notes) = image.into_pieces();
+    let mut runs: Vec<Piece> = Vec::new();
+    // The address of the last block, which is a multiple of `payload` after the start of its run.
+    let mut block = 0;
+    for mut piece in pieces {
+        let address = u64::from(piece.address);
+        let reaches = |run: &Piece| {
+            let end = u64::from(run.address) + run.data.len() as u64;
+            // A word that a block has begun belongs to it: no word lies in two blocks.
+            let same_word = address < end.next_multiple_of(WORD.into());
+            let near = options.max_gap.is_none_or(|most| address - end <= most.into());
+            address == end || address < block + payload as u64 && (near || same_word)
+        };
+        let gap = |from| (from..piece.address).map(|address| options.gap_fill.at(address));
+        if let Some(run) = runs.last_mut().filter(|run| reaches(run)) {
+            // It ends before the address of another piece.
+            let end = run.address + run.data.len() as u32;
+            run.data.extend(gap(end));
+            run.data.append(&mut piece.data);
+        } else {
+            let first = piece.address & !(WORD - 1);
+            if first < piece.address {
+                piece.data.splice(..0, gap(first));
             }
-            let Some((start, block)) = blocks.last_mut() else { break };
-            let gap = *start + block.len() as u32..address as u32;
-            block.extend(gap.map(|address| options.gap_fill.at(address)));
-            let (fitting, rest) = data.split_at(data.len().min(payload - block.len()));
-            block.extend_from_slice(fitting);
-            address += fitting.len() as u64;
-            data = rest;
+            block = first.into();
+            runs.push(Piece { address: first, ..piece });
+        }
+        if let Some(run) = runs.last() {
+            let end = u64::from(run.address) + run.data.len() as u64;
+            block += (end - 1 - block) / payload as u64 * payload as u64;
         }
     }
-    blocks
+    let mut all = Pieces::default();
+    runs.into_iter().for_each(|run| all.add(run.address, run.data, run.place));
+    (all.in_order(), notes)
 }

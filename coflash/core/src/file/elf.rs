@@ -10,10 +10,10 @@ use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::Endianness;
 
 use super::area::Area;
-use super::block_file::MAX_PROGRAM_SIZE;
 use super::fault::{Cause, Place, ReadError};
 use super::image::{Image, Pieces};
 use super::note::Note;
+use super::program::MAX_PROGRAM_SIZE;
 use super::range::AddressRange;
 
 /// Parses a whole file.
@@ -252,13 +252,13 @@ mod tests {
     const ALLOC: u32 = 2;
 
     fn segments(bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
-        read(bytes).unwrap().segments().collect()
+        read(bytes).unwrap().segments().map(|(address, data)| (address, data.into_owned())).collect()
     }
 
     const BOTH: [(u32, &[u8]); 2] = [(0x0801_0000, &[1, 2, 3, 4]), (0x0801_0100, &[5, 6, 7, 8])];
 
     fn is_both(bytes: &[u8]) -> bool {
-        read(bytes).unwrap().segments().eq(BOTH.map(|(address, data)| (address, data.to_vec())))
+        read(bytes).unwrap().segments().eq(BOTH.map(|(address, data)| (address, data.into())))
     }
 
     /// As GNU ld links with pages of 64 KiB, and rust-lld: the first segment begins with the headers.
@@ -312,7 +312,7 @@ mod tests {
         set(&mut bytes, 0, PADDR, 0);
         set(&mut bytes, 1, PADDR, 0);
         let image = read(&bytes).unwrap();
-        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4])]));
+        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4].into())]));
         let words = image.notes()[0].to_string();
         assert!(
             words.contains("0x20000000..=0x20000003 were left out") && words.contains("AT > FLASH"),
@@ -331,7 +331,7 @@ mod tests {
         set(&mut bytes, 1, OFFSET, 118);
         set(&mut bytes, 1, PADDR, 0x0801_0002);
         let image = read(&bytes).unwrap();
-        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4, 5, 6])]));
+        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4, 5, 6].into())]));
         let words = "offset 0x76: the data at 0x08010002 are those of offset 0x74 once more";
         assert_eq!(image.notes()[0].to_string(), words);
     }
@@ -345,7 +345,9 @@ mod tests {
     #[test]
     fn takes_the_load_addresses() {
         let image = read(&EXAMPLE).unwrap();
-        assert!(image.segments().eq([(0x0801_0000, vec![1, 2, 3, 4]), (0x0801_0100, vec![5, 6, 7, 8])]));
+        assert!(image
+            .segments()
+            .eq([(0x0801_0000, vec![1, 2, 3, 4].into()), (0x0801_0100, vec![5, 6, 7, 8].into())]));
     }
 
     #[test]

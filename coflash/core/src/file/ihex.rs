@@ -145,7 +145,7 @@ mod tests {
     fn reads_data_at_its_address() {
         let image = image(EXAMPLE);
         let data = [0x21, 0x46, 0x01, 0x36, 1, 0x21, 0x47, 1, 0x36, 0, 0x7E, 0xFE, 9, 0xD2, 0x19, 1];
-        assert!(image.segments().eq([(0x100, data.to_vec())]));
+        assert!(image.segments().eq([(0x100, data.to_vec().into())]));
     }
 
     /// Segment base 1234h (12340h) and linear base 0801h; the checksums of the base records were
@@ -160,7 +160,7 @@ mod tests {
             :0400000308010000F0\r\n\
             :040000050801018964\r\n\
             :00000001FF\r\n";
-        assert!(image(text).segments().eq([(0x0001_2350, vec![1]), (0x0801_0020, vec![2])]));
+        assert!(image(text).segments().eq([(0x0001_2350, vec![1].into()), (0x0801_0020, vec![2].into())]));
     }
 
     #[test]
@@ -213,6 +213,6 @@ mod tests {
     #[test]
     fn a_linear_record_may_cross_a_64_kib_border() {
         let text = ":020000040801F1\n:02FFFF000102FD\n:00000001FF";
-        assert!(image(text).segments().eq([(0x0801_FFFF, vec![1, 2])]));
+        assert!(image(text).segments().eq([(0x0801_FFFF, vec![1, 2].into())]));
     }
 }

@@ -1,5 +1,7 @@
 //! The memory contents in a firmware file, with gaps.
 
+use std::borrow::Cow;
+
 use super::area::{Area, FLASH};
 use super::fault::{Cause, Place, ReadError};
 use super::note::Note;
@@ -35,6 +37,16 @@ impl Pieces {
     pub(crate) fn add(&mut self, address: u32, data: Vec<u8>, place: Place) {
         if !data.is_empty() {
             self.pieces.push(Piece { address, data, place });
+        }
+    }
+
+    /// Adds data that lie after all others: a piece of their own, unless no gap precedes them.
+    pub(crate) fn extend(&mut self, address: u32, data: &[u8], place: Place) {
+        match self.pieces.last_mut() {
+            Some(last) if last.range().last.checked_add(1) == Some(address) => {
+                last.data.extend_from_slice(data);
+            }
+            _ => self.add(address, data.to_vec(), place),
         }
     }
 
@@ -114,18 +126,41 @@ impl Image {
     }
 
     /// The contiguous ranges of bytes, in address order.
-    pub fn segments(&self) -> impl Iterator<Item = (u32, Vec<u8>)> + '_ {
+    pub fn segments(&self) -> impl Iterator<Item = (u32, Cow<'_, [u8]>)> + '_ {
         let mut pieces = self.pieces.iter().peekable();
         std::iter::from_fn(move || {
             let piece = pieces.next()?;
-            let (address, mut data) = (piece.address, piece.data.clone());
+            let mut data = Cow::Borrowed(&piece.data[..]);
             let mut last = piece.range().last;
             while let Some(next) = pieces.next_if(|next| Some(next.address) == last.checked_add(1)) {
-                data.extend_from_slice(&next.data);
+                data.to_mut().extend_from_slice(&next.data);
                 last = next.range().last;
             }
-            Some((address, data))
+            Some((piece.address, data))
         })
+    }
+
+    /// Its pieces, addresses and bytes, in address order.
+    pub(crate) fn runs(&self) -> impl Iterator<Item = (u32, &[u8])> {
+        self.pieces.iter().map(|piece| (piece.address, &piece.data[..]))
+    }
+
+    /// The memory from `start` on, `size` bytes of it; the gaps are erased flash.
+    pub(crate) fn flat(&self, start: u32, size: u32) -> Cow<'_, [u8]> {
+        match &self.pieces[..] {
+            [piece] if piece.address == start && piece.data.len() == size as usize => {
+                return Cow::Borrowed(&piece.data);
+            }
+            _ => {}
+        }
+        let mut flash = vec![0xFF; size as usize];
+        for (address, data) in self.runs() {
+            let at = address.wrapping_sub(start) as usize;
+            if let Some(place) = at.checked_add(data.len()).and_then(|end| flash.get_mut(at..end)) {
+                place.copy_from_slice(data);
+            }
+        }
+        Cow::Owned(flash)
     }
 
     /// The image moved up by `offset`, or `None` if it would exceed the address space. An offset of
@@ -184,8 +219,9 @@ impl Image {
         all.into_iter().all(|byte| *byte == first).then_some(first)
     }
 
-    pub(crate) fn pieces(&self) -> &[Piece] {
-        &self.pieces
+    /// Its pieces, and what is odd about the file.
+    pub(crate) fn into_pieces(self) -> (Vec<Piece>, Vec<Note>) {
+        (self.pieces, self.notes)
     }
 
     /// What is odd about the file: its reader warns of it.
@@ -257,7 +293,7 @@ mod tests {
     #[test]
     fn neighbours_become_one_segment_whatever_their_order() {
         let image = image(&[(8, &[3]), (4, &[1, 2]), (6, &[9, 9]), (u32::MAX, &[7])]);
-        assert!(image.segments().eq([(4, vec![1, 2, 9, 9, 3]), (u32::MAX, vec![7])]));
+        assert!(image.segments().eq([(4, vec![1, 2, 9, 9, 3].into()), (u32::MAX, vec![7].into())]));
         assert_eq!(image.span(), AddressRange { first: 4, last: u32::MAX });
     }
 
@@ -292,7 +328,7 @@ mod tests {
             (12, &[9]),
         ])
         .unwrap();
-        assert!(image.segments().eq([(4, vec![1, 2, 3, 4, 5, 6]), (12, vec![9])]));
+        assert!(image.segments().eq([(4, vec![1, 2, 3, 4, 5, 6].into()), (12, vec![9].into())]));
         let words: Vec<String> = image.notes().iter().map(ToString::to_string).collect();
         assert_eq!(
             words,
@@ -320,7 +356,7 @@ mod tests {
     fn a_part_is_cut_at_both_ends() {
         let image = image(&[(4, &[1, 2, 3, 4]), (12, &[5])]);
         let range = AddressRange { first: 5, last: 6 };
-        assert!(image.part(range).unwrap().segments().eq([(5, vec![2, 3])]));
+        assert!(image.part(range).unwrap().segments().eq([(5, vec![2, 3].into())]));
         assert_eq!(image.part(AddressRange { first: 8, last: 11 }), None);
         assert!(image.check_inside(AddressRange { first: 4, last: 12 }).is_ok());
         let error = image.check_inside(AddressRange { first: 4, last: 11 }).unwrap_err().to_string();

@@ -9,11 +9,13 @@ use shared_abi::layout::Layout;
 use shared_abi::ram_image::{Header, Version};
 
 use super::area::Area;
-use super::block_file::{Block, BlockFile, Checksum};
+use super::block_file::{Block, BlockFile};
+use super::checksum::Checksum;
 use super::image::Image;
 use super::judge::{judge, Fault, StackAtEnd};
 use super::label::{label_of, Words};
 use super::note::Note;
+use super::program::Program;
 use super::ram_image::{self, RamImage};
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
@@ -83,10 +85,10 @@ impl Inspection {
             Firmware::Image(image) => {
                 Self::of_image(image, format, start.unwrap_or(image.span().first), board)
             }
-            Firmware::Blocks(file) => {
-                let start = start.unwrap_or_else(|| file.program_start());
-                let inspection = Self::of_image(&file.image(), format, start, board);
-                Self { blocks: Some(Blocks::of(file)), ..inspection }
+            Firmware::Blocks(program) => {
+                let start = start.unwrap_or_else(|| program.start());
+                let inspection = Self::of_image(program.image(), format, start, board);
+                Self { blocks: Some(Blocks::of(program)), ..inspection }
             }
         }
     }
@@ -117,8 +119,9 @@ impl Inspection {
 }
 
 impl Blocks {
-    fn of(file: &BlockFile) -> Self {
-        let line = |block: &Block| {
+    fn of(program: &Program) -> Self {
+        let file = BlockFile::of(program);
+        let line = |block: &Block<'_>| {
             let bytes = block.emit_with(file.checksum());
             let crc = bytes.last_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
             BlockLine {
@@ -132,9 +135,9 @@ impl Blocks {
             all: file.blocks().iter().map(line).collect(),
             checksum: file.checksum(),
             control: file.control(),
-            program_start: file.program_start(),
-            program_size: file.program_size(),
-            program_crc: file.program_crc(),
+            program_start: program.start(),
+            program_size: program.size(),
+            program_crc: program.crc(),
         }
     }
 

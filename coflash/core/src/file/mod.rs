@@ -2,6 +2,7 @@
 
 pub mod area;
 pub mod block_file;
+pub mod checksum;
 pub use coboot_linker::board;
 pub mod convert;
 pub mod elf;
@@ -15,6 +16,7 @@ pub mod label;
 pub mod limit;
 pub mod nameplate;
 mod note;
+pub mod program;
 pub mod ram_image;
 mod range;
 pub mod raw;
@@ -24,9 +26,10 @@ pub mod srec;
 pub(crate) mod text;
 
 pub use self::block_file::BlockFile;
-pub use self::convert::{blocks_of, convert};
+pub use self::convert::{convert, program_of};
 pub use self::fault::{Cause, FileError, Place, ReadError};
 pub use self::image::Image;
 pub use self::note::Note;
+pub use self::program::{Program, Target};
 pub use self::range::AddressRange;
 pub use self::read::{load, read, Firmware, Format};

@@ -2,7 +2,7 @@
 
 use shared_abi::ram_image::{Header, MAGIC};
 
-use super::block_file::CRC;
+use super::checksum::CRC;
 use super::image::Image;
 use super::read::Firmware;
 
@@ -47,7 +47,7 @@ impl RamImage {
     pub fn of(firmware: &Firmware) -> Option<Self> {
         match firmware {
             Firmware::Image(image) => Self::find(image),
-            Firmware::Blocks(file) => Self::find(&file.image()),
+            Firmware::Blocks(program) => Self::find(program.image()),
         }
     }
 

@@ -1,15 +1,15 @@
-//! Readers of firmware files: from bytes to [`Image`] or [`BlockFile`]. Only [`load`] uses the file
+//! Readers of firmware files: from bytes to [`Image`] or [`Program`]. Only [`load`] uses the file
 //! system, and no reader needs a device.
 
 use std::fmt;
 use std::path::Path;
 
-use super::block_file::BlockFile;
 use super::fault::{Cause, FileError, Place, ReadError};
 use super::image::Image;
+use super::program::Program;
 use super::sealed::{blocks, Sealed};
 use super::text::encoding;
-use super::{elf, foreign, ihex, limit, raw, srec};
+use super::{block_file, elf, foreign, ihex, limit, raw, srec};
 
 /// The formats of a firmware file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +37,7 @@ impl Format {
         match bytes {
             [0x7F, b'E', b'L', b'F', ..] => Some(Self::Elf),
             _ if Sealed::looks_like(bytes) => Some(Self::Sealed),
-            _ if BlockFile::looks_like(bytes) => Some(Self::BlockFile),
+            _ if block_file::looks_like(bytes) => Some(Self::BlockFile),
             _ if text.starts_with(b":") => Some(Self::IntelHex),
             _ if text.first() == Some(&b'S') && text.get(1).is_some_and(u8::is_ascii_digit) => {
                 Some(Self::SRecord)
@@ -80,10 +80,10 @@ impl fmt::Display for Format {
 /// The contents of a firmware file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Firmware {
-    /// Memory contents that must still be [converted](super::convert::convert).
+    /// Memory contents, of which [`program_of`](super::convert::program_of) makes a program.
     Image(Image),
-    /// Blocks for the device; every CRC was checked.
-    Blocks(BlockFile),
+    /// The program of a block file; every CRC was checked.
+    Blocks(Program),
 }
 
 /// Reads a firmware file that is already in memory.
@@ -150,7 +150,7 @@ fn read_telling(
         Format::SRecord => srec::read(bytes).map(Firmware::Image),
         Format::Elf => elf::read(bytes).map(Firmware::Image),
         Format::Raw => raw::read(bytes, raw_address).map(Firmware::Image),
-        Format::BlockFile if !blocks::looks_like(bytes) => BlockFile::parse(bytes).map(Firmware::Blocks),
+        Format::BlockFile if !blocks::looks_like(bytes) => block_file::read(bytes).map(Firmware::Blocks),
         // The contents of the blocks are not a program for the flash.
         Format::BlockFile | Format::Sealed => Err(Place::File.fault(Cause::Sealed)),
     };
@@ -171,7 +171,9 @@ mod tests {
     #[test]
     fn what_is_detected_can_be_read() {
         let segments = |text: &str, format| match read(text.as_bytes(), format, None) {
-            Ok(Firmware::Image(image)) => image.segments().collect::<Vec<_>>(),
+            Ok(Firmware::Image(image)) => {
+                image.segments().map(|(address, data)| (address, data.into_owned())).collect::<Vec<_>>()
+            }
             other => panic!("{other:?}"),
         };
         for blanks in ["", " ", "\t", "\n \n\t ", "\r\n"] {

@@ -133,7 +133,9 @@ mod tests {
     #[test]
     fn addresses_have_two_three_or_four_bytes() {
         let text = "S205010000AA4F\r\nS30608010000BB35\r\nS5030002FA\r\nS604000002F9\r\nS7050801018967\r\n";
-        assert!(image(text).segments().eq([(0x01_0000, vec![0xAA]), (0x0801_0000, vec![0xBB])]));
+        assert!(image(text)
+            .segments()
+            .eq([(0x01_0000, vec![0xAA].into()), (0x0801_0000, vec![0xBB].into())]));
     }
 
     /// The count record (S5, S6) proves that the data are complete, if nothing follows it.
@@ -141,7 +143,7 @@ mod tests {
     fn a_count_record_ends_a_file_as_well() {
         let good = "S1040000AA51\nS1040001AA50\n";
         for count in ["S5030002FA", "S604000002F9"] {
-            assert!(image(&format!("{good}{count}")).segments().eq([(0, vec![0xAA, 0xAA])]));
+            assert!(image(&format!("{good}{count}")).segments().eq([(0, vec![0xAA, 0xAA].into())]));
             let more = fault(&format!("{good}{count}\nS1040002AA4F\n"));
             assert!(more.starts_with("the file: the file ends without its end record"), "{more}");
         }

@@ -8,76 +8,126 @@ use shared_abi::layout;
 
 use super::content::{refusal_number, Content};
 use super::dialect::is_data;
-use super::options::{FlashOptions, Target};
+use super::options::FlashOptions;
 use super::steps::compare_target;
 use crate::device::access::{security_of, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
 use crate::device::{Dialect, Session};
-use crate::file::image::Image;
 use crate::file::judge::{judge, judge_place, Fault, StackAtEnd};
 use crate::file::sealed::{Refusal, SealedFile};
-use crate::file::{AddressRange, BlockFile};
+use crate::file::{AddressRange, Program};
 
-/// Checks a file for a device with this dialect. Returns whether the check is complete: an
-/// application may not know its region, and then the bootloader is asked later.
-///
-/// # Errors
-/// [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`], and the errors of a
-/// [read](Session::read).
-pub(super) fn admit(
-    session: &mut Session<'_>,
-    file: Content<'_>,
-    dialect: Dialect,
-    options: &FlashOptions,
-) -> Result<bool, Error> {
-    if options.force {
-        return Ok(true);
-    }
-    let file = match file {
-        Content::Blocks(file) => file,
-        Content::Sealed(file) => return admit_sealed(session, file, options.program),
-    };
-    let says = admit_open(session)?;
-    let image = file.image();
-    let mut is_judged = true;
-    if !is_data(dialect, options.program) {
-        judge(&image, file.program_start(), None).map_err(no_program)?;
-        is_judged = admit_stack(session, file, &image)?;
-        for target in [Target::of_control(file), Target::of_label(&image, file.program_start())] {
-            check_identity(session, target)?;
-        }
-    }
-    Ok(admit_place(session, file, &image, dialect, options.program)? && is_judged && says)
+/// The questions to a device before it is changed that are still open.
+pub(super) struct Admission<'f> {
+    /// The program: the sub-index of 1F50h.
+    number: u8,
+    /// Whether it is a sealed image that goes in blocks.
+    is_sealed_in_blocks: bool,
+    open: Vec<Question<'f>>,
 }
 
-/// Checks what an application may not know: the stack, the region, and which images the device takes;
-/// returns whether the device has reported its region.
+/// What decides whether a device can take the content.
+#[derive(Clone, Copy)]
+enum Question<'f> {
+    /// Whether it takes images that are not sealed.
+    TakesOpen,
+    /// Whether the image can be a program of its board.
+    Image(&'f Program),
+    /// Whether it is the device that the file names.
+    Target(&'f Program),
+    /// Whether the program is linked for its region.
+    Place(&'f Program),
+    /// Whether the sealed image is for this program of this device.
+    Manifest(&'f SealedFile),
+    /// Whether it takes sealed images, and this one is not too old.
+    TakesSealed(&'f SealedFile),
+    /// Whether the program has room in its region.
+    Room(&'f SealedFile),
+}
+
+/// Asks what runs in the device, a bootloader or an application.
 ///
 /// # Errors
-/// As [`admit`].
-pub(super) fn admit_to_bootloader(
+/// Those of [`Admission::ask`].
+pub(super) fn admit<'f>(
     session: &mut Session<'_>,
-    file: Content<'_>,
+    content: Content<'f>,
     dialect: Dialect,
     options: &FlashOptions,
-) -> Result<bool, Error> {
-    match file {
-        _ if options.force => Ok(true),
-        Content::Blocks(file) => {
-            admit_open(session)?;
-            let image = file.image();
-            if !is_data(dialect, options.program) {
-                admit_stack(session, file, &image)?;
-            }
-            admit_place(session, file, &image, dialect, options.program)
+) -> Result<Admission<'f>, Error> {
+    let number = options.program;
+    let open = match content {
+        _ if options.force => vec![],
+        Content::Program(program) if is_data(dialect, number) => {
+            vec![Question::TakesOpen, Question::Place(program)]
         }
-        Content::Sealed(file) => admit_capable(session, file, options.program),
+        Content::Program(program) => vec![
+            Question::TakesOpen,
+            Question::Image(program),
+            Question::Target(program),
+            Question::Place(program),
+        ],
+        Content::Sealed(file) => {
+            vec![Question::Manifest(file), Question::TakesSealed(file), Question::Room(file)]
+        }
+    };
+    let is_sealed_in_blocks = matches!(content, Content::Sealed(_)) && options.blocks.is_some();
+    let mut admission = Admission { number, is_sealed_in_blocks, open };
+    admission.ask(session, dialect)?;
+    Ok(admission)
+}
+
+impl Admission<'_> {
+    /// Asks all that is open of what runs now, and checks whether this dialect has the way in which the
+    /// content is to be sent. If an application leaves an answer out, its bootloader is asked all that it
+    /// knows better.
+    ///
+    /// # Errors
+    /// [`Error::NotInDialect`], [`Error::NoProgram`], [`Error::WrongTarget`], [`Error::OtherRegion`],
+    /// [`Error::SealedOnly`], and the errors of a [read](Session::read).
+    pub(super) fn ask(&mut self, session: &mut Session<'_>, dialect: Dialect) -> Result<(), Error> {
+        if self.is_sealed_in_blocks && dialect != Dialect::Block {
+            let what = "a sealed image is sent in one download, not in blocks";
+            return Err(Error::NotInDialect { dialect, what });
+        }
+        let mut has_all = true;
+        for question in &self.open {
+            has_all &= question.is_answered(session, dialect, self.number)?;
+        }
+        self.open.retain(|question| !has_all && question.is_for_bootloader());
+        Ok(())
+    }
+}
+
+impl Question<'_> {
+    /// Whether the answer of the bootloader counts more. Both have the same identity.
+    fn is_for_bootloader(&self) -> bool {
+        !matches!(self, Self::Target(_) | Self::Manifest(_))
+    }
+
+    /// Asks it; whether the device has answered.
+    fn is_answered(self, session: &mut Session<'_>, dialect: Dialect, number: u8) -> Result<bool, Error> {
+        match self {
+            Self::TakesOpen => takes_open(session),
+            Self::Image(program) => admit_image(session, program),
+            Self::Target(program) => {
+                // A value that the device does not report cannot differ.
+                for target in program.targets().into_iter().flatten() {
+                    compare_target(session, target, |session, at| told(session.read_number(at)))?;
+                }
+                Ok(true)
+            }
+            Self::Place(program) => admit_place(session, program, dialect, number),
+            Self::Manifest(file) => admit_manifest(session, file, number),
+            Self::TakesSealed(file) => takes_sealed(session, file),
+            Self::Room(file) => admit_room(session, file.head().size(), number),
+        }
     }
 }
 
 /// Checks that a device takes images that are not sealed; returns whether it has said so.
-fn admit_open(session: &mut Session<'_>) -> Result<bool, Error> {
+fn takes_open(session: &mut Session<'_>) -> Result<bool, Error> {
     match told_challenge(session)? {
         Some(challenge) if challenge.is_sealed() => {
             let roots = security_of(session, &challenge)?.roots;
@@ -87,8 +137,8 @@ fn admit_open(session: &mut Session<'_>) -> Result<bool, Error> {
     }
 }
 
-/// Checks a sealed image: its program number, its device and its size.
-fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
+/// Checks that a sealed image is for this program and this device.
+fn admit_manifest(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
     let head = file.head();
     if head.program() != program {
         return Err(refused(&Refusal::Program { image: head.program(), device: program }));
@@ -99,25 +149,23 @@ fn admit_sealed(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Re
         // 0 is a normal value here: it only matches a device with the identity 0.
         compare_identity(session, sub, image, what)?;
     }
-    admit_capable(session, file, program)
+    Ok(true)
 }
 
 /// Checks what the bootloader reports and an application may not: whether the device accepts sealed
-/// images, and its room. Returns whether the device has reported both.
-fn admit_capable(session: &mut Session<'_>, file: &SealedFile, program: u8) -> Result<bool, Error> {
-    let challenge = told_challenge(session)?;
-    if challenge.is_some_and(|challenge| !challenge.is_sealed()) {
-        let why = "cannot be installed: the device is not sealed and has no keys to check the image";
-        let advice =
-            "write keys into the device with a debug probe (coflash provision makes the file), or flash the \
-                      program as it is, not sealed";
-        return Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice });
+/// images, and of which age. Returns whether the device has reported it.
+fn takes_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<bool, Error> {
+    match told_challenge(session)? {
+        Some(challenge) if !challenge.is_sealed() => {
+            let why = "cannot be installed: the device is not sealed and has no keys to check the image";
+            let advice =
+                "write keys into the device with a debug probe (coflash provision makes the file), or flash the \
+                          program as it is, not sealed";
+            Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice })
+        }
+        Some(challenge) => admit_age(session, file, &challenge).map(|()| true),
+        None => Ok(false),
     }
-    if let Some(challenge) = &challenge {
-        admit_age(session, file, challenge)?;
-    }
-    let room = admit_room(session, file.head().size(), program)?;
-    Ok(room && challenge.is_some())
 }
 
 /// Checks security counter and epoch against those that the device has had at its last reset. It may have
@@ -153,11 +201,12 @@ fn refused(refusal: &Refusal) -> Error {
     Error::NoProgram { number, why, advice: refusal.advice() }
 }
 
-/// Checks a stack that begins at the end of a chip's SRAM: whether the handoff is there depends on the
-/// board, which the device's name (1008h) gives. Returns whether the device has told its name, or need
-/// not.
-fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Result<bool, Error> {
-    let start = file.program_start();
+/// Checks that the image can be a program. Whether the handoff is where a stack begins, at the end of a
+/// chip's SRAM, depends on the board, which the device's name (1008h) gives. Returns whether the device has
+/// told its name, or need not.
+fn admit_image(session: &mut Session<'_>, program: &Program) -> Result<bool, Error> {
+    let (image, start) = (program.image(), program.start());
+    judge(image, start, None).map_err(no_program)?;
     if StackAtEnd::of(image, start).is_none() {
         return Ok(true);
     }
@@ -167,27 +216,27 @@ fn admit_stack(session: &mut Session<'_>, file: &BlockFile, image: &Image) -> Re
     Ok(true)
 }
 
+/// Checks that the program is linked for its region; returns whether the device has reported it.
 fn admit_place(
     session: &mut Session<'_>,
-    file: &BlockFile,
-    image: &Image,
+    program: &Program,
     dialect: Dialect,
-    program: u8,
+    number: u8,
 ) -> Result<bool, Error> {
-    let Some(told) = program_region(session, program)? else { return Ok(false) };
+    let Some(told) = program_region(session, number)? else { return Ok(false) };
     let region = AddressRange { first: told.base, last: told.last() };
-    let (start, size) = (file.program_start(), u64::from(file.program_size()));
+    let (image, start, size) = (program.image(), program.start(), u64::from(program.size()));
     let fits = match dialect {
         // The CRC of the program counts from the region's start.
-        Dialect::Block => file.check_region(region).is_ok(),
-        Dialect::Hex | Dialect::EsAcademy if region.contains(&file.span()) => {
+        Dialect::Block => program.check_region(region).is_ok(),
+        Dialect::Hex | Dialect::EsAcademy if region.contains(&program.span()) => {
             // The data go to their own addresses: the vectors must be there.
             judge(image, region.first, None).map_err(no_program)?;
             true
         }
         Dialect::Hex | Dialect::EsAcademy => false,
         Dialect::Raw | Dialect::Lift if start == 0 => {
-            if !is_data(dialect, program) {
+            if !is_data(dialect, number) {
                 judge_place(image, region).map_err(no_program)?;
             }
             size <= region.len()
@@ -201,19 +250,10 @@ fn admit_place(
     let last = u64::from(start) + size.saturating_sub(1);
     Err(Error::OtherRegion {
         node: session.node(),
-        program,
+        program: number,
         image: (start, u32::try_from(last).unwrap_or(u32::MAX)),
         region: (first, region.last),
     })
-}
-
-/// Compares the identity in the file with 1018h, by the rule of the bootloader. A value that the device
-/// does not report cannot differ.
-fn check_identity(session: &mut Session<'_>, target: Option<Target>) -> Result<(), Error> {
-    match target {
-        Some(target) => compare_target(session, target, |session, at| told(session.read_number(at))),
-        None => Ok(()),
-    }
 }
 
 fn compare_identity(session: &mut Session<'_>, sub: u8, file: u32, what: Mismatch) -> Result<(), Error> {

@@ -1,23 +1,25 @@
 //! The update of a device: steps 2 to 15 of the procedure in the manual (L-1112d_10, "Prinzipieller
 //! Ablauf").
 //!
-//! Step 1, making the blocks, is [`convert`](mod@crate::file::convert). All checks that are
+//! Step 1, making the program, is [`convert`](mod@crate::file::convert); the dialect cuts it in blocks. All checks that are
 //! possible before the device is changed are made there and in `admission`.
 
+use super::admission::admit;
 use super::aftermath::look;
-use super::content::{Content, Program};
+use super::content::{Content, Payload};
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer};
 use super::dialect::{self, Downloaded};
+use super::entry::enter;
 use super::event::{Done, Event, Phase, Report};
 use super::options::FlashOptions;
-use super::reach::reach;
+use super::reach::{find, reach};
 use super::renew;
 use super::running::{give_back, telling_silence, RunningUpdate};
 use super::steps::compare_crc;
 use super::watch;
 use crate::device::{Dialect, Error, Session};
 use crate::file::sealed::SealedFile;
-use crate::file::BlockFile;
+use crate::file::Program;
 
 /// Downloads a program into a device: detects what runs there, calls the bootloader, erases, sends
 /// the blocks, compares the CRC, tries the program, releases it for autostart and starts it.
@@ -31,11 +33,11 @@ use crate::file::BlockFile;
 /// device comes up in the bootloader.
 pub fn flash(
     session: &mut Session<'_>,
-    file: &BlockFile,
+    program: &Program,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    flash_content(session, Content::Blocks(file), options, tell)
+    flash_content(session, Content::Program(program), options, tell)
 }
 
 /// [`flash`] with a sealed image, which is sent unchanged in one download. Only the device can
@@ -58,14 +60,14 @@ pub fn flash_sealed(
 /// Those of [`flash`].
 pub fn flash_program(
     session: &mut Session<'_>,
-    program: &Program,
+    payload: &Payload,
     options: &FlashOptions,
     tell: &mut dyn FnMut(Event),
 ) -> Result<Report, Error> {
-    match program {
-        Program::Blocks(file) => flash_content(session, Content::Blocks(file), options, tell),
-        Program::Sealed(file) => flash_content(session, Content::Sealed(file), options, tell),
-        Program::Bootloader(new) => renew::update(session, new, options, tell),
+    match payload {
+        Payload::Program(program) => flash_content(session, Content::Program(program), options, tell),
+        Payload::Sealed(file) => flash_content(session, Content::Sealed(file), options, tell),
+        Payload::Bootloader(new) => renew::update(session, new, options, tell),
     }
 }
 
@@ -81,7 +83,7 @@ fn flash_content(
         let result = procedure(session, file, options, &mut update);
         let left = match &result {
             Ok(_) => DeviceAfterUpdate { state: update.state, answer: DeviceAnswer::NotAsked },
-            Err(error) => look(session, error, &update, original, options.program, file.program_crcs()),
+            Err(error) => look(session, error, &update, original, options.program, file.crcs()),
         };
         if let Some(taken) = update.mastership.take() {
             give_back(session, taken, &mut |event| update.tell(event));
@@ -104,7 +106,11 @@ fn procedure(
 ) -> Result<Report, Error> {
     let began = session.now();
     let original = session.node();
-    let dialect = reach(session, file, options, update)?;
+    let dialect = reach(session, options, update, |session, update| {
+        let found = find(session, options, update)?;
+        let admission = admit(session, file, found.dialect, options)?;
+        enter(session, found, admission, options, update)
+    })?;
     let its = dialect::of(dialect);
     if dialect != Dialect::Block {
         session.leave_group();
@@ -122,11 +128,11 @@ fn procedure(
         None
     };
     if options.verify {
-        let crc = compare_crc(session, options.program, file.program_crcs())?;
+        let crc = compare_crc(session, options.program, file.crcs())?;
         update.tell(Phase::VerifiedAgain { crc }.into());
     }
     let took = session.now().saturating_sub(began);
-    let (program_size, program_crc) = (file.program_size(), file.program_crc());
+    let (program_size, program_crc) = (file.size(), file.crc());
     let transfers = session.transfers();
     Ok(Report {
         program_size,

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use canopen::frame::Channel;
 use canopen::{CobId, NodeId};
 
-use super::content::Program;
+use super::content::Payload;
 use super::device_after::{DeviceAfterUpdate, DeviceAnswer, DeviceState};
 use super::event::{Event, Note, Report, Warning};
 use super::flash::flash_program;
@@ -22,8 +22,8 @@ use coboot_can::{hub, Adapter, Gateway};
 pub struct Job {
     /// The device.
     pub node: NodeId,
-    /// The program.
-    pub file: Program,
+    /// What it gets.
+    pub file: Payload,
     /// The options.
     pub options: FlashOptions,
 }
@@ -31,7 +31,7 @@ pub struct Job {
 impl Job {
     /// An update of this device with this program.
     #[must_use]
-    pub fn new(node: NodeId, file: impl Into<Program>, options: FlashOptions) -> Self {
+    pub fn new(node: NodeId, file: impl Into<Payload>, options: FlashOptions) -> Self {
         Self { node, file: file.into(), options }
     }
 }

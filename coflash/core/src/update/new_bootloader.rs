@@ -5,10 +5,10 @@ use std::sync::Arc;
 use seal::wire::BOOTLOADER;
 use shared_abi::ram_image::Version;
 
-use super::options::Target;
 use crate::file::ram_image::{Fault, RamImage};
 use crate::file::read::{read, Firmware, Format};
 use crate::file::sealed::SealedFile;
+use crate::file::Target;
 
 /// A new bootloader.
 #[derive(Clone, Debug)]
@@ -74,7 +74,7 @@ impl NewBootloader {
             Self::Plain(image) => {
                 Target { vendor_id: image.header().vendor, product_code: image.header().product }
             }
-            Self::Sealed(file) => Target::of_sealed(file),
+            Self::Sealed(file) => file.target(),
         }
     }
 

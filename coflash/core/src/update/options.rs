@@ -2,16 +2,9 @@
 
 use std::time::Duration;
 
-use serde::Serialize;
-use shared_abi::block_file::Control;
-use shared_abi::label::Label;
-
 use super::password::Password;
 use crate::device::Dialect;
-use crate::file::image::Image;
-use crate::file::label::label_of;
-use crate::file::sealed::SealedFile;
-use crate::file::BlockFile;
+use crate::file::Target;
 
 /// The options of an update.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,46 +82,6 @@ impl FlashOptions {
         together: bool,
         from_start: bool,
         force: bool,
-    }
-}
-
-/// The target device of a program: the values that 1018h/1 and 1018h/2 must have.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub struct Target {
-    /// Vendor-ID.
-    pub vendor_id: u32,
-    /// Product code.
-    pub product_code: u32,
-}
-
-impl Target {
-    /// The device that a file names in its block 0 or in the program's label, if it does.
-    #[must_use]
-    pub fn of(file: &BlockFile) -> Option<Self> {
-        Self::of_control(file).or_else(|| Self::of_label(&file.image(), file.program_start()))
-    }
-
-    /// The device that a sealed image names.
-    #[must_use]
-    pub fn of_sealed(file: &SealedFile) -> Self {
-        let head = file.head();
-        Self { vendor_id: head.vendor_id(), product_code: head.product_code() }
-    }
-
-    /// The device named by the label of a program that starts at `start`.
-    pub(super) fn of_label(image: &Image, start: u32) -> Option<Self> {
-        let Label { vendor_id, product_code, .. } = label_of(image, start)?;
-        Some(Self { vendor_id, product_code })
-    }
-
-    /// The device that block 0 names.
-    pub(super) fn of_control(file: &BlockFile) -> Option<Self> {
-        match file.control() {
-            None | Some(Control::Plain) => None,
-            Some(Control::Identity(identity) | Control::Dated { identity, .. }) => {
-                Some(Self { vendor_id: identity.vendor_id, product_code: identity.product_code })
-            }
-        }
     }
 }
 

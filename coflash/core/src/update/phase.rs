@@ -6,10 +6,10 @@ use std::time::Duration;
 use canopen::NodeId;
 use serde::Serialize;
 
-use super::options::Target;
 use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
-use crate::file::block_file::Checksum;
+use crate::file::checksum::Checksum;
+use crate::file::Target;
 use crate::json;
 use shared_abi::ram_image::Version;
 

@@ -7,11 +7,11 @@ use canopen::{AbortCode, Address};
 use shared_abi::block_file::{fits, Difference};
 
 use super::event::{Event, Phase};
-use super::options::Target;
 use super::phase::{Note, PUT_OFF};
 use crate::device::error::{absent, told, Error, Mismatch};
 use crate::device::read_state::{autostart_words, program_start, state_after_failure};
 use crate::device::{DeviceType, Doing, Session, Timing};
+use crate::file::Target;
 
 /// How many times an application is called back. A program that was started directly after its
 /// download may take the first call for a confirmation.

@@ -9,7 +9,7 @@ use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
 use coflash_core::device::{Session, Timing, Transfers};
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::event::{Phase, Warning};
 use coflash_core::update::{flash, Event, FlashOptions, Report};
 use coflash_core::Error;
@@ -70,7 +70,7 @@ impl Ended {
 }
 
 fn update(bus: &mut CutBus, file: &[u8], transfers: Transfers, options: &FlashOptions) -> Ended {
-    let file = BlockFile::parse(file).expect("a block file");
+    let file = block_file::read(file).expect("a block file");
     let mut events = Vec::new();
     let mut session = Session::new(bus, NodeId::new(5).expect("a node-ID"), Timing::default());
     session.transfer_by(transfers);

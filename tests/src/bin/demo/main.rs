@@ -18,6 +18,7 @@ use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::open_board;
 use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::Program;
 use coflash_core::update::{flash, Event, FlashOptions};
 use emulator::candump;
 use emulator::time::Time;
@@ -170,18 +171,18 @@ fn heartbeat(bench: &mut Bench) -> Outcome<()> {
 }
 
 /// An application's ELF file as the blocks for the device.
-fn convert(image: &str) -> BlockFile {
+fn convert(image: &str) -> Program {
     let file = firmware::blocks(image);
-    let (size, crc) = (file.program_size(), file.program_crc());
+    let (size, crc) = (file.size(), file.crc());
     println!(
         "               {image} converted: {size} bytes in {} blocks, CRC {crc:08X}h",
-        file.blocks().len()
+        BlockFile::of(&file).blocks().len()
     );
     file
 }
 
 /// The whole procedure, printed step by step.
-fn install(bench: &mut Bench, file: &BlockFile) -> Outcome<()> {
+fn install(bench: &mut Bench, file: &Program) -> Outcome<()> {
     let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
     // The rate and the remaining time use the wall clock.
     let style = ProgressStyle::with_template(

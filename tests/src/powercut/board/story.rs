@@ -5,9 +5,9 @@ use std::sync::Arc;
 use canopen::program::ProgramControl;
 use canopen::BitRate;
 use coflash_core::device::Dialect;
-use coflash_core::file::block_file::BlockFile;
 use coflash_core::file::sealed::{SealedFile, Sealer};
-use coflash_core::update::{flash, renew, FlashOptions, Program};
+use coflash_core::file::Program;
+use coflash_core::update::{flash, renew, FlashOptions, Payload};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::machine::{Cells, Machine, Options};
 
@@ -204,7 +204,7 @@ fn write(bench: &mut Bench, options: &FlashOptions) -> Result<(), String> {
     write_file(bench, &firmware::blocks(firmware::APP_V2), options)
 }
 
-fn write_file(bench: &mut Bench, file: &BlockFile, options: &FlashOptions) -> Result<(), String> {
+fn write_file(bench: &mut Bench, file: &Program, options: &FlashOptions) -> Result<(), String> {
     match flash(&mut bench.session(), file, options, &mut |_| {}) {
         Ok(_) => Ok(()),
         Err(error) => Err(error.to_string()),
@@ -212,7 +212,7 @@ fn write_file(bench: &mut Bench, file: &BlockFile, options: &FlashOptions) -> Re
 }
 
 /// A board with its node-ID and bit rate stored, and this program in it.
-fn board(bootloader: &'static str, program: &Program) -> Result<Bench, String> {
+fn board(bootloader: &'static str, program: &Payload) -> Result<Bench, String> {
     let mut bench = Bench::of_image(bootloader);
     let board = bench.boards()[0];
     bench.commission(board, NODE, RATE);
@@ -235,7 +235,7 @@ fn board(bootloader: &'static str, program: &Program) -> Result<Bench, String> {
 /// The story of a board that runs version 1.
 fn from_version_1(
     bootloader: &'static str,
-    program: &Program,
+    program: &Payload,
     act: impl Fn(&mut Bench) -> Result<(), String> + Send + Sync + 'static,
 ) -> Result<Story, String> {
     let mut bench = board(bootloader, program)?;
@@ -342,18 +342,18 @@ fn renew_bootloader() -> Result<Story, String> {
 }
 
 /// An application as a sealed image with this security counter.
-fn seal(image: &str, compress: bool, counter: u32) -> Result<Program, String> {
+fn seal(image: &str, compress: bool, counter: u32) -> Result<Payload, String> {
     seal_with(Sealer { compress, ..sealed_board::sealer(counter) }, image)
 }
 
-fn seal_with(sealer: Sealer<'_>, image: &str) -> Result<Program, String> {
+fn seal_with(sealer: Sealer<'_>, image: &str) -> Result<Payload, String> {
     let bytes =
         sealer.seal(&firmware::raw(image), &sealed_board::release()).map_err(|error| error.to_string())?;
     let file = SealedFile::parse(bytes).map_err(|error| error.to_string())?;
-    Ok(Program::Sealed(Arc::new(file)))
+    Ok(Payload::Sealed(Arc::new(file)))
 }
 
-fn write_sealed(bench: &mut Bench, program: &Program) -> Result<(), String> {
+fn write_sealed(bench: &mut Bench, program: &Payload) -> Result<(), String> {
     coflash_core::update::flash_program(&mut bench.session(), program, &options(), &mut |_| {})
         .map(drop)
         .map_err(|error| error.to_string())

@@ -5,7 +5,7 @@ use seal::key_block::{
 };
 
 use super::key::{Kek, PublicKey};
-use crate::file::block_file::CRC;
+use crate::file::checksum::CRC;
 
 /// Why the key block is impossible.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]

@@ -12,7 +12,8 @@ use seal::wire::{
 use super::cipher::{chacha20, hash, wrap};
 use super::key::{Kek, PublicKey};
 use super::{key_block, lzma};
-use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
+use crate::file::checksum::CRC;
+use crate::file::program::{Target, MAX_PROGRAM_SIZE};
 
 /// A sealed image with the size that its head announces; no other property is checked.
 #[derive(Clone, Copy, Debug)]
@@ -57,6 +58,13 @@ impl SealedFile {
     #[must_use]
     pub fn bytes(&self) -> &[u8] {
         &self.bytes
+    }
+
+    /// The device that it names.
+    #[must_use]
+    pub fn target(&self) -> Target {
+        let head = self.head();
+        Target { vendor_id: head.vendor_id(), product_code: head.product_code() }
     }
 
     /// Manifest, certificate and signatures.

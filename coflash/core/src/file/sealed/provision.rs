@@ -83,7 +83,7 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     let mut pieces = Pieces::default();
     for part in [own, home] {
         for (address, data) in bootloader.part(part).iter().flat_map(Image::segments) {
-            pieces.add(address, data, Place::File);
+            pieces.extend(address, &data, Place::File);
         }
     }
     pieces.add(place.first, block.to_vec(), Place::File);

@@ -14,7 +14,8 @@ use shared_abi::ram_image::{self, Header};
 use super::cipher::{chacha20, hash, hmac, wrap};
 use super::key::{Kek, PublicKey, SigningKey};
 use super::lzma;
-use crate::file::block_file::{CRC, MAX_PROGRAM_SIZE};
+use crate::file::checksum::CRC;
+use crate::file::program::MAX_PROGRAM_SIZE;
 
 /// The prefix of the data from which an image's key and nonce are derived.
 const KEY_DOMAIN: &[u8] = b"coboot image key 1\0";

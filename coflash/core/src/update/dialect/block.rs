@@ -12,7 +12,8 @@ use super::procedure::{enter_by_call, Downloaded, Procedure};
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
-use crate::file::block_file::{Block as FileBlock, BlockFile, Checksum, FRAMING};
+use crate::file::block_file::{Block as FileBlock, BlockFile, FRAMING};
+use crate::file::checksum::Checksum;
 use crate::file::convert::{blocks_of_sealed, DEFAULT_BLOCK_SIZE};
 use crate::file::judge::Fault;
 use crate::file::sealed::SealedFile;
@@ -56,32 +57,26 @@ impl Procedure for Block {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (number, crcs) = (options.program, file.program_crcs());
+        let (number, crcs) = (options.program, file.crcs());
         let mut in_group = session.join_group()?;
         if options.together && !in_group {
             return Err(NOT_TOGETHER);
         }
-        let (cut, is_sealed);
-        let file = match file {
-            Content::Blocks(file) => {
-                is_sealed = false;
-                file
-            }
+        let (file, is_sealed) = match file {
+            Content::Program(program) => (BlockFile::of(program), false),
             Content::Sealed(sealed) => {
                 let size = match options.blocks {
                     None if in_group => DEFAULT_BLOCK_SIZE,
                     None => return cia302::download(session, sealed.bytes(), crcs, options, update),
                     Some(size) => size,
                 };
-                is_sealed = true;
-                cut = cut_up(session, sealed, size, number)?;
-                &cut
+                (cut_up(session, sealed, size, number)?, true)
             }
         };
         let joins = in_group || takes_joined(session, number)?;
-        let most = if in_group { usize::MAX } else { file.program_size() as usize / JOINED_PARTS };
+        let most = if in_group { usize::MAX } else { file.size() as usize / JOINED_PARTS };
         let joined = options.joined_blocks.filter(|_| joins).map(|size| file.joined(size.min(most)));
-        let file = Cut { own: file, joined: joined.as_ref() };
+        let file = Cut { own: &file, joined: joined.as_ref() };
         let sent = send_verified(session, file, crcs, &mut in_group, options, update);
         if let (Err(error), true) = (&sent, in_group) {
             leave_after(session, error);
@@ -117,29 +112,29 @@ const JOINED_PARTS: usize = 64;
 #[derive(Clone, Copy)]
 struct Cut<'f> {
     /// The file with its own blocks.
-    own: &'f BlockFile,
+    own: &'f BlockFile<'f>,
     /// The same with larger blocks, if the device takes them.
-    joined: Option<&'f BlockFile>,
+    joined: Option<&'f BlockFile<'f>>,
 }
 
 impl<'f> Cut<'f> {
     /// The file as it is sent.
-    fn file(self) -> &'f BlockFile {
+    fn file(self) -> &'f BlockFile<'f> {
         self.joined.unwrap_or(self.own)
     }
 
     /// Whether this block, as it is sent, has joined several of the file.
-    fn has_joined(self, sent: &FileBlock) -> bool {
-        let is_same = |own: &FileBlock| own.flash_address == sent.flash_address && own.data == sent.data;
+    fn has_joined(self, sent: &FileBlock<'_>) -> bool {
+        let is_same = |own: &FileBlock<'_>| own.flash_address == sent.flash_address && own.data == sent.data;
         !self.own.blocks().iter().any(is_same)
     }
 
     /// The blocks of the file itself from `refused` on, which has joined some of them. Their numbers
     /// follow those of the blocks before it.
-    fn own_from(self, refused: &FileBlock) -> Vec<FileBlock> {
+    fn own_from(self, refused: &FileBlock<'_>) -> Vec<FileBlock<'f>> {
         let rest = self.own.blocks().iter().filter(|block| block.number != NUMBER_CONTROL);
         let rest = rest.skip_while(|block| block.flash_address != refused.flash_address);
-        let number = |block: &FileBlock, at| if block.number == NUMBER_LAST { NUMBER_LAST } else { at };
+        let number = |block: &FileBlock<'_>, at| if block.number == NUMBER_LAST { NUMBER_LAST } else { at };
         rest.zip(refused.number..)
             .map(|(block, at)| FileBlock { number: number(block, at), ..block.clone() })
             .collect()
@@ -153,12 +148,12 @@ fn takes_joined(session: &mut Session<'_>, program: u8) -> Result<bool, Error> {
 }
 
 /// The blocks that carry a sealed image to the program's region of this device.
-fn cut_up(
+fn cut_up<'f>(
     session: &mut Session<'_>,
-    sealed: &SealedFile,
+    sealed: &'f SealedFile,
     block_size: usize,
     program: u8,
-) -> Result<BlockFile, Error> {
+) -> Result<BlockFile<'f>, Error> {
     let not_cut = |why: &str| Error::NoProgram {
         number: Fault::NUMBER,
         why: format!("cannot be sent in blocks: {why}"),
@@ -172,7 +167,7 @@ fn cut_up(
 
 impl PartialDownload {
     /// The CRC of the device, if it is the download of this file.
-    fn checksum_of(self, file: &BlockFile) -> Option<Checksum> {
+    fn checksum_of(self, file: &BlockFile<'_>) -> Option<Checksum> {
         let control = &file.blocks()[0];
         let is_its =
             |checksum: &Checksum| control.emit_with(*checksum).ends_with(&self.control_crc.to_le_bytes());
@@ -180,7 +175,7 @@ impl PartialDownload {
     }
 
     /// Whether the device has this block's data.
-    fn has(self, block: &FileBlock) -> bool {
+    fn has(self, block: &FileBlock<'_>) -> bool {
         let is_data = block.number != NUMBER_CONTROL && block.number != NUMBER_LAST;
         is_data && block.flash_address + block.data.len() as u32 <= self.end
     }
@@ -229,8 +224,8 @@ fn send(
     let before = steps::told_before(session, number)?;
     update.erases(before);
     if let Some(partial) = partial {
-        let total = file.own.program_size() as usize;
-        let done = partial.end.saturating_sub(file.own.program_start()) as usize;
+        let total = file.own.size() as usize;
+        let done = partial.end.saturating_sub(file.own.start()) as usize;
         // The record of the old program goes with the first good data.
         update.postponed = done == 0 && before.is_some_and(|crc| crc != 0);
         update.tell(Phase::GoingOn { done: done.min(total), total }.into());
@@ -259,8 +254,8 @@ fn send_blocks(
 ) -> Result<u32, Error> {
     let begun = partial.and_then(|partial| partial.checksum_of(file.own));
     let mut checksum = begun.unwrap_or(file.own.checksum());
-    let size = |blocks: &VecDeque<FileBlock>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
-    let mut blocks: VecDeque<FileBlock> = file.file().blocks().iter().cloned().collect();
+    let size = |blocks: &VecDeque<FileBlock<'_>>| blocks.iter().map(|block| FRAMING + block.data.len()).sum();
+    let mut blocks: VecDeque<FileBlock<'_>> = file.file().blocks().iter().cloned().collect();
     let mut total = size(&blocks);
     let mut may_split = file.joined.is_some() && !*in_group;
     let mut done = 0;
@@ -446,6 +441,7 @@ fn is_too_long(error: &Error) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::file::block_file;
 
     /// Both files have the same program, and block 0 has its CRC at offset 20.
     #[test]
@@ -455,7 +451,8 @@ mod tests {
             (Checksum::Crc16, include_bytes!("../../../tests/data/crc16-400.blk")),
         ];
         for (_, file) in files {
-            let file = BlockFile::parse(file).unwrap();
+            let program = block_file::read(file).unwrap();
+            let file = BlockFile::of(&program);
             for (checksum, begun) in files {
                 let control_crc = u32::from_le_bytes(begun[20..24].try_into().unwrap());
                 let partial = PartialDownload { control_crc, end: 0 };

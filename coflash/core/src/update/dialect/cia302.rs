@@ -1,32 +1,57 @@
-//! Common parts of the dialects of CiA 302-3: STOP, CLEAR, one download, START.
+//! The dialects `raw` and `hex`: CiA 302-3, with STOP, CLEAR, one download and START. They differ in the
+//! form of the program alone.
 
 use canopen::program::{self, ProgramControl, ProgramState};
 use canopen::Address;
 
-use super::procedure::Downloaded;
+use super::encode;
+use super::procedure::{Downloaded, Procedure};
 use super::whole::{self, Whole};
 use crate::device::error::absent;
 use crate::device::{DeviceType, Dialect, Error, Session};
+use crate::update::content::{Content, Encoder};
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Note, Phase};
 use crate::update::options::FlashOptions;
 use crate::update::running::RunningUpdate;
 use crate::update::steps::{call_back, clear_and_wait, running_program};
 
-/// Makes the bootloader run.
-pub(super) fn enter(
-    session: &mut Session<'_>,
-    running: DeviceType,
+/// See the [module](self).
+pub(super) struct Cia302 {
     dialect: Dialect,
-    number: u8,
-    update: &mut RunningUpdate<'_>,
-) -> Result<Dialect, Error> {
-    if !running.is_bootloader() {
-        update.state = DeviceState::Called;
-        stop_program(session, number, update)?;
+    encode: Encoder,
+}
+
+/// With the contents of the flash.
+pub(super) const RAW: Cia302 = Cia302 { dialect: Dialect::Raw, encode: encode::raw };
+/// With Intel HEX text.
+pub(super) const HEX: Cia302 = Cia302 { dialect: Dialect::Hex, encode: encode::hex };
+
+impl Procedure for Cia302 {
+    fn enter(
+        &self,
+        session: &mut Session<'_>,
+        running: DeviceType,
+        options: &FlashOptions,
+        update: &mut RunningUpdate<'_>,
+    ) -> Result<Dialect, Error> {
+        if !running.is_bootloader() {
+            update.state = DeviceState::Called;
+            stop_program(session, options.program, update)?;
+        }
+        update.tell(Note::Dialect { dialect: self.dialect }.into());
+        Ok(self.dialect)
     }
-    update.tell(Note::Dialect { dialect }.into());
-    Ok(dialect)
+
+    fn download(
+        &self,
+        session: &mut Session<'_>,
+        file: Content<'_>,
+        options: &FlashOptions,
+        update: &mut RunningUpdate<'_>,
+    ) -> Result<Downloaded, Error> {
+        download(session, &file.encoded(self.encode), file.crcs(), options, update)
+    }
 }
 
 /// Erases, and sends this content.

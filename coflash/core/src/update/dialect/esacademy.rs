@@ -5,12 +5,12 @@ use std::time::Duration;
 use canopen::program::{self, FlashError};
 use canopen::{AbortCode, Address, NodeId};
 
+use super::encode::hex;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
 use super::restart::{arrived, reset_program};
 use super::whole::{self, idle, Said, Whole};
 use crate::device::error::{absent, optional};
 use crate::device::{DeviceType, Dialect, Doing, Error, Session};
-use crate::file::ihex;
 use crate::update::content::Content;
 use crate::update::event::Note;
 use crate::update::options::FlashOptions;
@@ -45,14 +45,14 @@ impl Procedure for EsAcademy {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let content = file.stream(|blocks| ihex::emit(&blocks.image()).into_bytes());
+        let content = file.encoded(hex);
         let prepare = |session: &mut Session<'_>, update: &mut RunningUpdate<'_>| {
             if self.unlock(session, options, options.program)? {
                 update.tell(Note::Unlocked.into());
             }
             Ok(())
         };
-        let crcs = file.program_crcs();
+        let crcs = file.crcs();
         let whole = Whole { content: &content, crcs, prepare: &prepare, status };
         whole::download(session, &whole, options, update)
     }

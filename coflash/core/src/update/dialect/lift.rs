@@ -6,6 +6,7 @@ use canopen::nmt::parse_state_message;
 use canopen::program::LIFT_NODE_ID;
 use canopen::{AbortCode, Address, NodeId};
 
+use super::encode::raw;
 use super::procedure::{Downloaded, Procedure};
 use super::restart::{arrived, reset_program};
 use super::whole::{self, Whole};
@@ -13,7 +14,6 @@ use crate::device::flying_master::{self, Asked};
 use crate::device::info::nameplate;
 use crate::device::recognise::UNLOCK;
 use crate::device::{recognise, DeviceType, Dialect, Doing, Error, Session, Timing};
-use crate::file::BlockFile;
 use crate::update::content::Content;
 use crate::update::device_after::DeviceState;
 use crate::update::event::{Event, Note, Phase, Warning};
@@ -71,7 +71,7 @@ impl Procedure for Lift {
         options: &FlashOptions,
         update: &mut RunningUpdate<'_>,
     ) -> Result<Downloaded, Error> {
-        let (content, crcs) = (file.stream(BlockFile::flash_image), file.program_crcs());
+        let (content, crcs) = (file.encoded(raw), file.crcs());
         // The device is already unlocked; the download overwrites the old program.
         let prepare = |_: &mut Session<'_>, _: &mut RunningUpdate<'_>| Ok(());
         let whole = Whole { content: &content, crcs, prepare: &prepare, status: whole::status };

@@ -9,18 +9,18 @@
 //! | [`EsAcademy`](Dialect::EsAcademy) | Intel HEX text, one download | password in 7F50h, which erases | it runs by itself |
 //! | [`Lift`](Dialect::Lift) | image, one download, at node-ID 126 | password in 6005h, in application and bootloader | "reset program" |
 //!
-//! To add a dialect, add a file that implements `Procedure` and a line in `of`.
+//! `raw` and `hex` are one procedure with two encoders. To add a dialect, add a file that implements
+//! `Procedure` and a line in `of`.
 //! [`steps`](super::steps) has the steps that all dialects share.
 
 use crate::device::Dialect;
 
 mod block;
 mod cia302;
+mod encode;
 mod esacademy;
-mod hex;
 mod lift;
 mod procedure;
-mod raw;
 mod restart;
 mod whole;
 
@@ -39,8 +39,8 @@ pub const fn is_data(dialect: Dialect, program: u8) -> bool {
 pub(super) fn of(dialect: Dialect) -> &'static dyn Procedure {
     match dialect {
         Dialect::Block => &block::Block,
-        Dialect::Raw => &raw::Raw,
-        Dialect::Hex => &hex::Hex,
+        Dialect::Raw => &cia302::RAW,
+        Dialect::Hex => &cia302::HEX,
         Dialect::Lift => &lift::Lift,
         Dialect::EsAcademy => &esacademy::EsAcademy,
     }

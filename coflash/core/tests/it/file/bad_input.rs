@@ -1,8 +1,10 @@
 //! No input may cause a panic of a reader, and no damaged file may pass as firmware.
 
-use coflash_core::file::block_file::{BlockFile, Checksum};
-use coflash_core::file::convert::{blocks_of, GapFill, Options};
+use coflash_core::file::block_file::{self, BlockFile};
+use coflash_core::file::checksum::{Checksum, CRC};
+use coflash_core::file::convert::{program_of, GapFill, Options};
 use coflash_core::file::read::{self, Firmware, Format};
+use coflash_core::file::Program;
 use proptest::prelude::*;
 
 macro_rules! named {
@@ -24,9 +26,9 @@ const FILES: [(&str, &[u8]); 9] = [
 ];
 
 /// The contents of the file, or the reason why it is invalid.
-fn meaning(bytes: &[u8], format: Option<Format>) -> Result<BlockFile, String> {
+fn meaning(bytes: &[u8], format: Option<Format>) -> Result<Program, String> {
     let firmware = read::read(bytes, format, Some(0x0801_0000)).map_err(|error| error.to_string())?;
-    blocks_of(firmware, &Options::default()).map(|done| done.file).map_err(|error| error.to_string())
+    program_of(firmware, &Options::default()).map(|done| done.program).map_err(|error| error.to_string())
 }
 
 #[test]
@@ -155,7 +157,7 @@ fn a_damaged_block_file_is_named_with_its_offset() {
         bytes[at] = value;
         meaning(&bytes, Some(Format::BlockFile)).unwrap_err()
     };
-    let crc_of = |block: &[u8]| coflash_core::file::block_file::CRC.checksum(block).to_le_bytes();
+    let crc_of = |block: &[u8]| CRC.checksum(block).to_le_bytes();
     // Data of block 1, which starts after the 24 bytes of block 0.
     assert!(with(0x30, 0).starts_with("offset 0x18: CRC of block 1 is 0xc2fbc65a"), "{}", with(0x30, 0));
     assert!(
@@ -194,12 +196,13 @@ fn block_0_may_hold_what_a_product_wants() {
         let mut block = [0; 12].to_vec();
         block[8..].copy_from_slice(&(size as u32).to_le_bytes());
         block.extend(&data);
-        let crc = coflash_core::file::block_file::CRC.checksum(&block);
+        let crc = CRC.checksum(&block);
         block.extend(crc.to_le_bytes());
         // 24 bytes are block 0 of the good file.
         let file = meaning(&[&block, &good[24..]].concat(), None).unwrap();
-        assert_eq!((file.control(), &file.blocks()[0].data), (None, &data), "{size} bytes");
-        assert_eq!(coflash_core::update::Target::of(&file), None, "{size} bytes name no device");
+        let blocks = BlockFile::of(&file);
+        assert_eq!((blocks.control(), &blocks.blocks()[0].data[..]), (None, &data[..]), "{size} bytes");
+        assert_eq!(file.target(), None, "{size} bytes name no device");
     }
 }
 
@@ -238,7 +241,7 @@ fn the_segments_of_an_elf_file_are_added_up_before_they_are_copied() {
     );
     // So many headers are not a fault by themselves.
     let bytes = elf(20_000, 0, |number| (52 + 4 * number, 0x0801_0000 + 4 * number, 4));
-    assert_eq!(meaning(&bytes, None).unwrap().program_size(), 80_000);
+    assert_eq!(meaning(&bytes, None).unwrap().size(), 80_000);
     // The gap between two segments counts as well.
     let apart = elf(2, 0, |number| (52, 0x0C01_0000 + number * 0x0400_0000, 4));
     let error = meaning(&apart, None).unwrap_err();
@@ -305,13 +308,13 @@ proptest! {
         let Firmware::Image(image) = read::read(hex.as_bytes(), None, None).unwrap() else { panic!() };
         let gap_fill = GapFill::new(gap_fill);
         let options = Options::default().block_size(block_size).checksum(checksum).gap_fill(gap_fill).adjust_start(adjust_start);
-        let file = blocks_of(Firmware::Image(image), &options).unwrap().file;
+        let file = program_of(Firmware::Image(image), &options).unwrap().program;
         let mut memory = [0xFFu8; 4096];
         let mut covered = [false; 4096];
-        for block in file.program_blocks() {
+        for block in BlockFile::of(&file).program_blocks() {
             prop_assert!(block.data.len() + 16 <= block_size);
             prop_assert!(block.flash_address % 4 == 0);
-            for (address, byte) in ((block.flash_address - adjust_start) as usize..).zip(&block.data) {
+            for (address, byte) in ((block.flash_address - adjust_start) as usize..).zip(&*block.data) {
                 prop_assert!(!covered[address]);
                 (memory[address], covered[address]) = (*byte, true);
             }
@@ -326,8 +329,11 @@ proptest! {
             };
             prop_assert_eq!(byte, pieces.get(&address).copied().unwrap_or(hole));
         }
-        let start = (file.program_start() - adjust_start) as usize;
-        prop_assert_eq!(file.flash_image(), &memory[start..start + file.program_size() as usize]);
-        prop_assert_eq!(BlockFile::parse(&file.emit()).unwrap(), file);
+        let start = (file.start() - adjust_start) as usize;
+        prop_assert_eq!(&*file.flash_image(), &memory[start..start + file.size() as usize]);
+        let read = block_file::read(&block_file::emit(&file)).unwrap();
+        let (read_blocks, blocks) = (BlockFile::of(&read), BlockFile::of(&file));
+        prop_assert_eq!(read_blocks.blocks(), blocks.blocks());
+        prop_assert_eq!((read.size(), read.crc()), (file.size(), file.crc()));
     }
 }

@@ -1,10 +1,12 @@
 //! Conversion against block files made by other tools (`data/make.sh`) and against literals from
 //! the manual's tables.
 
-use coflash_core::file::block_file::{BlockFile, Checksum, LastBlock};
+use coflash_core::file::block_file::{self, emit, BlockFile};
+use coflash_core::file::checksum::Checksum;
 use coflash_core::file::convert::{
-    blocks_of, convert, ConvertError, Converted, GapFill, Label, Options, Region,
+    convert, program_of, ConvertError, Converted, GapFill, Label, Options, Region,
 };
+use coflash_core::file::program::LastBlock;
 use coflash_core::file::read::{self, Firmware, Format};
 use coflash_core::file::{AddressRange, Image};
 use shared_abi::layout::nucleo_f446re::LAYOUT;
@@ -40,8 +42,8 @@ fn every_format_of_one_program_gives_the_same_block_file() {
             (data!("identity-110.blk"), plain.block_size(0x110).label(IDENTITY)),
             (data!("release-110.blk"), plain.block_size(0x110).label(RELEASE)),
         ] {
-            let Converted { file, left_out, .. } = convert(&image, &options).unwrap();
-            assert!(file.emit() == expected, "{name}, {options:?}");
+            let Converted { program: file, left_out, .. } = convert(image.clone(), &options).unwrap();
+            assert!(emit(&file) == expected, "{name}, {options:?}");
             assert_eq!(left_out, 0);
         }
     }
@@ -53,20 +55,20 @@ fn every_format_of_one_program_gives_the_same_block_file() {
 fn the_last_block_of_2008_is_written_and_read() {
     let elf = image(data!("program.elf"));
     let options = Options::default().region(board()).last_block(LastBlock::Of2008);
-    let file = convert(&elf, &options).unwrap().file;
-    let (old, new) = (file.emit(), data!("plain-400.blk"));
+    let file = convert(elf.clone(), &options).unwrap().program;
+    let (old, new) = (emit(&file), data!("plain-400.blk"));
     let (before, last) = old.split_at(old.len() - 56);
     assert!(before == &new[..new.len() - 24]);
     let today = &new[new.len() - 24..];
     assert_eq!(last[..12], today[..12], "number, address, data size 8");
     assert_eq!((last[8..12].to_vec(), &last[12..44]), (vec![8, 0, 0, 0], &[0; 32][..]));
     assert_eq!(last[44..52], today[12..20], "size and CRC of the program");
-    assert_eq!(BlockFile::parse(&old).unwrap(), file);
+    assert_eq!(BlockFile::of(&block_file::read(&old).unwrap()), BlockFile::of(&file));
     // One byte less is no last block of either manual.
-    assert!(BlockFile::parse(&old[..old.len() - 1]).is_err());
+    assert!(block_file::read(&old[..old.len() - 1]).is_err());
     let mut damaged = old.clone();
     damaged[before.len() + 20] ^= 1;
-    assert!(BlockFile::parse(&damaged).is_err(), "its CRC runs over the reserved bytes");
+    assert!(block_file::read(&damaged).is_err(), "its CRC runs over the reserved bytes");
 }
 
 /// The table of the manual of 2008 contradicts itself: a field of 32 reserved bytes, and offsets (28h, 2Ch,
@@ -74,28 +76,28 @@ fn the_last_block_of_2008_is_written_and_read() {
 /// what they are, and sent as they are.
 #[test]
 fn the_last_block_of_2008_is_read_at_the_printed_offsets_and_after_32_bytes() {
-    let plain = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let plain = block_file::read(data!("plain-400.blk")).unwrap();
     for (file, last) in [(data!("last-2008-offsets-400.blk"), 52), (data!("last-2008-reserved-400.blk"), 56)]
     {
-        let read = BlockFile::parse(file).unwrap();
-        assert_eq!((read.program_size(), read.program_crc()), (plain.program_size(), plain.program_crc()));
-        assert!(read.image() == plain.image() && read.emit() == file);
-        assert_eq!(read.blocks().last().unwrap().emit(), file[file.len() - last..]);
+        let read = block_file::read(file).unwrap();
+        assert_eq!((read.size(), read.crc()), (plain.size(), plain.crc()));
+        assert!(read.image() == plain.image() && emit(&read) == file);
+        assert_eq!(BlockFile::of(&read).blocks().last().unwrap().emit(), file[file.len() - last..]);
         // A byte of the field more or less, and a damaged one.
         let at = file.len() - 20;
         for other in [[&file[..at], &file[at + 1..]].concat(), [&file[..at], &[0], &file[at..]].concat()] {
-            assert!(BlockFile::parse(&other).is_err(), "{}", other.len());
+            assert!(block_file::read(&other).is_err(), "{}", other.len());
         }
         let mut damaged = file.to_vec();
         damaged[at] ^= 1;
-        assert!(BlockFile::parse(&damaged).unwrap_err().to_string().contains("CRC of block"));
+        assert!(block_file::read(&damaged).unwrap_err().to_string().contains("CRC of block"));
         // The same with a data size that counts the field, as the device takes it, too.
         let mut counts = file[..file.len() - 4].to_vec();
         let size_at = file.len() - last + 8;
         counts[size_at] = last as u8 - 16;
         let crc = crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(&counts[size_at - 8..]);
         counts.extend(crc.to_le_bytes());
-        assert_eq!(BlockFile::parse(&counts).unwrap().program_crc(), plain.program_crc());
+        assert_eq!(block_file::read(&counts).unwrap().crc(), plain.crc());
     }
 }
 
@@ -105,31 +107,32 @@ fn the_last_block_of_2008_is_read_at_the_printed_offsets_and_after_32_bytes() {
 fn the_16_bit_crc_is_that_of_the_manual() {
     let elf = image(data!("program.elf"));
     let options = Options::default().region(board()).checksum(Checksum::Crc16);
-    let file = convert(&elf, &options).unwrap().file;
-    assert!(file.emit() == data!("crc16-400.blk"));
+    let file = convert(elf.clone(), &options).unwrap().program;
+    assert!(emit(&file) == data!("crc16-400.blk"));
     // Read back, it is known for what it is.
-    let read = BlockFile::parse(data!("crc16-400.blk")).unwrap();
-    assert_eq!(read, file);
-    assert_eq!((read.checksum(), read.program_crc() >> 16), (Checksum::Crc16, 0));
+    let read = block_file::read(data!("crc16-400.blk")).unwrap();
+    assert_eq!(BlockFile::of(&read), BlockFile::of(&file));
+    assert_eq!((read.checksum(), read.crc() >> 16), (Checksum::Crc16, 0));
     let mut damaged = data!("crc16-400.blk").to_vec();
     damaged[0x30] ^= 1;
-    assert!(BlockFile::parse(&damaged).unwrap_err().to_string().contains("CRC of block 1"));
+    assert!(block_file::read(&damaged).unwrap_err().to_string().contains("CRC of block 1"));
 }
 
 #[test]
 fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
     let elf = image(data!("program.elf"));
-    let with =
-        |region, adjust_start| convert(&elf, &Options::default().region(region).adjust_start(adjust_start));
+    let with = |region, adjust_start| {
+        convert(elf.clone(), &Options::default().region(region).adjust_start(adjust_start))
+    };
     let range = |first, last| Region::Cut(AddressRange { first, last });
     for region in [Region::Unknown, range(0x0801_0000, 0x080F_FFFF)] {
-        assert!(with(region, 0xF800_0000).unwrap().file.emit() == data!("adjusted-400.blk"), "{region:?}");
+        assert!(emit(&with(region, 0xF800_0000).unwrap().program) == data!("adjusted-400.blk"), "{region:?}");
     }
     // Away from the board and back to it.
     let moved = Firmware::Image(elf.moved(0x1000_0000).unwrap());
     let back = Options::default().region(board()).adjust_start(0xF000_0000);
-    assert!(blocks_of(moved.clone(), &back).unwrap().file.emit() == data!("plain-400.blk"));
-    assert!(blocks_of(moved, &Options::default().region(board())).is_err());
+    assert!(emit(&program_of(moved.clone(), &back).unwrap().program) == data!("plain-400.blk"));
+    assert!(program_of(moved, &Options::default().region(board())).is_err());
     // Over the end of the address space: the border within a piece, between two, and before the
     // first.
     for (region, offset) in [
@@ -142,7 +145,7 @@ fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
     }
     assert!(with(Region::Unknown, 2).is_ok(), "a start inside a word is rounded down");
     let blocks = read::read(data!("plain-400.blk"), None, None).unwrap();
-    let error = blocks_of(blocks, &Options::default().adjust_start(4)).unwrap_err();
+    let error = program_of(blocks, &Options::default().adjust_start(4)).unwrap_err();
     assert!(matches!(error, ConvertError::Blocks(_)), "{error}");
 }
 
@@ -150,9 +153,9 @@ fn addresses_are_adjusted_behind_the_cut_and_before_the_board() {
 #[test]
 fn the_flash_image_is_that_of_objcopy() {
     for bytes in [data!("plain-400.blk"), data!("identity-110.blk"), data!("crc16-400.blk")] {
-        let file = BlockFile::parse(bytes).unwrap();
+        let file = block_file::read(bytes).unwrap();
         assert!(file.flash_image() == data!("program.bin"));
-        assert_eq!(file.program_start(), 0x0801_0000);
+        assert_eq!(file.start(), 0x0801_0000);
     }
 }
 
@@ -168,7 +171,7 @@ fn the_software_version_is_found_in_every_format() {
     assert_eq!(raw(text).software_version(), found);
     // It may lie across two blocks.
     let options = Options::default().block_size(24);
-    let file = convert(&raw(text), &options).unwrap().file;
+    let file = convert(raw(text), &options).unwrap().program;
     assert_eq!(file.image().software_version(), found);
     assert_eq!(raw(&text[..4]).software_version(), None);
     assert_eq!(raw(&text[..27]).software_version(), None, "the mark's final zero is missing");
@@ -187,9 +190,9 @@ fn short_addresses_read_the_same_memory() {
 fn a_block_file_is_read_back_and_taken_as_it_is() {
     for bytes in [data!("plain-400.blk"), data!("identity-110.blk"), data!("release-110.blk")] {
         let firmware = read::read(bytes, None, None).unwrap();
-        let done = blocks_of(firmware, &Options::default().region(board())).unwrap();
-        assert!(done.file.emit() == bytes);
-        assert_eq!(done.file.program_size(), 0xFA1);
+        let done = program_of(firmware, &Options::default().region(board())).unwrap();
+        assert!(emit(&done.program) == bytes);
+        assert_eq!(done.program.size(), 0xFA1);
     }
 }
 
@@ -198,7 +201,7 @@ fn a_block_file_is_read_back_and_taken_as_it_is() {
 #[test]
 fn a_small_program_byte_by_byte() {
     let image = image(b":020000040801F1\n:050000000102030405EC\n:00000001FF\n");
-    let Converted { file, .. } = convert(&image, &Options::default()).unwrap();
+    let Converted { program: file, .. } = convert(image.clone(), &Options::default()).unwrap();
     #[rustfmt::skip]
     let expected = [
         0, 0, 0, 0,  0, 0, 0, 0,  8, 0, 0, 0,  0, 0, 0, 0, 0, 0, 0, 0,  0x73, 0xED, 0xD9, 0x09,
@@ -206,7 +209,7 @@ fn a_small_program_byte_by_byte() {
         0xFF, 0xFF, 0xFF, 0xFF,  0, 0, 0, 0,  8, 0, 0, 0,
             5, 0, 0, 0,  0xF4, 0x99, 0x0B, 0x47,  0x12, 0x88, 0x99, 0x41,
     ];
-    assert_eq!(file.emit(), expected);
+    assert_eq!(emit(&file), expected);
 }
 
 #[test]
@@ -214,8 +217,9 @@ fn gaps_inside_a_block_take_the_fill_and_count_in_the_crc() {
     // 01 at 08010000h, a gap of six bytes, 02 at 08010007h.
     let image = image(b":020000040801F1\n:0100000001FE\n:0100070002F6\n:00000001FF\n");
     let data = |gap_fill| {
-        let file = convert(&image, &Options::default().gap_fill(GapFill::new(gap_fill))).unwrap().file;
-        (file.program_blocks()[0].data.clone(), file.program_crc())
+        let file =
+            convert(image.clone(), &Options::default().gap_fill(GapFill::new(gap_fill))).unwrap().program;
+        (BlockFile::of(&file).program_blocks()[0].data.to_vec(), file.crc())
     };
     // CRCs: zlib.crc32 over the eight bytes.
     assert_eq!(data(0xFFFF_FFFF), (vec![1, 255, 255, 255, 255, 255, 255, 2], 0x08A9_57C5));
@@ -231,10 +235,13 @@ fn a_gap_that_is_too_long_starts_a_new_block() {
     let text = b":020000040801F1\n:0100000001FE\n:0100100002ED\n:0100130003E9\n:00000001FF\n";
     let image = image(text);
     let blocks = |max_gap| {
-        let file = convert(&image, &Options::default().max_gap(max_gap)).unwrap().file;
-        let blocks: Vec<(u32, usize)> =
-            file.program_blocks().iter().map(|block| (block.flash_address, block.data.len())).collect();
-        (blocks, file.program_size())
+        let file = convert(image.clone(), &Options::default().max_gap(max_gap)).unwrap().program;
+        let blocks: Vec<(u32, usize)> = BlockFile::of(&file)
+            .program_blocks()
+            .iter()
+            .map(|block| (block.flash_address, block.data.len()))
+            .collect();
+        (blocks, file.size())
     };
     let (start, next) = (0x0801_0000, 0x0801_0010);
     for whole in [None, Some(15), Some(u32::MAX)] {
@@ -249,7 +256,7 @@ fn a_gap_that_is_too_long_starts_a_new_block() {
 #[test]
 fn the_region_decides_about_data_outside() {
     let elf = image(data!("program.elf"));
-    let with = |region| convert(&elf, &Options::default().region(region));
+    let with = |region| convert(elf.clone(), &Options::default().region(region));
     let range = |first, last| AddressRange { first, last };
 
     let error = with(Region::Strict(range(0x0801_0000, 0x0801_0F9F))).unwrap_err().to_string();
@@ -261,20 +268,20 @@ fn the_region_decides_about_data_outside() {
     );
     // The manual's --start_address/--end_address leave it out.
     let cut = with(Region::Cut(range(0x0801_0000, 0x0801_02C5))).unwrap();
-    assert_eq!((cut.file.program_size(), cut.left_out), (0x2C6, 8 + 17));
+    assert_eq!((cut.program.size(), cut.left_out), (0x2C6, 8 + 17));
     assert_eq!(with(Region::CutBehind(0x0801_02C5)).unwrap(), cut);
     let error = with(Region::Cut(range(0, 0xFFFF))).unwrap_err().to_string();
     assert_eq!(error, "the file: holds no data inside 0x00000000..=0x0000ffff");
     // The size counts from the region's start.
     let early = with(Region::Strict(range(0x0800_FF00, 0x080F_FFFF))).unwrap();
-    assert_eq!(early.file.program_size(), 0xFA1 + 0x100);
+    assert_eq!(early.program.size(), 0xFA1 + 0x100);
     assert!(matches!(with(Region::Cut(range(2, 0xFFFF_FFFF))), Err(ConvertError::Start(2))));
     assert!(matches!(with(Region::Cut(range(8, 4))), Err(ConvertError::Range(_))));
 }
 
 #[test]
 fn a_block_file_for_another_place_is_refused() {
-    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let file = block_file::read(data!("plain-400.blk")).unwrap();
     let range = |first, last| AddressRange { first, last };
     assert!(file.check_region(range(0x0801_0000, 0x080F_FFFF)).is_ok());
     let error = file.check_region(range(0x0801_0000, 0x0801_0FFF - 0x60)).unwrap_err().to_string();
@@ -287,10 +294,11 @@ fn a_block_file_for_another_place_is_refused() {
 #[test]
 fn a_block_size_holds_every_block() {
     let elf = image(data!("program.elf"));
-    let with = |block_size, label| convert(&elf, &Options::default().block_size(block_size).label(label));
+    let with =
+        |block_size, label| convert(elf.clone(), &Options::default().block_size(block_size).label(label));
     for (least, label) in [(24, Label::None), (28, IDENTITY), (40, RELEASE)] {
-        let file = with(least, label).unwrap().file;
-        assert!(file.blocks().iter().all(|block| block.emit().len() <= least));
+        let file = with(least, label).unwrap().program;
+        assert!(BlockFile::of(&file).blocks().iter().all(|block| block.emit().len() <= least));
         let error = with(least - 1, label).unwrap_err().to_string();
         assert!(error.contains(&format!("must be {least} to 16384")), "{error}");
     }
@@ -301,13 +309,13 @@ fn a_block_size_holds_every_block() {
 #[test]
 fn two_memories_in_one_file_are_not_one_program() {
     let image = image(b":0100000001FE\n:02000004FFFFFC\n:01FFFF0002FF\n:00000001FF\n");
-    let error = convert(&image, &Options::default()).unwrap_err().to_string();
+    let error = convert(image.clone(), &Options::default()).unwrap_err().to_string();
     assert!(error.starts_with("the file: the data spans 0x00000000..=0xffffffff"), "{error}");
     // The end of the address space itself is no problem.
     let top = AddressRange { first: 0xFFFF_FF00, last: 0xFFFF_FFFF };
-    let file = convert(&image, &Options::default().region(Region::Cut(top))).unwrap().file;
-    assert_eq!((file.program_size(), file.span().last), (0x100, 0xFFFF_FFFF));
-    assert!(BlockFile::parse(&file.emit()).is_ok());
+    let file = convert(image.clone(), &Options::default().region(Region::Cut(top))).unwrap().program;
+    assert_eq!((file.size(), file.span().last), (0x100, 0xFFFF_FFFF));
+    assert!(block_file::read(&emit(&file)).is_ok());
 }
 
 #[test]
@@ -315,9 +323,9 @@ fn a_raw_file_goes_where_it_is_told() {
     let bytes = data!("program.bin");
     let read = |address| read::read(bytes, Some(Format::Raw), address);
     let Firmware::Image(raw) = read(Some(0x0801_0000)).unwrap() else { panic!() };
-    let file = convert(&raw, &Options::default().region(board())).unwrap().file;
-    let gapless = BlockFile::parse(data!("plain-400.blk")).unwrap();
-    assert_eq!((file.program_size(), file.program_crc()), (gapless.program_size(), gapless.program_crc()));
+    let file = convert(raw.clone(), &Options::default().region(board())).unwrap().program;
+    let gapless = block_file::read(data!("plain-400.blk")).unwrap();
+    assert_eq!((file.size(), file.crc()), (gapless.size(), gapless.crc()));
     assert!(read(None).unwrap_err().to_string().contains("give --start-address"));
     assert!(read(Some(0xFFFF_FF00)).is_err());
     assert!(read::read(bytes, None, None).unwrap_err().to_string().contains("not a firmware file"));

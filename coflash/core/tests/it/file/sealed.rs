@@ -4,6 +4,7 @@
 use std::io::Write as _;
 use std::process::{Command, Stdio};
 
+use coflash_core::file::block_file::emit;
 use coflash_core::file::sealed::blocks::{looks_like, FRONT};
 use coflash_core::file::sealed::open::Closed;
 use coflash_core::file::sealed::{
@@ -321,7 +322,7 @@ fn a_block_file_carries_a_sealed_image() {
         assert!(looks_like(&file[..FRONT]));
         let carried = carried(file.clone()).unwrap();
         assert!(carried.image == image);
-        assert_eq!(carried.blocks.unwrap().emit(), file);
+        assert_eq!(emit(&carried.blocks.unwrap()), file);
         assert!(verify(&carried.image, &device(&[root().public()], &[])).is_ok());
     }
     // What carries none stays what it is.

@@ -4,10 +4,9 @@
 use canopen::NodeId;
 use coflash_core::device::info::info;
 use coflash_core::device::{Dialect, Error, Session, Timing};
-use coflash_core::file::convert::{blocks_of, Label as Told, Options};
-use coflash_core::file::{raw, BlockFile, Firmware};
+use coflash_core::file::convert::{program_of, Label as Told, Options};
+use coflash_core::file::{raw, Firmware, Program};
 use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
-use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const START: u32 = 0x0801_0000;
 /// The values of 1018h in the fake.
@@ -32,12 +31,12 @@ fn labelled(vendor_id: u32, product_code: u32) -> Vec<u8> {
 }
 
 /// The file of an image at this address, with this in its block 0.
-fn file(bytes: &[u8], at: u32, label: Told) -> BlockFile {
+fn file(bytes: &[u8], at: u32, label: Told) -> Program {
     let image = raw::read(bytes, Some(at)).unwrap();
-    blocks_of(Firmware::Image(image), &Options::default().label(label)).unwrap().file
+    program_of(Firmware::Image(image), &Options::default().label(label)).unwrap().program
 }
 
-fn run(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
+fn run(fake: &mut Fake, file: &Program, options: FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
     let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, file, &options, &mut |event| events.push(event));
@@ -46,7 +45,7 @@ fn run(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> (Result<Repo
 
 /// The update is refused, and nothing was written: not even the call to the bootloader.
 #[track_caller]
-fn refused(fake: &mut Fake, file: &BlockFile, options: FlashOptions) -> Error {
+fn refused(fake: &mut Fake, file: &Program, options: FlashOptions) -> Error {
     let (result, events) = run(fake, file, options);
     let error = result.unwrap_err();
     assert_eq!(fake.writes(), [] as [&str; 0], "{error}");
@@ -157,14 +156,14 @@ fn other(objects: &'static [((u16, u8), &'static [u8])], only: Option<u32>) -> F
 fn a_device_without_identity_takes_any_program() {
     const NOBODY: &[((u16, u8), &[u8])] = &[((0x1018, 1), &[0; 4]), ((0x1018, 2), &[0; 4])];
     let file = file(&labelled(VENDOR, PRODUCT), START, Told::default());
-    let target = coflash_core::update::Target::of(&file);
+    let target = file.target();
     for options in [FlashOptions::default(), FlashOptions::default().check_target(target)] {
         run(&mut other(NOBODY, None), &file, options).0.unwrap();
     }
     // Each of the two numbers counts by itself.
     const NO_PRODUCT: &[((u16, u8), &[u8])] = &[((0x1018, 2), &[0; 4])];
     let foreign = self::file(&labelled(0x40, PRODUCT), START, Told::default());
-    let target = coflash_core::update::Target::of(&foreign);
+    let target = foreign.target();
     for options in [FlashOptions::default(), FlashOptions::default().force(true).check_target(target)] {
         let error = run(&mut other(NO_PRODUCT, None), &foreign, options).0.unwrap_err();
         assert!(matches!(error, Error::WrongTarget { file: 0x40, .. }), "{error}");
@@ -391,7 +390,7 @@ fn an_image_without_addresses_is_judged_by_the_devices_place() {
         assert_eq!(error.to_string(), words);
     }
     let mut fake = at(START, 1024, BOOTLOADER, &BOTH);
-    fake.crc = Some(file.program_crc());
+    fake.crc = Some(file.crc());
     run(&mut fake, &file, speaks(Dialect::Raw)).0.unwrap();
     assert!(fake.log.contains(&"5: 1F50/1, 1024 bytes".to_string()), "{:?}", fake.log);
 }

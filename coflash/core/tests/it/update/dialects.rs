@@ -6,13 +6,14 @@ use std::sync::{Arc, Mutex};
 use canopen::NodeId;
 use coboot_can::Adapter;
 use coflash_core::device::{recognise, Dialect, Doing, Session, Timing, Transfers};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::block_file;
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::ihex;
+use coflash_core::file::{Program, Target};
 use coflash_core::update::dialect::{self, read_locked};
 use coflash_core::update::event::{Note, Phase};
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
-use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report, Target};
+use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
 use coflash_core::Error;
 use embedded_can::Frame as _;
 
@@ -35,8 +36,8 @@ const PHRASE: &str = "open sesame";
 
 type Kept = Arc<Mutex<Vec<u8>>>;
 
-fn file() -> BlockFile {
-    BlockFile::parse(data!("identity-110.blk")).unwrap()
+fn file() -> Program {
+    block_file::read(data!("identity-110.blk")).unwrap()
 }
 
 fn node(id: u8) -> NodeId {
@@ -159,7 +160,7 @@ fn a_lift_is_unlocked_twice_moves_to_node_126_and_back() {
     let report = result.unwrap();
     assert_eq!((report.dialect, at), (Dialect::Lift, NODE));
     assert_eq!(report.running.unwrap().0, APPLICATION);
-    let image = file().flash_image();
+    let image = file().flash_image().into_owned();
     assert_eq!(*kept.lock().unwrap(), image, "the image from the program's start");
     let program = format!("126: 1F50/1, {} bytes", image.len());
     assert_eq!(
@@ -196,7 +197,7 @@ fn other_lifts_are_understood_too() {
             let (result, _, at) = run_at(&mut fake, from, &locked(PHRASE));
             let report = result.unwrap_or_else(|error| panic!("{case}, {running:X}: {error}"));
             assert_eq!((report.dialect, at, report.transfers), (Dialect::Lift, NODE, Transfers::Blocks));
-            assert_eq!(*kept.lock().unwrap(), file().flash_image());
+            assert_eq!(*kept.lock().unwrap(), *file().flash_image());
         }
     }
 }
@@ -355,7 +356,7 @@ fn esacademy_gets_the_password_and_then_intel_hex() {
         let password = [0x23, 0x50, 0x7F, 1, 0x54, 0x49, 0x4E, 0x49];
         assert_eq!(fake.sent.iter().filter(|frame| frame.data() == password).count(), 1);
         let text = kept.lock().unwrap().clone();
-        assert_eq!(text, ihex::emit(&file().image()).into_bytes());
+        assert_eq!(text, ihex::emit(file().image()).into_bytes());
         // A program that already runs is not restarted.
         assert_eq!(fake.count("64: 1F51/1, 1 bytes"), usize::from(!runs_by_itself));
     }
@@ -448,9 +449,9 @@ impl Maker for Standard {
 fn a_standard_device_is_stopped_cleared_written_and_started() {
     for state in [0, 1] {
         for (dialect, content) in [
-            (None, file().flash_image()),
-            (Some(Dialect::Raw), file().flash_image()),
-            (Some(Dialect::Hex), ihex::emit(&file().image()).into_bytes()),
+            (None, file().flash_image().into_owned()),
+            (Some(Dialect::Raw), file().flash_image().into_owned()),
+            (Some(Dialect::Hex), ihex::emit(file().image()).into_bytes()),
         ] {
             let (mut fake, kept) = Standard::fake(state);
             let options = FlashOptions::default().dialect(dialect);
@@ -515,7 +516,7 @@ fn intel_hex_is_written_as_its_description_has_it() {
 :00000001FF
 ";
     let firmware = coflash_core::file::read::read(text.as_bytes(), None, None).unwrap();
-    let written = ihex::emit(&blocks_of(firmware, &Options::default()).unwrap().file.image());
+    let written = ihex::emit(program_of(firmware, &Options::default()).unwrap().program.image());
     let lines: Vec<&str> = written.lines().collect();
     assert_eq!(lines[0], ":020000040000FA");
     assert_eq!(lines[1..].join("\n") + "\n", text);
@@ -526,9 +527,12 @@ fn intel_hex_is_written_as_its_description_has_it() {
         let firmware =
             coflash_core::file::read::read(&image, Some(coflash_core::file::read::Format::Raw), Some(start))
                 .unwrap();
-        let blocks = blocks_of(firmware, &Options::default()).unwrap().file;
+        let blocks = program_of(firmware, &Options::default()).unwrap().program;
         let again =
-            coflash_core::file::read::read(ihex::emit(&blocks.image()).as_bytes(), None, None).unwrap();
-        assert_eq!(blocks_of(again, &Options::default()).unwrap().file.emit(), blocks.emit());
+            coflash_core::file::read::read(ihex::emit(blocks.image()).as_bytes(), None, None).unwrap();
+        assert_eq!(
+            block_file::emit(&program_of(again, &Options::default()).unwrap().program),
+            block_file::emit(&blocks)
+        );
     }
 }

@@ -8,12 +8,11 @@ use canopen::{CobId, Frame, NodeId};
 use coboot_can::hub::{self, Act, Conversation, Terms};
 use coboot_can::Adapter;
 use coflash_core::device::Transfers;
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash_core::update::{DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
-use kit::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = data!("identity-110.blk");
 
@@ -30,7 +29,7 @@ fn devices(nodes: impl IntoIterator<Item = u8>) -> Bus {
 }
 
 fn jobs(nodes: impl IntoIterator<Item = u8>) -> Vec<Job> {
-    let file = Arc::new(BlockFile::parse(FILE).unwrap());
+    let file = Arc::new(block_file::read(FILE).unwrap());
     let job = |node| Job::new(NodeId::new(node).unwrap(), file.clone(), FlashOptions::default());
     nodes.into_iter().map(job).collect()
 }

@@ -8,7 +8,7 @@ use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
@@ -93,7 +93,7 @@ impl Adapter for Beside {
 }
 
 fn run(adapter: &mut dyn Adapter) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
@@ -193,7 +193,7 @@ fn listening_takes_no_time_of_its_own() {
     let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
     // The session has listened for a while when the update begins.
     session.wait(ms(200)).unwrap();
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap();
     let requests =
         || fake.sent.iter().zip(&fake.sent_at).filter_map(|(sent, at)| Some((sent.exactly::<8>()?, *at)));

@@ -8,7 +8,7 @@ use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::{Dialect, Session, Timing};
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::event::{Note, Warning};
 use coflash_core::update::{flash, Event, FlashOptions, Password, Report};
 use coflash_core::Error;
@@ -63,7 +63,7 @@ fn lift() -> Fake {
 }
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let file = block_file::read(data!("plain-400.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| {

@@ -9,18 +9,19 @@ use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coflash_core::device::info::info;
 use coflash_core::device::{Session, Timing, Transfers};
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::convert::{blocks_of, Options};
+use coflash_core::file::block_file::{self, BlockFile};
+use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::{raw, Firmware};
+use coflash_core::file::{Program, Target};
 use coflash_core::update::event::{Phase, RepeatReason, Retry, Warning};
-use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Report, Target};
+use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
 use embedded_can::{Frame as _, StandardId};
 use kit::fake::{crc16, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use proptest::prelude::*;
 
-fn file() -> BlockFile {
-    BlockFile::parse(data!("identity-110.blk")).unwrap()
+fn file() -> Program {
+    block_file::read(data!("identity-110.blk")).unwrap()
 }
 
 /// Five blocks: 0, 1 to 4 (three of code, one of text and data), -1.
@@ -85,7 +86,7 @@ fn the_whole_procedure_from_a_running_application() {
         (report.program_size, report.repeats, report.running.map(|running| running.0)),
         (4001, 0, Some(APPLICATION))
     );
-    assert_eq!(report.program_crc, file().program_crc());
+    assert_eq!(report.program_crc, file().crc());
     let words: Vec<String> = events
         .iter()
         .filter(|event| !matches!(event, Event::Progress { .. }))
@@ -254,16 +255,16 @@ impl kit::fake::Maker for Coboot {
 const LARGE_AT: u32 = 0x0802_0000;
 
 /// A program of so many KiB, in blocks of 1 KiB.
-fn large(kib: usize) -> BlockFile {
+fn large(kib: usize) -> Program {
     let mut bytes: Vec<u8> = (0..kib * 1024).map(|at| (at * 7 + at / 256) as u8).collect();
     bytes[..8].copy_from_slice(&[0, 0, 1, 0x20, 1, 2, 2, 8]);
     let image = raw::read(&bytes, Some(LARGE_AT)).unwrap();
-    blocks_of(Firmware::Image(image), &Options::default()).unwrap().file
+    program_of(Firmware::Image(image), &Options::default()).unwrap().program
 }
 
 /// Flashes a file into a bootloader of coboot, which must then have its program.
 fn into_coboot(
-    file: &BlockFile,
+    file: &Program,
     options: FlashOptions,
     change: impl FnOnce(&mut Fake),
 ) -> (Result<Report, Error>, Vec<Event>, Fake) {
@@ -275,8 +276,9 @@ fn into_coboot(
     let mut session = Session::new(&mut fake, node(), Timing::default());
     let result = flash(&mut session, file, &options, &mut |event| events.push(event));
     if result.is_ok() {
-        let taken = BlockFile::parse(&fake.blocks.concat()).unwrap();
-        assert_eq!((taken.flash_image(), taken.control()), (file.flash_image(), file.control()));
+        let taken = block_file::read(&fake.blocks.concat()).unwrap();
+        assert_eq!(taken.flash_image(), file.flash_image());
+        assert_eq!(BlockFile::of(&taken).control(), BlockFile::of(file).control());
     }
     (result, events, fake)
 }
@@ -284,7 +286,7 @@ fn into_coboot(
 #[test]
 fn blocks_are_joined_where_the_device_takes_them() {
     let file = large(256);
-    let own = file.blocks().len();
+    let own = BlockFile::of(&file).blocks().len();
     // 256 KiB in pieces of 4 times 1008 bytes, and two blocks more.
     let (report, _, fake) = into_coboot(&file, FlashOptions::default(), |_| {});
     assert_eq!((report.unwrap().repeats, fake.blocks.len()), (0, (256 * 1024_usize).div_ceil(4 * 1008) + 2));
@@ -294,7 +296,7 @@ fn blocks_are_joined_where_the_device_takes_them() {
     assert_eq!(fake.blocks.len(), own);
     let small = large(64);
     let (_, _, fake) = into_coboot(&small, FlashOptions::default(), |_| {});
-    assert_eq!(fake.blocks.len(), small.blocks().len());
+    assert_eq!(fake.blocks.len(), BlockFile::of(&small).blocks().len());
     // A device with a smaller buffer gets the blocks of the file.
     let (report, events, fake) = into_coboot(&file, FlashOptions::default(), |fake| fake.room = 1100);
     assert_eq!((fake.blocks.len(), fake.count("command 03")), (own, 1));
@@ -350,7 +352,7 @@ fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
         let sent = |fake: &mut Fake, options: FlashOptions| {
             fake.crc_of_blocks = Some(of);
             let mut session = Session::new(fake, node(), Timing::default());
-            flash(&mut session, &BlockFile::parse(file).unwrap(), &options, &mut |_| {})
+            flash(&mut session, &block_file::read(file).unwrap(), &options, &mut |_| {})
         };
         let mut fake = Fake::new(BOOTLOADER);
         let report = sent(&mut fake, FlashOptions::default()).unwrap();
@@ -371,7 +373,7 @@ fn a_device_with_the_other_crc_gets_the_blocks_with_it() {
 
 #[test]
 fn a_file_for_another_device_erases_nothing() {
-    let target = Target::of(&file()).unwrap();
+    let target = file().target().unwrap();
     assert_eq!((target.vendor_id, target.product_code), (0, 1234));
     let check = |check_target| FlashOptions::default().check_target(Some(check_target));
     for running in [APPLICATION, BOOTLOADER] {
@@ -407,7 +409,7 @@ fn verify_looks_once_more_at_the_running_program() {
     assert_eq!(fake.count("read 1F56/1"), 3);
     assert_eq!(fake.log.last().unwrap(), "read 1F56/1");
     let [.., last, Event::Done(_)] = events.as_slice() else { panic!("{events:?}") };
-    assert_eq!(*last, Phase::VerifiedAgain { crc: file().program_crc() }.into());
+    assert_eq!(*last, Phase::VerifiedAgain { crc: file().crc() }.into());
     // A program that reports another CRC while it runs.
     let mut fake = Fake::new(BOOTLOADER);
     fake.crc_of_application = Some(0x1234_5678);

@@ -10,14 +10,14 @@ use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::error::{Error, IdentityPart};
 use coflash_core::device::{Session, Timing};
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::event::Phase;
 use coflash_core::update::{catch, flash, CatchOptions, Event, FlashOptions, Report};
 
 use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 fn run(adapter: &mut dyn Adapter, options: &FlashOptions) -> (Result<Report, Error>, Vec<Event>) {
-    let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+    let file = block_file::read(data!("plain-400.blk")).unwrap();
     let mut session = Session::new(adapter, NodeId::new(NODE).unwrap(), Timing::default());
     let mut events = Vec::new();
     let result = flash(&mut session, &file, options, &mut |event| events.push(event));
@@ -252,7 +252,7 @@ fn the_user_gives_up() {
         fake.on_command = Box::new(|_| Outcome::Ignore);
         let (end, flag) = (fake.now + Duration::from_secs(120), Arc::new(AtomicBool::new(false)));
         let mut bus = GivesUp(fake, end, flag.clone());
-        let file = BlockFile::parse(data!("plain-400.blk")).unwrap();
+        let file = block_file::read(data!("plain-400.blk")).unwrap();
         let mut session = Session::new(&mut bus, NodeId::new(NODE).unwrap(), Timing::default());
         session.cancel_by(flag);
         let options = FlashOptions::default().wait(true);

@@ -10,15 +10,14 @@ use coboot_can::gateway::{Ask, Gateway, GatewayError};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::{Doing, Session, Timing};
-use coflash_core::file::block_file::BlockFile;
+use coflash_core::file::block_file;
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
-use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {
-    let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+    let file = block_file::read(data!("identity-110.blk")).unwrap();
     let began = fake.now;
     let mut session = Session::new(fake, NodeId::new(NODE).unwrap(), Timing::default());
     let result = flash(&mut session, &file, &options, &mut |_| {});
@@ -129,7 +128,7 @@ fn a_program_that_falls_silent_in_its_watch_is_told() {
     for (ends, released) in [(vec![silent], false), (vec![None, silent], true)] {
         let mut fake = device(&ends, Some([2, 0, 0]));
         let mut events = Vec::new();
-        let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+        let file = block_file::read(data!("identity-110.blk")).unwrap();
         let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
         let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
         let error = result.unwrap_err();
@@ -159,7 +158,7 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
         let mut fake = device(&[], None);
         fake.frames_left = frames;
         let mut events = Vec::new();
-        let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+        let file = block_file::read(data!("identity-110.blk")).unwrap();
         let mut session = Session::new(&mut fake, NodeId::new(NODE).unwrap(), Timing::default());
         let result = flash(&mut session, &file, &FlashOptions::default(), &mut |event| events.push(event));
         assert_eq!(result.unwrap_err().number(), 0x6000_0303, "{frames}");
@@ -169,7 +168,7 @@ fn an_adapter_that_dies_in_a_trial_is_named_with_the_state_of_the_device() {
 }
 
 fn many(bus: &mut Bus, nodes: &[u8]) -> Vec<Result<Report, (String, DeviceState)>> {
-    let file = Arc::new(BlockFile::parse(data!("identity-110.blk")).unwrap());
+    let file = Arc::new(block_file::read(data!("identity-110.blk")).unwrap());
     let job = |node: &u8| Job::new(NodeId::new(*node).unwrap(), file.clone(), FlashOptions::default());
     let jobs: Vec<Job> = nodes.iter().map(job).collect();
     let results = flash_many(bus, &jobs, &ManyOptions::default(), &|_, _| {});
@@ -316,7 +315,7 @@ impl Gateway for Through {
 #[test]
 fn boot_up_messages_of_a_gateway_count_as_those_of_a_bus() {
     let through = |fake: Fake| {
-        let file = BlockFile::parse(data!("identity-110.blk")).unwrap();
+        let file = block_file::read(data!("identity-110.blk")).unwrap();
         let mut gateway = Through(fake);
         let mut session = Session::through(&mut gateway, NodeId::new(NODE).unwrap(), Timing::default());
         text(&flash(&mut session, &file, &FlashOptions::default(), &mut |_| {}).unwrap_err())

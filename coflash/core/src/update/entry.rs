@@ -1,0 +1,66 @@
+//! Step 3: the way of a device into its bootloader.
+
+use canopen::NodeId;
+
+use super::admission::Admission;
+use super::dialect;
+use super::event::Phase;
+use super::options::FlashOptions;
+use super::reach::Found;
+use super::running::RunningUpdate;
+use crate::device::{Dialect, Error, Session};
+
+/// Brings the device into its bootloader, which answers what the application did not know. Returns the
+/// dialect of the bootloader.
+///
+/// # Errors
+/// [`Error::NotAlone`], [`Error::NoBootloader`], and those of the [admission](Admission::ask). The program
+/// that was called back is started again, if the device still answers.
+pub(super) fn enter(
+    session: &mut Session<'_>,
+    found: Found,
+    mut admission: Admission<'_>,
+    options: &FlashOptions,
+    update: &mut RunningUpdate<'_>,
+) -> Result<Dialect, Error> {
+    match (options.alone, options.wait) {
+        (false, _) => {}
+        (true, false) => session.still_alone()?,
+        (true, true) => session.ensure_alone()?,
+    }
+    let (original, before) = (session.node(), session.now());
+    let dialect = dialect::of(found.dialect).enter(session, found.running, options, update)?;
+    let is_ready = (|| {
+        if !found.running.is_bootloader() {
+            admission.ask(session, dialect)?;
+        }
+        match update.called {
+            _ if !options.alone => Ok(()),
+            Some(_) => session.await_peace(before),
+            None => session.still_alone(),
+        }
+    })();
+    if let (Err(error), Some(program)) = (&is_ready, update.called) {
+        let is_lost = matches!(error, Error::Adapter(_) | Error::Cancelled | Error::NoAnswer { .. });
+        // The device belongs to the tool that commands it.
+        if !is_lost && !session.is_commanded_since(before) {
+            start_again(session, dialect, original, program, update);
+        }
+    }
+    is_ready.map(|()| dialect)
+}
+
+/// Starts the program again that was called back for an update which does not take place. The reason
+/// for that stays the result, whether the program starts or not.
+fn start_again(
+    session: &mut Session<'_>,
+    dialect: Dialect,
+    original: NodeId,
+    program: u8,
+    update: &mut RunningUpdate<'_>,
+) {
+    update.tell(Phase::StartingAgain.into());
+    if let Ok(running) = dialect::of(dialect).start(session, original, program) {
+        update.tell(Phase::Started(running).into());
+    }
+}
