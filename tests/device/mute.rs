@@ -4,7 +4,6 @@
 use std::time::Duration;
 
 use coboot_can::{Adapter, AdapterError};
-use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::device::error::TrialFailure;

@@ -4,7 +4,6 @@
 use canopen::program::{ProgramControl, PROGRAM_DATA};
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::SdoIds;
-use coboot_can::SdoIds;
 use coboot_tests::bench::Bench;
 use coboot_tests::{firmware, renewal};
 use coflash_core::device::{Doing, Session, Timing};

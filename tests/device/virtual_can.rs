@@ -8,8 +8,6 @@ use std::time::Duration;
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
 use coboot_can::slcan::Slcan;
-use coboot_can::slcan::Slcan;
-use coboot_can::Adapter;
 use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;

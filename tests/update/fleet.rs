@@ -8,7 +8,6 @@ use std::time::Duration;
 use canopen::program::{FlashError, DEVICE_STATE, PROGRAM_ID, STATE_RENEWAL};
 use canopen::{Address, BitRate};
 use coboot_can::Adapter as _;
-use coboot_can::Adapter as _;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;

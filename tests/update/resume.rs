@@ -7,7 +7,6 @@ use std::time::Duration;
 use canopen::program::PROGRAM_ID;
 use canopen::{Address, BitRate};
 use coboot_can::{Adapter, AdapterError};
-use coboot_can::{Adapter, AdapterError};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::fleet::file;

@@ -7,7 +7,6 @@
 use std::time::Duration;
 
 use coboot_can::Adapter;
-use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::file::block_file::BlockFile;

@@ -60,7 +60,7 @@ const RULES: &[(&str, &str)] = &[
         "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",
     ),
     ("coboot-fuzz", "boot-core canopen coboot-can coflash-conform coflash-core coflash-ui seal shared-abi kit"),
-    ("coboot-zencan", "bsp canopen coboot-can coboot-tests emulator"),
+    ("coboot-zencan", "bsp canopen coboot-can coboot-tests coflash-core emulator"),
     ("new-board", "shared-abi"),
     ("xtask", "new-board shared-abi kit"),
 ];

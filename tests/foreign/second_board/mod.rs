@@ -15,7 +15,6 @@ use board::Board;
 use canopen::program::ProgramControl;
 use canopen::{Address, NodeId};
 use coboot_can::slcan::{Line, Slcan};
-use coboot_can::slcan::{Line, Slcan};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::serial::SerialLine;

@@ -13,7 +13,6 @@ use std::time::Duration;
 use canopen::node::{Config, NmtPolicy, Node};
 use canopen::{CobId, Frame};
 use coboot_can::{Adapter, AdapterError};
-use coboot_can::{Adapter, AdapterError};
 use coboot_fuzz::Input;
 use coflash_conform::{checks, run, Means, Outcome};
 use coflash_core::file::convert::{program_of, Options, Region};

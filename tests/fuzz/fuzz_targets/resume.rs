@@ -86,13 +86,13 @@ impl File {
         image[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
         image[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
         // Block 0 with an identity: reserved word, vendor-ID, product code (L-1112d_10, figure 13).
-        let identity = [len as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
+        let identity: Vec<u8> = [len as u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
         let mut blocks = vec![Block { number: 0, flash_address: 0, data: identity.into() }.emit()];
         for (number, data) in (0..).zip(image.chunks(CHUNK)) {
             let flash_address = PROGRAM.base + number * CHUNK as u32;
             blocks.push(Block { number: number + 1, flash_address, data: data.into() }.emit());
         }
-        let last = [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
+        let last: Vec<u8> = [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
         blocks.push(Block { number: u32::MAX, flash_address: 0, data: last.into() }.emit());
         Self { image, blocks }
     }

@@ -16,7 +16,6 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use crate::tool::folder;
 use coflash_agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
 use coflash_core::file::block_file;
 use coflash_core::update::Payload;

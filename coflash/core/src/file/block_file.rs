@@ -171,7 +171,7 @@ impl<'p> BlockFile<'p> {
     /// The bytes of one of its blocks for a device that checks with this CRC: the block's own one, and
     /// in the last block that of the program.
     #[must_use]
-    pub(crate) fn emit_block(&self, block: &Block<'_>, checksum: Checksum) -> Vec<u8> {
+    pub fn emit_block(&self, block: &Block<'_>, checksum: Checksum) -> Vec<u8> {
         if block.number != NUMBER_LAST {
             return block.emit_with(checksum);
         }

@@ -7,6 +7,7 @@ use coflash_core::device::{Dialect, Error, Session, Timing};
 use coflash_core::file::convert::{program_of, Label as Told, Options};
 use coflash_core::file::{raw, Firmware, Program};
 use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Password, Report};
+use kit::fake::{Deed, Fake, Maker, Outcome, APPLICATION, BOOTLOADER, NODE};
 
 const START: u32 = 0x0801_0000;
 /// The values of 1018h in the fake.

@@ -9,6 +9,7 @@ use coflash_core::file::{block_file, Target};
 use coflash_core::update::event::{Note, Phase, Problem, RepeatReason, Retry, Warning};
 use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
+use kit::fake::{Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
 use serde_json::{json, Value};
 
 fn node() -> NodeId {

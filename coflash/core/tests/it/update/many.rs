@@ -13,6 +13,7 @@ use coflash_core::update::event::Phase;
 use coflash_core::update::many::{flash_many, Failed, Job, ManyOptions};
 use coflash_core::update::{DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
+use kit::fake::{Blocks, Bus, Fake, Outcome, APPLICATION, BOOTLOADER};
 
 const FILE: &[u8] = data!("identity-110.blk");
 

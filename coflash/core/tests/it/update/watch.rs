@@ -14,6 +14,7 @@ use coflash_core::file::block_file;
 use coflash_core::update::many::{flash_many, Job, ManyOptions};
 use coflash_core::update::{flash, DeviceAnswer, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
+use kit::fake::{Bus, Deed, End, Fake, Maker, APPLICATION, BOOTLOADER, NODE};
 
 /// The result of an update, and its length in virtual time.
 fn run(fake: &mut Fake, options: FlashOptions) -> (Result<Report, Error>, Duration) {
