@@ -976,6 +976,7 @@ impl Chip {
             let levels = self.exti_levels();
             self.exti.settle(levels);
         }
+        let caches_data = self.flash.caches_data();
         let result = self.block_mut(block).write(offset, value, now);
         match block {
             Block::Rcc => {
@@ -995,6 +996,7 @@ impl Chip {
             Block::Wwdg => self.slice.leave = true,
             Block::Crc if self.costs => self.clock.cycles += CRC_WORD,
             Block::Flash => {
+                self.slice.leave |= self.flash.caches_data() != caches_data;
                 self.settle_flash();
             }
             Block::Gpio(_) => {
@@ -1090,6 +1092,13 @@ impl Chip {
                 self.wire_pins();
             }
         }
+    }
+
+    /// The CPU is about to load from the flash array.
+    pub fn load_flash(&mut self, address: u32, size: u32) {
+        let address = self.behind_alias(address).unwrap_or(address);
+        self.flash.load(address.wrapping_sub(self.geometry.flash.base) % self.geometry.flash.size, size);
+        self.take_flash_changes();
     }
 
     /// The CPU stores into the flash array.

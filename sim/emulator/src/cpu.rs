@@ -162,6 +162,8 @@ struct Notes {
     /// The traps of CCR that [`on_instruction`] looks for, and its hook; none without a trap.
     traps: Traps,
     trap_hook: Option<UcHookId>,
+    /// The hook of loads from flash; none while nothing depends on them.
+    load_hook: Option<UcHookId>,
     /// The instructions from here on to there are those of an IT block, where the engine does not
     /// stop.
     it_block: (u32, u32),
@@ -474,6 +476,7 @@ impl Cpu {
             blocks: std::mem::take(&mut notes.blocks),
             traps: notes.traps,
             trap_hook: notes.trap_hook.take(),
+            load_hook: notes.load_hook.take(),
             ..Notes::default()
         };
         notes.blocks.clear();
@@ -597,6 +600,7 @@ impl Cpu {
     pub fn run(&mut self, single: bool) -> Exit {
         self.drop_stale();
         self.set_traps();
+        self.watch_loads();
         self.chip_mut().slice.leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
         self.uc.get_data_mut().notes.masks = masks;
@@ -664,6 +668,33 @@ impl Cpu {
                 self.uc.get_data_mut().notes.trap_hook = hook.ok();
             }
         }
+        let _ = self.uc.ctl_flush_tb();
+    }
+
+    /// Has every load from flash noticed while the data cache is in the way, and none otherwise: it costs time.
+    /// The loads in the rest of the block that switches the cache on are not noticed.
+    fn watch_loads(&mut self) {
+        let State { chip, notes } = self.uc.get_data_mut();
+        let flash = chip.geometry.flash;
+        if chip.flash.caches_data() == notes.load_hook.is_some() {
+            return;
+        }
+        match notes.load_hook.take() {
+            Some(hook) => {
+                let _ = self.uc.remove_hook(hook);
+            }
+            None => {
+                let (first, last) = (u64::from(flash.base), u64::from(flash.end() - 1));
+                let hook =
+                    self.uc.add_mem_hook(HookType::MEM_READ, first, last, |uc, _, address, size, _| {
+                        uc.get_data_mut().chip.load_flash(address as u32, size as u32);
+                        forget_it_state(uc);
+                        true
+                    });
+                self.uc.get_data_mut().notes.load_hook = hook.ok();
+            }
+        }
+        // Loads that are translated already do not look for hooks.
         let _ = self.uc.ctl_flush_tb();
     }
 

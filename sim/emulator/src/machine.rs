@@ -669,7 +669,7 @@ impl Machine {
         &mut self.cpu.chip_mut().usarts
     }
 
-    /// The flash array.
+    /// The flash array, as a load of the CPU sees it.
     #[must_use]
     pub fn flash(&self) -> &[u8] {
         self.cpu.chip().flash.array.bytes()

@@ -5,6 +5,7 @@
 //! reads; the machine stalls the CPU then.
 
 mod cells;
+mod data_cache;
 mod lock;
 mod options;
 
@@ -20,6 +21,7 @@ use crate::supply::NOMINAL;
 use crate::time::{Span, Time};
 use cells::{carry_out, weak_bits};
 pub use cells::{Cells, Cut, Operation};
+use data_cache::DataCache;
 use lock::Lock;
 use options::{OptionBytes, Request};
 
@@ -150,6 +152,8 @@ pub struct Flash {
     redraw_at: Time,
     /// VDD in mV.
     supply: u32,
+    /// The data cache, on a chip whose lines become stale.
+    data_cache: Option<DataCache>,
     /// The operations that have started since somebody wants to know them.
     log: Option<Vec<Operation>>,
     /// Usage.
@@ -180,6 +184,7 @@ impl Flash {
             noise: Noise(0),
             redraw_at: Time(0),
             supply: NOMINAL,
+            data_cache: silicon.stale_lines.then(DataCache::default),
             log: None,
             counters: FlashCounters::default(),
         }
@@ -195,6 +200,39 @@ impl Flash {
     #[must_use]
     pub fn acr(&self) -> u32 {
         self.acr
+    }
+
+    /// Whether each load from the array has to be noticed ([`Self::load`]).
+    #[must_use]
+    pub fn caches_data(&self) -> bool {
+        self.data_cache.as_ref().is_some_and(DataCache::is_enabled)
+    }
+
+    /// How many lines of the data cache differ from the array.
+    #[must_use]
+    pub fn stale_lines(&self) -> usize {
+        self.data_cache.as_ref().map_or(0, DataCache::stale)
+    }
+
+    /// The CPU is about to load from the array.
+    pub fn load(&mut self, offset: u32, len: u32) {
+        if let Some(cache) = self.data_cache.as_mut().filter(|cache| cache.is_enabled()) {
+            cache.load(offset, len, self.array.bytes_mut(), &mut self.changed);
+        }
+    }
+
+    /// The array has its true bytes, whatever the data cache has.
+    fn show_array(&mut self) {
+        if let Some(cache) = &mut self.data_cache {
+            cache.show_array(self.array.bytes_mut(), &mut self.changed);
+        }
+    }
+
+    /// The CPU sees the array through the data cache again.
+    fn show_lines(&mut self) {
+        if let Some(cache) = &mut self.data_cache {
+            cache.show_lines(self.array.bytes_mut(), &mut self.changed);
+        }
     }
 
     /// The wait states that are set (ACR.LATENCY).
@@ -299,18 +337,22 @@ impl Flash {
 
     /// The bits between 0 and 1 read otherwise.
     fn redraw(&mut self) {
+        self.show_array();
         for (at, bits) in &self.unstable {
             let cell = &mut self.array.bytes_mut()[*at as usize];
             *cell = *cell & !bits | self.noise.byte() & bits;
             self.changed.push((*at, 1));
         }
+        self.show_lines();
     }
 
     /// Writes into the array as a debug probe does, whatever the locks say.
     pub fn preset(&mut self, offset: u32, bytes: &[u8]) {
+        self.show_array();
         let start = offset as usize;
         self.array.bytes_mut()[start..start + bytes.len()].copy_from_slice(bytes);
         self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
+        self.show_lines();
     }
 
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
@@ -326,11 +368,19 @@ impl Flash {
 
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
+        self.empty_data_cache();
         if let Some(running) = self.running.take() {
             self.tear(&running.operation, Cut::Torn { seed });
         }
         self.cut = None;
         self.power_failed = false;
+    }
+
+    fn empty_data_cache(&mut self) {
+        self.show_array();
+        if let Some(cache) = &mut self.data_cache {
+            cache.reset();
+        }
     }
 
     fn width(&self) -> u32 {
@@ -504,6 +554,7 @@ impl Flash {
     }
 
     fn complete(&mut self, operation: &Operation) {
+        self.show_array();
         match operation {
             Operation::Program { .. } => self.counters.units_programmed += 1,
             Operation::Erase { sectors } => self.counters.sectors_erased += sectors.len() as u64,
@@ -516,12 +567,17 @@ impl Flash {
             }
         }
         self.carry_out(operation, Cut::After);
+        if let Some(cache) = &mut self.data_cache {
+            cache.note(operation);
+        }
+        self.show_lines();
     }
 
     /// Completes an operation that had too little voltage: what it leaves reads right at first, and may not
     /// last (section 3.6.2).
     fn complete_weakly(&mut self, operation: &Operation, now: Time) {
         self.counters.weak += 1;
+        self.show_array();
         let weak = weak_bits(operation, self.geometry, self.array.bytes(), &mut self.noise);
         self.complete(operation);
         if self.unstable.is_empty() {
@@ -537,6 +593,7 @@ impl Flash {
         if let Operation::Options { .. } = operation {
             self.options.tear();
         }
+        self.show_array();
         self.carry_out(operation, how);
     }
 
@@ -638,6 +695,11 @@ impl Peripheral for Flash {
             0x00 => {
                 // The cache reset bits act at once and stay as written.
                 self.acr = value & ACR_MASK;
+                self.show_array();
+                if let Some(cache) = &mut self.data_cache {
+                    cache.control(self.acr);
+                }
+                self.show_lines();
                 Ok(())
             }
             0x04 | 0x08 => {
@@ -694,6 +756,7 @@ impl Peripheral for Flash {
     /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not
     /// protected).
     fn reset(&mut self) {
+        self.empty_data_cache();
         if let Some(running) = self.running.take() {
             // A fixed seed: a reset is no power failure, but leaves the same kind of half-done
             // work.

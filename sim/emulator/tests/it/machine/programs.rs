@@ -72,4 +72,5 @@ programs! {
     SLEEPS_WITH_A_TIMER,
     TIME_IN_A_BLOCK,
     COUNTS_DOWN,
+    LOADS_BY_THE_CACHE,
 }
