@@ -56,6 +56,11 @@ const FPB: u32 = 0xE000_2000;
 const SCS: u32 = 0xE000_E000;
 const DBGMCU: u32 = 0xE004_2000;
 
+/// Where loads from hidden sectors of the flash go (PCROP); an address of external memory, which no chip here has.
+pub const HIDDEN: Region = Region::new(0x9000_0000, 0x0020_0000);
+/// What a bank of the flash has, on a chip whose banks can be swapped.
+const BANK: u32 = 0x0010_0000;
+
 /// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM
 /// is mapped.
 pub const SRAM_ALIAS: u32 = 0x2200_0000;
@@ -342,11 +347,44 @@ impl Chip {
         is_open
     }
 
-    /// The memory at an address from 0 on, and its address there: flash, or the system memory.
+    /// The memory at an address from 0 on, and its address there: flash, or the system memory. The same for an
+    /// address of the flash whose banks are swapped.
     #[must_use]
     pub fn behind_alias(&self, address: u32) -> Option<u32> {
         let memory = if self.syscfg.maps_system_memory() { SYSTEM_MEMORY } else { self.geometry.flash };
-        (address < memory.size).then(|| memory.base + address)
+        let swap = |address: u32| match self.swaps_banks() && self.geometry.flash.contains(address, 1) {
+            true => address ^ BANK,
+            false => address,
+        };
+        if address < memory.size {
+            return Some(swap(memory.base + address));
+        }
+        self.swaps_banks().then(|| swap(address))
+    }
+
+    /// Whether the second bank of the flash is in the place of the first.
+    #[must_use]
+    pub fn swaps_banks(&self) -> bool {
+        self.geometry.second_bank.is_some() && self.syscfg.swaps_banks()
+    }
+
+    /// What ST's loader does after a reset with BFB2 (AN2606, dual bank boot): it starts the bank whose first word
+    /// is an address in SRAM, the second bank first, which it maps to the start of the flash. Returns the address
+    /// of the vector table; `None` if a program is in the system memory here, or if neither bank has one.
+    pub fn dual_bank_boot(&mut self) -> Option<u32> {
+        let is_empty = self.system.bytes()[..4] == [0xFF; 4];
+        if !self.flash.boots_from_system_memory() || !is_empty {
+            return None;
+        }
+        let Region { base, size } = self.geometry.sram;
+        let is_program = |offset: u32| {
+            let at = offset as usize;
+            let sp = u32::from_le_bytes(self.flash.array.bytes()[at..at + 4].try_into().expect("a word"));
+            (base..=base + size).contains(&sp)
+        };
+        let bank = [BANK, 0].into_iter().find(|bank| is_program(*bank))?;
+        self.syscfg.swap_banks(bank != 0);
+        Some(self.geometry.flash.base)
     }
 
     /// The virtual time.
@@ -511,6 +549,9 @@ impl Chip {
         }
         for i2c in &mut self.i2c {
             i2c.reset();
+        }
+        if self.flash.boots_from_system_memory() {
+            self.syscfg.boot_from_system_memory();
         }
         self.wire_pins();
         let option_bytes = self.flash.option_bytes();

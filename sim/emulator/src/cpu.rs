@@ -26,8 +26,8 @@ use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Pro
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
-    counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
-    PRIVATE, SRAM_ALIAS, SYSTEM,
+    counts_cycles, Chip, BOOT_ALIAS, HIDDEN, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2,
+    PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS, SYSTEM,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
@@ -267,6 +267,17 @@ impl Cpu {
         }
         self.uc
             .mmio_map(
+                HIDDEN.base.into(),
+                HIDDEN.size.into(),
+                Some(|uc: &mut Unicorn<'_, State>, _: u64, _: usize| {
+                    uc.get_data_mut().chip.flash.load_hidden();
+                    0
+                }),
+                None::<fn(&mut Unicorn<'_, State>, u64, usize, u64)>,
+            )
+            .map_err(failed("mapping what is hidden"))?;
+        self.uc
+            .mmio_map(
                 SRAM_ALIAS.into(),
                 u64::from(sram_size) * 32,
                 Some(|uc: &mut Unicorn<'_, State>, offset: u64, _size: usize| {
@@ -463,8 +474,9 @@ impl Cpu {
         for register in [R::PRIMASK, R::BASEPRI, R::FAULTMASK, R::FPSCR, R::PSP] {
             self.set(register, 0);
         }
-        let sp = self.peek(BOOT_ALIAS).unwrap_or(0) & !3;
-        let entry = self.peek(BOOT_ALIAS + 4).unwrap_or(0);
+        let table = self.chip_mut().dual_bank_boot().unwrap_or(BOOT_ALIAS);
+        let sp = self.peek(table).unwrap_or(0) & !3;
+        let entry = self.peek(table + 4).unwrap_or(0);
         self.set(R::MSP, sp);
         self.set(R::XPSR_NZCVQG, if entry & 1 != 0 { XPSR_T } else { 0 });
         self.set(R::PC, entry);
@@ -553,6 +565,10 @@ impl Cpu {
     }
 
     fn peek(&self, address: u32) -> Option<u32> {
+        let chip = self.chip();
+        if chip.flash.is_shut() && is_flash(chip, address) {
+            return None;
+        }
         let mut word = [0; 4];
         self.read_memory(address, &mut word).then(|| u32::from_le_bytes(word))
     }
@@ -807,6 +823,10 @@ impl Cpu {
         for (address, len) in std::mem::take(&mut self.chip_mut().slice.stale) {
             if !self.was_executed(address, len) {
                 continue;
+            }
+            if self.chip().swaps_banks() {
+                // The code is at another address.
+                let _ = self.uc.ctl_flush_tb();
             }
             let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
             self.uc.get_data_mut().notes.blocks.clear();
@@ -1493,23 +1513,39 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         state.notes.asked_again += 1;
     }
     let paddr = chip.behind_alias(address).unwrap_or(address);
+    if HIDDEN.contains(address, 1) {
+        return entry(NOWHERE, Prot::READ | Prot::WRITE);
+    }
     if SYSTEM_MEMORY.contains(paddr, 1) {
         return entry(paddr, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ | Prot::EXEC });
     }
     if is_flash(chip, address) {
+        let offset = paddr - geometry.flash.base;
+        let is_hidden = chip.flash.hides(offset);
         return match kind {
+            MemType::READ if chip.flash.is_shut() => {
+                state.notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
+                None
+            }
+            MemType::FETCH if chip.flash.is_shut() => {
+                state.notes.fault = Some(Fault::bus(cfsr::IBUSERR, None));
+                None
+            }
             // A separate entry that allows only writes; the hook of stores carries out the store.
             MemType::WRITE => entry(paddr, Prot::WRITE),
             MemType::READ if is_flash_busy(chip) => {
                 state.notes.flash_busy = true;
                 None
             }
+            MemType::READ if is_hidden => entry(HIDDEN.base + offset, Prot::READ),
             _ => {
                 // As for RAM: the first fetch from a page that was only read so far must come here,
                 // so that the page is recorded as executed.
-                let executed =
-                    &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
+                let executed = &mut state.notes.flash_executed[(offset / PAGE) as usize];
                 *executed |= kind == MemType::FETCH;
+                if is_hidden {
+                    return entry(paddr, Prot::EXEC);
+                }
                 entry(paddr, if *executed { Prot::READ | Prot::EXEC } else { Prot::READ })
             }
         };

@@ -36,6 +36,8 @@ const SR_WRPERR: u32 = 1 << 4;
 const SR_PGAERR: u32 = 1 << 5;
 const SR_PGPERR: u32 = 1 << 6;
 const SR_PGSERR: u32 = 1 << 7;
+/// A load from a sector that is protected against reading (chips with PCROP).
+const SR_RDERR: u32 = 1 << 8;
 const SR_BSY: u32 = 1 << 16;
 const SR_CLEARABLE: u32 = SR_EOP | SR_OPERR | SR_WRPERR | SR_PGAERR | SR_PGPERR | SR_PGSERR;
 
@@ -135,6 +137,8 @@ pub struct Flash {
     cr: u32,
     lock: Lock,
     options: OptionBytes,
+    /// A debugger has connected, with read-out protection: no access until the next power-on.
+    is_shut: bool,
     running: Option<Running>,
     /// Ranges of the array that changed since the machine last asked, as (offset, length).
     changed: Vec<(u32, u32)>,
@@ -173,7 +177,8 @@ impl Flash {
             sr: 0,
             cr: 0,
             lock: Lock::default(),
-            options: OptionBytes::default(),
+            options: OptionBytes::of(geometry),
+            is_shut: false,
             running: None,
             changed: Vec::new(),
             bus_error: false,
@@ -369,6 +374,7 @@ impl Flash {
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
         self.empty_data_cache();
+        self.is_shut = false;
         if let Some(running) = self.running.take() {
             self.tear(&running.operation, Cut::Torn { seed });
         }
@@ -404,8 +410,48 @@ impl Flash {
         Span::from_millis(self.pick(table[self.psize()]))
     }
 
+    /// A debugger connects: with read-out protection of level 1 that shuts the flash until the next power-on
+    /// (section 3.7.3). Returns whether it can connect: with level 2 the port is off.
+    pub fn connect_debugger(&mut self) -> bool {
+        self.is_shut |= self.options.level() == 1;
+        self.options.level() != 2
+    }
+
+    /// Whether the array answers with bus errors alone.
+    #[must_use]
+    pub fn is_shut(&self) -> bool {
+        self.is_shut
+    }
+
+    /// BFB2: whether the chip boots from the system memory in place of the flash.
+    #[must_use]
+    pub fn boots_from_system_memory(&self) -> bool {
+        self.options.boots_from_system_memory()
+    }
+
+    /// Whether the data bus is kept out of the sector with this offset (PCROP, section 3.7.5).
+    #[must_use]
+    pub fn hides(&self, offset: u32) -> bool {
+        let Some(sector) = self.geometry.sector_at(self.geometry.flash.base + offset) else { return false };
+        match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
+            Some(within) => self.options.hides_second(within),
+            None => self.options.hides(sector.number),
+        }
+    }
+
+    /// The CPU loads from such a sector.
+    pub fn load_hidden(&mut self) {
+        self.sr |= SR_RDERR;
+        if self.cr & CR_ERRIE != 0 {
+            self.sr |= SR_OPERR;
+        }
+    }
+
     /// nWRP: a zero protects the sector (section 3.6.5).
     fn is_protected(&self, sector: Sector) -> bool {
+        if self.is_shut {
+            return true;
+        }
         match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
             Some(within) => self.options.protects_second(within),
             None => self.options.protects(sector.number),
@@ -633,11 +679,19 @@ impl Flash {
 
     fn write_optcr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
         let start = self.wait_until_idle(now);
-        if let Request::Program(optcr) = self.options.write(value)? {
-            // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
-            // KiB sector.
-            let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
-            self.start(Operation::Options { optcr }, takes, start);
+        match self.options.write(value)? {
+            Request::Done => {}
+            Request::Program(optcr) => {
+                // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
+                // KiB sector.
+                let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
+                self.start(Operation::Options { optcr }, takes, start);
+            }
+            Request::Protected => {
+                let why = "FLASH_OPTCR would take back a protection against reading, and not erase the flash";
+                self.refuse(SR_WRPERR, why);
+                return Err(Unmodelled(why.into()));
+            }
         }
         Ok(())
     }
@@ -709,7 +763,8 @@ impl Peripheral for Flash {
                 result
             }
             0x0C => {
-                self.sr &= !(value & SR_CLEARABLE);
+                let of_the_chip = if self.options.may_hide() { SR_RDERR } else { 0 };
+                self.sr &= !(value & (SR_CLEARABLE | of_the_chip));
                 Ok(())
             }
             0x10 => self.write_cr(value, now),

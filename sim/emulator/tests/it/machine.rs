@@ -2,6 +2,7 @@
 //! results come from the architecture and the reference manuals.
 
 mod can_pins;
+mod option_bytes;
 mod programs;
 mod supply;
 
