@@ -18,6 +18,7 @@ use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
 use crate::periph::i2c::I2c;
 use crate::periph::iwdg::Iwdg;
+use crate::periph::otg::{self, Otg};
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
@@ -84,6 +85,7 @@ enum Block {
     Usart(usize),
     Tim(usize),
     I2c(usize),
+    Otg,
 }
 
 /// The block that answers at an address, with the offset in its registers.
@@ -102,7 +104,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 42] = [
+const BLOCKS: [(u32, Block, ClockEnable); 43] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -145,9 +147,19 @@ const BLOCKS: [(u32, Block, ClockEnable); 42] = [
     (0x4002_3000, Block::Crc, Some((rcc::AHB1ENR, 12))),
     (0x4002_3800, Block::Rcc, None),
     (0x4002_3C00, Block::Flash, None),
+    (0x5000_0000, Block::Otg, Some((rcc::AHB2ENR, 7))),
 ];
-/// Every block of the F4 occupies this much.
-const BLOCK_SIZE: u32 = 0x400;
+
+impl Block {
+    /// Bytes of its registers.
+    fn size(self) -> u32 {
+        match self {
+            Self::Otg => otg::SIZE,
+            _ => 0x400,
+        }
+    }
+}
+
 const RCC_CFGR: u32 = 0x4002_3808;
 const SYSCFG_MEMRMP: u32 = 0x4001_3800;
 
@@ -169,7 +181,7 @@ const UNMODELLED: [(u32, &str); 20] = [
     (0x4002_6400, "DMA2"),
     (0x4002_8000, "Ethernet"),
     (0x4004_0000, "USB OTG HS"),
-    (0x5000_0000, "USB OTG FS"),
+    (0x5000_1000, "a FIFO of USB OTG FS"),
     (0x5005_0000, "DCMI"),
     (0x5006_0000, "CRYP/HASH"),
     (0x5006_0800, "RNG"),
@@ -235,6 +247,7 @@ pub struct Chip {
     /// The timers, as in [`tim::INSTANCES`].
     tims: [Tim; 12],
     i2c: [I2c; 3],
+    otg: Otg,
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
@@ -300,6 +313,7 @@ impl Chip {
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             tims: tim::INSTANCES.each_ref().map(Tim::new),
             i2c: ["I2C1", "I2C2", "I2C3"].map(I2c::new),
+            otg: Otg::default(),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
@@ -550,6 +564,7 @@ impl Chip {
         for i2c in &mut self.i2c {
             i2c.reset();
         }
+        self.otg.reset();
         if self.flash.boots_from_system_memory() {
             self.syscfg.boot_from_system_memory();
         }
@@ -880,7 +895,7 @@ impl Chip {
         let there = |block: Block| !matches!(block, Block::Gpio(port) if port >= self.gpio.len());
         let block =
             BLOCKS.iter().filter(|&&(_, block, _)| there(block)).find_map(|&(base, block, enable)| {
-                within(base, BLOCK_SIZE).map(|offset| Place::Block { block, offset, enable })
+                within(base, block.size()).map(|offset| Place::Block { block, offset, enable })
             });
         block
             .or_else(|| within(SCS, PAGE).map(Place::Scs))
@@ -907,6 +922,7 @@ impl Chip {
             Block::Usart(index) => &mut self.usarts[index],
             Block::Tim(index) => &mut self.tims[index],
             Block::I2c(index) => &mut self.i2c[index],
+            Block::Otg => &mut self.otg,
         }
     }
 
