@@ -18,6 +18,7 @@ use crate::periph::flash::{Flash, Store};
 use crate::periph::gpio::Gpio;
 use crate::periph::i2c::I2c;
 use crate::periph::iwdg::Iwdg;
+use crate::periph::otg::{self, Otg};
 use crate::periph::pwr::Pwr;
 use crate::periph::rcc::{self, Clocks, Rcc, ResetCause};
 use crate::periph::syscfg::Syscfg;
@@ -56,6 +57,11 @@ const FPB: u32 = 0xE000_2000;
 const SCS: u32 = 0xE000_E000;
 const DBGMCU: u32 = 0xE004_2000;
 
+/// Where loads from hidden sectors of the flash go (PCROP); an address of external memory, which no chip here has.
+pub const HIDDEN: Region = Region::new(0x9000_0000, 0x0020_0000);
+/// What a bank of the flash has, on a chip whose banks can be swapped.
+const BANK: u32 = 0x0010_0000;
+
 /// Bit-band alias of the first MiB of SRAM space (PM0214 section 2.2.5); as much as there is SRAM
 /// is mapped.
 pub const SRAM_ALIAS: u32 = 0x2200_0000;
@@ -79,6 +85,7 @@ enum Block {
     Usart(usize),
     Tim(usize),
     I2c(usize),
+    Otg,
 }
 
 /// The block that answers at an address, with the offset in its registers.
@@ -97,7 +104,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 42] = [
+const BLOCKS: [(u32, Block, ClockEnable); 43] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -140,9 +147,19 @@ const BLOCKS: [(u32, Block, ClockEnable); 42] = [
     (0x4002_3000, Block::Crc, Some((rcc::AHB1ENR, 12))),
     (0x4002_3800, Block::Rcc, None),
     (0x4002_3C00, Block::Flash, None),
+    (0x5000_0000, Block::Otg, Some((rcc::AHB2ENR, 7))),
 ];
-/// Every block of the F4 occupies this much.
-const BLOCK_SIZE: u32 = 0x400;
+
+impl Block {
+    /// Bytes of its registers.
+    fn size(self) -> u32 {
+        match self {
+            Self::Otg => otg::SIZE,
+            _ => 0x400,
+        }
+    }
+}
+
 const RCC_CFGR: u32 = 0x4002_3808;
 const SYSCFG_MEMRMP: u32 = 0x4001_3800;
 
@@ -164,7 +181,7 @@ const UNMODELLED: [(u32, &str); 20] = [
     (0x4002_6400, "DMA2"),
     (0x4002_8000, "Ethernet"),
     (0x4004_0000, "USB OTG HS"),
-    (0x5000_0000, "USB OTG FS"),
+    (0x5000_1000, "a FIFO of USB OTG FS"),
     (0x5005_0000, "DCMI"),
     (0x5006_0000, "CRYP/HASH"),
     (0x5006_0800, "RNG"),
@@ -230,6 +247,7 @@ pub struct Chip {
     /// The timers, as in [`tim::INSTANCES`].
     tims: [Tim; 12],
     i2c: [I2c; 3],
+    otg: Otg,
     pwr: Pwr,
     crc: Crc,
     syscfg: Syscfg,
@@ -295,6 +313,7 @@ impl Chip {
             usarts: usart::INSTANCES.each_ref().map(Usart::new),
             tims: tim::INSTANCES.each_ref().map(Tim::new),
             i2c: ["I2C1", "I2C2", "I2C3"].map(I2c::new),
+            otg: Otg::default(),
             pwr: Pwr::new(variant),
             crc: Crc::default(),
             syscfg: Syscfg::default(),
@@ -342,11 +361,44 @@ impl Chip {
         is_open
     }
 
-    /// The memory at an address from 0 on, and its address there: flash, or the system memory.
+    /// The memory at an address from 0 on, and its address there: flash, or the system memory. The same for an
+    /// address of the flash whose banks are swapped.
     #[must_use]
     pub fn behind_alias(&self, address: u32) -> Option<u32> {
         let memory = if self.syscfg.maps_system_memory() { SYSTEM_MEMORY } else { self.geometry.flash };
-        (address < memory.size).then(|| memory.base + address)
+        let swap = |address: u32| match self.swaps_banks() && self.geometry.flash.contains(address, 1) {
+            true => address ^ BANK,
+            false => address,
+        };
+        if address < memory.size {
+            return Some(swap(memory.base + address));
+        }
+        self.swaps_banks().then(|| swap(address))
+    }
+
+    /// Whether the second bank of the flash is in the place of the first.
+    #[must_use]
+    pub fn swaps_banks(&self) -> bool {
+        self.geometry.second_bank.is_some() && self.syscfg.swaps_banks()
+    }
+
+    /// What ST's loader does after a reset with BFB2 (AN2606, dual bank boot): it starts the bank whose first word
+    /// is an address in SRAM, the second bank first, which it maps to the start of the flash. Returns the address
+    /// of the vector table; `None` if a program is in the system memory here, or if neither bank has one.
+    pub fn dual_bank_boot(&mut self) -> Option<u32> {
+        let is_empty = self.system.bytes()[..4] == [0xFF; 4];
+        if !self.flash.boots_from_system_memory() || !is_empty {
+            return None;
+        }
+        let Region { base, size } = self.geometry.sram;
+        let is_program = |offset: u32| {
+            let at = offset as usize;
+            let sp = u32::from_le_bytes(self.flash.array.bytes()[at..at + 4].try_into().expect("a word"));
+            (base..=base + size).contains(&sp)
+        };
+        let bank = [BANK, 0].into_iter().find(|bank| is_program(*bank))?;
+        self.syscfg.swap_banks(bank != 0);
+        Some(self.geometry.flash.base)
     }
 
     /// The virtual time.
@@ -511,6 +563,10 @@ impl Chip {
         }
         for i2c in &mut self.i2c {
             i2c.reset();
+        }
+        self.otg.reset();
+        if self.flash.boots_from_system_memory() {
+            self.syscfg.boot_from_system_memory();
         }
         self.wire_pins();
         let option_bytes = self.flash.option_bytes();
@@ -839,7 +895,7 @@ impl Chip {
         let there = |block: Block| !matches!(block, Block::Gpio(port) if port >= self.gpio.len());
         let block =
             BLOCKS.iter().filter(|&&(_, block, _)| there(block)).find_map(|&(base, block, enable)| {
-                within(base, BLOCK_SIZE).map(|offset| Place::Block { block, offset, enable })
+                within(base, block.size()).map(|offset| Place::Block { block, offset, enable })
             });
         block
             .or_else(|| within(SCS, PAGE).map(Place::Scs))
@@ -866,6 +922,7 @@ impl Chip {
             Block::Usart(index) => &mut self.usarts[index],
             Block::Tim(index) => &mut self.tims[index],
             Block::I2c(index) => &mut self.i2c[index],
+            Block::Otg => &mut self.otg,
         }
     }
 
@@ -976,6 +1033,7 @@ impl Chip {
             let levels = self.exti_levels();
             self.exti.settle(levels);
         }
+        let caches_data = self.flash.caches_data();
         let result = self.block_mut(block).write(offset, value, now);
         match block {
             Block::Rcc => {
@@ -995,6 +1053,7 @@ impl Chip {
             Block::Wwdg => self.slice.leave = true,
             Block::Crc if self.costs => self.clock.cycles += CRC_WORD,
             Block::Flash => {
+                self.slice.leave |= self.flash.caches_data() != caches_data;
                 self.settle_flash();
             }
             Block::Gpio(_) => {
@@ -1090,6 +1149,13 @@ impl Chip {
                 self.wire_pins();
             }
         }
+    }
+
+    /// The CPU is about to load from the flash array.
+    pub fn load_flash(&mut self, address: u32, size: u32) {
+        let address = self.behind_alias(address).unwrap_or(address);
+        self.flash.load(address.wrapping_sub(self.geometry.flash.base) % self.geometry.flash.size, size);
+        self.take_flash_changes();
     }
 
     /// The CPU stores into the flash array.

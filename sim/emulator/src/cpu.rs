@@ -26,8 +26,8 @@ use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Pro
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
-    counts_cycles, Chip, BOOT_ALIAS, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2, PERIPHERAL_ALIAS,
-    PRIVATE, SRAM_ALIAS, SYSTEM,
+    counts_cycles, Chip, BOOT_ALIAS, HIDDEN, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2,
+    PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS, SYSTEM,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
 use crate::cortex::exceptions::{
@@ -162,6 +162,8 @@ struct Notes {
     /// The traps of CCR that [`on_instruction`] looks for, and its hook; none without a trap.
     traps: Traps,
     trap_hook: Option<UcHookId>,
+    /// The hook of loads from flash; none while nothing depends on them.
+    load_hook: Option<UcHookId>,
     /// The instructions from here on to there are those of an IT block, where the engine does not
     /// stop.
     it_block: (u32, u32),
@@ -263,6 +265,17 @@ impl Cpu {
                 )
                 .map_err(failed("mapping peripherals"))?;
         }
+        self.uc
+            .mmio_map(
+                HIDDEN.base.into(),
+                HIDDEN.size.into(),
+                Some(|uc: &mut Unicorn<'_, State>, _: u64, _: usize| {
+                    uc.get_data_mut().chip.flash.load_hidden();
+                    0
+                }),
+                None::<fn(&mut Unicorn<'_, State>, u64, usize, u64)>,
+            )
+            .map_err(failed("mapping what is hidden"))?;
         self.uc
             .mmio_map(
                 SRAM_ALIAS.into(),
@@ -461,8 +474,9 @@ impl Cpu {
         for register in [R::PRIMASK, R::BASEPRI, R::FAULTMASK, R::FPSCR, R::PSP] {
             self.set(register, 0);
         }
-        let sp = self.peek(BOOT_ALIAS).unwrap_or(0) & !3;
-        let entry = self.peek(BOOT_ALIAS + 4).unwrap_or(0);
+        let table = self.chip_mut().dual_bank_boot().unwrap_or(BOOT_ALIAS);
+        let sp = self.peek(table).unwrap_or(0) & !3;
+        let entry = self.peek(table + 4).unwrap_or(0);
         self.set(R::MSP, sp);
         self.set(R::XPSR_NZCVQG, if entry & 1 != 0 { XPSR_T } else { 0 });
         self.set(R::PC, entry);
@@ -474,6 +488,7 @@ impl Cpu {
             blocks: std::mem::take(&mut notes.blocks),
             traps: notes.traps,
             trap_hook: notes.trap_hook.take(),
+            load_hook: notes.load_hook.take(),
             ..Notes::default()
         };
         notes.blocks.clear();
@@ -550,6 +565,10 @@ impl Cpu {
     }
 
     fn peek(&self, address: u32) -> Option<u32> {
+        let chip = self.chip();
+        if chip.flash.is_shut() && is_flash(chip, address) {
+            return None;
+        }
         let mut word = [0; 4];
         self.read_memory(address, &mut word).then(|| u32::from_le_bytes(word))
     }
@@ -597,6 +616,7 @@ impl Cpu {
     pub fn run(&mut self, single: bool) -> Exit {
         self.drop_stale();
         self.set_traps();
+        self.watch_loads();
         self.chip_mut().slice.leave = false;
         let masks = self.is_unprivileged().then(|| self.privileged(|cpu| cpu.masks()));
         self.uc.get_data_mut().notes.masks = masks;
@@ -664,6 +684,33 @@ impl Cpu {
                 self.uc.get_data_mut().notes.trap_hook = hook.ok();
             }
         }
+        let _ = self.uc.ctl_flush_tb();
+    }
+
+    /// Has every load from flash noticed while the data cache is in the way, and none otherwise: it costs time.
+    /// The loads in the rest of the block that switches the cache on are not noticed.
+    fn watch_loads(&mut self) {
+        let State { chip, notes } = self.uc.get_data_mut();
+        let flash = chip.geometry.flash;
+        if chip.flash.caches_data() == notes.load_hook.is_some() {
+            return;
+        }
+        match notes.load_hook.take() {
+            Some(hook) => {
+                let _ = self.uc.remove_hook(hook);
+            }
+            None => {
+                let (first, last) = (u64::from(flash.base), u64::from(flash.end() - 1));
+                let hook =
+                    self.uc.add_mem_hook(HookType::MEM_READ, first, last, |uc, _, address, size, _| {
+                        uc.get_data_mut().chip.load_flash(address as u32, size as u32);
+                        forget_it_state(uc);
+                        true
+                    });
+                self.uc.get_data_mut().notes.load_hook = hook.ok();
+            }
+        }
+        // Loads that are translated already do not look for hooks.
         let _ = self.uc.ctl_flush_tb();
     }
 
@@ -776,6 +823,10 @@ impl Cpu {
         for (address, len) in std::mem::take(&mut self.chip_mut().slice.stale) {
             if !self.was_executed(address, len) {
                 continue;
+            }
+            if self.chip().swaps_banks() {
+                // The code is at another address.
+                let _ = self.uc.ctl_flush_tb();
             }
             let _ = self.uc.ctl_remove_cache(u64::from(address), u64::from(address) + u64::from(len));
             self.uc.get_data_mut().notes.blocks.clear();
@@ -1462,23 +1513,39 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         state.notes.asked_again += 1;
     }
     let paddr = chip.behind_alias(address).unwrap_or(address);
+    if HIDDEN.contains(address, 1) {
+        return entry(NOWHERE, Prot::READ | Prot::WRITE);
+    }
     if SYSTEM_MEMORY.contains(paddr, 1) {
         return entry(paddr, if kind == MemType::WRITE { Prot::WRITE } else { Prot::READ | Prot::EXEC });
     }
     if is_flash(chip, address) {
+        let offset = paddr - geometry.flash.base;
+        let is_hidden = chip.flash.hides(offset);
         return match kind {
+            MemType::READ if chip.flash.is_shut() => {
+                state.notes.fault = Some(Fault::bus(cfsr::PRECISERR, Some(address)));
+                None
+            }
+            MemType::FETCH if chip.flash.is_shut() => {
+                state.notes.fault = Some(Fault::bus(cfsr::IBUSERR, None));
+                None
+            }
             // A separate entry that allows only writes; the hook of stores carries out the store.
             MemType::WRITE => entry(paddr, Prot::WRITE),
             MemType::READ if is_flash_busy(chip) => {
                 state.notes.flash_busy = true;
                 None
             }
+            MemType::READ if is_hidden => entry(HIDDEN.base + offset, Prot::READ),
             _ => {
                 // As for RAM: the first fetch from a page that was only read so far must come here,
                 // so that the page is recorded as executed.
-                let executed =
-                    &mut state.notes.flash_executed[((paddr - geometry.flash.base) / PAGE) as usize];
+                let executed = &mut state.notes.flash_executed[(offset / PAGE) as usize];
                 *executed |= kind == MemType::FETCH;
+                if is_hidden {
+                    return entry(paddr, Prot::EXEC);
+                }
                 entry(paddr, if *executed { Prot::READ | Prot::EXEC } else { Prot::READ })
             }
         };

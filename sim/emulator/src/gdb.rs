@@ -125,6 +125,9 @@ impl SingleThreadBase for Machine {
 
     /// Memory as far as it reaches from `start`, or registers word by word.
     fn read_addrs(&mut self, start: u32, data: &mut [u8]) -> TargetResult<usize, Self> {
+        if self.denies_debugger(start) {
+            return Ok(0);
+        }
         if self.read_memory(start, data).is_ok() {
             return Ok(data.len());
         }
@@ -305,7 +308,11 @@ impl Door {
     }
 
     fn open(&mut self, machine: &mut Machine, stream: TcpStream, peer: SocketAddr) {
-        machine.attach_debugger();
+        if !machine.attach_debugger() {
+            let why = "read-out protection of level 2 has switched the debug port off";
+            self.notices.push(format!("a debugger from {peer} could not be served: {why}"));
+            return;
+        }
         let line = stream.try_clone().map(|stream| Line { stream, waiting: Vec::new() });
         let session = line.map_err(|error| error.to_string()).and_then(|line| {
             GdbStub::new(line).run_state_machine(machine).map_err(|error| error.to_string())

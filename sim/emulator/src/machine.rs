@@ -521,9 +521,24 @@ impl Machine {
     // --- the debugger
     // --------------------------------------------------------------------------------------------------
 
-    /// Halts the machine for a debugger that takes over.
-    pub fn attach_debugger(&mut self) {
+    /// Halts the machine for a debugger that takes over. Returns whether one can: read-out protection of level
+    /// 2 switches its port off, and with level 1 the flash is shut until the next power-on.
+    pub fn attach_debugger(&mut self) -> bool {
+        let chip = self.cpu.chip_mut();
+        if !chip.flash.connect_debugger() {
+            return false;
+        }
+        chip.slice.flush_tlb = true;
         self.debugger = Debugger::attached();
+        true
+    }
+
+    /// Whether a debugger that is attached is denied this address.
+    #[must_use]
+    pub fn denies_debugger(&self, address: u32) -> bool {
+        let chip = self.cpu.chip();
+        let address = chip.behind_alias(address).unwrap_or(address);
+        chip.flash.is_shut() && chip.geometry.flash.contains(address, 1)
     }
 
     /// The debugger leaves: its breakpoints go, and the machine goes on.
@@ -612,8 +627,8 @@ impl Machine {
         self.cpu.chip_mut().flash.protect_sector(number, protected);
     }
 
-    /// Sets all option bytes as a debug probe does, in the form of FLASH_OPTCR; BFB2 and DB1M are shown and
-    /// have no effect.
+    /// Sets all option bytes as a debug probe does, in the form of FLASH_OPTCR. Bits that the chip does not
+    /// have are shown and have no effect, as has DB1M.
     pub fn set_option_bytes(&mut self, optcr: u32) {
         self.cpu.chip_mut().flash.preset_options(optcr);
     }
@@ -638,7 +653,7 @@ impl Machine {
     }
 
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
-    /// anything else level 1. The model shows it in its registers and does nothing about it.
+    /// anything else level 1.
     pub fn set_read_protection(&mut self, rdp: u8) {
         self.cpu.chip_mut().flash.preset_read_protection(rdp);
     }
@@ -669,7 +684,7 @@ impl Machine {
         &mut self.cpu.chip_mut().usarts
     }
 
-    /// The flash array.
+    /// The flash array, as a load of the CPU sees it.
     #[must_use]
     pub fn flash(&self) -> &[u8] {
         self.cpu.chip().flash.array.bytes()

@@ -40,6 +40,9 @@ pub struct Silicon {
     pub can_sticks: bool,
     /// How far the times of the flash are from the typical to the worst of the datasheet, in thousandths.
     pub flash_slowness_permille: u32,
+    /// Whether the data cache of the flash interface keeps its lines over an erase, so that software which does
+    /// not flush it reads old data (RM0090 section 3.6.4). Most programs never meet one.
+    pub stale_lines: bool,
 }
 
 /// The typical values of the datasheet, and what most programs assume where it has none.
@@ -54,6 +57,7 @@ pub const TYPICAL: Silicon = Silicon {
     can_sleeps_deeply: false,
     can_sticks: false,
     flash_slowness_permille: 0,
+    stale_lines: false,
 };
 
 /// The ends of the ranges that do most harm: the watchdog bites early, the core is too fast, and the first
@@ -69,6 +73,7 @@ pub const WORST: Silicon = Silicon {
     can_sleeps_deeply: true,
     can_sticks: true,
     flash_slowness_permille: *FLASH_SLOWNESS.end(),
+    stale_lines: true,
 };
 
 const LSI: RangeInclusive<u32> = 17_000..=47_000;
@@ -102,6 +107,7 @@ impl Silicon {
             can_sleeps_deeply: draw(0..=1) == 1,
             can_sticks: draw(0..=1) == 1,
             flash_slowness_permille: draw(FLASH_SLOWNESS),
+            stale_lines: draw(0..=1) == 1,
         }
     }
 }
@@ -116,14 +122,15 @@ impl fmt::Display for Silicon {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { lsi_hz, hsi_hz, iwdg_update_periods, systick_value, flags_after_standby, .. } = self;
         let Self { crystal_start_us, can_mode_us, can_sleeps_deeply, can_sticks, .. } = self;
-        let slowness = self.flash_slowness_permille;
+        let (slowness, stale_lines) = (self.flash_slowness_permille, self.stale_lines);
         let flags = if *flags_after_standby { "those of a power-on" } else { "none" };
         write!(
             f,
             "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
-             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst"
+             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its data cache: \
+             {stale_lines}"
         )
     }
 }
@@ -200,6 +207,7 @@ mod tests {
         );
         assert!(chips.iter().any(|chip| chip.flags_after_standby));
         assert!(chips.iter().any(|chip| !chip.flags_after_standby));
+        assert!(chips.iter().any(|chip| chip.stale_lines) && chips.iter().any(|chip| !chip.stale_lines));
     }
 
     #[test]

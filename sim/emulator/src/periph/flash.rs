@@ -5,6 +5,7 @@
 //! reads; the machine stalls the CPU then.
 
 mod cells;
+mod data_cache;
 mod lock;
 mod options;
 
@@ -20,6 +21,7 @@ use crate::supply::NOMINAL;
 use crate::time::{Span, Time};
 use cells::{carry_out, weak_bits};
 pub use cells::{Cells, Cut, Operation};
+use data_cache::DataCache;
 use lock::Lock;
 use options::{OptionBytes, Request};
 
@@ -34,6 +36,8 @@ const SR_WRPERR: u32 = 1 << 4;
 const SR_PGAERR: u32 = 1 << 5;
 const SR_PGPERR: u32 = 1 << 6;
 const SR_PGSERR: u32 = 1 << 7;
+/// A load from a sector that is protected against reading (chips with PCROP).
+const SR_RDERR: u32 = 1 << 8;
 const SR_BSY: u32 = 1 << 16;
 const SR_CLEARABLE: u32 = SR_EOP | SR_OPERR | SR_WRPERR | SR_PGAERR | SR_PGPERR | SR_PGSERR;
 
@@ -133,6 +137,8 @@ pub struct Flash {
     cr: u32,
     lock: Lock,
     options: OptionBytes,
+    /// A debugger has connected, with read-out protection: no access until the next power-on.
+    is_shut: bool,
     running: Option<Running>,
     /// Ranges of the array that changed since the machine last asked, as (offset, length).
     changed: Vec<(u32, u32)>,
@@ -150,6 +156,8 @@ pub struct Flash {
     redraw_at: Time,
     /// VDD in mV.
     supply: u32,
+    /// The data cache, on a chip whose lines become stale.
+    data_cache: Option<DataCache>,
     /// The operations that have started since somebody wants to know them.
     log: Option<Vec<Operation>>,
     /// Usage.
@@ -169,7 +177,8 @@ impl Flash {
             sr: 0,
             cr: 0,
             lock: Lock::default(),
-            options: OptionBytes::default(),
+            options: OptionBytes::of(geometry),
+            is_shut: false,
             running: None,
             changed: Vec::new(),
             bus_error: false,
@@ -180,6 +189,7 @@ impl Flash {
             noise: Noise(0),
             redraw_at: Time(0),
             supply: NOMINAL,
+            data_cache: silicon.stale_lines.then(DataCache::default),
             log: None,
             counters: FlashCounters::default(),
         }
@@ -195,6 +205,39 @@ impl Flash {
     #[must_use]
     pub fn acr(&self) -> u32 {
         self.acr
+    }
+
+    /// Whether each load from the array has to be noticed ([`Self::load`]).
+    #[must_use]
+    pub fn caches_data(&self) -> bool {
+        self.data_cache.as_ref().is_some_and(DataCache::is_enabled)
+    }
+
+    /// How many lines of the data cache differ from the array.
+    #[must_use]
+    pub fn stale_lines(&self) -> usize {
+        self.data_cache.as_ref().map_or(0, DataCache::stale)
+    }
+
+    /// The CPU is about to load from the array.
+    pub fn load(&mut self, offset: u32, len: u32) {
+        if let Some(cache) = self.data_cache.as_mut().filter(|cache| cache.is_enabled()) {
+            cache.load(offset, len, self.array.bytes_mut(), &mut self.changed);
+        }
+    }
+
+    /// The array has its true bytes, whatever the data cache has.
+    fn show_array(&mut self) {
+        if let Some(cache) = &mut self.data_cache {
+            cache.show_array(self.array.bytes_mut(), &mut self.changed);
+        }
+    }
+
+    /// The CPU sees the array through the data cache again.
+    fn show_lines(&mut self) {
+        if let Some(cache) = &mut self.data_cache {
+            cache.show_lines(self.array.bytes_mut(), &mut self.changed);
+        }
     }
 
     /// The wait states that are set (ACR.LATENCY).
@@ -299,18 +342,22 @@ impl Flash {
 
     /// The bits between 0 and 1 read otherwise.
     fn redraw(&mut self) {
+        self.show_array();
         for (at, bits) in &self.unstable {
             let cell = &mut self.array.bytes_mut()[*at as usize];
             *cell = *cell & !bits | self.noise.byte() & bits;
             self.changed.push((*at, 1));
         }
+        self.show_lines();
     }
 
     /// Writes into the array as a debug probe does, whatever the locks say.
     pub fn preset(&mut self, offset: u32, bytes: &[u8]) {
+        self.show_array();
         let start = offset as usize;
         self.array.bytes_mut()[start..start + bytes.len()].copy_from_slice(bytes);
         self.changed.push((offset, u32::try_from(bytes.len()).unwrap_or(u32::MAX)));
+        self.show_lines();
     }
 
     /// Sets the option byte RDP as a debug probe does: AAh no read-out protection, CCh level 2,
@@ -326,11 +373,20 @@ impl Flash {
 
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
+        self.empty_data_cache();
+        self.is_shut = false;
         if let Some(running) = self.running.take() {
             self.tear(&running.operation, Cut::Torn { seed });
         }
         self.cut = None;
         self.power_failed = false;
+    }
+
+    fn empty_data_cache(&mut self) {
+        self.show_array();
+        if let Some(cache) = &mut self.data_cache {
+            cache.reset();
+        }
     }
 
     fn width(&self) -> u32 {
@@ -354,8 +410,48 @@ impl Flash {
         Span::from_millis(self.pick(table[self.psize()]))
     }
 
+    /// A debugger connects: with read-out protection of level 1 that shuts the flash until the next power-on
+    /// (section 3.7.3). Returns whether it can connect: with level 2 the port is off.
+    pub fn connect_debugger(&mut self) -> bool {
+        self.is_shut |= self.options.level() == 1;
+        self.options.level() != 2
+    }
+
+    /// Whether the array answers with bus errors alone.
+    #[must_use]
+    pub fn is_shut(&self) -> bool {
+        self.is_shut
+    }
+
+    /// BFB2: whether the chip boots from the system memory in place of the flash.
+    #[must_use]
+    pub fn boots_from_system_memory(&self) -> bool {
+        self.options.boots_from_system_memory()
+    }
+
+    /// Whether the data bus is kept out of the sector with this offset (PCROP, section 3.7.5).
+    #[must_use]
+    pub fn hides(&self, offset: u32) -> bool {
+        let Some(sector) = self.geometry.sector_at(self.geometry.flash.base + offset) else { return false };
+        match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
+            Some(within) => self.options.hides_second(within),
+            None => self.options.hides(sector.number),
+        }
+    }
+
+    /// The CPU loads from such a sector.
+    pub fn load_hidden(&mut self) {
+        self.sr |= SR_RDERR;
+        if self.cr & CR_ERRIE != 0 {
+            self.sr |= SR_OPERR;
+        }
+    }
+
     /// nWRP: a zero protects the sector (section 3.6.5).
     fn is_protected(&self, sector: Sector) -> bool {
+        if self.is_shut {
+            return true;
+        }
         match self.geometry.second_bank.and_then(|first| sector.number.checked_sub(first)) {
             Some(within) => self.options.protects_second(within),
             None => self.options.protects(sector.number),
@@ -504,6 +600,7 @@ impl Flash {
     }
 
     fn complete(&mut self, operation: &Operation) {
+        self.show_array();
         match operation {
             Operation::Program { .. } => self.counters.units_programmed += 1,
             Operation::Erase { sectors } => self.counters.sectors_erased += sectors.len() as u64,
@@ -516,12 +613,17 @@ impl Flash {
             }
         }
         self.carry_out(operation, Cut::After);
+        if let Some(cache) = &mut self.data_cache {
+            cache.note(operation);
+        }
+        self.show_lines();
     }
 
     /// Completes an operation that had too little voltage: what it leaves reads right at first, and may not
     /// last (section 3.6.2).
     fn complete_weakly(&mut self, operation: &Operation, now: Time) {
         self.counters.weak += 1;
+        self.show_array();
         let weak = weak_bits(operation, self.geometry, self.array.bytes(), &mut self.noise);
         self.complete(operation);
         if self.unstable.is_empty() {
@@ -537,6 +639,7 @@ impl Flash {
         if let Operation::Options { .. } = operation {
             self.options.tear();
         }
+        self.show_array();
         self.carry_out(operation, how);
     }
 
@@ -576,11 +679,19 @@ impl Flash {
 
     fn write_optcr(&mut self, value: u32, now: Time) -> Result<(), Unmodelled> {
         let start = self.wait_until_idle(now);
-        if let Request::Program(optcr) = self.options.write(value)? {
-            // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
-            // KiB sector.
-            let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
-            self.start(Operation::Options { optcr }, takes, start);
+        match self.options.write(value)? {
+            Request::Done => {}
+            Request::Program(optcr) => {
+                // Option bytes lie in a sector of their own; the datasheet gives no time: that of a 16
+                // KiB sector.
+                let takes = Span::from_millis(self.pick(ERASE_16_KIB[2]));
+                self.start(Operation::Options { optcr }, takes, start);
+            }
+            Request::Protected => {
+                let why = "FLASH_OPTCR would take back a protection against reading, and not erase the flash";
+                self.refuse(SR_WRPERR, why);
+                return Err(Unmodelled(why.into()));
+            }
         }
         Ok(())
     }
@@ -638,6 +749,11 @@ impl Peripheral for Flash {
             0x00 => {
                 // The cache reset bits act at once and stay as written.
                 self.acr = value & ACR_MASK;
+                self.show_array();
+                if let Some(cache) = &mut self.data_cache {
+                    cache.control(self.acr);
+                }
+                self.show_lines();
                 Ok(())
             }
             0x04 | 0x08 => {
@@ -647,7 +763,8 @@ impl Peripheral for Flash {
                 result
             }
             0x0C => {
-                self.sr &= !(value & SR_CLEARABLE);
+                let of_the_chip = if self.options.may_hide() { SR_RDERR } else { 0 };
+                self.sr &= !(value & (SR_CLEARABLE | of_the_chip));
                 Ok(())
             }
             0x10 => self.write_cr(value, now),
@@ -694,6 +811,7 @@ impl Peripheral for Flash {
     /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not
     /// protected).
     fn reset(&mut self) {
+        self.empty_data_cache();
         if let Some(running) = self.running.take() {
             // A fixed seed: a reset is no power failure, but leaves the same kind of half-done
             // work.

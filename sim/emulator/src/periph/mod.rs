@@ -6,6 +6,7 @@ pub mod flash;
 pub mod gpio;
 pub mod i2c;
 pub mod iwdg;
+pub mod otg;
 pub mod pwr;
 pub mod rcc;
 pub mod syscfg;

@@ -3,6 +3,11 @@
 use crate::peripheral::{Peripheral, Unmodelled};
 use crate::time::Time;
 
+/// SYSCFG_MEMRMP.
+const MEM_MODE: u32 = 0b111;
+/// Of chips with two banks.
+const UFB_MODE: u32 = 1 << 8;
+
 /// SYSCFG: memory remap, the EXTI multiplexers, the compensation cell.
 #[derive(Clone, Debug, Default)]
 pub struct Syscfg {
@@ -16,7 +21,23 @@ impl Syscfg {
     /// Whether the system memory is at address 0, in place of the flash (section 9.2.1).
     #[must_use]
     pub fn maps_system_memory(&self) -> bool {
-        self.memrmp == 1
+        self.memrmp & MEM_MODE == 1
+    }
+
+    /// The boot pins, or BFB2, have chosen the system memory.
+    pub fn boot_from_system_memory(&mut self) {
+        self.memrmp = 1;
+    }
+
+    /// UFB_MODE: whether the second bank of the flash is in the place of the first (section 9.3.1).
+    #[must_use]
+    pub fn swaps_banks(&self) -> bool {
+        self.memrmp & UFB_MODE != 0
+    }
+
+    /// Sets UFB_MODE.
+    pub fn swap_banks(&mut self, swap: bool) {
+        self.memrmp = self.memrmp & !UFB_MODE | if swap { UFB_MODE } else { 0 };
     }
 
     /// The port whose pin an EXTI line from 0 to 15 follows; 0 is port A (section 9.2.3).
@@ -44,7 +65,7 @@ impl Peripheral for Syscfg {
 
     fn write(&mut self, offset: u32, value: u32, _now: Time) -> Result<(), Unmodelled> {
         match offset {
-            0x00 if value & 7 < 2 => self.memrmp = value & 1,
+            0x00 if value & 7 < 2 => self.memrmp = value & (1 | UFB_MODE),
             0x00 => {
                 return Err(Unmodelled(
                     "memory remap (SYSCFG_MEMRMP) to RAM or external memory: address 0 stays as it is".into(),

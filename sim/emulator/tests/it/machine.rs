@@ -2,6 +2,7 @@
 //! results come from the architecture and the reference manuals.
 
 mod can_pins;
+mod option_bytes;
 mod programs;
 mod supply;
 
@@ -740,6 +741,29 @@ fn a_load_from_busy_flash_stalls_code_in_ram() {
     let log = words(&machine, 3);
     assert_eq!(log, [1, 1, 2], "BSY was clear at the first poll");
     assert_eq!(machine.counters().flash_stalls, 1);
+}
+
+/// RM0090 section 3.6.4, programming and caches: a store writes through the data cache, an erase does not reach
+/// it, and DCRST empties it. With the cache off, or on a chip that drops such lines, the array is read.
+#[test]
+fn a_load_by_the_data_cache_is_stale_after_an_erase_until_the_flush() {
+    const OLD: u32 = 0x0BAD_F00D;
+    const NEW: u32 = 0x1234_5678;
+    const BLANK: u32 = u32::MAX;
+    let run = |stale_lines, acr| {
+        let silicon = Silicon { stale_lines, ..TYPICAL };
+        let options = Options { silicon, ..Options::default() };
+        let mut machine = machine_in_ram(&programs::LOADS_BY_THE_CACHE, acr, options);
+        machine.load_bin(0x0800_4000, &OLD.to_le_bytes().repeat(8)).unwrap();
+        machine.run_until(ms(300));
+        assert_eq!(machine.flash()[SECTOR_1 + 4..SECTOR_1 + 8], [0xFF; 4]);
+        words(&machine, 7)
+    };
+    let true_words = [OLD, BLANK, NEW, BLANK, BLANK, BLANK, BLANK];
+    // DCEN; ICEN and PRFTEN.
+    assert_eq!(run(true, 1 << 10), [OLD, OLD, NEW, OLD, BLANK, OLD, BLANK]);
+    assert_eq!(run(true, 1 << 9 | 1 << 8), true_words);
+    assert_eq!(run(false, 1 << 10), true_words);
 }
 
 #[test]

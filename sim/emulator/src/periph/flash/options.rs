@@ -6,9 +6,15 @@
 //! reset, the loss of power and a mass erase leave them.
 //!
 //! **Read-out protection.** Level 2 is for good: the option bytes can no longer be changed. Going
-//! from level 1 to level 0 erases the whole array (section 3.6.3). What the levels deny a debugger
-//! and code in RAM is not modelled: there is no debugger here but the emulator's own, and the
-//! programs boot from flash.
+//! from level 1 to level 0 erases the whole array (section 3.6.3). From level 1 on a debugger that
+//! connects shuts the flash; with level 2 none can. Programs boot from flash here, so that what the
+//! levels deny code that booted from elsewhere is not modelled.
+//!
+//! **Proprietary code read-out protection** (PCROP, section 3.7.5). With SPRMOD a one of nWRP keeps the
+//! data bus out of its sector, and code runs from it. Only the way from level 1 to level 0, with its
+//! erase, takes the protection back.
+
+use shared_abi::geometry::{Geometry, Line};
 
 use super::lock::Lock;
 use crate::peripheral::Unmodelled;
@@ -17,10 +23,13 @@ const KEYS: [u32; 2] = [0x0819_2A3B, 0x4C5D_6E7F];
 
 const OPTLOCK: u32 = 1 << 0;
 const OPTSTRT: u32 = 1 << 1;
-/// What is kept of a value: nWRP, RDP, the user options, BOR_LEV.
+/// What each chip keeps of a value: nWRP, RDP, the user options, BOR_LEV.
 const KEPT: u32 = 0x0FFF_FFEC;
-/// nWRP means protection against reading, too (STM32F42x, F43x, F446, F469, F479).
+/// The chip boots from the system memory, whose loader starts one of two banks (chips with two).
+const BFB2: u32 = 1 << 4;
+/// nWRP means protection against reading, too (all but STM32F405, F407, F415 and F417).
 const SPRMOD: u32 = 1 << 31;
+const NWRP: u32 = 0x0FFF_0000;
 /// From the factory: no protection, BOR off, software watchdog (section 3.9.9).
 const FACTORY: u32 = 0x0FFF_AAEC;
 /// OPTCR1 has nWRP of the second bank. From the factory no sector is protected.
@@ -29,7 +38,7 @@ const SECOND: u32 = 0x0FFF_0000;
 /// read-out protection level 1 with no sector protected. Of an STM32F429 it was reported in ST's
 /// forum ("STM32F429ZIT6 reset values for flash option bytes when power down", 2018); there the
 /// same ones are SPRMOD, too, so that no sector can be read and the part never starts again.
-const ERASED: u32 = KEPT;
+const ERASED: u32 = u32::MAX;
 
 /// RDP of level 0.
 const LEVEL_0: u8 = 0xAA;
@@ -43,11 +52,15 @@ pub enum Request {
     Done,
     /// The option bytes shall be programmed with this value.
     Program(u32),
+    /// The value would take back a protection against reading: WRPERR.
+    Protected,
 }
 
 /// The option bytes, the register, and its lock.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct OptionBytes {
+    /// The bits of OPTCR that the chip keeps.
+    kept: u32,
     /// What is programmed, as OPTCR shows it.
     programmed: u32,
     /// OPTCR as written.
@@ -61,6 +74,7 @@ pub struct OptionBytes {
 impl Default for OptionBytes {
     fn default() -> Self {
         Self {
+            kept: KEPT,
             programmed: FACTORY,
             register: FACTORY,
             programmed_second: SECOND,
@@ -71,6 +85,15 @@ impl Default for OptionBytes {
 }
 
 impl OptionBytes {
+    /// Those of a chip as it leaves the factory.
+    #[must_use]
+    pub fn of(chip: &Geometry) -> Self {
+        let sprmod =
+            if matches!(chip.line, Line::F405 | Line::F407 | Line::F415 | Line::F417) { 0 } else { SPRMOD };
+        let bfb2 = if chip.second_bank.is_some() { BFB2 } else { 0 };
+        Self { kept: KEPT | sprmod | bfb2, ..Self::default() }
+    }
+
     /// Takes a write to OPTKEYR.
     ///
     /// # Errors
@@ -120,7 +143,7 @@ impl OptionBytes {
         if !self.lock.is_open() {
             return Err(Unmodelled("FLASH_OPTCR is written while it is locked: the chip ignores it".into()));
         }
-        self.register = value & KEPT;
+        self.register = value & self.kept;
         if value & OPTLOCK != 0 {
             self.lock = self.lock.close();
         } else if value & OPTSTRT != 0 {
@@ -131,23 +154,65 @@ impl OptionBytes {
                         .into(),
                 ));
             }
+            if self.takes_protection_back() {
+                return Ok(Request::Protected);
+            }
             return Ok(Request::Program(self.register));
         }
         Ok(Request::Done)
+    }
+
+    /// Whether the registers would take SPRMOD or the protection of a sector back, without the erase that goes
+    /// with the way to level 0.
+    fn takes_protection_back(&self) -> bool {
+        let opens = self.level() == 1 && level_of(self.register) == 0;
+        let lost = |old: u32, new: u32| old & !new & NWRP != 0;
+        let is_lost = self.register & SPRMOD == 0
+            || lost(self.programmed, self.register)
+            || lost(self.programmed_second, self.register_second);
+        self.hides_code() && is_lost && !opens
+    }
+
+    fn hides_code(&self) -> bool {
+        self.programmed & self.kept & SPRMOD != 0
+    }
+
+    /// Whether the data bus is kept out of a sector from 0 to 11.
+    #[must_use]
+    pub fn hides(&self, sector: u8) -> bool {
+        self.hides_code() && self.programmed >> 16 & 1 << sector != 0
+    }
+
+    /// The same for a sector of the second bank, counted from 0.
+    #[must_use]
+    pub fn hides_second(&self, sector: u8) -> bool {
+        self.hides_code() && self.programmed_second >> 16 & 1 << sector != 0
+    }
+
+    /// Whether the chip has the protection against reading.
+    #[must_use]
+    pub fn may_hide(&self) -> bool {
+        self.kept & SPRMOD != 0
+    }
+
+    /// BFB2: whether the chip boots from the system memory in place of the flash.
+    #[must_use]
+    pub fn boots_from_system_memory(&self) -> bool {
+        self.programmed & self.kept & BFB2 != 0
     }
 
     /// The option bytes are programmed. Returns whether that erases the array: read-out protection
     /// went from level 1 to level 0.
     pub fn program(&mut self, value: u32) -> bool {
         let before = self.level();
-        self.programmed = value & KEPT;
+        self.programmed = value & self.kept;
         self.programmed_second = self.register_second;
         before == 1 && self.level() == 0
     }
 
     /// The power fails, or a reset comes, while they are programmed.
     pub fn tear(&mut self) {
-        self.programmed = ERASED;
+        self.programmed = ERASED & self.kept;
         self.programmed_second = SECOND;
     }
 
@@ -161,11 +226,7 @@ impl OptionBytes {
     /// The level of read-out protection, 0 to 2 (section 3.6.3).
     #[must_use]
     pub fn level(&self) -> u8 {
-        match (self.programmed >> 8) as u8 {
-            LEVEL_0 => 0,
-            LEVEL_2 => 2,
-            _ => 1,
-        }
+        level_of(self.programmed)
     }
 
     /// nWRP: a zero protects the sector, with SPRMOD a one (sections 3.7.4 and 3.9.10). For sectors 0 to 11.
@@ -253,12 +314,24 @@ impl OptionBytes {
     }
 }
 
+fn level_of(optcr: u32) -> u8 {
+    match (optcr >> 8) as u8 {
+        LEVEL_0 => 0,
+        LEVEL_2 => 2,
+        _ => 1,
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use shared_abi::geometry::{STM32F407VG, STM32F429ZI};
 
     fn open() -> OptionBytes {
-        let mut options = OptionBytes::default();
+        opened(OptionBytes::default())
+    }
+
+    fn opened(mut options: OptionBytes) -> OptionBytes {
         for key in [0x0819_2A3B, 0x4C5D_6E7F] {
             options.write_key(key).unwrap();
         }
@@ -371,6 +444,47 @@ mod tests {
         options.tear();
         options.reset();
         assert_eq!(options.read(false), 0x0FFF_FFED);
+        assert_eq!(options.level(), 1);
+    }
+
+    /// Section 3.7.5: with SPRMOD a one of nWRP protects, and only the way from level 1 to level 0 takes a
+    /// protection back; more sectors and other options may be set. OPTCR has BFB2 and SPRMOD on an STM32F42x
+    /// alone (section 3.9.10 and the one before).
+    #[test]
+    fn a_protection_against_reading_goes_with_the_flash_alone() {
+        const SECTOR_5: u32 = 0x8020_AAEC;
+        let mut options = opened(OptionBytes::of(&STM32F429ZI));
+        assert_eq!(options.write(SECTOR_5 | OPTSTRT), Ok(Request::Program(SECTOR_5)));
+        options.program(SECTOR_5);
+        assert!((0..12).filter(|sector| options.hides(*sector)).eq([5]));
+        for (value, wanted) in [
+            (SECTOR_5 & !SPRMOD, Request::Protected),
+            (0x8000_AAEC, Request::Protected),
+            (0x8001_AAEC, Request::Protected),
+            (0x8021_AAEC, Request::Program(0x8021_AAEC)),
+            (0x8020_AAE0, Request::Program(0x8020_AAE0)),
+            (0x8020_AAFC, Request::Program(0x8020_AAFC)),
+            (0x0FFF_55EC, Request::Protected),
+        ] {
+            assert_eq!(options.write(value | OPTSTRT), Ok(wanted), "{value:08X}h");
+        }
+        options.program(0x8020_55EC);
+        assert_eq!(options.write(0x0FFF_AAEC | OPTSTRT), Ok(Request::Program(0x0FFF_AAEC)));
+        assert!(options.program(0x0FFF_AAEC), "the array is erased");
+        assert!((0..12).all(|sector| !options.hides(sector)));
+
+        let mut options = opened(OptionBytes::of(&STM32F407VG));
+        assert_eq!(options.write(0x8020_AAFC | OPTSTRT), Ok(Request::Program(0x0020_AAEC)));
+        options.preset_all(0x8020_AAFC);
+        assert!(!options.hides(5) && !options.boots_from_system_memory());
+    }
+
+    /// The forum's report above: ones are SPRMOD and nWRP, too.
+    #[test]
+    fn torn_ones_of_an_stm32f429_hide_the_whole_flash() {
+        let mut options = OptionBytes::of(&STM32F429ZI);
+        options.tear();
+        assert!((0..12).all(|sector| options.hides(sector) && options.hides_second(sector)));
         assert_eq!(options.level(), 1);
     }
 }

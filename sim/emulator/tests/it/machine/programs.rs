@@ -72,4 +72,6 @@ programs! {
     SLEEPS_WITH_A_TIMER,
     TIME_IN_A_BLOCK,
     COUNTS_DOWN,
+    LOADS_BY_THE_CACHE,
+    LOADS_HIDDEN_CODE,
 }
