@@ -329,9 +329,8 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut input = Input::new(bytes);
     let mut host = Host { file: None, next: 1, honest: true };
-    loop {
-        // When the power is cut in this life, and in what state of the operation.
-        let Some([how, low, high]) = input.array() else { break };
+    // When the power is cut in this life, and in what state of the operation.
+    while let Some([how, low, high]) = input.array() {
         let operation = u32::from(u16::from_le_bytes([low, high])) % 2000 + 1;
         flash.cut = match how & 7 {
             0 => Some((operation, Cut::Before)),

@@ -93,7 +93,7 @@ fn made() -> &'static Made {
         let root = SigningKey::from_seed([1; 32]).expect("its id is not 0");
         let keks = [Kek::new([5; 32]).expect("its id is not 0")];
         let key_block = key_block(&[root.public()], &keks, 0, 0, false).expect("it has room");
-        let mut image: Vec<u8> = (0..2100).map(|i: u32| (i * 31 ^ i >> 8) as u8 & 0x3F).collect();
+        let mut image: Vec<u8> = (0..2100).map(|i: u32| ((i * 31) ^ (i >> 8)) as u8 & 0x3F).collect();
         image[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
         image[4..8].copy_from_slice(&(PROGRAM.base + 0x101).to_le_bytes());
         let sealed = (0..8_u8)
@@ -256,7 +256,6 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut target = device(&mut flash, &mut buffer, &mut room);
     settle(&mut target);
     let installed = send(&mut target, &file, &mut input, until);
-    drop(target);
     flash.power_on();
     assert!(!installed || verifies(&flash), "the device says that it is installed");
     if until.is_none() && file == *good {
@@ -282,7 +281,6 @@ coboot_fuzz::target!(|bytes: &[u8]| {
         let mut target = device(&mut flash, &mut buffer, &mut room);
         settle(&mut target);
         assert!(send(&mut target, good, &mut Input::new(&[]), None), "a good image is refused");
-        drop(target);
         assert!(flash.cells(PROGRAM).starts_with(image));
     }
 });
