@@ -92,7 +92,8 @@ impl File {
             let flash_address = PROGRAM.base + number * CHUNK as u32;
             blocks.push(Block { number: number + 1, flash_address, data: data.into() }.emit());
         }
-        let last: Vec<u8> = [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
+        let last: Vec<u8> =
+            [len as u32, CRC.checksum(&image)].into_iter().flat_map(u32::to_le_bytes).collect();
         blocks.push(Block { number: u32::MAX, flash_address: 0, data: last.into() }.emit());
         Self { image, blocks }
     }
