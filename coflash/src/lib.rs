@@ -6,6 +6,7 @@
 //! | [`file`](mod@file) | firmware files: read, checked, converted | |
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `bus` |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `bus`, `device`, `file` |
+//! | [`machine`] | a package with the programs of a whole machine: its file, the plan for a bus, the update | `bus`, `device`, `file`, `update` |
 //! | `agent` (feature `agent`) | a client of an update server, for the devices of its buses | `bus`, `device`, `file`, `update` |
 //! | `conform` (feature `conform`) | conformance checks on a device | `bus`, `device` |
 //! | `ui` (feature `ui`) | a local web server and its page in the browser | `bus`, `device`, `file`, `update` |
@@ -54,6 +55,7 @@ pub mod cli;
 pub mod conform;
 pub mod device;
 pub mod file;
+pub mod machine;
 #[cfg(feature = "ui")]
 pub mod ui;
 pub mod update;

@@ -43,8 +43,7 @@ const BOOT_CORE: &[Rule] = &[
     ("profile", "bootloader policy"),
 ];
 
-/// The rooms of `coflash`. A new room needs a row. `update` uses `bus` for several devices at once,
-/// which share an adapter.
+/// The rooms of `coflash`, as above. `update` uses `bus`: several devices share an adapter.
 const COFLASH: &[Rule] = &[
     ("setters", ""),
     ("unicode", ""),
@@ -53,9 +52,10 @@ const COFLASH: &[Rule] = &[
     ("file", "setters shared_abi unicode"),
     ("device", "bus canopen json setters shared_abi unicode"),
     ("update", "bus canopen device file json setters shared_abi"),
+    ("machine", "bus canopen device file json setters shared_abi update"),
     ("agent", "bus canopen device file shared_abi update"),
     ("conform", "bus canopen device shared_abi update"),
-    ("cli", "agent bus canopen conform device file shared_abi ui update"),
+    ("cli", "agent bus canopen conform device file machine shared_abi ui update"),
     ("ui", "bus canopen device file shared_abi update"),
 ];
 

@@ -14,6 +14,7 @@ mod cli;
 mod device;
 mod fake;
 mod file;
+mod machine;
 mod tool;
 mod ui;
 mod update;
