@@ -40,6 +40,7 @@ mod nameplate;
 mod nmt;
 mod objects;
 mod output;
+mod package;
 mod program;
 mod progress;
 mod provision;
@@ -127,6 +128,7 @@ enum Command {
     Show(verify::Show),
     Provision(provision::Provision),
     Nameplate(nameplate::MakeNameplate),
+    Package(package::MakePackage),
     Flash(Box<flash::Flash>),
     Adapters(adapters::Adapters),
     Scan(scan::Scan),
@@ -171,6 +173,7 @@ impl Command {
                 | Self::Show(_)
                 | Self::Provision(_)
                 | Self::Nameplate(_)
+                | Self::Package(_)
                 | Self::Adapters(_)
                 | Self::Completions(_)
                 | Self::Man(_)
@@ -191,6 +194,7 @@ impl Command {
             Self::Show(show) => show.run(context),
             Self::Provision(provision) => provision.run(context),
             Self::Nameplate(nameplate) => nameplate.run(context),
+            Self::Package(package) => package.run(context),
             Self::Flash(flash) => flash.run(context),
             Self::Adapters(adapters) => adapters.run(context),
             Self::Scan(scan) => scan.run(context),
