@@ -196,10 +196,10 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Program, Fault> {
     Ok(program)
 }
 
-/// The type of device that a program names.
+/// The type of device that a program names; two zeros name none.
 pub(super) fn target(program: &Program) -> Option<Identity> {
     let Target { vendor_id: vendor, product_code: product } = program.target()?;
-    (vendor != 0 && product != 0).then_some(Identity { vendor, product, revision: None })
+    (vendor != 0 || product != 0).then_some(Identity { vendor, product, revision: None })
 }
 
 /// The version of a program, if it has one.

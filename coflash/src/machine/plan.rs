@@ -151,9 +151,13 @@ pub fn plan(
             let Some(bootloader) = &its.bootloader else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
-            let has = program_info(&mut session, bootloader.number)?;
-            if step.todo == Todo::Update && has_bootloader(its, &has, new) {
-                step.todo = Todo::Has;
+            match program_info(&mut session, bootloader.number) {
+                Ok(has) if step.todo == Todo::Update && has_bootloader(its, &has, new) => {
+                    step.todo = Todo::Has;
+                }
+                Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error.into()),
+                // The run asks a device again that answers no more, and says so.
+                Ok(_) | Err(_) => {}
             }
         }
     }
@@ -209,6 +213,7 @@ pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Pla
 
 /// The programs of the package for this device.
 fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>, Fault> {
+    let number = |step: &Step| package.program(step.entry).map(|(entry, _)| entry.program);
     let mut steps: Vec<Step> = Vec::new();
     for (at, (entry, program)) in package.programs().enumerate() {
         let is_named = entry.nodes.contains(&node.get());
@@ -219,10 +224,7 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
             None if has(info, entry, program) => Todo::Has,
             None => Todo::Update,
         };
-        let same = |step: &&Step| {
-            let number = package.program(step.entry).map(|(earlier, _)| earlier.program);
-            number == Some(entry.program) && !matches!(step.todo, Todo::Leave(_))
-        };
+        let same = |step: &&Step| number(step) == Some(entry.program) && !matches!(step.todo, Todo::Leave(_));
         if let (Some(first), false) = (steps.iter().find(same), matches!(todo, Todo::Leave(_))) {
             return Err(Fault::TwoPrograms {
                 first: first.program.clone(),
@@ -234,6 +236,10 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
         let (from, to) = versions(info, entry, program);
         steps.push(Step { entry: at, program: entry.name.clone(), from, to, todo });
     }
+    // A package may have a program for each device that can be at a node.
+    let served: Vec<Option<u8>> =
+        steps.iter().filter(|step| !matches!(step.todo, Todo::Leave(_))).map(number).collect();
+    steps.retain(|step| !matches!(step.todo, Todo::Leave(_)) || !served.contains(&number(step)));
     Ok(steps)
 }
 

@@ -59,6 +59,10 @@ fn a_file_that_names_its_device_needs_no_other_name() {
     assert_eq!(parts[0].entry.identity, Some(Identity { vendor: 0x3F, product: 7, revision: None }));
     let parts = recipe("[[program]]\nimage = 'a.cbs'\nrevision = 3\n", &folder).unwrap().parts;
     assert_eq!(parts[0].entry.identity.unwrap().revision, Some(3));
+    // Block 0 has vendor 0 and product 1234 (expected.py), as the reference application has.
+    fs::copy(data("identity-110.blk"), folder.join("d.blk")).unwrap();
+    let parts = recipe("[[program]]\nimage = 'd.blk'\n", &folder).unwrap().parts;
+    assert_eq!(parts[0].entry.identity, Some(Identity { vendor: 0, product: 1234, revision: None }));
     for (text, words) in [
         ("", "line 1: it names no program"),
         ("name = 5\n", "line 1: "),

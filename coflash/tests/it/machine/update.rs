@@ -176,6 +176,20 @@ fn another_device_at_a_named_node_is_said_and_not_written() {
     assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
 }
 
+/// A program for each device that can be at a node: the one that is there gets its own, and the other one is
+/// no mistake.
+#[test]
+fn a_node_may_be_one_device_or_another() {
+    let at = |product: u32| format!(r#""nodes": [5], "identity": {{"vendor": 63, "product": {product}}}"#);
+    let package = package(&[("old", &at(1234)), ("new", &at(1235))]);
+    for (product, name) in [(1234, "old"), (1235, "new")] {
+        let plan = planned(&mut Bus(vec![device(5, product)]), &package);
+        assert_eq!(steps(&plan), [(5, name, "update")]);
+    }
+    let plan = planned(&mut Bus(vec![device(5, 1236)]), &package);
+    assert_eq!(steps(&plan), [(5, "old", "leave"), (5, "new", "leave")]);
+}
+
 /// One with nodes and one with an identity: whether they meet is known when the bus is.
 #[test]
 fn two_programs_for_a_node_of_the_bus_are_refused() {
