@@ -4,8 +4,8 @@
 //! command line, a page or an agent, shows and confirms in its own way:
 //!
 //! 1. [`Package::parse`] checks all of the file, [`Package::trust`] its signatures;
-//! 2. [`plan`] compares the bus with it, and changes nothing;
-//! 3. [`run`] carries out what the user has confirmed.
+//! 2. [`plan()`] compares the bus with it, and changes nothing;
+//! 3. [`run()`] carries out what the user has confirmed.
 
 mod fault;
 pub mod manifest;
