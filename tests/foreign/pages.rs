@@ -65,6 +65,7 @@ pages! {
     first_hour "docs/first-hour.md"
     fleet "docs/fleet.md"
     emulator "docs/emulator.md"
+    machine_package "docs/machine-package.md"
     masters "docs/masters.md"
     node "docs/node.md"
     product "docs/product.md"

@@ -52,6 +52,7 @@ const COFLASH: &[Rule] = &[
     ("file", "setters shared_abi unicode"),
     ("device", "canopen coboot_can json setters shared_abi unicode"),
     ("update", "canopen coboot_can device file json setters shared_abi"),
+    ("machine", "canopen coboot_can device file json setters shared_abi update"),
 ];
 
 /// The dependencies of `coflash-core` that a room may use only if its row lists them.

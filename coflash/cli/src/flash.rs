@@ -31,6 +31,7 @@ use super::file::{warn, Source};
 use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
+use super::package::{is_package, Given, Machine, Typed};
 use super::progress::Progress;
 use super::renew::bootloader_in;
 use super::values::{nodes, number, program_number, watch_time};
@@ -59,6 +60,9 @@ enum Together {
 ///
 /// The tool detects bootloaders of other makers by itself; --dialect names one.
 ///
+/// With a package for a machine (coflash package) the tool scans the bus, shows its plan, asks, and
+/// updates each device with its program; the package says which.
+///
 /// With several nodes, or with a job file, the devices are updated at the same time; if one device
 /// fails, the others continue.
 ///
@@ -67,6 +71,10 @@ enum Together {
 /// DotNetFlashtool, -F, --node_id and --prog_no leave the trial out unless --chk_run is given.
 #[derive(Debug, Args)]
 pub(super) struct Flash {
+    // The first one: the parser takes each value out as it reads it.
+    #[command(flatten)]
+    typed: Typed,
+
     /// The firmware: Intel HEX, Motorola S-record, ELF, raw binary, block file or sealed image.
     #[arg(value_name = "FILE", conflicts_with = "legacy_file", required_unless_present_any = ["legacy_file", "job", "vxd_type", "index"])]
     file: Option<PathBuf>,
@@ -171,6 +179,9 @@ pub(super) struct Flash {
     access: Access,
 
     #[command(flatten)]
+    machine: Machine,
+
+    #[command(flatten)]
     legacy: Legacy,
 }
 
@@ -190,6 +201,11 @@ impl Flash {
             return Ok(());
         }
         self.legacy.check(context)?;
+        let package = self.file.as_deref().filter(|file| is_package(file));
+        self.typed.check(package.is_some())?;
+        if let Some(package) = package {
+            return self.machine(context, package);
+        }
         let devices = match &self.job {
             Some(job) => self.devices_of_job(context, job)?,
             None => self.devices(context)?,
@@ -206,6 +222,38 @@ impl Flash {
             [device] if self.job.is_none() => self.one(context, &mut link, device),
             devices => self.many(context, &mut link, devices),
         }
+    }
+
+    /// Updates a machine with a package.
+    fn machine(&self, context: &Context, package: &Path) -> Result<(), Failure> {
+        let flash = FlashOptions::default()
+            .repeats(self.block_repeats)
+            .watch(self.watch)
+            .dialect(self.access.dialect())
+            .unlock(self.access.unlock())
+            .wait(self.wait)
+            .alone(!self.not_alone)
+            .mastership(!self.no_mastership)
+            .from_start(self.from_start)
+            .together(self.together == Together::Always);
+        let given = Given {
+            patience: &self.patience,
+            flash,
+            many: self.many_options()?,
+            report: self.report.as_deref(),
+            not_alone: self.not_alone,
+        };
+        self.machine.run(context, package, &given)
+    }
+
+    /// The options for several devices.
+    fn many_options(&self) -> Result<ManyOptions, Failure> {
+        Ok(ManyOptions::default()
+            .timing(self.patience.timing())
+            .transfers(self.patience.transfers())
+            .at_once(self.at_once as usize)
+            .together(self.together != Together::Never)
+            .cancelled(cancelled()?))
     }
 
     /// Whether the manual's words leave the trial of this file out. DotNetFlashtool knows neither job
@@ -486,12 +534,7 @@ impl Flash {
             };
             outcomes.push(outcome);
         }
-        let options = ManyOptions::default()
-            .timing(self.patience.timing())
-            .transfers(self.patience.transfers())
-            .at_once(self.at_once as usize)
-            .together(self.together != Together::Never)
-            .cancelled(cancelled()?);
+        let options = self.many_options()?;
         let (numbers, jobs): (Vec<usize>, Vec<Job>) = jobs.into_iter().unzip();
         let nodes: Vec<NodeId> = jobs.iter().map(|job| job.node).collect();
         let board = Board::new(context.out, &nodes);

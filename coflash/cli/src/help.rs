@@ -8,7 +8,7 @@ use super::output::EXIT_CODES;
 
 /// The groups of `--help`, with the options in each.
 const GROUPS: [(&str, &[&str]); 5] = [
-    ("Devices", &["node", "job", "at_once", "together", "program", "report"]),
+    ("Devices", &["node", "job", "at_once", "together", "program", "report", "trust", "yes"]),
     (
         "Firmware file",
         &[
@@ -108,7 +108,7 @@ const RARE: [&str; 39] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 36] = [
+const EXAMPLES: [(&str, &str); 37] = [
     (
         "",
         "\
@@ -128,7 +128,15 @@ Examples:
   coflash flash app.elf --board stm32f407g-disc1 --node 5
   coflash flash app.blk --node 5-9 --check-target --verify
   coflash flash app.hex --board my-board.toml
-  coflash flash --job line.toml --report result.json",
+  coflash flash --job line.toml --report result.json
+  coflash flash machine.cpk --trust root.pub",
+    ),
+    (
+        "package",
+        "\
+Examples:
+  coflash package machine.toml
+  coflash package machine.toml -o press-4.cpk --key release.pem --cert release.cert",
     ),
     (
         "convert",

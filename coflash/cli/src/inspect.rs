@@ -8,13 +8,14 @@ use serde_json::{json, Value};
 use super::context::Context;
 use super::file::{Input, Source};
 use super::output::Failure;
+use super::package::{self, Trusted};
 use super::values::program_number;
 use super::verify::{is_sealed, show};
 
 /// Shows the contents of a firmware file, and checks the whole file.
 ///
 /// This checks every record, size and CRC, also those of a block file. Of a sealed image it checks
-/// only the form; verify checks the rest.
+/// only the form; verify checks the rest. A package for a machine is checked as before its update.
 ///
 /// With --board it also checks that the program fits into its region of that board's flash. This
 /// command needs no device.
@@ -29,11 +30,17 @@ pub(super) struct Inspect {
 
     #[command(flatten)]
     source: Source,
+
+    #[command(flatten)]
+    trusted: Trusted,
 }
 
 impl Inspect {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
+        if package::is_package(path) {
+            return package::inspect(context, path, &self.trusted);
+        }
         if is_sealed(path) {
             return show(context, "inspect", path);
         }

@@ -41,6 +41,7 @@ mod nameplate;
 mod nmt;
 mod objects;
 mod output;
+mod package;
 #[cfg(test)]
 mod pages;
 mod program;
@@ -130,6 +131,7 @@ enum Command {
     Show(verify::Show),
     Provision(provision::Provision),
     Nameplate(nameplate::MakeNameplate),
+    Package(package::MakePackage),
     Flash(Box<flash::Flash>),
     Adapters(adapters::Adapters),
     Scan(scan::Scan),
@@ -174,6 +176,7 @@ impl Command {
                 | Self::Show(_)
                 | Self::Provision(_)
                 | Self::Nameplate(_)
+                | Self::Package(_)
                 | Self::Adapters(_)
                 | Self::Completions(_)
                 | Self::Man(_)
@@ -194,6 +197,7 @@ impl Command {
             Self::Show(show) => show.run(context),
             Self::Provision(provision) => provision.run(context),
             Self::Nameplate(nameplate) => nameplate.run(context),
+            Self::Package(package) => package.run(context),
             Self::Flash(flash) => flash.run(context),
             Self::Adapters(adapters) => adapters.run(context),
             Self::Scan(scan) => scan.run(context),

@@ -15,6 +15,7 @@ use coflash_core::file::board::NamedError;
 use coflash_core::file::convert::ConvertError;
 use coflash_core::file::sealed::Refusal;
 use coflash_core::file::{judge, Cause, FileError};
+use coflash_core::machine;
 use coflash_core::update::job::Fault;
 use coflash_core::update::{refusal_number, DeviceAfterUpdate, DeviceAnswer};
 use coflash_core::Error;
@@ -372,6 +373,29 @@ impl Failure {
     /// An error in a job file.
     pub(super) fn job(path: &Path, fault: &Fault) -> Self {
         Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
+    }
+
+    /// An error in the recipe of a package.
+    pub(super) fn recipe(path: &Path, fault: &machine::RecipeFault) -> Self {
+        Self::new(Exit::File, None, format!("{}, {fault}", path.display()), None)
+    }
+
+    /// A package that breaks a rule.
+    pub(super) fn package(path: &Path, fault: &machine::Fault) -> Self {
+        let (what, advice) = (format!("{} {fault}", path.display()), fault.advice().to_string());
+        // The manual's tools do not know such files.
+        let legacy = Exit::File.legacy();
+        Self { legacy, ..Self::new(Exit::File, Some(fault.number()), what, Some(advice)) }
+    }
+
+    /// A device of a package that was not begun.
+    pub(super) fn of_device(fault: &machine::DeviceFault) -> Self {
+        let exit = match fault {
+            machine::DeviceFault::Absent { .. } | machine::DeviceFault::TooFew { .. } => Exit::NoAnswer,
+            _ => Exit::Device,
+        };
+        let advice = Some(fault.advice().to_string());
+        Self { legacy: exit.legacy(), ..Self::new(exit, Some(fault.number()), fault.to_string(), advice) }
     }
 
     /// The same failure, with the state of the device.

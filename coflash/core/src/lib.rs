@@ -6,6 +6,7 @@
 //! | [`file`](mod@file) | firmware files: read, checked, converted | |
 //! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | |
 //! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `device`, `file` |
+//! | [`machine`] | a package with the programs of a whole machine: its file, the plan for a bus, the update | `device`, `file`, `update` |
 //!
 //! The page in the browser, the update agent, the conformance checks and the command line are crates
 //! beside this one (`coflash-ui`, `coflash-agent`, `coflash-conform`, `coflash`) and use it as every
@@ -40,6 +41,7 @@ mod unicode;
 
 pub mod device;
 pub mod file;
+pub mod machine;
 pub mod update;
 
 pub use device::{Error, Session};

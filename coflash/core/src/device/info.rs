@@ -76,7 +76,7 @@ pub struct Nameplate {
 pub type Identity = [Option<u32>; 4];
 
 /// The parts of the identity under their names.
-fn identity_fields<S: Serializer>(identity: &Identity, serializer: S) -> Result<S::Ok, S::Error> {
+pub(crate) fn identity_fields<S: Serializer>(identity: &Identity, serializer: S) -> Result<S::Ok, S::Error> {
     let names = ["vendor_id", "product_code", "revision", "serial_number"];
     let mut fields = serializer.serialize_struct("Identity", names.len())?;
     for (name, part) in names.into_iter().zip(identity) {

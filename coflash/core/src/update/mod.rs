@@ -42,3 +42,4 @@ pub use self::options::{FlashOptions, JOINED_BLOCKS};
 pub use self::password::Password;
 pub use self::renew::renew;
 pub use self::renewal::Renewal;
+pub(crate) use self::toml_line::line_of;

@@ -9,4 +9,5 @@ macro_rules! data {
 
 mod device;
 mod file;
+mod machine;
 mod update;

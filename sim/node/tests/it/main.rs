@@ -9,6 +9,7 @@ mod cut;
 mod cuts;
 #[cfg(unix)]
 mod hosted;
+mod machine;
 mod nodes;
 mod pages;
 mod production_line;

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use canopen::NodeId;
 use coflash_core::device::info::info;
+use coflash_core::device::scan::ScanOptions;
 use coflash_core::device::{Session, Timing};
 use coflash_core::file::ram_image::RamImage;
 use coflash_core::file::raw;
@@ -15,7 +16,7 @@ use coflash_core::Error;
 use shared_abi::ram_image::Version;
 
 use kit::fake::renewal::*;
-use kit::fake::{Fake, APPLICATION, BOOTLOADER, NODE};
+use kit::fake::{Bus, Fake, APPLICATION, BOOTLOADER, NODE};
 
 fn new() -> NewBootloader {
     let image = raw::read(&image(NEW), Some(0x0801_0000)).unwrap();
@@ -331,4 +332,54 @@ fn of_several_devices_the_first_one_goes_first() {
             }
         }
     }
+}
+
+/// In a package for a machine: the plan says what is due, the run renews the first one before the others, and
+/// then nothing is due. A bootloader on trial has to be confirmed.
+#[test]
+fn a_package_renews_bootloaders() {
+    use coflash_core::machine::{make, plan, run, Entry, Package, Part, RunOptions};
+    let entry = Entry {
+        name: "bootloader".to_owned(),
+        file: String::new(),
+        size: 0,
+        sha256: String::new(),
+        nodes: vec![5, 6, 7],
+        identity: None,
+        count: None,
+        program: 255,
+        dialect: None,
+        trial_run: true,
+        verify: false,
+    };
+    let package = make(None, None, &[Part { entry, bytes: image(NEW) }], &[]).unwrap();
+    let package = Package::parse(&package).unwrap();
+    let due = |bus: &mut Bus| {
+        let plan = plan(bus, &package, &ScanOptions::default(), &Arc::default()).unwrap();
+        let updates = plan.updates();
+        (plan, updates)
+    };
+    let outcome = |bus: &mut Bus| {
+        let (plan, _) = due(bus);
+        let outcomes = run(bus, &package, &plan, &RunOptions::default(), &|_, _, _| {});
+        outcomes.iter().map(|outcome| outcome.result.is_ok()).collect::<Vec<_>>()
+    };
+    let (mut bus, log) = devices([Trial::Works; 3]);
+    let (plan, updates) = due(&mut bus);
+    // The halves of the version word, which are 0001_0002h and 0001_0003h.
+    assert!(plan.to_string().contains("node 5: bootloader: 1.2 -> 1.3"), "{plan}");
+    assert_eq!((updates, written(&log)), (3, vec![]));
+    assert_eq!(outcome(&mut bus), [true; 3]);
+    assert_eq!(written(&log), [WHOLE; 3].concat());
+    assert_eq!((due(&mut bus).1, written(&log)), (0, vec![]));
+
+    let (mut bus, log) = devices([Trial::Ends([1, 0]), Trial::Works, Trial::Works]);
+    assert_eq!(outcome(&mut bus), [false; 3]);
+    assert_eq!(written(&log), WHOLE[..3]);
+
+    let (mut bus, _) = devices([Trial::Works; 3]);
+    let staging = Some((NEW, word_of(&image(NEW), 4)));
+    bus.0[0].maker =
+        Some(Box::new(Board { state: STAGED, origin: TRIAL, staging, ..Board::new(&Log::default()) }));
+    assert_eq!(due(&mut bus).1, 3);
 }

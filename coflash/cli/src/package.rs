@@ -1,0 +1,412 @@
+//! `coflash package`, and the update of a machine with a package: `coflash flash machine.cpk`.
+
+use std::io::{self, BufRead as _, IsTerminal as _, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+
+use canopen::NodeId;
+use clap::parser::ValueSource;
+use clap::{ArgMatches, Args, Command, FromArgMatches};
+use coboot_can::Link;
+use coflash_core::device::scan::ScanOptions;
+use coflash_core::file::limit;
+use coflash_core::machine::{
+    self, kind, version, Bad, Good, Outcome, Package, Plan, PlanError, Recipe, RunOptions, Signer,
+};
+use coflash_core::update::many::ManyOptions;
+use coflash_core::update::FlashOptions;
+use seal::wire::CERTIFICATE;
+use serde_json::{json, Value};
+
+use super::context::Context;
+use super::device::{cancelled, Patience};
+use super::keys::{self, public_key, signing_key};
+use super::many::{write_report, Board};
+use super::output::{Exit, Failure};
+
+/// Makes a package for a machine: one file with the programs of several types of nodes.
+///
+/// The recipe says which firmware file is for which nodes, in the order of the update. Each file is
+/// read, checked and converted as by flash. The same input gives the same output, byte for byte.
+#[derive(Debug, Args)]
+pub(super) struct MakePackage {
+    /// The recipe (see the manual).
+    #[arg(value_name = "RECIPE")]
+    recipe: PathBuf,
+
+    /// The package to write; by default the recipe's name with .cpk.
+    #[arg(long, short, value_name = "OUT")]
+    output: Option<PathBuf>,
+
+    /// Sign the package with this private key; give the option once for each key, three at most.
+    #[arg(long, value_name = "FILE")]
+    key: Vec<PathBuf>,
+
+    /// The certificate of a key; a key without one is a root.
+    #[arg(long, value_name = "FILE", requires = "key")]
+    cert: Vec<PathBuf>,
+}
+
+impl MakePackage {
+    pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
+        let path = &self.recipe;
+        let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
+        let Recipe { name, release, parts } = Recipe::read(&text, path.parent().unwrap_or(Path::new("")))
+            .map_err(|fault| Failure::recipe(path, &fault))?;
+        let keys = self.key.iter().map(|path| signing_key(path)).collect::<Result<Vec<_>, _>>()?;
+        let certificates =
+            self.cert.iter().map(|path| keys::certificate(path)).collect::<Result<Vec<_>, _>>()?;
+        let of = |certificate: &[u8; CERTIFICATE]| seal::wire::Certificate(certificate).key();
+        let pairs: Vec<_> = keys
+            .iter()
+            .map(|key| (key, certificates.iter().find(|its| of(its) == key.public().bytes()).copied()))
+            .collect();
+        let is_used =
+            |certificate: &&[u8; CERTIFICATE]| pairs.iter().any(|(_, its)| its.as_ref() == Some(certificate));
+        if !certificates.iter().all(|certificate| is_used(&certificate)) {
+            let advice = "give each certificate with its key";
+            return Err(Failure::usage("a certificate belongs to none of the keys", advice));
+        }
+        let bytes =
+            machine::make(name, release, &parts, &pairs).map_err(|fault| Failure::package(path, &fault))?;
+        let output = self.output.clone().unwrap_or_else(|| path.with_extension("cpk"));
+        if output == *path {
+            return Err(Failure::usage(
+                "the package would replace its recipe",
+                "name the package with --output",
+            ));
+        }
+        keys::write(&output, &bytes)?;
+        let package = Package::parse(&bytes).map_err(|fault| Failure::package(&output, &fault))?;
+        show(context, "package", &output, &package, false);
+        Ok(())
+    }
+}
+
+/// Whether a file begins as a package; `false` if it cannot be read.
+pub(super) fn is_package(path: &Path) -> bool {
+    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
+    let mut front = Vec::new();
+    let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
+    is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && machine::looks_like(&front)
+}
+
+/// Reads and checks a package.
+fn read(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
+    let roots = trusted.trust.iter().map(|path| public_key(path)).collect::<Result<Vec<_>, _>>()?;
+    let package =
+        Package::parse(&super::file::bytes(path)?).map_err(|fault| Failure::package(path, &fault))?;
+    if !roots.is_empty() {
+        package.trust(&roots).map_err(|fault| Failure::package(path, &fault))?;
+    }
+    Ok(package)
+}
+
+/// Shows a package, for `inspect`.
+pub(super) fn inspect(context: &Context, path: &Path, trusted: &Trusted) -> Result<(), Failure> {
+    let package = read(path, trusted)?;
+    show(context, "inspect", path, &package, !trusted.trust.is_empty());
+    Ok(())
+}
+
+/// The roots that may sign packages.
+#[derive(Debug, Args)]
+pub(super) struct Trusted {
+    /// Take a package only if this root has signed it or certified its signer (public key); give the
+    /// option once for each root.
+    #[arg(long, value_name = "FILE")]
+    trust: Vec<PathBuf>,
+}
+
+/// Shows what is in a package.
+fn show(context: &Context, command: &str, path: &Path, package: &Package, is_trusted: bool) {
+    let manifest = package.manifest();
+    let mut words = format!("{}: package for a machine", path.display());
+    for text in [&manifest.name, &manifest.release].into_iter().flatten() {
+        words += &format!(", {text}");
+    }
+    words += "\n";
+    for (entry, program) in package.programs() {
+        let version = version(program).map_or(String::new(), |version| format!(", version {version}"));
+        let count = entry.count.map_or(String::new(), |count| format!(", {count} devices"));
+        let number = if entry.is_bootloader() { String::new() } else { format!(" {}", entry.program) };
+        words += &format!(
+            "  {}: {}{number} of {} bytes{version}, for {}{count}\n",
+            entry.name,
+            kind(program),
+            program.program_size(),
+            entry.whom()
+        );
+    }
+    for signer in package.signers() {
+        words += &format!("  signed by {}\n", signer_words(signer, is_trusted));
+    }
+    if package.signers().is_empty() {
+        words += "  not signed\n";
+    }
+    context.out.result(words, || {
+        let program = |(entry, program): (&machine::Entry, &coflash_core::update::Program)| {
+            let mut value = json!(entry);
+            value["kind"] = kind(program).into();
+            value["version"] = version(program).into();
+            value["program_size"] = program.program_size().into();
+            value["crc"] = program.program_crc().into();
+            value
+        };
+        json!({
+            "command": command,
+            "format": "package",
+            "output": path.display().to_string(),
+            "name": manifest.name,
+            "release": manifest.release,
+            "programs": package.programs().map(program).collect::<Vec<_>>(),
+            "signers": package.signers().iter().map(|signer| json!({
+                "key": signer.key,
+                "root": signer.certificate().map(|certificate| certificate.root_id()),
+            })).collect::<Vec<_>>(),
+            "trusted": is_trusted,
+        })
+    });
+}
+
+fn signer_words(signer: &Signer, is_trusted: bool) -> String {
+    let whose = match signer.certificate() {
+        Some(certificate) => format!("certified by root {:08X}h", certificate.root_id()),
+        None => "which is a root".to_owned(),
+    };
+    let unchecked = if is_trusted { "" } else { "; give --trust with the root to check that" };
+    format!("key {:08X}h, {whose}{unchecked}", signer.key)
+}
+
+/// The options of `flash` that a package has values for.
+const OF_PACKAGES: [(&str, &str); 24] = [
+    ("node", "--node"),
+    ("node_id", "--node_id"),
+    ("program", "--program"),
+    ("prog_no", "--prog_no"),
+    ("serial", "--ser_num"),
+    ("board", "--board"),
+    ("start_address", "--start-address"),
+    ("end_address", "--end-address"),
+    ("adjust_start", "--adjust-start"),
+    ("format", "--input-format"),
+    ("block_size", "--block-size"),
+    ("gap_fill", "--gap-fill"),
+    ("block_max_gap", "--block-max-gap"),
+    ("crc16", "--crc16"),
+    ("last_block_2008", "--last-block-2008"),
+    ("vid", "--vid"),
+    ("pid", "--pid"),
+    ("ver", "--ver"),
+    ("no_label", "--no-label"),
+    ("check_target", "--check-target"),
+    ("no_trial", "--no-trial"),
+    ("no_start", "--no-start"),
+    ("in_blocks", "--blocks"),
+    ("force", "--force"),
+];
+
+/// Which options a user has typed: a default, also one of the configuration, contradicts nothing.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Typed {
+    /// The first one that has no meaning beside a package.
+    beside_package: Option<&'static str>,
+    /// Whether one is for packages alone.
+    is_for_package: bool,
+}
+
+impl Typed {
+    /// Refuses an option that means nothing for a package, or for any other file.
+    pub(super) fn check(self, is_package: bool) -> Result<(), Failure> {
+        if !is_package && self.is_for_package {
+            let advice = "leave --yes and --trust out, or name a package that coflash package made";
+            return Err(Failure::usage("only the update with a package is confirmed and signed", advice));
+        }
+        let Some(option) = self.beside_package.filter(|_| is_package) else { return Ok(()) };
+        let advice = "leave it out: the package says which device gets which program";
+        Err(Failure::usage(format!("{option} has no meaning beside a package"), advice))
+    }
+}
+
+impl FromArgMatches for Typed {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let is_typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
+        Ok(Self {
+            beside_package: OF_PACKAGES.iter().find(|(id, _)| is_typed(id)).map(|(_, option)| *option),
+            is_for_package: is_typed("yes") || is_typed("trust"),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl Args for Typed {
+    fn augment_args(command: Command) -> Command {
+        command
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        command
+    }
+}
+
+/// The options of `flash` for a package alone.
+#[derive(Debug, Args)]
+pub(super) struct Machine {
+    #[command(flatten)]
+    trusted: Trusted,
+
+    /// Carry out the plan of a package without asking.
+    #[arg(long, short)]
+    yes: bool,
+}
+
+/// What an update with a package takes from the other options.
+pub(super) struct Given<'a> {
+    pub(super) patience: &'a Patience,
+    pub(super) flash: FlashOptions,
+    pub(super) many: ManyOptions,
+    pub(super) report: Option<&'a Path>,
+    /// Continue beside another process.
+    pub(super) not_alone: bool,
+}
+
+impl Machine {
+    /// Updates the machine: scan, plan, confirmation, and the run.
+    pub(super) fn run(&self, context: &Context, path: &Path, given: &Given<'_>) -> Result<(), Failure> {
+        let out = context.out;
+        let package = read(path, &self.trusted)?;
+        for signer in package.signers() {
+            out.say(format_args!("signed by {}", signer_words(signer, !self.trusted.trust.is_empty())));
+        }
+        let Link::Bus(mut adapter) = context.link()? else {
+            let advice = "connect to the bus of the machine with an adapter";
+            return Err(Failure::usage(
+                "a gateway cannot search the bus for the devices of a package",
+                advice,
+            ));
+        };
+        let flag = cancelled()?;
+        let waiting = context.waiting("all nodes were asked, and had time to answer");
+        let scan = ScanOptions::default().timing(given.patience.timing());
+        let plan = machine::plan(&mut *adapter, &package, &scan, &flag).map_err(|error| match error {
+            PlanError::Bus(error) => Failure::from(error),
+            PlanError::Package(fault) => Failure::package(path, &fault),
+        })?;
+        drop(waiting);
+        out.say(plan.to_string().trim_end());
+        if plan.updates() > 0 {
+            self.confirm(context, &plan)?;
+        }
+        let locks = plan.nodes().filter(|_| !given.not_alone);
+        let _locks =
+            locks.map(|node| context.lock(context.bus.as_deref(), node)).collect::<Result<Vec<_>, _>>()?;
+        let nodes: Vec<NodeId> = plan.nodes().collect();
+        let board = Board::new(out, &nodes);
+        let show = |node: NodeId, _, event| {
+            if let Some(at) = nodes.iter().position(|its| *its == node) {
+                board.show(at, event);
+            }
+        };
+        let options = RunOptions::default().flash(given.flash).many(given.many.clone());
+        let outcomes = machine::run(&mut *adapter, &package, &plan, &options, &show);
+        board.finish();
+        summary(context, path, &package, &plan, outcomes, given.report)
+    }
+
+    /// Asks the user for the start.
+    fn confirm(&self, context: &Context, plan: &Plan) -> Result<(), Failure> {
+        if self.yes {
+            return Ok(());
+        }
+        if !context.out.for_people() || !io::stdin().is_terminal() {
+            let advice = "look at the plan, and run the command again with --yes";
+            return Err(Failure::usage("nobody can confirm the plan here, and nothing was changed", advice));
+        }
+        let count = plan.updates();
+        let what = if count == 1 { "1 program".to_owned() } else { format!("{count} programs") };
+        let _ = write!(io::stderr(), "Write {what}? [y/N] ");
+        let mut line = String::new();
+        let _ = io::stdin().lock().read_line(&mut line);
+        match line.trim().to_ascii_lowercase().as_str() {
+            "y" | "yes" => Ok(()),
+            _ => Err(Failure::from(coflash_core::Error::Cancelled)),
+        }
+    }
+}
+
+/// Shows the outcome of each program of each device; the result of the command.
+fn summary(
+    context: &Context,
+    path: &Path,
+    package: &Package,
+    plan: &Plan,
+    outcomes: Vec<Outcome>,
+    report: Option<&Path>,
+) -> Result<(), Failure> {
+    let out = context.out;
+    let mut failures: Vec<Failure> = Vec::new();
+    let mut devices: Vec<Value> = Vec::new();
+    out.say("");
+    let all = outcomes.len();
+    for Outcome { node, entry, result, .. } in outcomes {
+        let Some((its, _)) = package.programs().nth(entry) else { continue };
+        let whom = node.map_or_else(|| "machine".to_owned(), |node| format!("node {node}"));
+        let mut value = json!({
+            "node": node.map(NodeId::get),
+            "name": whom,
+            "program": its.name,
+            "image": its.file,
+            "ok": result.is_ok(),
+        });
+        let device = plan.devices.iter().find(|device| Some(device.node) == node);
+        if let Some(device) = device {
+            let step = device.steps.iter().find(|step| step.entry == entry);
+            value["serial_number"] = json!(device.identity[3]);
+            value["from"] = json!(step.and_then(|step| step.from.as_ref()));
+            value["to"] = json!(step.map(|step| &step.to));
+        }
+        match result {
+            Ok(Good::Had) => {
+                out.say(format_args!("{whom}: {}: it had this program", its.name));
+                value["state"] = "had".into();
+            }
+            Ok(Good::Updated(report)) => {
+                let took = report.took.as_secs_f64();
+                out.say(format_args!("{whom}: {}: done in {took:.1} s", its.name));
+                value["state"] = "updated".into();
+                value["report"] = json!(report);
+            }
+            Err(bad) => {
+                let failure = match bad {
+                    Bad::Left(fault) => Failure::of_device(&fault),
+                    Bad::Failed(failed) => Failure::from(failed.error).leaving(Some(failed.left)),
+                };
+                out.say(format_args!("{whom}: {}: {}", its.name, failure.to_string().trim_end()));
+                value["state"] = "failed".into();
+                value["error"] = failure.value()["error"].clone();
+                failures.push(failure);
+            }
+        }
+        devices.push(value);
+    }
+    let failed = failures.len();
+    out.say(format_args!("{} of {all} programs are in their devices", all - failed));
+    let document = json!({
+        "command": "flash",
+        "package": path.display().to_string(),
+        "devices": devices,
+        "foreign": plan.foreign,
+        "failed": failed,
+    });
+    out.value(&document);
+    if let Some(report) = report {
+        write_report(report, &document)?;
+    }
+    let Some(first) = failures.first() else { return Ok(()) };
+    let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
+    let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
+    Err(Failure::told(exit, first.legacy, failed, all))
+}

@@ -1,0 +1,230 @@
+//! A package: its members, read, checked and parsed, before anything of it is used.
+
+use std::sync::Arc;
+
+use sha2::{Digest as _, Sha256};
+use shared_abi::block_file::{Control, ProgramVersion};
+
+use super::fault::Fault;
+use super::manifest::{self, Entry, Identity, Manifest};
+use super::signature::{self, Signer};
+use super::zip::{self, Member};
+use crate::device::Dialect;
+use crate::file::judge::judge;
+use crate::file::label::label_of;
+use crate::file::sealed::show::digits;
+use crate::file::sealed::{PublicKey, SealedFile, SigningKey};
+use crate::file::{self, Firmware, Format};
+use crate::update::dialect::is_data;
+use crate::update::{NewBootloader, Program, Target};
+use seal::wire::CERTIFICATE;
+
+/// A package whose members were checked.
+#[derive(Clone, Debug)]
+pub struct Package {
+    manifest: Manifest,
+    /// The bytes that are signed.
+    signed: Vec<u8>,
+    signers: Vec<Signer>,
+    programs: Vec<Program>,
+}
+
+/// Whether a file begins as a package: with its manifest.
+#[must_use]
+pub fn looks_like(front: &[u8]) -> bool {
+    zip::looks_like(front) && front.get(30..).is_some_and(|name| name.starts_with(manifest::NAME.as_bytes()))
+}
+
+/// The bytes that [`looks_like`] needs.
+pub const FRONT: usize = 64;
+
+impl Package {
+    /// Reads a package and checks all of it: each member has the size and the hash of the manifest, no two
+    /// programs are for one node, each signature whose key is known is good, and each program can be one
+    /// of its devices. Nothing of it is unpacked.
+    ///
+    /// # Errors
+    /// The first [`Fault`].
+    pub fn parse(bytes: &[u8]) -> Result<Self, Fault> {
+        let members = zip::read(bytes)?;
+        let mut rest = members.as_slice();
+        let first = rest.split_off_first().filter(|member| member.name == manifest::NAME);
+        let signed = first.ok_or(Fault::NotPackage("its first member is not its manifest"))?.bytes;
+        let manifest = Manifest::parse(signed)?;
+        let mut signers = Vec::new();
+        if let [Member { name: signature::NAME, bytes }, programs @ ..] = rest {
+            signers = signature::parse(bytes)?;
+            signature::verify(&signers, signed)?;
+            signature::covered(&signers, &manifest)?;
+            rest = programs;
+        }
+        let is_listed =
+            |member: &&Member<'_>| manifest.programs.iter().any(|entry| entry.file == member.name);
+        if let Some(member) = rest.iter().find(|member| !is_listed(member)) {
+            return Err(Fault::Unlisted(member.name.to_owned()));
+        }
+        let mut programs = Vec::new();
+        for entry in &manifest.programs {
+            let member = rest.iter().find(|member| member.name == entry.file);
+            let member = member.ok_or_else(|| Fault::Missing(entry.file.clone()))?;
+            let differs = |what| Fault::Damaged { member: entry.file.clone(), what };
+            if member.bytes.len() as u64 != entry.size {
+                return Err(differs("size"));
+            }
+            if entry.hash() != Some(Sha256::digest(member.bytes).into()) {
+                return Err(differs("SHA-256"));
+            }
+            programs.push(program(entry, member.bytes)?);
+        }
+        Ok(Self { manifest, signed: signed.to_vec(), signers, programs })
+    }
+
+    /// Checks that one of these roots has signed the package, or certified its signers.
+    ///
+    /// # Errors
+    /// [`Fault::Signature`].
+    pub fn trust(&self, roots: &[PublicKey]) -> Result<(), Fault> {
+        Ok(signature::trust(&self.signers, &self.manifest, &self.signed, roots)?)
+    }
+
+    /// Its manifest.
+    #[must_use]
+    pub const fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// The keys that have signed it.
+    #[must_use]
+    pub fn signers(&self) -> &[Signer] {
+        &self.signers
+    }
+
+    /// Its programs in the order of the update, with their entries in the manifest.
+    pub fn programs(&self) -> impl ExactSizeIterator<Item = (&Entry, &Program)> {
+        self.manifest.programs.iter().zip(&self.programs)
+    }
+
+    pub(super) fn program(&self, entry: usize) -> Option<(&Entry, &Program)> {
+        self.manifest.programs.get(entry).zip(self.programs.get(entry))
+    }
+}
+
+/// A part of a package that is made: an entry without size and hash, which follow from the bytes.
+#[derive(Clone, Debug)]
+pub struct Part {
+    /// The entry; `file`, `size` and `sha256` are filled in.
+    pub entry: Entry,
+    /// The content of the member.
+    pub bytes: Vec<u8>,
+}
+
+/// Makes a package of these parts, signed by these keys. The same input gives the same bytes.
+///
+/// # Errors
+/// The first rule that it breaks: the result is read again as any other package.
+pub fn make(
+    name: Option<String>,
+    release: Option<String>,
+    parts: &[Part],
+    keys: &[(&SigningKey, Option<[u8; CERTIFICATE]>)],
+) -> Result<Vec<u8>, Fault> {
+    let entry = |(number, part): (usize, &Part)| Entry {
+        file: format!("program-{number}.{}", extension(&part.bytes)),
+        size: part.bytes.len() as u64,
+        sha256: digits(&Sha256::digest(&part.bytes)),
+        ..part.entry.clone()
+    };
+    let manifest = Manifest::new(name, release, (1..).zip(parts).map(entry).collect())?;
+    let bytes = manifest.emit();
+    let signatures = if keys.is_empty() { None } else { Some(signature::sign(&manifest, keys)?) };
+    let mut members = vec![Member { name: manifest::NAME, bytes: &bytes }];
+    members.extend(signatures.iter().map(|bytes| Member { name: signature::NAME, bytes }));
+    let programs = manifest.programs.iter().zip(parts);
+    members.extend(programs.map(|(entry, part)| Member { name: &entry.file, bytes: &part.bytes }));
+    let package = zip::write(&members);
+    Package::parse(&package)?;
+    Ok(package)
+}
+
+/// The ending of a member with these bytes.
+fn extension(bytes: &[u8]) -> &'static str {
+    match Format::detect(bytes) {
+        Some(Format::Sealed) => "cbs",
+        Some(_) => "blk",
+        None => "bin",
+    }
+}
+
+/// The program in a member: blocks, a sealed image, or the RAM image of a bootloader.
+fn program(entry: &Entry, bytes: &[u8]) -> Result<Program, Fault> {
+    let unusable = |why: String| Fault::Program { program: entry.name.clone(), why };
+    let format = Format::detect(bytes);
+    let program = match format {
+        Some(Format::Sealed) if entry.is_bootloader() => {
+            let new = NewBootloader::of_sealed(bytes);
+            Program::from(new.ok_or_else(|| unusable("it is a sealed program and no bootloader".to_owned()))?)
+        }
+        None if entry.is_bootloader() => {
+            let new = NewBootloader::in_file(bytes, Some(Format::Raw));
+            let new = new.map_err(|fault| unusable(format!("it {fault}")))?;
+            Program::from(new.ok_or_else(|| unusable("it is no bootloader".to_owned()))?)
+        }
+        Some(Format::Sealed) => {
+            let file = SealedFile::for_program(bytes.to_vec(), entry.program);
+            Program::from(Arc::new(file.map_err(|refusal| unusable(refusal.to_string()))?))
+        }
+        Some(Format::BlockFile) if !entry.is_bootloader() => {
+            let blocks = match file::read(bytes, format, None).map_err(|error| unusable(error.to_string()))? {
+                Firmware::Blocks(blocks) => blocks,
+                Firmware::Image(_) => return Err(unusable("it has no blocks".to_owned())),
+            };
+            if !is_data(entry.dialect().unwrap_or(Dialect::Lift), entry.program) {
+                let judged = judge(&blocks.image(), blocks.program_start(), None);
+                judged.map_err(|fault| unusable(format!("the image {fault}")))?;
+            }
+            Program::from(Arc::new(blocks))
+        }
+        _ => return Err(unusable("it is neither a block file nor a sealed image".to_owned())),
+    };
+    let Some((wanted, said)) = entry.identity.zip(program.target()) else { return Ok(program) };
+    // 0 is any, as for a device.
+    let other = |wanted: u32, said: u32| said != 0 && said != wanted;
+    if other(wanted.vendor, said.vendor_id) || other(wanted.product, said.product_code) {
+        let whose = Identity { vendor: said.vendor_id, product: said.product_code, revision: None };
+        return Err(unusable(format!("it is for {whose}, and the package has it for {wanted}")));
+    }
+    Ok(program)
+}
+
+/// The type of device that a program names; two zeros name none.
+pub(super) fn target(program: &Program) -> Option<Identity> {
+    let Target { vendor_id: vendor, product_code: product } = program.target()?;
+    (vendor != 0 || product != 0).then_some(Identity { vendor, product, revision: None })
+}
+
+/// The version of a program, if it has one.
+#[must_use]
+pub fn version(program: &Program) -> Option<String> {
+    match program {
+        Program::Bootloader(new) => Some(new.version().to_string()),
+        Program::Sealed(file) => Some(ProgramVersion(file.head().version()).to_string()),
+        Program::Blocks(file) => match file.control() {
+            Some(Control::Dated { version, .. }) => Some(ProgramVersion(version).to_string()),
+            _ => {
+                let label = label_of(&file.image(), file.program_start())?;
+                Some(ProgramVersion(label.version).to_string())
+            }
+        },
+    }
+}
+
+/// The kind of a program, in words.
+#[must_use]
+pub fn kind(program: &Program) -> &'static str {
+    match program {
+        Program::Blocks(_) => "program",
+        Program::Sealed(_) => "sealed program",
+        Program::Bootloader(NewBootloader::Plain(_)) => "bootloader",
+        Program::Bootloader(NewBootloader::Sealed(_)) => "sealed bootloader",
+    }
+}

@@ -1,0 +1,358 @@
+//! The plan: the devices of a bus, matched with the programs of a package. To make it changes nothing.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+
+use canopen::program::ProgramState;
+use canopen::NodeId;
+use serde::{Serialize, Serializer};
+
+use super::fault::{DeviceFault, Fault};
+use super::manifest::Entry;
+use super::package::{version, Package};
+use crate::device::info::{self, program_info, DeviceInfo, ProgramInfo};
+use crate::device::scan::{scan, Found, ScanOptions};
+use crate::device::{Error, Session};
+use crate::json;
+use crate::update::{NewBootloader, Program};
+use coboot_can::Adapter;
+
+/// Why there is no plan.
+#[derive(Debug, thiserror::Error)]
+pub enum PlanError {
+    /// The bus.
+    #[error("{0}")]
+    Bus(#[from] Error),
+    /// The package has two programs for one of the nodes.
+    #[error("the package {0}")]
+    Package(#[from] Fault),
+}
+
+/// The plan of an update.
+#[derive(Clone, Debug, Serialize)]
+pub struct Plan {
+    /// The devices that the package is for, by their node-IDs.
+    pub devices: Vec<Device>,
+    /// What the package names and the bus does not have.
+    pub missing: Vec<Missing>,
+    /// Nodes that nothing of the package is for. Nothing is done with them.
+    pub foreign: Vec<Foreign>,
+}
+
+/// A device, and the programs for it.
+#[derive(Clone, Debug, Serialize)]
+pub struct Device {
+    /// Its node-ID.
+    #[serde(serialize_with = "json::node")]
+    pub node: NodeId,
+    /// 1008h, device name.
+    pub name: Option<String>,
+    /// 1018h/1 to 4.
+    #[serde(flatten, serialize_with = "info::identity_fields")]
+    pub identity: info::Identity,
+    /// The programs, in the order of the update.
+    pub steps: Vec<Step>,
+}
+
+/// A program of a device.
+#[derive(Clone, Debug, Serialize)]
+pub struct Step {
+    /// The program: its place in the package.
+    #[serde(skip)]
+    pub entry: usize,
+    /// Its name.
+    pub program: String,
+    /// The version or the CRC of what the device has, if it has a program.
+    pub from: Option<String>,
+    /// The same of the program in the package.
+    pub to: String,
+    /// What is to be done.
+    #[serde(serialize_with = "todo_name")]
+    pub todo: Todo,
+}
+
+/// What is to be done with a program of a device.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Todo {
+    /// Nothing: the device has the program.
+    Has,
+    /// The device gets it.
+    Update,
+    /// Nothing: the device is not the one of the package.
+    Leave(DeviceFault),
+}
+
+/// What the package names and the bus does not have.
+#[derive(Clone, Debug, Serialize)]
+pub struct Missing {
+    /// The program: its place in the package.
+    #[serde(skip)]
+    pub entry: usize,
+    /// Its name.
+    pub program: String,
+    /// The node, if the package names it.
+    #[serde(serialize_with = "some_node")]
+    pub node: Option<NodeId>,
+    /// What is missing.
+    #[serde(serialize_with = "json::words")]
+    pub fault: DeviceFault,
+}
+
+/// A node that nothing of the package is for.
+#[derive(Clone, Debug, Serialize)]
+pub struct Foreign {
+    /// Its node-ID.
+    #[serde(serialize_with = "json::node")]
+    pub node: NodeId,
+    /// What it is, or why it is not known.
+    pub what: String,
+}
+
+impl Todo {
+    /// Its stable name for programs.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Has => "has",
+            Self::Update => "update",
+            Self::Leave(_) => "leave",
+        }
+    }
+}
+
+fn todo_name<S: Serializer>(todo: &Todo, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(todo.name())
+}
+
+fn some_node<S: Serializer>(node: &Option<NodeId>, serializer: S) -> Result<S::Ok, S::Error> {
+    node.map(NodeId::get).serialize(serializer)
+}
+
+/// Scans the bus, and matches its nodes with the programs of the package.
+///
+/// # Errors
+/// [`PlanError::Bus`] if the bus fails or the user cancels, [`PlanError::Package`] for a node that two
+/// programs of the package are for.
+pub fn plan(
+    adapter: &mut dyn Adapter,
+    package: &Package,
+    options: &ScanOptions,
+    cancelled: &Arc<AtomicBool>,
+) -> Result<Plan, PlanError> {
+    let found = scan(adapter, options, cancelled)?;
+    let mut plan = matched(package, &found)?;
+    // The CRC of a bootloader is not among the information about a device.
+    for device in &mut plan.devices {
+        let Some(its) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
+        for step in &mut device.steps {
+            let Some((_, Program::Bootloader(new))) = package.program(step.entry) else { continue };
+            let Some(bootloader) = &its.bootloader else { continue };
+            let mut session = Session::new(&mut *adapter, device.node, options.timing);
+            session.cancel_by(cancelled.clone());
+            match program_info(&mut session, bootloader.number) {
+                Ok(has) if step.todo == Todo::Update && has_bootloader(its, &has, new) => {
+                    step.todo = Todo::Has;
+                }
+                Err(error @ (Error::Adapter(_) | Error::Cancelled)) => return Err(error.into()),
+                // The run asks a device again that answers no more, and says so.
+                Ok(_) | Err(_) => {}
+            }
+        }
+    }
+    Ok(plan)
+}
+
+/// Matches the nodes of a scan with the programs of the package.
+///
+/// # Errors
+/// [`Fault::TwoPrograms`].
+pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Plan, Fault> {
+    let mut plan = Plan { devices: Vec::new(), missing: Vec::new(), foreign: Vec::new() };
+    for (node, found) in found {
+        let Some(info) = &found.info else {
+            let what = found
+                .but
+                .as_ref()
+                .map_or("it does not answer".to_owned(), |but| format!("it answers, but {but}"));
+            plan.foreign.push(Foreign { node: *node, what });
+            continue;
+        };
+        let steps = steps(package, *node, info)?;
+        if steps.is_empty() {
+            plan.foreign.push(Foreign { node: *node, what: words(info) });
+        } else {
+            let (name, identity) = (info.name.clone(), info.identity);
+            plan.devices.push(Device { node: *node, name, identity, steps });
+        }
+    }
+    for (entry, (its, _)) in package.programs().enumerate() {
+        let mut miss = |node, fault| {
+            plan.missing.push(Missing { entry, program: its.name.clone(), node, fault });
+        };
+        for node in its.nodes.iter().filter_map(|node| NodeId::new(*node)) {
+            if !plan.devices.iter().any(|device| device.node == node) {
+                miss(Some(node), DeviceFault::Absent { node });
+            }
+        }
+        let devices = plan.devices.iter().flat_map(|device| &device.steps);
+        let count = devices.filter(|step| step.entry == entry).count();
+        match its.count.map(usize::from) {
+            Some(expected) if count < expected => {
+                miss(None, DeviceFault::TooFew { program: its.name.clone(), expected, found: count });
+            }
+            _ => {}
+        }
+    }
+    let is_missing = |node: NodeId| plan.missing.iter().any(|missing| missing.node == Some(node));
+    // It is said once.
+    plan.foreign.retain(|foreign| !is_missing(foreign.node));
+    Ok(plan)
+}
+
+/// The programs of the package for this device.
+fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>, Fault> {
+    let number = |step: &Step| package.program(step.entry).map(|(entry, _)| entry.program);
+    let mut steps: Vec<Step> = Vec::new();
+    for (at, (entry, program)) in package.programs().enumerate() {
+        let is_named = entry.nodes.contains(&node.get());
+        let todo = match differs(entry, node, info) {
+            _ if !is_named && !entry.nodes.is_empty() => continue,
+            Some(_) if !is_named => continue,
+            Some(fault) => Todo::Leave(fault),
+            None if has(info, entry, program) => Todo::Has,
+            None => Todo::Update,
+        };
+        let same = |step: &&Step| number(step) == Some(entry.program) && !matches!(step.todo, Todo::Leave(_));
+        if let (Some(first), false) = (steps.iter().find(same), matches!(todo, Todo::Leave(_))) {
+            return Err(Fault::TwoPrograms {
+                first: first.program.clone(),
+                second: entry.name.clone(),
+                number: entry.program,
+                whom: format!("node {node}"),
+            });
+        }
+        let (from, to) = versions(info, entry, program);
+        steps.push(Step { entry: at, program: entry.name.clone(), from, to, todo });
+    }
+    // A package may have a program for each device that can be at a node.
+    let served: Vec<Option<u8>> =
+        steps.iter().filter(|step| !matches!(step.todo, Todo::Leave(_))).map(number).collect();
+    steps.retain(|step| !matches!(step.todo, Todo::Leave(_)) || !served.contains(&number(step)));
+    Ok(steps)
+}
+
+/// The part of the identity in which a device differs from the package.
+fn differs(entry: &Entry, node: NodeId, info: &DeviceInfo) -> Option<DeviceFault> {
+    let wanted = entry.identity?;
+    let parts = [
+        ("vendor-ID", Some(wanted.vendor)),
+        ("product code", Some(wanted.product)),
+        ("revision", wanted.revision),
+    ];
+    let mut parts = parts.into_iter().zip(info.identity);
+    parts.find(|((_, wanted), device)| wanted.is_some() && wanted != device).map(
+        |((what, wanted), device)| DeviceFault::OtherDevice {
+            node,
+            program: entry.name.clone(),
+            what,
+            device: hex(device),
+            package: hex(wanted),
+        },
+    )
+}
+
+/// A part of an identity in words.
+pub(super) fn hex(part: Option<u32>) -> String {
+    part.map_or("not reported".to_owned(), |part| format!("{part:08X}h"))
+}
+
+/// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not
+/// been released yet.
+fn has(info: &DeviceInfo, entry: &Entry, program: &Program) -> bool {
+    let its = info.programs.iter().find(|its| its.number == entry.program);
+    let is_there = its.is_some_and(|its| {
+        its.state() != Some(ProgramState::Absent)
+            && its.crc.is_some_and(|crc| crc != 0 && program.program_crcs().contains(&crc))
+    });
+    !info.device_type.is_bootloader() && is_there
+}
+
+/// Whether the device has this bootloader. The CRC of a sealed one is not known here, and an application
+/// need not report any: then the version decides.
+fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &NewBootloader) -> bool {
+    let Some(its) = info.bootloader else { return false };
+    // One on trial has to be confirmed.
+    let is_settled =
+        its.running.is_none_or(|running| running.progress.state != shared_abi::renewal::State::Staged);
+    let is_same = match (new, has.crc) {
+        (NewBootloader::Plain(_), Some(crc)) if crc != 0 => crc == new.crc(),
+        _ => its.version == new.version(),
+    };
+    is_settled && is_same
+}
+
+/// What the device has and what it gets: their versions, if both have one and these differ, and otherwise
+/// their CRCs.
+fn versions(info: &DeviceInfo, entry: &Entry, program: &Program) -> (Option<String>, String) {
+    let its = info.programs.iter().find(|its| its.number == entry.program);
+    let its = its.filter(|its| its.state() != Some(ProgramState::Absent));
+    let has = match info.bootloader.filter(|_| entry.is_bootloader()) {
+        Some(bootloader) => Some(bootloader.version.to_string()),
+        None => its.and_then(ProgramInfo::release).map(|version| version.to_string()),
+    };
+    let crc = |crc: u32| format!("CRC {crc:08X}h");
+    match (has, version(program)) {
+        (Some(has), Some(gets)) if has != gets || entry.is_bootloader() => (Some(has), gets),
+        (None, Some(gets)) if its.is_none() => (None, gets),
+        _ => (its.and_then(|its| its.crc).filter(|crc| *crc != 0).map(crc), crc(program.program_crc())),
+    }
+}
+
+/// What a foreign node is.
+fn words(info: &DeviceInfo) -> String {
+    let [vendor, product, ..] = info.identity.map(hex);
+    let name = info.name.as_ref().map_or(String::new(), |name| format!("{name}, "));
+    format!("{name}vendor {vendor}, product {product}")
+}
+
+impl Plan {
+    /// How many programs are written.
+    #[must_use]
+    pub fn updates(&self) -> usize {
+        let steps = self.devices.iter().flat_map(|device| &device.steps);
+        steps.filter(|step| step.todo == Todo::Update).count()
+    }
+
+    /// The devices that are changed.
+    pub fn nodes(&self) -> impl Iterator<Item = NodeId> + '_ {
+        let is_changed = |device: &&Device| device.steps.iter().any(|step| step.todo == Todo::Update);
+        self.devices.iter().filter(is_changed).map(|device| device.node)
+    }
+}
+
+impl fmt::Display for Plan {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for device in &self.devices {
+            let serial =
+                device.identity[3].map_or(String::new(), |serial| format!(" (serial number {serial:08X}h)"));
+            for Step { program, from, to, todo, .. } in &device.steps {
+                write!(f, "node {}: {program}: ", device.node)?;
+                let from = from.as_deref().unwrap_or("no program");
+                match todo {
+                    Todo::Has => writeln!(f, "it has {to}{serial}")?,
+                    Todo::Update => writeln!(f, "{from} -> {to}{serial}")?,
+                    Todo::Leave(fault) => writeln!(f, "is not written: {fault}")?,
+                }
+            }
+        }
+        for Missing { program, fault, .. } in &self.missing {
+            writeln!(f, "{program}: {fault}")?;
+        }
+        for Foreign { node, what } in &self.foreign {
+            writeln!(f, "node {node}: not in the package, and left alone: {what}")?;
+        }
+        Ok(())
+    }
+}

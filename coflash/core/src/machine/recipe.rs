@@ -1,0 +1,184 @@
+//! The recipe of a package, `machine.toml`: which files become which programs of which devices.
+
+use std::path::{Path, PathBuf};
+
+use seal::wire::BOOTLOADER;
+use serde::Deserialize;
+
+use super::manifest::{Entry, Identity};
+use super::package::{target, Part};
+use crate::device::Dialect;
+use crate::file::board::{self, in_folder};
+use crate::file::convert::{blocks_of, Options, Region};
+use crate::file::judge::judge;
+use crate::file::sealed::carried;
+use crate::file::{limit, ram_image, read, AddressRange, Format, Place};
+use crate::update::dialect::is_data;
+use crate::update::{line_of, NewBootloader, Program};
+
+/// A recipe.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct File {
+    name: Option<String>,
+    release: Option<String>,
+    board: Option<String>,
+    #[serde(default, rename = "program")]
+    programs: Vec<Row>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct Row {
+    name: Option<String>,
+    image: PathBuf,
+    board: Option<String>,
+    #[serde(default)]
+    nodes: Vec<u8>,
+    vendor: Option<u32>,
+    product: Option<u32>,
+    revision: Option<u32>,
+    count: Option<u8>,
+    program: Option<u8>,
+    dialect: Option<String>,
+    trial_run: Option<bool>,
+    verify: Option<bool>,
+}
+
+/// The parts of a package, with its texts.
+#[derive(Debug)]
+pub struct Recipe {
+    /// The machine, for people.
+    pub name: Option<String>,
+    /// The release, for people.
+    pub release: Option<String>,
+    /// The programs, in the order of the update.
+    pub parts: Vec<Part>,
+}
+
+/// An error in a recipe, with its place.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum RecipeFault {
+    /// In this line.
+    #[error("line {0}: {1}")]
+    Line(usize, String),
+    /// In the program of this number, counted from 1.
+    #[error("program {0}: {1}")]
+    Program(usize, String),
+}
+
+impl Recipe {
+    /// Parses a recipe in this folder, and reads, judges and converts its files.
+    ///
+    /// # Errors
+    /// The first error in the recipe or in one of its files.
+    pub fn read(text: &str, folder: &Path) -> Result<Self, RecipeFault> {
+        let file: File = toml::from_str(text)
+            .map_err(|error| RecipeFault::Line(line_of(text, &error), error.message().to_owned()))?;
+        if file.programs.is_empty() {
+            return Err(RecipeFault::Line(1, "it names no program: write a [[program]] for each".to_owned()));
+        }
+        let mut parts = Vec::new();
+        for (number, row) in (1..).zip(file.programs) {
+            let part = row.part(file.board.as_deref(), folder);
+            parts.push(part.map_err(|what| RecipeFault::Program(number, what))?);
+        }
+        Ok(Self { name: file.name, release: file.release, parts })
+    }
+}
+
+impl Row {
+    fn part(self, board: Option<&str>, folder: &Path) -> Result<Part, String> {
+        let path = folder.join(&self.image);
+        let dialect = match self.dialect.as_deref() {
+            None => None,
+            Some(name) => {
+                let found = Dialect::ALL.into_iter().find(|dialect| dialect.name() == name);
+                Some(found.ok_or_else(|| format!("there is no dialect {name:?}"))?)
+            }
+        };
+        let board = self.board.as_deref().or(board).map(|word| in_folder(word, folder));
+        let (program, bytes) = content(&path, board.as_deref(), self.program.unwrap_or(1), dialect)?;
+        let identity = match (self.vendor, self.product) {
+            (Some(vendor), Some(product)) => Some(Identity { vendor, product, revision: self.revision }),
+            (None, None) if self.nodes.is_empty() || self.revision.is_some() => {
+                let target = target(&program).ok_or(
+                    "the file does not say for which device it is: give nodes, or vendor and product",
+                )?;
+                Some(Identity { revision: self.revision, ..target })
+            }
+            (None, None) => None,
+            _ => return Err("vendor and product belong together".to_owned()),
+        };
+        let stem = || self.image.file_stem().map(|stem| stem.to_string_lossy().into_owned());
+        let number = match &program {
+            Program::Bootloader(_) => match self.program {
+                None | Some(BOOTLOADER) => BOOTLOADER,
+                Some(_) => {
+                    return Err("the file is a bootloader, which has no other number than 255".to_owned())
+                }
+            },
+            _ => self.program.unwrap_or(1),
+        };
+        let entry = Entry {
+            name: self.name.or_else(stem).unwrap_or_default(),
+            file: String::new(),
+            size: 0,
+            sha256: String::new(),
+            nodes: self.nodes,
+            identity,
+            count: self.count,
+            program: number,
+            dialect: dialect.map(|dialect| dialect.name().to_owned()),
+            trial_run: self.trial_run.unwrap_or(true),
+            verify: self.verify.unwrap_or(false),
+        };
+        Ok(Part { entry, bytes })
+    }
+}
+
+/// Reads and judges a firmware file, as `coflash flash` does, and gives it in the form for a package.
+fn content(
+    path: &Path,
+    board: Option<&str>,
+    number: u8,
+    dialect: Option<Dialect>,
+) -> Result<(Program, Vec<u8>), String> {
+    let said = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
+    let bytes = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()).to_string())?;
+    let bytes = carried(bytes).map_err(|error| error.of(path.display()).to_string())?.image;
+    let format = Format::of(path, &bytes);
+    let new = NewBootloader::in_file(&bytes, format);
+    if let Some(new) = new.map_err(|fault| said(&format!("it {fault}: {}", ram_image::Fault::ADVICE)))? {
+        let bytes = match &new {
+            NewBootloader::Plain(image) => image.bytes().to_vec(),
+            NewBootloader::Sealed(file) => file.bytes().to_vec(),
+        };
+        return Ok((new.into(), bytes));
+    }
+    if format == Some(Format::Sealed) {
+        let file = crate::file::sealed::SealedFile::for_program(bytes.clone(), number);
+        let file = file.map_err(|refusal| said(&format!("{refusal}: {}", refusal.advice())))?;
+        return Ok((std::sync::Arc::new(file).into(), bytes));
+    }
+    let layout = board.map(board::named).transpose().map_err(|error| error.to_string())?;
+    let region: Option<AddressRange> = match layout {
+        None => None,
+        Some(layout) => {
+            let region = layout.program(number).ok_or(format!("{} has no program {number}", layout.board))?;
+            Some(region.into())
+        }
+    };
+    let is_image = matches!(dialect, Some(Dialect::Raw | Dialect::Lift));
+    let raw_address = region.map(|region| region.first).or(is_image.then_some(0));
+    let firmware =
+        read::read(&bytes, format, raw_address).map_err(|error| error.of(path.display()).to_string())?;
+    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
+    let blocks = blocks_of(firmware, &options).map_err(|error| said(&error))?.file;
+    if !is_data(dialect.unwrap_or(Dialect::Lift), number) {
+        judge(&blocks.image(), blocks.program_start(), layout)
+            .map_err(|fault| said(&format!("the image {fault}: {}", fault.advice())))?;
+    }
+    let bytes = blocks.emit();
+    Ok((std::sync::Arc::new(blocks).into(), bytes))
+}

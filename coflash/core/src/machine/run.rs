@@ -1,0 +1,209 @@
+//! The run: carries out a plan, program by program in the order of the package.
+
+use std::collections::BTreeSet;
+use std::sync::atomic::Ordering;
+
+use canopen::NodeId;
+
+use super::fault::DeviceFault;
+use super::manifest::Entry;
+use super::package::Package;
+use super::plan::{hex, Device, Plan, Todo};
+use crate::device::info::identity;
+use crate::device::{Error, Session};
+use crate::update::event::Event;
+use crate::update::many::{flash_many, Failed, Job, ManyOptions};
+use crate::update::{
+    flash_program, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Program, Report, Target,
+};
+use coboot_can::Adapter;
+
+/// The options of a run.
+#[derive(Clone, Debug, Default)]
+#[non_exhaustive]
+pub struct RunOptions {
+    /// The options for all devices. What the package says wins.
+    pub flash: FlashOptions,
+    /// How devices with the same program are updated at the same time.
+    pub many: ManyOptions,
+}
+
+impl RunOptions {
+    setters! {
+        flash: FlashOptions,
+        many: ManyOptions,
+    }
+}
+
+/// The outcome of a program of a device, or of what is missing.
+#[derive(Debug)]
+#[non_exhaustive]
+pub struct Outcome {
+    /// The device; `None` if the package does not name it.
+    pub node: Option<NodeId>,
+    /// The program: its place in the package.
+    pub entry: usize,
+    /// What became of it.
+    pub result: Result<Good, Bad>,
+}
+
+/// A good outcome.
+#[derive(Clone, Copy, Debug)]
+pub enum Good {
+    /// The device had the program before.
+    Had,
+    /// The device got it.
+    Updated(Report),
+}
+
+/// A bad outcome.
+#[derive(Debug)]
+pub enum Bad {
+    /// The device was not begun.
+    Left(DeviceFault),
+    /// The update failed.
+    Failed(Failed),
+}
+
+/// Carries out a plan. The programs are written in the order of the package, each to all of its devices, which
+/// are updated together where they can. Before that, the identity of each device is compared with the plan
+/// again. If one fails, the others go on; a device gets nothing more after a program that failed.
+///
+/// `tell` gets the events of each device, on separate threads. The outcomes are in the order of the package.
+/// An interrupted run is continued by a new plan: devices that have their program are not written again, and
+/// a download that was cut off goes on.
+pub fn run(
+    adapter: &mut dyn Adapter,
+    package: &Package,
+    plan: &Plan,
+    options: &RunOptions,
+    tell: &(dyn Fn(NodeId, usize, Event) + Sync),
+) -> Vec<Outcome> {
+    let mut failed: BTreeSet<NodeId> = BTreeSet::new();
+    let mut outcomes = Vec::new();
+    for (at, (entry, program)) in package.programs().enumerate() {
+        let missing = plan.missing.iter().filter(|missing| missing.entry == at);
+        outcomes.extend(missing.map(|missing| {
+            let (node, result) = (missing.node, Err(Bad::Left(missing.fault.clone())));
+            Outcome { node, entry: at, result }
+        }));
+        let mut due: Vec<&Device> = Vec::new();
+        let mut ended: Vec<(NodeId, Result<Good, Bad>)> = Vec::new();
+        for device in &plan.devices {
+            for step in device.steps.iter().filter(|step| step.entry == at) {
+                let (node, program) = (device.node, entry.name.clone());
+                match &step.todo {
+                    Todo::Has => ended.push((node, Ok(Good::Had))),
+                    Todo::Leave(fault) => ended.push((node, Err(Bad::Left(fault.clone())))),
+                    Todo::Update if failed.contains(&node) => {
+                        ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));
+                    }
+                    Todo::Update => match is_the_same(adapter, entry, device, options) {
+                        Ok(()) => due.push(device),
+                        Err(bad) => ended.push((node, Err(bad))),
+                    },
+                }
+            }
+        }
+        ended.extend(update(adapter, at, entry, program, &due, options, tell));
+        ended.sort_by_key(|(node, _)| *node);
+        failed.extend(ended.iter().filter(|(_, result)| result.is_err()).map(|(node, _)| *node));
+        outcomes.extend(ended.into_iter().map(|(node, result)| Outcome {
+            node: Some(node),
+            entry: at,
+            result,
+        }));
+    }
+    outcomes
+}
+
+/// Compares the identity of a device with that in the plan.
+fn is_the_same(
+    adapter: &mut dyn Adapter,
+    entry: &Entry,
+    device: &Device,
+    options: &RunOptions,
+) -> Result<(), Bad> {
+    let node = device.node;
+    if options.many.cancelled.load(Ordering::Relaxed) {
+        return Err(untouched(Error::Cancelled));
+    }
+    let mut session = Session::new(adapter, node, options.many.timing);
+    session.cancel_by(options.many.cancelled.clone());
+    let now = session.find().and_then(|_| identity(&mut session)).map_err(untouched)?;
+    let revision = entry.identity.is_some_and(|identity| identity.revision.is_some());
+    let names = ["vendor-ID", "product code", "revision", "serial number"];
+    // Bootloader and application need not report the same parts, and 0 is no report.
+    let differs = |((what, was), is): ((&'static str, Option<u32>), Option<u32>)| {
+        let counts = what != "revision" || revision;
+        let is_told = |part: Option<u32>| part.is_some_and(|part| part != 0);
+        let is_other = counts && is_told(was) && is_told(is) && was != is;
+        is_other.then(|| DeviceFault::Exchanged { node, what, was: hex(was), is: hex(is) })
+    };
+    match names.into_iter().zip(device.identity).zip(now).find_map(differs) {
+        Some(fault) => Err(Bad::Left(fault)),
+        None => Ok(()),
+    }
+}
+
+/// An error before the device was changed.
+fn untouched(error: Error) -> Bad {
+    let left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
+    Bad::Failed(Failed { error, left })
+}
+
+/// Writes a program to these devices.
+fn update(
+    adapter: &mut dyn Adapter,
+    at: usize,
+    entry: &Entry,
+    program: &Program,
+    devices: &[&Device],
+    options: &RunOptions,
+    tell: &(dyn Fn(NodeId, usize, Event) + Sync),
+) -> Vec<(NodeId, Result<Good, Bad>)> {
+    let target = entry.identity.map(|its| Target { vendor_id: its.vendor, product_code: its.product });
+    let flash = FlashOptions {
+        // A renewal finds the number of the bootloader by itself.
+        program: if entry.is_bootloader() { options.flash.program } else { entry.program },
+        check_target: target,
+        trial_run: entry.trial_run,
+        verify: entry.verify,
+        dialect: entry.dialect().or(options.flash.dialect),
+        ..options.flash
+    };
+    let jobs: Vec<Job> = devices.iter().map(|device| Job::new(device.node, program.clone(), flash)).collect();
+    let results = match jobs.as_slice() {
+        [] => Vec::new(),
+        // A device alone can be followed to another node-ID, which lifts need.
+        [job] => vec![alone(adapter, job, options, &|event| tell(job.node, at, event))],
+        jobs => {
+            let tell = |number: usize, event| {
+                if let Some(job) = jobs.get(number) {
+                    tell(job.node, at, event);
+                }
+            };
+            flash_many(adapter, jobs, &options.many, &tell)
+        }
+    };
+    let good = |result: Result<Report, Failed>| result.map(Good::Updated).map_err(Bad::Failed);
+    devices.iter().map(|device| device.node).zip(results.into_iter().map(good)).collect()
+}
+
+/// Updates one device.
+fn alone(
+    adapter: &mut dyn Adapter,
+    job: &Job,
+    options: &RunOptions,
+    tell: &dyn Fn(Event),
+) -> Result<Report, Failed> {
+    let mut session = Session::new(adapter, job.node, options.many.timing);
+    session.cancel_by(options.many.cancelled.clone());
+    session.transfer_by(options.many.transfers);
+    let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
+    let result = flash_program(&mut session, &job.file, &job.options, &mut |event| {
+        left = event.left().unwrap_or(left);
+        tell(event);
+    });
+    result.map_err(|error| Failed { error, left })
+}

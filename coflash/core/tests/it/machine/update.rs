@@ -1,0 +1,295 @@
+//! Plan and run on a bus of fake devices, in virtual time.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use canopen::{Frame, NodeId};
+use coboot_can::Adapter;
+use coboot_can::AdapterError;
+use coflash_core::device::scan::ScanOptions;
+use coflash_core::machine::{
+    plan, run, Bad, DeviceFault, Good, Outcome, Package, Plan, PlanError, RunOptions, Todo,
+};
+use coflash_core::update::many::ManyOptions;
+use coflash_core::update::{DeviceState, Event};
+use coflash_core::Error;
+
+use super::packed;
+use kit::fake::{Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER};
+
+/// The CRC in the last block of `plain-400.blk`, as expected.py computed it (bytes 875 to 878).
+const CRC: u32 = 0x4CF3_C5A5;
+
+/// The identity of a device: vendor-ID, product code, revision and serial number.
+struct Plate([u32; 4]);
+
+impl Maker for Plate {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        match at {
+            (0x1018, sub @ 1..=4) => Some(Ok(self.0[usize::from(sub) - 1].to_le_bytes().to_vec())),
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+fn device(node: u8, product: u32) -> Fake {
+    let mut fake = Fake::new(APPLICATION).at(node, 1);
+    fake.maker = Some(Box::new(Plate([63, product, 2, 1000 + u32::from(node)])));
+    fake.crc_of_application = Some(0x1234_5678);
+    fake
+}
+
+const DRIVES: &str = r#""nodes": [5, 6], "identity": {"vendor": 63, "product": 1234}"#;
+
+/// Whether nothing was written to a device; a scan ends what another tool may have left unfinished.
+fn is_untouched(fake: &Fake) -> bool {
+    fake.writes().iter().all(|entry| entry.starts_with("abort"))
+}
+
+fn package(programs: &[(&str, &str)]) -> Package {
+    Package::parse(&packed(programs)).unwrap()
+}
+
+fn planned(bus: &mut dyn Adapter, package: &Package) -> Plan {
+    plan(bus, package, &ScanOptions::default(), &Arc::default()).unwrap()
+}
+
+/// Node, name of the program and what is to be done.
+fn steps(plan: &Plan) -> Vec<(u8, &str, &str)> {
+    let of = |device: &'_ coflash_core::machine::Device| device.node.get();
+    let each = plan.devices.iter().flat_map(|device| device.steps.iter().map(move |step| (of(device), step)));
+    each.map(|(node, step)| (node, step.program.as_str(), step.todo.name())).collect()
+}
+
+fn carried_out(bus: &mut dyn Adapter, package: &Package, plan: &Plan) -> Vec<Outcome> {
+    run(bus, package, plan, &RunOptions::default(), &|_, _, _| {})
+}
+
+fn words(outcomes: &[Outcome]) -> Vec<(Option<u8>, usize, String)> {
+    let word = |outcome: &Outcome| match &outcome.result {
+        Ok(Good::Had) => "had".to_owned(),
+        Ok(Good::Updated(_)) => "updated".to_owned(),
+        Err(Bad::Left(fault)) => format!("{:08X}h", fault.number()),
+        Err(Bad::Failed(failed)) => format!("{:08X}h {}", failed.error.number(), failed.left.state.name()),
+    };
+    outcomes.iter().map(|outcome| (outcome.node.map(NodeId::get), outcome.entry, word(outcome))).collect()
+}
+
+#[test]
+fn each_node_is_matched_and_a_foreign_one_is_left_alone() {
+    let package = package(&[
+        ("drive", DRIVES),
+        ("valve", r#""identity": {"vendor": 63, "product": 77}, "count": 2"#),
+        ("panel", r#""nodes": [9, 10]"#),
+    ]);
+    let mut has = device(6, 1234);
+    has.crc_of_application = Some(CRC);
+    let mut bus = Bus(vec![device(5, 1234), has, device(7, 77), device(9, 99), device(20, 5)]);
+    let plan = planned(&mut bus, &package);
+    assert_eq!(
+        steps(&plan),
+        [(5, "drive", "update"), (6, "drive", "has"), (7, "valve", "update"), (9, "panel", "update")]
+    );
+    assert_eq!(plan.foreign.iter().map(|foreign| foreign.node.get()).collect::<Vec<_>>(), [20]);
+    let missing: Vec<_> = plan.missing.iter().map(|missing| missing.fault.clone()).collect();
+    assert_eq!(
+        missing,
+        [
+            DeviceFault::TooFew { program: "valve".to_owned(), expected: 2, found: 1 },
+            DeviceFault::Absent { node: NodeId::new(10).unwrap() },
+        ]
+    );
+    assert_eq!((plan.updates(), plan.nodes().count()), (3, 3));
+    // To make a plan changes nothing.
+    assert!(bus.0.iter().all(is_untouched));
+    let outcomes = carried_out(&mut bus, &package, &plan);
+    let expected = [
+        (Some(5), 0, "updated"),
+        (Some(6), 0, "had"),
+        (None, 1, "6000040Ah"),
+        (Some(7), 1, "updated"),
+        (Some(10), 2, "60000013h"),
+        (Some(9), 2, "updated"),
+    ];
+    assert_eq!(words(&outcomes), expected.map(|(node, entry, word)| (node, entry, word.to_owned())));
+    for (node, is_written) in [(0, true), (1, false), (2, true), (3, true), (4, false)] {
+        assert_eq!(!bus.0[node].blocks.is_empty(), is_written, "{node}");
+        assert_eq!(bus.0[node].running, Some(APPLICATION));
+    }
+}
+
+/// A program is due in the order of the package, also if the bus has the devices in another order.
+#[test]
+fn the_order_is_that_of_the_package() {
+    let package = package(&[("panel", r#""nodes": [9]"#), ("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234), device(9, 1)]);
+    let plan = planned(&mut bus, &package);
+    let seen: Mutex<Vec<(u8, usize)>> = Mutex::default();
+    let outcomes = run(&mut bus, &package, &plan, &RunOptions::default(), &|node, entry, event| {
+        if matches!(event, Event::Done(_)) {
+            seen.lock().unwrap().push((node.get(), entry));
+        }
+    });
+    assert!(outcomes.iter().all(|outcome| outcome.result.is_ok()), "{:?}", words(&outcomes));
+    let mut seen = seen.into_inner().unwrap();
+    assert_eq!(seen[0], (9, 0));
+    seen.sort_unstable();
+    assert_eq!(seen, [(5, 1), (6, 1), (9, 0)]);
+    // The next run has nothing to do.
+    let plan = planned(&mut bus, &package);
+    // The fake's application reports what it is told to.
+    assert_eq!(plan.updates(), 3);
+    for fake in &mut bus.0 {
+        fake.crc_of_application = None;
+    }
+    assert_eq!(planned(&mut bus, &package).updates(), 0);
+}
+
+/// A device in its bootloader has not got its program released: its CRC alone does not count.
+#[test]
+fn a_device_that_was_interrupted_is_not_done() {
+    let package = package(&[("drive", DRIVES)]);
+    let mut waits = device(5, 1234);
+    (waits.running, waits.crc) = (Some(BOOTLOADER), Some(CRC));
+    let mut bus = Bus(vec![waits, device(6, 1234)]);
+    assert_eq!(steps(&planned(&mut bus, &package)), [(5, "drive", "update"), (6, "drive", "update")]);
+}
+
+#[test]
+fn another_device_at_a_named_node_is_said_and_not_written() {
+    let package = package(&[("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1235), device(6, 1234)]);
+    let plan = planned(&mut bus, &package);
+    assert_eq!(steps(&plan), [(5, "drive", "leave"), (6, "drive", "update")]);
+    let words_of = plan.to_string();
+    assert!(words_of.contains("its product code is 000004D3h, and \"drive\" is for 000004D2h"), "{words_of}");
+    let outcomes = carried_out(&mut bus, &package, &plan);
+    assert_eq!(words(&outcomes), [(Some(5), 0, "6000040Bh".to_owned()), (Some(6), 0, "updated".to_owned())]);
+    assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
+}
+
+/// A program for each device that can be at a node: the one that is there gets its own, and the other one is
+/// no mistake.
+#[test]
+fn a_node_may_be_one_device_or_another() {
+    let at = |product: u32| format!(r#""nodes": [5], "identity": {{"vendor": 63, "product": {product}}}"#);
+    let package = package(&[("old", &at(1234)), ("new", &at(1235))]);
+    for (product, name) in [(1234, "old"), (1235, "new")] {
+        let plan = planned(&mut Bus(vec![device(5, product)]), &package);
+        assert_eq!(steps(&plan), [(5, name, "update")]);
+    }
+    let plan = planned(&mut Bus(vec![device(5, 1236)]), &package);
+    assert_eq!(steps(&plan), [(5, "old", "leave"), (5, "new", "leave")]);
+}
+
+/// One with nodes and one with an identity: whether they meet is known when the bus is.
+#[test]
+fn two_programs_for_a_node_of_the_bus_are_refused() {
+    let package =
+        package(&[("a", r#""nodes": [5]"#), ("b", r#""identity": {"vendor": 63, "product": 1234}"#)]);
+    let mut bus = Bus(vec![device(5, 1), device(6, 1234)]);
+    assert_eq!(steps(&planned(&mut bus, &package)).len(), 2);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234)]);
+    let error = plan(&mut bus, &package, &ScanOptions::default(), &Arc::default()).unwrap_err();
+    let PlanError::Package(fault) = error else { panic!("{error}") };
+    assert_eq!(fault.number(), 0x6000_0407);
+    assert!(fault.to_string().contains("node 5"), "{fault}");
+    assert!(bus.0.iter().all(is_untouched));
+}
+
+/// Somebody has put another device to the node between plan and update.
+#[test]
+fn a_device_that_was_exchanged_is_not_written() {
+    let package = package(&[("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234)]);
+    let plan = planned(&mut bus, &package);
+    for (plate, what) in [
+        ([63, 1234, 2, 4711], "its serial number was 000003EDh, and is 00001267h"),
+        ([63, 99, 2, 1005], "its product code was 000004D2h, and is 00000063h"),
+    ] {
+        bus.0[0].maker = Some(Box::new(Plate(plate)));
+        bus.0[1].crc_of_application = Some(CRC);
+        let outcomes = carried_out(&mut bus, &package, &plan);
+        let Err(Bad::Left(fault)) = &outcomes[0].result else { panic!("{:?}", words(&outcomes)) };
+        assert_eq!(fault.number(), 0x6000_040C);
+        assert!(fault.to_string().contains(what), "{fault}");
+        assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
+    }
+    // Bootloader and application may report a part or not, and their revisions may differ.
+    bus.0[0].maker = Some(Box::new(Plate([63, 1234, 3, 0])));
+    assert_eq!(words(&carried_out(&mut bus, &package, &plan))[0].2, "updated");
+}
+
+/// A device without power costs the others nothing, and gets nothing more after a program that failed.
+#[test]
+fn a_device_that_is_gone_costs_the_others_nothing() {
+    let package = package(&[("drive", DRIVES), ("data", r#""nodes": [5, 6], "program": 2"#)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234)]);
+    let plan = planned(&mut bus, &package);
+    bus.0[0].running = None;
+    let outcomes = words(&carried_out(&mut bus, &package, &plan));
+    assert_eq!(outcomes[0], (Some(5), 0, "60000013h untouched".to_owned()));
+    assert_eq!(outcomes[1], (Some(6), 0, "updated".to_owned()));
+    assert_eq!(outcomes[2], (Some(5), 1, "6000040Dh".to_owned()));
+}
+
+/// A bus on which the user cancels at a block of a download.
+struct Interrupted<'a> {
+    bus: &'a mut Bus,
+    flag: Arc<AtomicBool>,
+    blocks: usize,
+}
+
+impl Adapter for Interrupted<'_> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if self.bus.0.iter().map(|fake| fake.blocks.len()).sum::<usize>() >= self.blocks {
+            self.flag.store(true, Ordering::Relaxed);
+        }
+        self.bus.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        self.bus.receive(timeout)
+    }
+
+    fn now(&self) -> Duration {
+        self.bus.now()
+    }
+}
+
+/// Cancelled in the first of three devices: the outcome of each is kept, and the next run does the rest.
+#[test]
+fn an_interrupted_run_is_continued_by_the_next() {
+    let package = package(&[("panel", r#""nodes": [9]"#), ("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234), device(9, 1)]);
+    for fake in &mut bus.0 {
+        fake.crc_of_application = None;
+    }
+    let plan = planned(&mut bus, &package);
+    let flag: Arc<AtomicBool> = Arc::default();
+    let options = RunOptions::default().many(ManyOptions::default().cancelled(flag.clone()));
+    let mut interrupted = Interrupted { bus: &mut bus, flag, blocks: 2 };
+    let outcomes = run(&mut interrupted, &package, &plan, &options, &|_, _, _| {});
+    assert_eq!(outcomes.len(), 3);
+    for (outcome, state) in
+        outcomes.iter().zip([DeviceState::Erased, DeviceState::Untouched, DeviceState::Untouched])
+    {
+        let Err(Bad::Failed(failed)) = &outcome.result else { panic!("{:?}", words(&outcomes)) };
+        assert!(matches!(failed.error, Error::Cancelled), "{failed:?}");
+        assert_eq!(failed.left.state, state);
+    }
+    let plan = planned(&mut bus, &package);
+    assert!(plan.devices.iter().flat_map(|device| &device.steps).all(|step| step.todo == Todo::Update));
+    let outcomes = carried_out(&mut bus, &package, &plan);
+    assert!(outcomes.iter().all(|outcome| outcome.result.is_ok()), "{:?}", words(&outcomes));
+    assert_eq!(planned(&mut bus, &package).updates(), 0);
+}
