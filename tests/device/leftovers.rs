@@ -7,7 +7,8 @@ use coflash_core::device::Doing;
 use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::{flash, FlashOptions};
-use emulator::machine::{ResetCause, Stop};
+use emulator::machine::{self, ResetCause, Stop};
+use emulator::silicon::{Silicon, TYPICAL};
 use emulator::time::Span;
 
 /// A program that takes every peripheral's clock in sleep mode away, spreads the clock of the PLL by 3 %
@@ -223,6 +224,39 @@ fn whatever_a_program_leaves_wrong_the_device_is_reachable() {
         bench.session().await_idle(1, Doing::Block(0)).unwrap();
     }
     assert!(lost.is_empty(), "not reachable after: {lost:#?}");
+}
+
+/// A program that jumps with the caches of the flash on, into a bootloader that erases and programs: an erase leaves
+/// what they have (RM0090 section 3.6.4).
+#[test]
+fn a_program_that_leaves_the_caches_of_the_flash_on_does_no_harm() {
+    const ACR: u32 = 0x4002_3C00;
+    // DCEN, ICEN, PRFTEN.
+    const CACHES: u32 = 0x700;
+    let silicon = Silicon { stale_lines: true, ..TYPICAL };
+    let mut bench = Bench::with(machine::Options { silicon, ..machine::Options::default() });
+    bench.power_on();
+    bench.await_boot_up(100);
+    let wrong = Wrong { what: "caches on", stores: &[(ACR, CACHES)], core: 0 };
+    let base = firmware::board().programs[0].base;
+    let image = read(&scripted_program(&wrong), Some(Format::Raw), Some(base)).unwrap();
+    let blocks = blocks_of(image, &Options::default()).unwrap().file;
+    flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+    bench.run_ms(100);
+    bench.fill_journal();
+    bench.session().command(1, ProgramControl::Start).unwrap();
+    bench.await_boot_up(1_000);
+    bench.run_ms(500);
+    let left_on = bench.machine().register(ACR).unwrap() & CACHES;
+    let options = FlashOptions::default().trial_run(false);
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {}).unwrap();
+    assert!(!bench.is_bootloader(NODE));
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+    bench.await_program(1_000);
+    assert!(!bench.is_bootloader(NODE));
+    assert_eq!(left_on, 0, "the bootloader needs none");
 }
 
 #[test]

@@ -10,6 +10,7 @@ use coflash_core::device::{Doing, Error};
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{Operation, ResetCause, Stop};
 use emulator::time::Span;
+use shared_abi::geometry::{Line, Region};
 
 const OPTION_BYTES: Address = Address::new(0x2007, 6);
 const SUPPLY: Address = Address::new(0x2007, 7);
@@ -202,6 +203,10 @@ fn with_every_combination_of_option_bytes_a_program_is_called_back_and_erased() 
     }
 }
 
+fn has_sprmod() -> bool {
+    !matches!(firmware::board().chip.line, Line::F405 | Line::F407)
+}
+
 /// Each combination of brown-out level, WDG_SW, BFB2, SPRMOD, RDP and a protected sector is shown as it is, and
 /// `coflash info` names what is wrong with it.
 #[test]
@@ -222,6 +227,12 @@ fn every_combination_of_option_bytes_is_shown() {
         let mut bench = Bench::new();
         bench.machine().set_option_bytes(optcr);
         bench.power_on();
+        if has_sprmod() && bits >> 4 & 0b11 == 0b11 {
+            // Sector 0 cannot be read: the boot stage has no constants.
+            bench.run_ms(100);
+            assert_eq!(bench.records().len(), 0, "{optcr:08X}h");
+            continue;
+        }
         bench.await_boot_up(1000);
         let told = bench.session().read_number(OPTION_BYTES).unwrap();
         // OPTLOCK is set.
@@ -233,5 +244,111 @@ fn every_combination_of_option_bytes_is_shown() {
         assert_eq!(has("WDG_SW"), bits >> 3 & 1 == 0, "{optcr:08X}h");
         assert_eq!(has("SPRMOD"), bits >> 4 & 1 != 0, "{optcr:08X}h");
         assert_eq!(has("not write-protected"), bits >> 5 & 1 == 0, "{optcr:08X}h");
+    }
+}
+
+/// RM0090 section 3.7.3: what RDP denies a debugger it does not deny the bootloader, which boots from the flash.
+#[test]
+fn with_each_level_of_read_out_protection_a_program_is_replaced_and_called_back() {
+    for rdp in [0x55, 0xCC] {
+        let mut bench = Bench::new();
+        bench.machine().set_read_protection(rdp);
+        bench.power_on();
+        bench.await_boot_up(1_000);
+        for image in [firmware::APP_V1, firmware::APP_V2] {
+            update(&mut bench, image).unwrap();
+            assert!(!bench.is_bootloader(NODE));
+            bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+            bench.await_boot_up(1_000);
+            bench.run_ms(20);
+        }
+        assert_eq!(bench.session().read_number(OPTION_BYTES).unwrap() >> 8 & 0xFF, u32::from(rdp));
+    }
+}
+
+/// BFB2 of a chip with two banks (RM0090 section 2.4, AN2606): ST's loader starts the first bank as long as the second
+/// one does not begin with an address in SRAM. The device works, and says what its option bytes are. A program whose
+/// part in the second bank begins like that takes the place of the bootloader.
+#[test]
+fn with_bfb2_the_device_works_until_its_second_bank_begins_with_a_stack_pointer() {
+    const BFB2: u32 = 1 << 4;
+    let chip = firmware::board().chip;
+    let mut bench = Bench::new();
+    bench.machine().set_option_bytes(0x0FFF_AAEC | BFB2);
+    bench.power_on();
+    bench.await_boot_up(1_000);
+    update(&mut bench, firmware::APP_V1).unwrap();
+    bench.session().command(1, ProgramControl::StartBootloader).unwrap();
+    bench.await_boot_up(1_000);
+    bench.run_ms(20);
+    let told = bench.session().read_number(OPTION_BYTES).unwrap();
+    assert!(OptionBytes(told).boots_from_bank_2());
+    let Some(bank) = chip.second_bank else { return };
+    let second = chip.sector(bank).unwrap().region.base;
+    bench.machine().load_bin(second, &chip.sram.base.to_le_bytes()).unwrap();
+    bench.power_off();
+    bench.run_ms(10);
+    bench.power_on();
+    let from = bench.time();
+    bench.run_ms(3_000);
+    assert_eq!(bench.frames_since(from), []);
+}
+
+/// What is left of a device whose data bus is kept out of one of its sectors.
+#[derive(Debug, PartialEq, Eq)]
+enum Left {
+    /// Its program starts.
+    Program,
+    /// The bootloader answers.
+    Bootloader,
+    Nothing,
+}
+
+/// PCROP (RM0090 section 3.7.5): SPRMOD, and a one of nWRP. A chip without SPRMOD reads all of its flash. The
+/// sectors of a program: it is not valid any more, the bootloader says why it stays, and refuses another one before
+/// anything changes. The bootloader's own sectors: it cannot read its constants.
+#[test]
+fn a_sector_that_cannot_be_read_leaves_the_bootloader_unless_it_is_its_own() {
+    let board = firmware::board();
+    let pristine = board_with_a_program().machine().flash().to_vec();
+    let number = |region: Region| board.chip.sector_at(region.base).unwrap().number;
+    let of = |region: Option<Region>, left: Left| region.map(|region| (region, left));
+    let all_of_it = [
+        of(Some(board.bootloader), Left::Nothing),
+        // It is damaged, and the program starts.
+        of(board.home, Left::Program),
+        of(board.data, Left::Program),
+        of(Some(board.programs[0]), Left::Bootloader),
+        // The region with the records, and the other one.
+        of(Some(board.parameters[0]), Left::Bootloader),
+        of(Some(board.parameters[1]), Left::Program),
+    ];
+    for (region, expected) in all_of_it.into_iter().flatten() {
+        let mut bench = Bench::new();
+        bench.machine().load_bin(board.chip.flash.base, &pristine).unwrap();
+        let optcr = 0x8000_AAEC | 1 << (16 + number(region));
+        bench.machine().set_option_bytes(optcr);
+        bench.power_on();
+        let from = bench.time();
+        bench.run_ms(2_000);
+        let has_boot_up = bench.frames_since(from).iter().any(|(_, _, data)| *data == [0]);
+        let left = match has_boot_up {
+            false => Left::Nothing,
+            true if bench.is_bootloader(NODE) => Left::Bootloader,
+            true => Left::Program,
+        };
+        let expected = if has_sprmod() { expected } else { Left::Program };
+        assert_eq!(left, expected, "{region:X?}");
+        if left != Left::Bootloader {
+            continue;
+        }
+        let state = read_state(&mut bench.session()).unwrap().unwrap();
+        assert_eq!(state.option_bytes, Some(OptionBytes(optcr | 1)), "{region:X?}");
+        if region == board.programs[0] {
+            bench.machine().keep_flash_log();
+            let refused = update(&mut bench, firmware::APP_V2);
+            assert!(matches!(refused, Err(Error::Failed { error: FlashError::Secured, .. })), "{refused:?}");
+            assert_eq!(bench.machine().take_flash_log(), []);
+        }
     }
 }

@@ -248,6 +248,28 @@ impl Bench {
         }
     }
 
+    /// Writes the last record of the journal into all of its free slots, as a debug probe could: the next value that
+    /// is stored makes it change over to its other region.
+    ///
+    /// # Panics
+    /// Never: the layout's parameters are in flash.
+    pub fn fill_journal(&mut self) {
+        /// Seven words.
+        const SLOT: usize = 28;
+        for region in firmware::board().parameters {
+            let mut bytes = vec![0; region.size as usize];
+            self.machine().read_memory(region.base, &mut bytes).expect("it is in flash");
+            let used = bytes.iter().rposition(|byte| *byte != 0xFF).map_or(0, |last| last + 1);
+            let free = used.next_multiple_of(SLOT);
+            // A header, and a record.
+            if free >= 2 * SLOT {
+                let record = bytes[free - SLOT..free].to_vec();
+                bytes[free..].chunks_exact_mut(SLOT).for_each(|slot| slot.copy_from_slice(&record));
+                self.machine().load_bin(region.base, &bytes).expect("it is in flash");
+            }
+        }
+    }
+
     /// Runs for this time.
     pub fn run_ms(&mut self, ms: u64) {
         self.world.run_for(Span::from_millis(ms));

@@ -3,7 +3,8 @@
 
 use bsp::pac;
 
-/// Keeps the caches on or off. When it is dropped, it empties the caches and restores their state.
+/// Keeps the caches on or off. When it is dropped, it empties the caches; after [`off`](Self::off) it also
+/// restores their state.
 pub struct Caches {
     registers: pac::FLASH,
     before: u32,
@@ -17,7 +18,7 @@ const PREFETCH: u32 = 1 << 8;
 const RESETS: u32 = 0b11 << 11;
 
 impl Caches {
-    /// Switches the caches and the prefetch off.
+    /// Switches the caches and the prefetch off, and empties the caches.
     ///
     /// # Safety
     /// Nothing else may change the access control register until this value is dropped.
@@ -26,11 +27,12 @@ impl Caches {
         unsafe { Self::set(0) }
     }
 
-    /// Switches the caches on: code in flash is some five times as fast at the full clock.
+    /// Switches the caches on: code in flash is some five times as fast at the full clock. When this
+    /// value is dropped, they are off: an application that has jumped here may have left them on, and
+    /// the RAM image programs without them.
     ///
     /// # Safety
-    /// As for [`off`](Self::off). The caches must also have been off since the flash was last
-    /// programmed.
+    /// As for [`off`](Self::off).
     pub unsafe fn on() -> Self {
         // SAFETY: the caller guarantees it.
         unsafe { Self::set(CACHES) }
@@ -40,9 +42,21 @@ impl Caches {
         // SAFETY: the caller guarantees it.
         let registers = unsafe { pac::FLASH::steal() };
         let before = registers.acr().read().bits();
-        let this = Self { registers, before };
-        this.write(this.disabled() | enabled);
+        let mut this = Self { registers, before };
+        this.empty();
+        if enabled != 0 {
+            this.before = this.disabled();
+            this.write(this.before | enabled);
+        }
         this
+    }
+
+    /// Empties the caches, which are off then.
+    fn empty(&self) {
+        let off = self.disabled();
+        self.write(off);
+        self.write(off | RESETS);
+        self.write(off);
     }
 
     /// The register's original value, with caches and prefetch off.
@@ -59,10 +73,7 @@ impl Caches {
 
 impl Drop for Caches {
     fn drop(&mut self) {
-        let off = self.disabled();
-        self.write(off);
-        self.write(off | RESETS);
-        self.write(off);
+        self.empty();
         self.write(self.before);
     }
 }

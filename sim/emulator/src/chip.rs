@@ -104,7 +104,7 @@ enum Place {
 type ClockEnable = Option<(u32, u32)>;
 
 /// Start, block, and its clock.
-const BLOCKS: [(u32, Block, ClockEnable); 43] = [
+const BLOCKS: [(u32, Block, ClockEnable); 45] = [
     (0x4000_0000, Block::Tim(0), Some((rcc::APB1ENR, 0))),
     (0x4000_0400, Block::Tim(1), Some((rcc::APB1ENR, 1))),
     (0x4000_0800, Block::Tim(2), Some((rcc::APB1ENR, 2))),
@@ -126,6 +126,8 @@ const BLOCKS: [(u32, Block, ClockEnable); 43] = [
     (0x4000_6400, Block::Can1, Some((rcc::APB1ENR, 25))),
     (0x4000_6800, Block::Can2, Some((rcc::APB1ENR, 26))),
     (0x4000_7000, Block::Pwr, Some((rcc::APB1ENR, 28))),
+    (0x4001_0000, Block::Tim(12), Some((rcc::APB2ENR, 0))),
+    (0x4001_0400, Block::Tim(13), Some((rcc::APB2ENR, 1))),
     (0x4001_1000, Block::Usart(0), Some((rcc::APB2ENR, 4))),
     (0x4001_1400, Block::Usart(5), Some((rcc::APB2ENR, 5))),
     (0x4001_3800, Block::Syscfg, Some((rcc::APB2ENR, 14))),
@@ -164,15 +166,13 @@ const RCC_CFGR: u32 = 0x4002_3808;
 const SYSCFG_MEMRMP: u32 = 0x4001_3800;
 
 /// Names of blocks that are not modelled, for reports (RM0090 table 1).
-const UNMODELLED: [(u32, &str); 20] = [
+const UNMODELLED: [(u32, &str); 18] = [
     (0x4000_2800, "RTC"),
     (0x4000_3400, "I2S2ext"),
     (0x4000_3800, "SPI2"),
     (0x4000_3C00, "SPI3"),
     (0x4000_4000, "I2S3ext"),
     (0x4000_7400, "DAC"),
-    (0x4001_0000, "TIM1"),
-    (0x4001_0400, "TIM8"),
     (0x4001_2000, "ADC"),
     (0x4001_2C00, "SDIO"),
     (0x4001_3000, "SPI1"),
@@ -245,7 +245,7 @@ pub struct Chip {
     /// The USARTs, as in [`usart::INSTANCES`].
     pub usarts: [Usart; 6],
     /// The timers, as in [`tim::INSTANCES`].
-    tims: [Tim; 12],
+    tims: [Tim; 14],
     i2c: [I2c; 3],
     otg: Otg,
     pwr: Pwr,

@@ -22,18 +22,34 @@ struct Check {
     chip: &'static Geometry,
     /// The controller that the transceiver is at: 0 is CAN1.
     can: usize,
+    bit_rate: u32,
     play: fn(&mut Desk) -> Result<String, String>,
 }
 
-/// All of them, at 500 kbit/s and with a crystal of 8 MHz.
+/// Most of them have this one.
+const K500: u32 = 500_000;
+
+/// All of them, with a crystal of 8 MHz.
 const CHECKS: [Check; 7] = [
-    Check { name: "katapult", chip: &STM32F407VG, can: 0, play: |desk| desk.unassigned(KATAPULT).map(uuid) },
-    Check { name: "klipper", chip: &STM32F407VG, can: 0, play: klipper },
-    Check { name: "klipper-katapult", chip: &STM32F407VG, can: 0, play: klipper_is_called_back },
-    Check { name: "chibios", chip: &STM32F407VG, can: 1, play: chibios },
-    Check { name: "canopennode", chip: &STM32F407VG, can: 0, play: canopennode },
-    Check { name: "openblt", chip: &STM32F405RG, can: 0, play: openblt },
-    Check { name: "stm32f4xx-hal", chip: &STM32F407VG, can: 0, play: hal_can_send },
+    Check {
+        name: "katapult",
+        chip: &STM32F407VG,
+        can: 0,
+        bit_rate: K500,
+        play: |desk| desk.unassigned(KATAPULT).map(uuid),
+    },
+    Check { name: "klipper", chip: &STM32F407VG, can: 0, bit_rate: K500, play: klipper },
+    Check {
+        name: "klipper-katapult",
+        chip: &STM32F407VG,
+        can: 0,
+        bit_rate: K500,
+        play: klipper_is_called_back,
+    },
+    Check { name: "chibios", chip: &STM32F407VG, can: 1, bit_rate: K500, play: chibios },
+    Check { name: "canopennode", chip: &STM32F407VG, can: 1, bit_rate: 125_000, play: canopennode },
+    Check { name: "openblt", chip: &STM32F405RG, can: 0, bit_rate: K500, play: openblt },
+    Check { name: "stm32f4xx-hal", chip: &STM32F407VG, can: 0, bit_rate: K500, play: hal_can_send },
 ];
 
 /// Klipper's protocol on CAN: the administrator asks, and a node without a number answers with its UUID and
@@ -52,7 +68,7 @@ impl Desk {
         }
         let mut world = World::new();
         let board = world.add_machine(machine);
-        let host = world.add_host_port(500_000);
+        let host = world.add_host_port(check.bit_rate);
         world.power_on(board);
         Ok(Self { world, board, host })
     }

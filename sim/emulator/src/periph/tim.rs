@@ -66,7 +66,7 @@ const BITS_16: u32 = 0xFFFF;
 const BITS_32: u32 = u32::MAX;
 
 /// Interrupt lines: RM0090 table 62. Widths and channels: datasheet, table of the timers' features.
-pub static INSTANCES: [Instance; 12] = [
+pub static INSTANCES: [Instance; 14] = [
     instance("TIM2", 28, 4, BITS_32, false),
     instance("TIM3", 29, 4, BITS_16, false),
     instance("TIM4", 30, 4, BITS_16, false),
@@ -79,6 +79,9 @@ pub static INSTANCES: [Instance; 12] = [
     instance("TIM12", 43, 2, BITS_16, false),
     instance("TIM13", 44, 1, BITS_16, false),
     instance("TIM14", 45, 1, BITS_16, false),
+    // Of the advanced ones the counter alone, with the line of the update (TIM1_UP_TIM10, TIM8_UP_TIM13).
+    instance("TIM1", 25, 0, BITS_16, true),
+    instance("TIM8", 44, 0, BITS_16, true),
 ];
 
 /// A register with a preload: what was written, and what is in force.
