@@ -240,8 +240,8 @@ fn a_program_that_leaves_the_caches_of_the_flash_on_does_no_harm() {
     let wrong = Wrong { what: "caches on", stores: &[(ACR, CACHES)], core: 0 };
     let base = firmware::board().programs[0].base;
     let image = read(&scripted_program(&wrong), Some(Format::Raw), Some(base)).unwrap();
-    let blocks = blocks_of(image, &Options::default()).unwrap().file;
-    flash(&mut bench.session(), &blocks, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
+    let program = program_of(image, &Options::default()).unwrap().program;
+    flash(&mut bench.session(), &program, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     bench.run_ms(100);
     bench.fill_journal();
     bench.session().command(1, ProgramControl::Start).unwrap();

@@ -3,7 +3,7 @@
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::silicon::{play, play_on, SCENARIOS};
-use coflash::update::{flash, FlashOptions};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::Outcome;
 use emulator::machine::Options;
 use emulator::silicon::{Choice, Silicon, TYPICAL};

@@ -133,7 +133,7 @@ fn show(context: &Context, command: &str, path: &Path, package: &Package, is_tru
             "  {}: {}{number} of {} bytes{version}, for {}{count}\n",
             entry.name,
             kind(program),
-            program.program_size(),
+            program.size(),
             entry.whom()
         );
     }
@@ -144,12 +144,12 @@ fn show(context: &Context, command: &str, path: &Path, package: &Package, is_tru
         words += "  not signed\n";
     }
     context.out.result(words, || {
-        let program = |(entry, program): (&machine::Entry, &coflash_core::update::Program)| {
+        let program = |(entry, program): (&machine::Entry, &coflash_core::update::Payload)| {
             let mut value = json!(entry);
             value["kind"] = kind(program).into();
             value["version"] = version(program).into();
-            value["program_size"] = program.program_size().into();
-            value["crc"] = program.program_crc().into();
+            value["program_size"] = program.size().into();
+            value["crc"] = program.crc().into();
             value
         };
         json!({

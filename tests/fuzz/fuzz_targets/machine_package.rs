@@ -10,7 +10,7 @@ use coflash_core::machine::zip::{self, Member, MAX_MEMBERS};
 use coflash_core::machine::{Fault, Package};
 
 /// A program, whose size and SHA-256 the kept manifests have.
-const BLOCKS: &[u8] = include_bytes!("../../../coflash/tests/data/plain-400.blk");
+const BLOCKS: &[u8] = include_bytes!("../../../coflash/core/tests/data/plain-400.blk");
 
 fn container(bytes: &[u8]) {
     let Ok(members) = zip::read(bytes) else { return };

@@ -7,6 +7,7 @@ mod commands;
 mod gateway;
 mod legacy;
 mod mistakes;
+mod package;
 mod renew;
 mod sealing;
 mod several;

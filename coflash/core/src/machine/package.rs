@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
-use shared_abi::block_file::{Control, ProgramVersion};
+use shared_abi::block_file::ProgramVersion;
 
 use super::fault::Fault;
 use super::manifest::{self, Entry, Identity, Manifest};
@@ -11,12 +11,11 @@ use super::signature::{self, Signer};
 use super::zip::{self, Member};
 use crate::device::Dialect;
 use crate::file::judge::judge;
-use crate::file::label::label_of;
 use crate::file::sealed::show::digits;
 use crate::file::sealed::{PublicKey, SealedFile, SigningKey};
-use crate::file::{self, Firmware, Format};
+use crate::file::{self, Firmware, Format, Target};
 use crate::update::dialect::is_data;
-use crate::update::{NewBootloader, Program, Target};
+use crate::update::{NewBootloader, Payload};
 use seal::wire::CERTIFICATE;
 
 /// A package whose members were checked.
@@ -26,7 +25,7 @@ pub struct Package {
     /// The bytes that are signed.
     signed: Vec<u8>,
     signers: Vec<Signer>,
-    programs: Vec<Program>,
+    programs: Vec<Payload>,
 }
 
 /// Whether a file begins as a package: with its manifest.
@@ -100,11 +99,11 @@ impl Package {
     }
 
     /// Its programs in the order of the update, with their entries in the manifest.
-    pub fn programs(&self) -> impl ExactSizeIterator<Item = (&Entry, &Program)> {
+    pub fn programs(&self) -> impl ExactSizeIterator<Item = (&Entry, &Payload)> {
         self.manifest.programs.iter().zip(&self.programs)
     }
 
-    pub(super) fn program(&self, entry: usize) -> Option<(&Entry, &Program)> {
+    pub(super) fn program(&self, entry: usize) -> Option<(&Entry, &Payload)> {
         self.manifest.programs.get(entry).zip(self.programs.get(entry))
     }
 }
@@ -156,22 +155,22 @@ fn extension(bytes: &[u8]) -> &'static str {
 }
 
 /// The program in a member: blocks, a sealed image, or the RAM image of a bootloader.
-fn program(entry: &Entry, bytes: &[u8]) -> Result<Program, Fault> {
+fn program(entry: &Entry, bytes: &[u8]) -> Result<Payload, Fault> {
     let unusable = |why: String| Fault::Program { program: entry.name.clone(), why };
     let format = Format::detect(bytes);
     let program = match format {
         Some(Format::Sealed) if entry.is_bootloader() => {
             let new = NewBootloader::of_sealed(bytes);
-            Program::from(new.ok_or_else(|| unusable("it is a sealed program and no bootloader".to_owned()))?)
+            Payload::from(new.ok_or_else(|| unusable("it is a sealed program and no bootloader".to_owned()))?)
         }
         None if entry.is_bootloader() => {
             let new = NewBootloader::in_file(bytes, Some(Format::Raw));
             let new = new.map_err(|fault| unusable(format!("it {fault}")))?;
-            Program::from(new.ok_or_else(|| unusable("it is no bootloader".to_owned()))?)
+            Payload::from(new.ok_or_else(|| unusable("it is no bootloader".to_owned()))?)
         }
         Some(Format::Sealed) => {
             let file = SealedFile::for_program(bytes.to_vec(), entry.program);
-            Program::from(Arc::new(file.map_err(|refusal| unusable(refusal.to_string()))?))
+            Payload::from(Arc::new(file.map_err(|refusal| unusable(refusal.to_string()))?))
         }
         Some(Format::BlockFile) if !entry.is_bootloader() => {
             let blocks = match file::read(bytes, format, None).map_err(|error| unusable(error.to_string()))? {
@@ -179,10 +178,10 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Program, Fault> {
                 Firmware::Image(_) => return Err(unusable("it has no blocks".to_owned())),
             };
             if !is_data(entry.dialect().unwrap_or(Dialect::Lift), entry.program) {
-                let judged = judge(&blocks.image(), blocks.program_start(), None);
+                let judged = judge(blocks.image(), blocks.start(), None);
                 judged.map_err(|fault| unusable(format!("the image {fault}")))?;
             }
-            Program::from(Arc::new(blocks))
+            Payload::from(Arc::new(blocks))
         }
         _ => return Err(unusable("it is neither a block file nor a sealed image".to_owned())),
     };
@@ -197,34 +196,32 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Program, Fault> {
 }
 
 /// The type of device that a program names; two zeros name none.
-pub(super) fn target(program: &Program) -> Option<Identity> {
+pub(super) fn target(program: &Payload) -> Option<Identity> {
     let Target { vendor_id: vendor, product_code: product } = program.target()?;
     (vendor != 0 || product != 0).then_some(Identity { vendor, product, revision: None })
 }
 
 /// The version of a program, if it has one.
 #[must_use]
-pub fn version(program: &Program) -> Option<String> {
+pub fn version(program: &Payload) -> Option<String> {
     match program {
-        Program::Bootloader(new) => Some(new.version().to_string()),
-        Program::Sealed(file) => Some(ProgramVersion(file.head().version()).to_string()),
-        Program::Blocks(file) => match file.control() {
-            Some(Control::Dated { version, .. }) => Some(ProgramVersion(version).to_string()),
-            _ => {
-                let label = label_of(&file.image(), file.program_start())?;
-                Some(ProgramVersion(label.version).to_string())
-            }
-        },
+        Payload::Bootloader(new) => Some(new.version().to_string()),
+        Payload::Sealed(file) => Some(ProgramVersion(file.head().version()).to_string()),
+        Payload::Program(program) => {
+            let named = program.release().map(|release| release.version);
+            let version = named.or_else(|| Some(ProgramVersion(program.label()?.version)))?;
+            Some(version.to_string())
+        }
     }
 }
 
 /// The kind of a program, in words.
 #[must_use]
-pub fn kind(program: &Program) -> &'static str {
+pub fn kind(program: &Payload) -> &'static str {
     match program {
-        Program::Blocks(_) => "program",
-        Program::Sealed(_) => "sealed program",
-        Program::Bootloader(NewBootloader::Plain(_)) => "bootloader",
-        Program::Bootloader(NewBootloader::Sealed(_)) => "sealed bootloader",
+        Payload::Program(_) => "program",
+        Payload::Sealed(_) => "sealed program",
+        Payload::Bootloader(NewBootloader::Plain(_)) => "bootloader",
+        Payload::Bootloader(NewBootloader::Sealed(_)) => "sealed bootloader",
     }
 }

@@ -16,7 +16,7 @@ use crate::device::info::{self, program_info, DeviceInfo, ProgramInfo};
 use crate::device::scan::{scan, Found, ScanOptions};
 use crate::device::{Error, Session};
 use crate::json;
-use crate::update::{NewBootloader, Program};
+use crate::update::{NewBootloader, Payload};
 use coboot_can::Adapter;
 
 /// Why there is no plan.
@@ -147,7 +147,7 @@ pub fn plan(
     for device in &mut plan.devices {
         let Some(its) = found.get(&device.node).and_then(|found| found.info.as_ref()) else { continue };
         for step in &mut device.steps {
-            let Some((_, Program::Bootloader(new))) = package.program(step.entry) else { continue };
+            let Some((_, Payload::Bootloader(new))) = package.program(step.entry) else { continue };
             let Some(bootloader) = &its.bootloader else { continue };
             let mut session = Session::new(&mut *adapter, device.node, options.timing);
             session.cancel_by(cancelled.clone());
@@ -270,11 +270,11 @@ pub(super) fn hex(part: Option<u32>) -> String {
 
 /// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not
 /// been released yet.
-fn has(info: &DeviceInfo, entry: &Entry, program: &Program) -> bool {
+fn has(info: &DeviceInfo, entry: &Entry, program: &Payload) -> bool {
     let its = info.programs.iter().find(|its| its.number == entry.program);
     let is_there = its.is_some_and(|its| {
         its.state() != Some(ProgramState::Absent)
-            && its.crc.is_some_and(|crc| crc != 0 && program.program_crcs().contains(&crc))
+            && its.crc.is_some_and(|crc| crc != 0 && program.crcs().contains(&crc))
     });
     !info.device_type.is_bootloader() && is_there
 }
@@ -295,7 +295,7 @@ fn has_bootloader(info: &DeviceInfo, has: &ProgramInfo, new: &NewBootloader) -> 
 
 /// What the device has and what it gets: their versions, if both have one and these differ, and otherwise
 /// their CRCs.
-fn versions(info: &DeviceInfo, entry: &Entry, program: &Program) -> (Option<String>, String) {
+fn versions(info: &DeviceInfo, entry: &Entry, program: &Payload) -> (Option<String>, String) {
     let its = info.programs.iter().find(|its| its.number == entry.program);
     let its = its.filter(|its| its.state() != Some(ProgramState::Absent));
     let has = match info.bootloader.filter(|_| entry.is_bootloader()) {
@@ -306,7 +306,7 @@ fn versions(info: &DeviceInfo, entry: &Entry, program: &Program) -> (Option<Stri
     match (has, version(program)) {
         (Some(has), Some(gets)) if has != gets || entry.is_bootloader() => (Some(has), gets),
         (None, Some(gets)) if its.is_none() => (None, gets),
-        _ => (its.and_then(|its| its.crc).filter(|crc| *crc != 0).map(crc), crc(program.program_crc())),
+        _ => (its.and_then(|its| its.crc).filter(|crc| *crc != 0).map(crc), crc(program.crc())),
     }
 }
 

@@ -9,12 +9,12 @@ use super::manifest::{Entry, Identity};
 use super::package::{target, Part};
 use crate::device::Dialect;
 use crate::file::board::{self, in_folder};
-use crate::file::convert::{blocks_of, Options, Region};
+use crate::file::convert::{program_of, Options, Region};
 use crate::file::judge::judge;
 use crate::file::sealed::carried;
-use crate::file::{limit, ram_image, read, AddressRange, Format, Place};
+use crate::file::{block_file, limit, ram_image, read, AddressRange, Format, Place};
 use crate::update::dialect::is_data;
-use crate::update::{line_of, NewBootloader, Program};
+use crate::update::{line_of, NewBootloader, Payload};
 
 /// A recipe.
 #[derive(Debug, Deserialize)]
@@ -112,7 +112,7 @@ impl Row {
         };
         let stem = || self.image.file_stem().map(|stem| stem.to_string_lossy().into_owned());
         let number = match &program {
-            Program::Bootloader(_) => match self.program {
+            Payload::Bootloader(_) => match self.program {
                 None | Some(BOOTLOADER) => BOOTLOADER,
                 Some(_) => {
                     return Err("the file is a bootloader, which has no other number than 255".to_owned())
@@ -143,7 +143,7 @@ fn content(
     board: Option<&str>,
     number: u8,
     dialect: Option<Dialect>,
-) -> Result<(Program, Vec<u8>), String> {
+) -> Result<(Payload, Vec<u8>), String> {
     let said = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
     let bytes = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()).to_string())?;
     let bytes = carried(bytes).map_err(|error| error.of(path.display()).to_string())?.image;
@@ -174,11 +174,11 @@ fn content(
     let firmware =
         read::read(&bytes, format, raw_address).map_err(|error| error.of(path.display()).to_string())?;
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
-    let blocks = blocks_of(firmware, &options).map_err(|error| said(&error))?.file;
+    let program = program_of(firmware, &options).map_err(|error| said(&error))?.program;
     if !is_data(dialect.unwrap_or(Dialect::Lift), number) {
-        judge(&blocks.image(), blocks.program_start(), layout)
+        judge(program.image(), program.start(), layout)
             .map_err(|fault| said(&format!("the image {fault}: {}", fault.advice())))?;
     }
-    let bytes = blocks.emit();
-    Ok((std::sync::Arc::new(blocks).into(), bytes))
+    let bytes = block_file::emit(&program);
+    Ok((std::sync::Arc::new(program).into(), bytes))
 }

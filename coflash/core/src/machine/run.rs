@@ -11,10 +11,11 @@ use super::package::Package;
 use super::plan::{hex, Device, Plan, Todo};
 use crate::device::info::identity;
 use crate::device::{Error, Session};
+use crate::file::Target;
 use crate::update::event::Event;
 use crate::update::many::{flash_many, Failed, Job, ManyOptions};
 use crate::update::{
-    flash_program, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Program, Report, Target,
+    flash_program, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report,
 };
 use coboot_can::Adapter;
 
@@ -157,7 +158,7 @@ fn update(
     adapter: &mut dyn Adapter,
     at: usize,
     entry: &Entry,
-    program: &Program,
+    program: &Payload,
     devices: &[&Device],
     options: &RunOptions,
     tell: &(dyn Fn(NodeId, usize, Event) + Sync),

@@ -5,7 +5,7 @@
 //! and counts are compared with the limits before any byte of a member is looked at.
 
 use super::fault::{Fault, Limit};
-use crate::file::block_file::CRC;
+use crate::file::checksum::CRC;
 
 /// Signatures of the records (APPNOTE 4.3.7, 4.3.12, 4.3.16).
 const LOCAL: [u8; 4] = *b"PK\x03\x04";

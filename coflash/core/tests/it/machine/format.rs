@@ -141,7 +141,7 @@ fn a_package_has_its_programs_in_order() {
     assert_eq!(whom[0], "nodes 5, 6 (vendor 0000003Fh, product 000004D2h, revision 00000002h)");
     assert_eq!((whom[1].as_str(), whom[2].as_str()), ("vendor 00000001h, product 000004D2h", "node 9"));
     // In expected.py the program has FA1h bytes.
-    assert!(package.programs().all(|(_, program)| program.program_size() == 0xFA1));
+    assert!(package.programs().all(|(_, program)| program.size() == 0xFA1));
 }
 
 const NODE: &str = r#""nodes": [5]"#;

@@ -1,7 +1,6 @@
 //! Packages for machines: the file, and the plan and run on a bus of fake devices.
 
 mod format;
-mod recipe;
 mod signed;
 mod update;
 

@@ -1,4 +1,4 @@
-//! The recipe of a package.
+//! Packages for machines: their recipe, and the command line.
 
 use std::fs;
 
