@@ -9,7 +9,7 @@
 
 use std::collections::BTreeMap;
 
-use super::Operation;
+use super::cells::Operation;
 
 /// Bytes of a line.
 const LINE: u32 = 16;
