@@ -1,5 +1,5 @@
 //! Updates of the real firmware that are cut at a random point: the next one goes on where they
-//! stopped. `sim/node/tests/cuts.rs` does the same on the model of the flash, many more times.
+//! stopped. `sim/node/tests/it/cuts.rs` does the same on the model of the flash, many more times.
 
 use std::io;
 use std::time::Duration;

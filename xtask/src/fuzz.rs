@@ -200,8 +200,8 @@ impl Tools {
         }
         command.arg(target).current_dir(workspace::root());
         command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
-        // The lines of a panic.
-        command.env("CARGO_PROFILE_RELEASE_DEBUG", "1");
+        // The lines of a panic; and a wrapped number is a find, too.
+        command.env("CARGO_PROFILE_RELEASE_DEBUG", "1").env("CARGO_PROFILE_RELEASE_OVERFLOW_CHECKS", "true");
         command
     }
 

@@ -59,9 +59,9 @@ impl Caches {
         self.write(off);
     }
 
-    /// The register's original value, with caches and prefetch off.
+    /// The register's original value, with caches, prefetch and resets off.
     fn disabled(&self) -> u32 {
-        self.before & !(CACHES | PREFETCH)
+        self.before & !(CACHES | PREFETCH | RESETS)
     }
 
     fn write(&self, bits: u32) {
@@ -74,6 +74,7 @@ impl Caches {
 impl Drop for Caches {
     fn drop(&mut self) {
         self.empty();
-        self.write(self.before);
+        // A cache that stayed in reset would be empty for ever.
+        self.write(self.before & !RESETS);
     }
 }

@@ -83,7 +83,7 @@ pub unsafe extern "C" fn stage() -> ! {
     } else {
         count_crash_resets(&mut parameters, &mut flash, reset_cause, request)
     };
-    // SAFETY: as above; nothing is programmed from here on.
+    // SAFETY: as above; nothing else changes the register until it is dropped.
     let caches = unsafe { Caches::on() };
 
     let node = product::node_parameters(&parameters, &flash);

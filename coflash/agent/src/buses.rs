@@ -1,5 +1,5 @@
 //! The devices: flashes them and asks them for their attributes. The only file of the agent that
-//! calls the rest of the library for that.
+//! calls `coflash-core` for that.
 //!
 //! Devices of one bus whose orders come while the bus is in use are updated together, once it is
 //! free.

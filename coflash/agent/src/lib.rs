@@ -13,7 +13,7 @@
 //! | `http` | requests to the server, with limits |
 //! | `download` | artifacts: fetched piece by piece, checked |
 //! | `firmware` | the artifact as a program |
-//! | `buses` | the devices: the only file that calls the rest of the library |
+//! | `buses` | the devices: the only file that calls `coflash-core` |
 //! | `run` | a thread for each device, which joins these parts |
 //!
 //! Nothing is flashed whose size and SHA-256 were not compared with the deployment.

@@ -18,7 +18,7 @@
 //! | `shared` | what server and bus thread share |
 //! | `worker` | the thread that owns the bus |
 //! | `job` | what can be done |
-//! | `work` | how it is done, by the rest of the library |
+//! | `work` | how it is done, by `coflash-core` |
 //! | `firmware` | the file that was dropped on the page |
 //! | `frames` | what goes over the bus, in words, counted, and as a log |
 //! | `load` | how long a frame keeps the bus busy |

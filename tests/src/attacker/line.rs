@@ -1,5 +1,5 @@
 //! The same firmware with CAN over its UART: the masters are one host on a serial line, and frames
-//! are text (`docs/virtual-can.md`). Between them come bytes that are no frame.
+//! are text (`docs/can-over-uart.md`). Between them come bytes that are no frame.
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;

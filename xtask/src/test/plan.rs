@@ -54,7 +54,7 @@ pub const LATER: &[Later] = &[
     later("device", "leftovers::whatever", Tier::Ci, "sixteen states of a chip, 1 minute"),
     later("device", "stuck_bus::", Tier::All, "minutes of a bus that does not move"),
     later("device", "supply::with_every_combination", Tier::All, "32 combinations of option bytes, 1 minute"),
-    later("device", "supply::", Tier::Ci, "each supply voltage, 1 minute"),
+    later("device", "supply::", Tier::Ci, "supply voltages and option bytes, 1 minute"),
     later("device", "silicon::each_scenario_works_with_the_chips", Tier::Ci, "more chips than the worst one"),
     later("update", "attacker::", Tier::All, "the standing attacker on boards, 2 minutes"),
     later("update", "coflash_dialects::the_profile_of_lifts", Tier::Ci, TWO),

@@ -1,5 +1,5 @@
 //! The agent against a server with faults, over real sockets, with devices that only note what they
-//! are given. Devices on a bus: sim/node/tests/agent.rs.
+//! are given. Devices on a bus: sim/node/tests/it/agent.rs.
 
 /// The content of a file of the library's tests.
 macro_rules! data {

@@ -3,7 +3,6 @@
 //!
 //! The operating system holds the lock during the life of the process; a file that is left over has
 //! no effect. If the file cannot be created, there is no lock.
-//! means nothing. Where there can be no such file there is no lock.
 
 use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{Read, Seek, SeekFrom, Write};

@@ -3,7 +3,6 @@
 //!
 //! Host tool, bus and chip run in this process, in virtual time; the firmware is the firmware for
 //! the board.
-//! onto the board.
 
 mod renew;
 mod sealed;
