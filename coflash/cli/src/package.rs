@@ -82,8 +82,12 @@ impl MakePackage {
     }
 }
 
-/// Whether a file begins as a package; `false` if it cannot be read.
+/// Whether a file is one for a machine: by its ending, or because it begins as a package. A file with this
+/// ending that is no package is refused, so that its name does not get it past the roots of the configuration.
 pub(super) fn is_package(path: &Path) -> bool {
+    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("cpk")) {
+        return true;
+    }
     let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
     let mut front = Vec::new();
     let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
@@ -205,21 +209,27 @@ const OF_PACKAGES: [(&str, &str); 24] = [
     ("force", "--force"),
 ];
 
+/// The options for packages alone, and what they would do.
+const FOR_PACKAGES: [(&str, &str); 2] = [
+    ("yes", "only the update with a package is confirmed"),
+    ("trust", "only the signers of a package are compared with --trust"),
+];
+
 /// Which options a user has typed: a default, also one of the configuration, contradicts nothing.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Typed {
     /// The first one that has no meaning beside a package.
     beside_package: Option<&'static str>,
-    /// Whether one is for packages alone.
-    is_for_package: bool,
+    /// What the first one that is for packages alone would do.
+    for_package: Option<&'static str>,
 }
 
 impl Typed {
     /// Refuses an option that means nothing for a package, or for any other file.
     pub(super) fn check(self, is_package: bool) -> Result<(), Failure> {
-        if !is_package && self.is_for_package {
+        if let Some(what) = self.for_package.filter(|_| !is_package) {
             let advice = "leave --yes and --trust out, or name a package that coflash package made";
-            return Err(Failure::usage("only the update with a package is confirmed and signed", advice));
+            return Err(Failure::usage(what, advice));
         }
         let Some(option) = self.beside_package.filter(|_| is_package) else { return Ok(()) };
         let advice = "leave it out: the package says which device gets which program";
@@ -229,11 +239,12 @@ impl Typed {
 
 impl FromArgMatches for Typed {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let is_typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
-        Ok(Self {
-            beside_package: OF_PACKAGES.iter().find(|(id, _)| is_typed(id)).map(|(_, option)| *option),
-            is_for_package: is_typed("yes") || is_typed("trust"),
-        })
+        // A command need not have all of them.
+        let is_typed = |id: &str| {
+            matches.try_contains_id(id).is_ok() && matches.value_source(id) == Some(ValueSource::CommandLine)
+        };
+        let first = |of: &[(&str, &'static str)]| of.iter().find(|(id, _)| is_typed(id)).map(|its| its.1);
+        Ok(Self { beside_package: first(&OF_PACKAGES), for_package: first(&FOR_PACKAGES) })
     }
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {

@@ -116,6 +116,10 @@ fn the_command_makes_and_shows_a_package() {
     // A root of the configuration is for packages, and any other file has nothing to do with it.
     let config = folder.write("coflash.toml", format!("trust = '{public}'\nnode = 5\n").as_bytes());
     let config = config.to_str().unwrap();
+    // Another file with the name of a package does not get past this root.
+    let named = folder.join("x.CPK");
+    fs::copy(data("plain-400.blk"), &named).unwrap();
+    let named = named.to_str().unwrap();
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
@@ -124,6 +128,11 @@ fn the_command_makes_and_shows_a_package() {
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),
         (&["flash", package, "--no-trial"], 2, "--no-trial has no meaning beside a package"),
+        (&["flash", named, "--config", config], 3, "[0x60000400]"),
+        (&["inspect", named], 3, "[0x60000400]"),
+        (&["inspect", &data("plain-400.blk"), "--trust", &public], 2, "only the signers of a package"),
+        (&["inspect", package, "--board", "nucleo-f446re"], 2, "--board has no meaning beside a package"),
+        (&["flash", &data("plain-400.blk"), "--trust", &public], 2, "only the signers of a package"),
         (&["flash", &data("plain-400.blk"), "--yes"], 2, "only the update with a package is confirmed"),
         (&["flash", package, "--trust", &public], 3, "[0x60000408]"),
     ] {
