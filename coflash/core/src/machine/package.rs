@@ -78,11 +78,12 @@ impl Package {
         Ok(Self { manifest, signed: signed.to_vec(), signers, programs })
     }
 
-    /// Checks that one of these roots has signed the package, or certified its signers.
+    /// Checks that one of these roots has signed the package, or certified its signers. Returns the signers
+    /// of these roots; nothing is known of the others.
     ///
     /// # Errors
     /// [`Fault::Signature`].
-    pub fn trust(&self, roots: &[PublicKey]) -> Result<(), Fault> {
+    pub fn trust(&self, roots: &[PublicKey]) -> Result<Vec<Signer>, Fault> {
         Ok(signature::trust(&self.signers, &self.manifest, &self.signed, roots)?)
     }
 

@@ -169,7 +169,7 @@ fn update(
         program: if entry.is_bootloader() { options.flash.program } else { entry.program },
         check_target: target,
         trial_run: entry.trial_run,
-        verify: entry.verify,
+        verify: entry.verify || options.flash.verify,
         dialect: entry.dialect().or(options.flash.dialect),
         ..options.flash
     };
