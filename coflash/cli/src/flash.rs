@@ -201,7 +201,7 @@ impl Flash {
             return Ok(());
         }
         self.legacy.check(context)?;
-        let package = self.file.as_deref().filter(|file| is_package(file));
+        let package = self.image().filter(|file| is_package(file));
         self.typed.check(package.is_some())?;
         if let Some(package) = package {
             return self.machine(context, package);
@@ -216,7 +216,7 @@ impl Flash {
                  (--chk_run tries it first)",
             );
         }
-        let bus = context.bus.clone().or_else(|| self.legacy.bus());
+        let bus = self.bus(context);
         let mut link = context.link_at(bus.as_deref(), self.legacy.bit_rate())?;
         match devices.as_slice() {
             [device] if self.job.is_none() => self.one(context, &mut link, device),
@@ -235,9 +235,12 @@ impl Flash {
             .alone(!self.not_alone)
             .mastership(!self.no_mastership)
             .from_start(self.from_start)
+            .verify(self.verify)
             .together(self.together == Together::Always);
         let given = Given {
             patience: &self.patience,
+            bus: self.bus(context),
+            bit_rate: self.legacy.bit_rate(),
             flash,
             many: self.many_options()?,
             report: self.report.as_deref(),
@@ -268,6 +271,16 @@ impl Flash {
         self.is_untried(&device.file) && has_trial && !self.no_trial && !self.no_start
     }
 
+    /// The bus, in either spelling.
+    fn bus(&self, context: &Context) -> Option<String> {
+        context.bus.clone().or_else(|| self.legacy.bus())
+    }
+
+    /// The firmware file, in either spelling.
+    fn image(&self) -> Option<&Path> {
+        self.file.as_deref().or(self.legacy.file())
+    }
+
     /// The program number, in either spelling.
     fn number(&self) -> u8 {
         self.legacy.program().unwrap_or(self.program)
@@ -284,7 +297,7 @@ impl Flash {
     /// The devices of the command line, which all get the same program.
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
-        let image = self.file.as_deref().or(self.legacy.file()).ok_or_else(unnamed)?;
+        let image = self.image().ok_or_else(unnamed)?;
         let file = self.payload(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
         let options = self.options(&file, &Settings::default())?;
         match &file {
@@ -452,11 +465,10 @@ impl Flash {
 
     /// Locks the node, so that no other process of this computer works on it.
     fn lock(&self, context: &Context, node: NodeId) -> Result<Option<Lock>, Failure> {
-        let bus = context.bus.clone().or_else(|| self.legacy.bus());
         if self.not_alone {
             Ok(None)
         } else {
-            context.lock(bus.as_deref(), node).map(Some)
+            context.lock(self.bus(context).as_deref(), node).map(Some)
         }
     }
 

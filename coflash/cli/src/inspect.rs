@@ -8,7 +8,7 @@ use serde_json::{json, Value};
 use super::context::Context;
 use super::file::{Input, Source};
 use super::output::Failure;
-use super::package::{self, Trusted};
+use super::package::{self, Trusted, Typed};
 use super::values::program_number;
 use super::verify::{is_sealed, show};
 
@@ -21,6 +21,10 @@ use super::verify::{is_sealed, show};
 /// command needs no device.
 #[derive(Debug, Args)]
 pub(super) struct Inspect {
+    // The first one: the parser takes each value out as it reads it.
+    #[command(flatten)]
+    typed: Typed,
+
     #[command(flatten)]
     input: Input,
 
@@ -38,7 +42,9 @@ pub(super) struct Inspect {
 impl Inspect {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = self.input.path();
-        if package::is_package(path) {
+        let is_package = package::is_package(path);
+        self.typed.check(is_package)?;
+        if is_package {
             return package::inspect(context, path, &self.trusted);
         }
         if is_sealed(path) {

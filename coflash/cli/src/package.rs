@@ -77,34 +77,44 @@ impl MakePackage {
         }
         keys::write(&output, &bytes)?;
         let package = Package::parse(&bytes).map_err(|fault| Failure::package(&output, &fault))?;
-        show(context, "package", &output, &package, false);
+        show(context, "package", &output, &Checked { package, known: None });
         Ok(())
     }
 }
 
-/// Whether a file begins as a package; `false` if it cannot be read.
+/// Whether a file is one for a machine: by its ending, or because it begins as a package. A file with this
+/// ending that is no package is refused, so that its name does not get it past the roots of the configuration.
 pub(super) fn is_package(path: &Path) -> bool {
+    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("cpk")) {
+        return true;
+    }
     let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
     let mut front = Vec::new();
     let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
     is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && machine::looks_like(&front)
 }
 
+/// A package, and which of its signers belong to the roots that the user has named, if any was named.
+struct Checked {
+    package: Package,
+    known: Option<Vec<Signer>>,
+}
+
 /// Reads and checks a package.
-fn read(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
+fn read(path: &Path, trusted: &Trusted) -> Result<Checked, Failure> {
     let roots = trusted.trust.iter().map(|path| public_key(path)).collect::<Result<Vec<_>, _>>()?;
     let package =
         Package::parse(&super::file::bytes(path)?).map_err(|fault| Failure::package(path, &fault))?;
-    if !roots.is_empty() {
-        package.trust(&roots).map_err(|fault| Failure::package(path, &fault))?;
-    }
-    Ok(package)
+    let known = match roots.as_slice() {
+        [] => None,
+        roots => Some(package.trust(roots).map_err(|fault| Failure::package(path, &fault))?),
+    };
+    Ok(Checked { package, known })
 }
 
 /// Shows a package, for `inspect`.
 pub(super) fn inspect(context: &Context, path: &Path, trusted: &Trusted) -> Result<(), Failure> {
-    let package = read(path, trusted)?;
-    show(context, "inspect", path, &package, !trusted.trust.is_empty());
+    show(context, "inspect", path, &read(path, trusted)?);
     Ok(())
 }
 
@@ -118,7 +128,8 @@ pub(super) struct Trusted {
 }
 
 /// Shows what is in a package.
-fn show(context: &Context, command: &str, path: &Path, package: &Package, is_trusted: bool) {
+fn show(context: &Context, command: &str, path: &Path, checked: &Checked) {
+    let Checked { package, known } = checked;
     let manifest = package.manifest();
     let mut words = format!("{}: package for a machine", path.display());
     for text in [&manifest.name, &manifest.release].into_iter().flatten() {
@@ -137,11 +148,8 @@ fn show(context: &Context, command: &str, path: &Path, package: &Package, is_tru
             entry.whom()
         );
     }
-    for signer in package.signers() {
-        words += &format!("  signed by {}\n", signer_words(signer, is_trusted));
-    }
-    if package.signers().is_empty() {
-        words += "  not signed\n";
+    for line in checked.signers() {
+        words += &format!("  {line}\n");
     }
     context.out.result(words, || {
         let program = |(entry, program): (&machine::Entry, &coflash_core::update::Payload)| {
@@ -162,28 +170,45 @@ fn show(context: &Context, command: &str, path: &Path, package: &Package, is_tru
             "signers": package.signers().iter().map(|signer| json!({
                 "key": signer.key,
                 "root": signer.certificate().map(|certificate| certificate.root_id()),
+                "trusted": known.as_ref().is_some_and(|known| known.contains(signer)),
             })).collect::<Vec<_>>(),
-            "trusted": is_trusted,
+            "trusted": known.is_some(),
         })
     });
 }
 
-fn signer_words(signer: &Signer, is_trusted: bool) -> String {
-    let whose = match signer.certificate() {
-        Some(certificate) => format!("certified by root {:08X}h", certificate.root_id()),
-        None => "which is a root".to_owned(),
-    };
-    let unchecked = if is_trusted { "" } else { "; give --trust with the root to check that" };
-    format!("key {:08X}h, {whose}{unchecked}", signer.key)
+impl Checked {
+    /// Who has signed it, a line for each.
+    fn signers(&self) -> Vec<String> {
+        let line = |signer: &Signer| {
+            let whose = match signer.certificate() {
+                Some(certificate) => format!("certified by root {:08X}h", certificate.root_id()),
+                None => "which is a root".to_owned(),
+            };
+            let key = format!("key {:08X}h, {whose}", signer.key);
+            match &self.known {
+                None => format!("signed by {key}; give --trust with the root to check that"),
+                Some(known) if known.contains(signer) => format!("signed by {key}"),
+                Some(_) => format!("not checked: another root: {key}"),
+            }
+        };
+        match self.package.signers() {
+            [] => vec!["not signed".to_owned()],
+            signers => signers.iter().map(line).collect(),
+        }
+    }
 }
 
 /// The options of `flash` that a package has values for.
-const OF_PACKAGES: [(&str, &str); 24] = [
+const OF_PACKAGES: [(&str, &str); 30] = [
     ("node", "--node"),
     ("node_id", "--node_id"),
     ("program", "--program"),
     ("prog_no", "--prog_no"),
     ("serial", "--ser_num"),
+    ("revision", "--rev"),
+    ("product", "--pcode"),
+    ("vendor", "--vendor"),
     ("board", "--board"),
     ("start_address", "--start-address"),
     ("end_address", "--end-address"),
@@ -197,12 +222,21 @@ const OF_PACKAGES: [(&str, &str); 24] = [
     ("vid", "--vid"),
     ("pid", "--pid"),
     ("ver", "--ver"),
+    ("date", "--date"),
     ("no_label", "--no-label"),
     ("check_target", "--check-target"),
+    ("chk_tgt", "--chk_tgt"),
+    ("chk_run", "--chk_run"),
     ("no_trial", "--no-trial"),
     ("no_start", "--no-start"),
     ("in_blocks", "--blocks"),
     ("force", "--force"),
+];
+
+/// The options for packages alone, and what they would do.
+const FOR_PACKAGES: [(&str, &str); 2] = [
+    ("yes", "only the update with a package is confirmed"),
+    ("trust", "only the signers of a package are compared with --trust"),
 ];
 
 /// Which options a user has typed: a default, also one of the configuration, contradicts nothing.
@@ -210,16 +244,16 @@ const OF_PACKAGES: [(&str, &str); 24] = [
 pub(super) struct Typed {
     /// The first one that has no meaning beside a package.
     beside_package: Option<&'static str>,
-    /// Whether one is for packages alone.
-    is_for_package: bool,
+    /// What the first one that is for packages alone would do.
+    for_package: Option<&'static str>,
 }
 
 impl Typed {
     /// Refuses an option that means nothing for a package, or for any other file.
     pub(super) fn check(self, is_package: bool) -> Result<(), Failure> {
-        if !is_package && self.is_for_package {
+        if let Some(what) = self.for_package.filter(|_| !is_package) {
             let advice = "leave --yes and --trust out, or name a package that coflash package made";
-            return Err(Failure::usage("only the update with a package is confirmed and signed", advice));
+            return Err(Failure::usage(what, advice));
         }
         let Some(option) = self.beside_package.filter(|_| is_package) else { return Ok(()) };
         let advice = "leave it out: the package says which device gets which program";
@@ -229,11 +263,12 @@ impl Typed {
 
 impl FromArgMatches for Typed {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
-        let is_typed = |id: &str| matches.value_source(id) == Some(ValueSource::CommandLine);
-        Ok(Self {
-            beside_package: OF_PACKAGES.iter().find(|(id, _)| is_typed(id)).map(|(_, option)| *option),
-            is_for_package: is_typed("yes") || is_typed("trust"),
-        })
+        // A command need not have all of them.
+        let is_typed = |id: &str| {
+            matches.try_contains_id(id).is_ok() && matches.value_source(id) == Some(ValueSource::CommandLine)
+        };
+        let first = |of: &[(&str, &'static str)]| of.iter().find(|(id, _)| is_typed(id)).map(|its| its.1);
+        Ok(Self { beside_package: first(&OF_PACKAGES), for_package: first(&FOR_PACKAGES) })
     }
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
@@ -266,6 +301,9 @@ pub(super) struct Machine {
 /// What an update with a package takes from the other options.
 pub(super) struct Given<'a> {
     pub(super) patience: &'a Patience,
+    /// The bus, and its bit rate if the URL has none.
+    pub(super) bus: Option<String>,
+    pub(super) bit_rate: Option<u32>,
     pub(super) flash: FlashOptions,
     pub(super) many: ManyOptions,
     pub(super) report: Option<&'a Path>,
@@ -277,11 +315,10 @@ impl Machine {
     /// Updates the machine: scan, plan, confirmation, and the run.
     pub(super) fn run(&self, context: &Context, path: &Path, given: &Given<'_>) -> Result<(), Failure> {
         let out = context.out;
-        let package = read(path, &self.trusted)?;
-        for signer in package.signers() {
-            out.say(format_args!("signed by {}", signer_words(signer, !self.trusted.trust.is_empty())));
-        }
-        let Link::Bus(mut adapter) = context.link()? else {
+        let checked = read(path, &self.trusted)?;
+        checked.signers().iter().for_each(|line| out.say(line));
+        let package = checked.package;
+        let Link::Bus(mut adapter) = context.link_at(given.bus.as_deref(), given.bit_rate)? else {
             let advice = "connect to the bus of the machine with an adapter";
             return Err(Failure::usage(
                 "a gateway cannot search the bus for the devices of a package",
@@ -302,7 +339,7 @@ impl Machine {
         }
         let locks = plan.nodes().filter(|_| !given.not_alone);
         let _locks =
-            locks.map(|node| context.lock(context.bus.as_deref(), node)).collect::<Result<Vec<_>, _>>()?;
+            locks.map(|node| context.lock(given.bus.as_deref(), node)).collect::<Result<Vec<_>, _>>()?;
         let nodes: Vec<NodeId> = plan.nodes().collect();
         let board = Board::new(out, &nodes);
         let show = |node: NodeId, _, event| {
@@ -409,4 +446,60 @@ fn summary(
     let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
     let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };
     Err(Failure::told(exit, first.legacy, failed, all))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The options of `flash` that do beside a package what they do beside another file.
+    const BESIDE_PACKAGES: [&str; 31] = [
+        // What is done, and where it is said.
+        "file",
+        "legacy_file",
+        "job",
+        "report",
+        "at_once",
+        "together",
+        "from_start",
+        "block_repeats",
+        "verify",
+        "watch",
+        "wait",
+        "not_alone",
+        "no_mastership",
+        "dialect",
+        "unlock",
+        // Time limits and transfers.
+        "boot_timeout",
+        "command_timeout",
+        "delay",
+        "repeats",
+        "sdo_attempts",
+        "sdo_timeout",
+        "segmented",
+        "silence_timeout",
+        // The bus; what is ignored or refused for any file is said for a package, too.
+        "baudrate",
+        "index",
+        "vxd_type",
+        "device_no",
+        "ip_addr",
+        "ip_port",
+        "gateway_id",
+        "network_id",
+    ];
+
+    /// A new option of `flash` needs a decision: it has an effect beside a package, or is refused there.
+    #[test]
+    fn each_option_of_flash_has_an_effect_beside_a_package_or_is_refused() {
+        let command = super::super::commands();
+        let flash = command.find_subcommand("flash").unwrap();
+        let mut all: Vec<&str> = flash.get_arguments().map(|argument| argument.get_id().as_str()).collect();
+        let decided = OF_PACKAGES.iter().chain(&FOR_PACKAGES).map(|(id, _)| *id);
+        let mut decided: Vec<&str> = decided.chain(BESIDE_PACKAGES).collect();
+        all.sort_unstable();
+        decided.sort_unstable();
+        assert_eq!(decided, all);
+    }
 }

@@ -106,6 +106,22 @@ fn the_command_makes_and_shows_a_package() {
         "{}",
         shown.out
     );
+    assert!(shown.out.contains("signed by key ") && !shown.out.contains("not checked"), "{}", shown.out);
+    // With a second signer, whose root is not named.
+    let (other, both) = (key("other.pem"), key("both.cpk"));
+    assert_eq!(coflash(&["key", "new", "--role", "root", "-o", &other]).exit, 0);
+    let keys = ["--key", &release, "--cert", &cert, "--key", &other];
+    assert_eq!(coflash(&[&["package", recipe, "-o", &both][..], &keys].concat()).exit, 0);
+    let shown = coflash(&["inspect", &both, "--trust", &key("root.pub")]);
+    for words in ["signed by key ", "not checked: another root: key "] {
+        assert_eq!(shown.out.matches(words).count(), 1, "{}", shown.out);
+    }
+    let said = coflash(&["flash", &both, "--trust", &key("root.pub"), "--bus", "slcan:no-such-port"]);
+    assert!(said.out.contains("not checked: another root: key "), "{}{}", said.out, said.err);
+    let open = key("open.cpk");
+    assert_eq!(coflash(&["package", recipe, "-o", &open]).exit, 0);
+    let said = coflash(&["flash", &open, "--bus", "slcan:no-such-port"]);
+    assert!(said.out.contains("not signed"), "{}{}", said.out, said.err);
     let stranger = coflash(&["inspect", package, "--trust", &public]);
     assert_eq!(stranger.exit, 3);
     assert!(
@@ -116,6 +132,10 @@ fn the_command_makes_and_shows_a_package() {
     // A root of the configuration is for packages, and any other file has nothing to do with it.
     let config = folder.write("coflash.toml", format!("trust = '{public}'\nnode = 5\n").as_bytes());
     let config = config.to_str().unwrap();
+    // Another file with the name of a package does not get past this root.
+    let named = folder.join("x.CPK");
+    fs::copy(data("plain-400.blk"), &named).unwrap();
+    let named = named.to_str().unwrap();
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
@@ -124,6 +144,17 @@ fn the_command_makes_and_shows_a_package() {
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),
         (&["flash", package, "--no-trial"], 2, "--no-trial has no meaning beside a package"),
+        (&["flash", named, "--config", config], 3, "[0x60000400]"),
+        (&["inspect", named], 3, "[0x60000400]"),
+        (&["inspect", &data("plain-400.blk"), "--trust", &public], 2, "only the signers of a package"),
+        (&["inspect", package, "--board", "nucleo-f446re"], 2, "--board has no meaning beside a package"),
+        (&["flash", package, "--chk_tgt", "1"], 2, "--chk_tgt has no meaning beside a package"),
+        (&["flash", package, "--chk_run"], 2, "--chk_run has no meaning beside a package"),
+        (&["flash", package, "--rev", "1"], 2, "--rev has no meaning beside a package"),
+        (&["flash", package, "--pcode", "1"], 2, "--pcode has no meaning beside a package"),
+        (&["flash", package, "--vendor", "1"], 2, "--vendor has no meaning beside a package"),
+        (&["flash", "-F", package, "--trust", &public], 3, "[0x60000408]"),
+        (&["flash", &data("plain-400.blk"), "--trust", &public], 2, "only the signers of a package"),
         (&["flash", &data("plain-400.blk"), "--yes"], 2, "only the update with a package is confirmed"),
         (&["flash", package, "--trust", &public], 3, "[0x60000408]"),
     ] {
@@ -131,4 +162,8 @@ fn the_command_makes_and_shows_a_package() {
         assert_eq!(done.exit, exit, "{words:?}: {}", done.err);
         assert!(done.err.contains(error), "{words:?}: {}", done.err);
     }
+    // The bus of the manual's options, which is not there.
+    let done = coflash(&["flash", package, "--vxd_type", "16", "--device_no", "99"]);
+    let port = if cfg!(windows) { "COM99" } else { "ttyS98" };
+    assert!(done.exit != 0 && done.err.contains(port), "{}", done.err);
 }

@@ -13,7 +13,7 @@ use canopen::{AbortCode, Address, CobId, Frame, NodeId};
 use super::error::Error;
 use super::info::{info, DeviceInfo};
 use super::listen::listen;
-use super::session::Session;
+use super::session::{ensure_bus_alone, Session};
 use super::timing::Timing;
 use coboot_can::Adapter;
 
@@ -42,6 +42,9 @@ pub struct ScanOptions {
     pub timing: Timing,
     /// Whether to send requests.
     pub ask: bool,
+    /// Whether to listen first, and to ask nobody while another tool sends SDO requests: those of a scan would
+    /// break its transfer.
+    pub alone: bool,
 }
 
 impl ScanOptions {
@@ -50,6 +53,7 @@ impl ScanOptions {
         listen: Duration,
         timing: Timing,
         ask: bool,
+        alone: bool,
     }
 }
 
@@ -60,6 +64,7 @@ impl Default for ScanOptions {
             listen: Duration::from_millis(1100),
             timing: Timing::default(),
             ask: true,
+            alone: false,
         }
     }
 }
@@ -74,12 +79,16 @@ const AT_ONCE: usize = 16;
 /// could take a request for a segment and not answer it.
 ///
 /// # Errors
-/// [`Error::Adapter`] or [`Error::Cancelled`]; an empty bus is not an error.
+/// [`Error::Adapter`] or [`Error::Cancelled`], and [`Error::NotAlone`] if that is [wanted](ScanOptions::alone); an
+/// empty bus is not an error.
 pub fn scan(
     adapter: &mut dyn Adapter,
     options: &ScanOptions,
     cancelled: &Arc<AtomicBool>,
 ) -> Result<BTreeMap<NodeId, Found>, Error> {
+    if options.alone {
+        ensure_bus_alone(adapter, cancelled)?;
+    }
     let mut found: BTreeMap<NodeId, Found> = BTreeMap::new();
     let mut answered: Vec<NodeId> = Vec::new();
     if options.ask {

@@ -220,6 +220,14 @@ pub enum DeviceFault {
         /// The device.
         node: NodeId,
     },
+    /// It answered the scan, but not as a device whose identity can be compared.
+    #[error("node {node} answers, but {but}")]
+    Mute {
+        /// The device.
+        node: NodeId,
+        /// What is wrong with its answers.
+        but: String,
+    },
     /// Fewer devices than the package says.
     #[error("the package wants {expected} devices for {program:?}, and the bus has {found}")]
     TooFew {
@@ -277,6 +285,7 @@ impl DeviceFault {
             Self::OtherDevice { .. } => BASE + 0xB,
             Self::Exchanged { .. } => BASE + 0xC,
             Self::EarlierFailed { .. } => BASE + 0xD,
+            Self::Mute { .. } => BASE + 0xE,
         }
     }
 
@@ -285,6 +294,9 @@ impl DeviceFault {
     pub const fn advice(&self) -> &'static str {
         match self {
             Self::Absent { .. } => "check its plug and its node-ID, and run the command again: it updates what is missing",
+            Self::Mute { .. } => {
+                "nothing was written to it: find out why it answers so (coflash info), and run the command again"
+            }
             Self::TooFew { .. } => {
                 "check plugs and node-IDs (coflash scan), and run the command again: it updates what is missing"
             }

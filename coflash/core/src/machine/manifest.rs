@@ -274,9 +274,10 @@ fn hash(digits: &str) -> Option<[u8; 32]> {
     bytes.try_into().ok()
 }
 
-/// A text is shown on terminals: it has no control characters.
+/// A text is shown on terminals, in a line that the user confirms: it has no control characters, and none that
+/// is invisible or changes the direction of the text.
 fn check_text(text: &str) -> Result<(), Fault> {
-    if text.is_empty() || text.chars().count() > MAX_TEXT || text.chars().any(char::is_control) {
+    if text.is_empty() || text.chars().count() > MAX_TEXT || text.chars().any(changes_line) {
         let what =
             format!("a name has 1 to {MAX_TEXT} characters and none for control: {:?}", shortened(text));
         return Err(Fault::Manifest(what));
@@ -284,10 +285,15 @@ fn check_text(text: &str) -> Result<(), Fault> {
     Ok(())
 }
 
+fn changes_line(letter: char) -> bool {
+    letter.is_control()
+        || matches!(letter, '\u{200B}'..='\u{200F}' | '\u{2028}'..='\u{202E}' | '\u{2060}'..='\u{206F}' | '\u{FEFF}')
+}
+
 /// A message with the name of a field of the file, which may have any characters.
 fn printable(text: &str) -> String {
     text.chars()
-        .map(|letter| if letter.is_control() { char::REPLACEMENT_CHARACTER } else { letter })
+        .map(|letter| if changes_line(letter) { char::REPLACEMENT_CHARACTER } else { letter })
         .collect()
 }
 

@@ -8,7 +8,7 @@ use shared_abi::block_file::ProgramVersion;
 use super::fault::Fault;
 use super::manifest::{self, Entry, Identity, Manifest};
 use super::signature::{self, Signer};
-use super::zip::{self, Member};
+use super::zip::{self, Member, MAX_MEMBER};
 use crate::device::Dialect;
 use crate::file::judge::judge;
 use crate::file::sealed::show::digits;
@@ -26,6 +26,8 @@ pub struct Package {
     signed: Vec<u8>,
     signers: Vec<Signer>,
     programs: Vec<Payload>,
+    /// The CRCs of each: they go over its whole span, and every device is compared with them.
+    crcs: Vec<[u32; 2]>,
 }
 
 /// Whether a file begins as a package: with its manifest.
@@ -75,14 +77,16 @@ impl Package {
             }
             programs.push(program(entry, member.bytes)?);
         }
-        Ok(Self { manifest, signed: signed.to_vec(), signers, programs })
+        let crcs = programs.iter().map(Payload::crcs).collect();
+        Ok(Self { manifest, signed: signed.to_vec(), signers, programs, crcs })
     }
 
-    /// Checks that one of these roots has signed the package, or certified its signers.
+    /// Checks that one of these roots has signed the package, or certified its signers. Returns the signers
+    /// of these roots; nothing is known of the others.
     ///
     /// # Errors
     /// [`Fault::Signature`].
-    pub fn trust(&self, roots: &[PublicKey]) -> Result<(), Fault> {
+    pub fn trust(&self, roots: &[PublicKey]) -> Result<Vec<Signer>, Fault> {
         Ok(signature::trust(&self.signers, &self.manifest, &self.signed, roots)?)
     }
 
@@ -101,6 +105,11 @@ impl Package {
     /// Its programs in the order of the update, with their entries in the manifest.
     pub fn programs(&self) -> impl ExactSizeIterator<Item = (&Entry, &Payload)> {
         self.manifest.programs.iter().zip(&self.programs)
+    }
+
+    /// The values that a device with this program may report.
+    pub(super) fn crcs(&self, entry: usize) -> [u32; 2] {
+        self.crcs.get(entry).copied().unwrap_or_default()
     }
 
     pub(super) fn program(&self, entry: usize) -> Option<(&Entry, &Payload)> {
@@ -177,6 +186,12 @@ fn program(entry: &Entry, bytes: &[u8]) -> Result<Payload, Fault> {
                 Firmware::Blocks(blocks) => blocks,
                 Firmware::Image(_) => return Err(unusable("it has no blocks".to_owned())),
             };
+            if blocks.size() as usize > MAX_MEMBER {
+                // The gaps between blocks cost the file nothing, and each CRC its time.
+                let what =
+                    format!("it extends over {} bytes, and at most {MAX_MEMBER} are allowed", blocks.size());
+                return Err(unusable(what));
+            }
             if !is_data(entry.dialect().unwrap_or(Dialect::Lift), entry.program) {
                 let judged = judge(blocks.image(), blocks.start(), None);
                 judged.map_err(|fault| unusable(format!("the image {fault}")))?;

@@ -193,7 +193,9 @@ pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Pla
         };
         for node in its.nodes.iter().filter_map(|node| NodeId::new(*node)) {
             if !plan.devices.iter().any(|device| device.node == node) {
-                miss(Some(node), DeviceFault::Absent { node });
+                let but = found.get(&node).and_then(|found| found.but.clone());
+                let absent = DeviceFault::Absent { node };
+                miss(Some(node), but.map_or(absent, |but| DeviceFault::Mute { node, but }));
             }
         }
         let devices = plan.devices.iter().flat_map(|device| &device.steps);
@@ -221,7 +223,7 @@ fn steps(package: &Package, node: NodeId, info: &DeviceInfo) -> Result<Vec<Step>
             _ if !is_named && !entry.nodes.is_empty() => continue,
             Some(_) if !is_named => continue,
             Some(fault) => Todo::Leave(fault),
-            None if has(info, entry, program) => Todo::Has,
+            None if has(info, entry, package.crcs(at)) => Todo::Has,
             None => Todo::Update,
         };
         let same = |step: &&Step| number(step) == Some(entry.program) && !matches!(step.todo, Todo::Leave(_));
@@ -270,11 +272,11 @@ pub(super) fn hex(part: Option<u32>) -> String {
 
 /// Whether the device runs with this program. One in its bootloader, with a program of this CRC, has not
 /// been released yet.
-fn has(info: &DeviceInfo, entry: &Entry, program: &Payload) -> bool {
+fn has(info: &DeviceInfo, entry: &Entry, crcs: [u32; 2]) -> bool {
     let its = info.programs.iter().find(|its| its.number == entry.program);
     let is_there = its.is_some_and(|its| {
         its.state() != Some(ProgramState::Absent)
-            && its.crc.is_some_and(|crc| crc != 0 && program.crcs().contains(&crc))
+            && its.crc.is_some_and(|crc| crc != 0 && crcs.contains(&crc))
     });
     !info.device_type.is_bootloader() && is_there
 }

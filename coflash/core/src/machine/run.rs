@@ -13,10 +13,8 @@ use crate::device::info::identity;
 use crate::device::{Error, Session};
 use crate::file::Target;
 use crate::update::event::Event;
-use crate::update::many::{flash_many, Failed, Job, ManyOptions};
-use crate::update::{
-    flash_program, DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report,
-};
+use crate::update::many::{self, flash_many, Failed, Job, ManyOptions};
+use crate::update::{DeviceAfterUpdate, DeviceAnswer, DeviceState, FlashOptions, Payload, Report};
 use coboot_can::Adapter;
 
 /// The options of a run.
@@ -88,7 +86,7 @@ pub fn run(
             let (node, result) = (missing.node, Err(Bad::Left(missing.fault.clone())));
             Outcome { node, entry: at, result }
         }));
-        let mut due: Vec<&Device> = Vec::new();
+        let mut due: Vec<(NodeId, Target)> = Vec::new();
         let mut ended: Vec<(NodeId, Result<Good, Bad>)> = Vec::new();
         for device in &plan.devices {
             for step in device.steps.iter().filter(|step| step.entry == at) {
@@ -100,7 +98,7 @@ pub fn run(
                         ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));
                     }
                     Todo::Update => match is_the_same(adapter, entry, device, options) {
-                        Ok(()) => due.push(device),
+                        Ok(its) => due.push((node, its)),
                         Err(bad) => ended.push((node, Err(bad))),
                     },
                 }
@@ -118,19 +116,24 @@ pub fn run(
     outcomes
 }
 
-/// Compares the identity of a device with that in the plan.
+/// Compares the identity of a device with that in the plan; returns the part that is compared again just before
+/// the device is written.
 fn is_the_same(
     adapter: &mut dyn Adapter,
     entry: &Entry,
     device: &Device,
     options: &RunOptions,
-) -> Result<(), Bad> {
+) -> Result<Target, Bad> {
     let node = device.node;
     if options.many.cancelled.load(Ordering::Relaxed) {
         return Err(untouched(Error::Cancelled));
     }
     let mut session = Session::new(adapter, node, options.many.timing);
     session.cancel_by(options.many.cancelled.clone());
+    if options.flash.alone {
+        // Before the first request, as in `reach`: it would disturb another tool's running transfer.
+        session.ensure_alone().map_err(untouched)?;
+    }
     let now = session.find().and_then(|_| identity(&mut session)).map_err(untouched)?;
     let revision = entry.identity.is_some_and(|identity| identity.revision.is_some());
     let names = ["vendor-ID", "product code", "revision", "serial number"];
@@ -143,7 +146,11 @@ fn is_the_same(
     };
     match names.into_iter().zip(device.identity).zip(now).find_map(differs) {
         Some(fault) => Err(Bad::Left(fault)),
-        None => Ok(()),
+        // What runs now has said it: the bootloader may report less than the application did in the plan.
+        None => Ok(entry.identity.map_or_else(
+            || Target { vendor_id: now[0].unwrap_or(0), product_code: now[1].unwrap_or(0) },
+            |its| Target { vendor_id: its.vendor, product_code: its.product },
+        )),
     }
 }
 
@@ -159,25 +166,30 @@ fn update(
     at: usize,
     entry: &Entry,
     program: &Payload,
-    devices: &[&Device],
+    devices: &[(NodeId, Target)],
     options: &RunOptions,
     tell: &(dyn Fn(NodeId, usize, Event) + Sync),
 ) -> Vec<(NodeId, Result<Good, Bad>)> {
-    let target = entry.identity.map(|its| Target { vendor_id: its.vendor, product_code: its.product });
     let flash = FlashOptions {
         // A renewal finds the number of the bootloader by itself.
         program: if entry.is_bootloader() { options.flash.program } else { entry.program },
-        check_target: target,
         trial_run: entry.trial_run,
-        verify: entry.verify,
+        verify: entry.verify || options.flash.verify,
         dialect: entry.dialect().or(options.flash.dialect),
         ..options.flash
     };
-    let jobs: Vec<Job> = devices.iter().map(|device| Job::new(device.node, program.clone(), flash)).collect();
+    let job = |(node, target): &(NodeId, Target)| {
+        Job::new(*node, program.clone(), flash.check_target(Some(*target)))
+    };
+    let jobs: Vec<Job> = devices.iter().map(job).collect();
     let results = match jobs.as_slice() {
         [] => Vec::new(),
         // A device alone can be followed to another node-ID, which lifts need.
-        [job] => vec![alone(adapter, job, options, &|event| tell(job.node, at, event))],
+        [job] => {
+            let mut session = Session::new(adapter, job.node, options.many.timing);
+            let tell = &mut |event| tell(job.node, at, event);
+            vec![many::update(&mut session, job, &job.options, &options.many, tell)]
+        }
         jobs => {
             let tell = |number: usize, event| {
                 if let Some(job) = jobs.get(number) {
@@ -188,23 +200,5 @@ fn update(
         }
     };
     let good = |result: Result<Report, Failed>| result.map(Good::Updated).map_err(Bad::Failed);
-    devices.iter().map(|device| device.node).zip(results.into_iter().map(good)).collect()
-}
-
-/// Updates one device.
-fn alone(
-    adapter: &mut dyn Adapter,
-    job: &Job,
-    options: &RunOptions,
-    tell: &dyn Fn(Event),
-) -> Result<Report, Failed> {
-    let mut session = Session::new(adapter, job.node, options.many.timing);
-    session.cancel_by(options.many.cancelled.clone());
-    session.transfer_by(options.many.transfers);
-    let mut left = DeviceAfterUpdate { state: DeviceState::Untouched, answer: DeviceAnswer::NotAsked };
-    let result = flash_program(&mut session, &job.file, &job.options, &mut |event| {
-        left = event.left().unwrap_or(left);
-        tell(event);
-    });
-    result.map_err(|error| Failed { error, left })
+    devices.iter().map(|(node, _)| *node).zip(results.into_iter().map(good)).collect()
 }

@@ -113,7 +113,7 @@ pub(super) fn verify(signers: &[Signer], manifest: &[u8]) -> Result<(), Signatur
 }
 
 /// Checks that one of these roots has signed or certified a signer, and that each program has a signer that may
-/// sign it.
+/// sign it. Returns the signers of these roots; the signature of another one was not checked.
 ///
 /// # Errors
 /// [`SignatureFault`].
@@ -122,7 +122,7 @@ pub(super) fn trust(
     manifest: &Manifest,
     bytes: &[u8],
     roots: &[PublicKey],
-) -> Result<(), SignatureFault> {
+) -> Result<Vec<Signer>, SignatureFault> {
     let first = signers.first().ok_or(SignatureFault::None)?;
     let message = message(bytes);
     let mut known = Vec::new();
@@ -144,7 +144,8 @@ pub(super) fn trust(
         let root = first.certificate().map(|certificate| certificate.root_id());
         return Err(SignatureFault::Stranger { key: first.key, root });
     }
-    covered(&known, manifest)
+    covered(&known, manifest)?;
+    Ok(known)
 }
 
 /// Checks that each program has a signer that may sign it.

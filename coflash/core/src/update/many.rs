@@ -259,7 +259,7 @@ pub fn flash_in_turn(
 }
 
 /// Updates one of the devices.
-fn update(
+pub(crate) fn update(
     session: &mut Session<'_>,
     job: &Job,
     one: &FlashOptions,

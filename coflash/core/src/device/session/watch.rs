@@ -114,7 +114,7 @@ impl Watch {
 }
 
 /// The object of a request; none for a segment, which does not name it.
-fn object_of(frame: &Frame) -> Option<Address> {
+pub(super) fn object_of(frame: &Frame) -> Option<Address> {
     let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
     let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
     initiates.then(|| Address::new(u16::from_le_bytes([low, high]), sub))

@@ -1,7 +1,9 @@
 //! The file: its ZIP container (APPNOTE.TXT 6.3.10), its manifest, and what is refused.
 
+use coflash_core::file::convert::{convert, Options, Region};
+use coflash_core::file::{block_file, ihex, AddressRange};
 use coflash_core::machine::zip::{self, Member};
-use coflash_core::machine::{Fault, Limit, Package};
+use coflash_core::machine::{make, Fault, Limit, Manifest, Package, Part};
 use proptest::prelude::*;
 
 use super::{entry, manifest, package, packed, refused};
@@ -270,4 +272,60 @@ proptest! {
         let _ = zip::read(&bytes);
         let _ = Package::parse(&[&bytes[..], &[0; 22]].concat());
     }
+}
+
+/// What the user confirms is a line of a terminal: no text of a package hides a part of it or turns it round.
+#[test]
+fn a_text_that_changes_how_a_line_looks_is_refused() {
+    let hidden =
+        ['\u{200B}', '\u{200F}', '\u{2028}', '\u{202E}', '\u{2060}', '\u{2066}', '\u{206F}', '\u{FEFF}'];
+    for letter in hidden {
+        let text =
+            entry("a", r#""nodes": [5]"#).replace(r#""name": "a""#, &format!(r#""name": "a{letter}b""#));
+        refused(&package(&manifest(&[text]), &["a.blk"]), 0x6000_0406, "none for control");
+        let field = entry("a", &format!(r#""nodes": [5], "x{letter}": 1"#));
+        let fault = Package::parse(&package(&manifest(&[field]), &["a.blk"])).unwrap_err();
+        assert!(!fault.to_string().contains(letter), "{fault}");
+    }
+    for good in ["\u{FC}b", "\u{200A}", "\u{2030}", "\u{205F}", "\u{2070}"] {
+        let text = entry("a", r#""nodes": [5]"#).replace(r#""name": "a""#, &format!(r#""name": "a{good}""#));
+        assert!(Package::parse(&package(&manifest(&[text]), &["a.blk"])).is_ok(), "{good:?}");
+    }
+}
+
+/// Two blocks far apart are a small file with a large program, whose CRC takes its time.
+#[test]
+fn a_program_of_a_huge_span_is_refused() {
+    let far = |upper: u16| {
+        let line = |bytes: &[u8]| {
+            let sum = bytes.iter().fold(0u8, |sum, byte| sum.wrapping_add(*byte));
+            let digits: String = bytes.iter().map(|byte| format!("{byte:02X}")).collect();
+            format!(":{digits}{:02X}\n", sum.wrapping_neg())
+        };
+        let [high, low] = upper.to_be_bytes();
+        [
+            line(&[2, 0, 0, 4, 8, 0]),
+            line(&[8, 0, 0, 0, 0, 0, 2, 0x20, 1, 2, 0, 8]),
+            line(&[2, 0, 0, 4, high, low]),
+            line(&[4, 0, 0, 0, 1, 2, 3, 4]),
+            line(&[0, 0, 0, 1]),
+        ]
+        .concat()
+    };
+    // Program 2 may be data, which are not judged as a program for the flash.
+    let region = AddressRange { first: 0x0800_0000, last: 0x08FF_FFFF };
+    let options = Options::default().region(Region::Strict(region));
+    let refusal = |upper| {
+        let image = ihex::read(far(upper).as_bytes()).unwrap();
+        let blocks = convert(image, &options).unwrap().program;
+        let said =
+            Manifest::parse(manifest(&[entry("a", r#""nodes": [5], "program": 2"#)]).as_bytes()).unwrap();
+        let part = Part { entry: said.programs[0].clone(), bytes: block_file::emit(&blocks) };
+        make(None, None, &[part], &[]).err().map(|fault| (fault.number(), fault.to_string()))
+    };
+    // 8 MiB are 80h pages of 64 KiB.
+    assert_eq!(refusal(0x087F), None);
+    let (number, words) = refusal(0x0880).unwrap();
+    assert_eq!(number, 0x6000_0409);
+    assert!(words.contains("extends over 8388612 bytes, and at most 8388608 are allowed"), "{words}");
 }

@@ -47,7 +47,7 @@ fn made(parts: &[Part], keys: &[(&SigningKey, Option<[u8; 152]>)]) -> Result<Vec
 }
 
 fn trust(bytes: &[u8], roots: &[PublicKey]) -> Result<(), Fault> {
-    Package::parse(bytes)?.trust(roots)
+    Package::parse(bytes)?.trust(roots).map(drop)
 }
 
 #[test]
@@ -115,6 +115,22 @@ fn what_a_stranger_signs_counts_for_nothing() {
         matches!(&fault, Fault::Signature(SignatureFault::NotAllowed { program, .. }) if program == "panel"),
         "{fault}"
     );
+}
+
+/// The root is a stranger to whoever names another one: its signature is not among those that were checked.
+#[test]
+fn the_signers_of_the_named_roots_are_told_from_the_others() {
+    let (root, release, other) = (key(1), key(2), key(3));
+    let keys = [(&other, None), (&release, Some(certificate(&root, &release, Role::Release, 0)))];
+    let package = Package::parse(&made(&[part(Some(DRIVE))], &keys).unwrap()).unwrap();
+    let known = |roots: &[PublicKey]| {
+        let known = package.trust(roots).unwrap();
+        known.iter().map(|signer| signer.key).collect::<Vec<_>>()
+    };
+    let (release, other_id) = (release.public().id(), other.public().id());
+    assert_eq!(known(&[root.public()]), [release]);
+    assert_eq!(known(&[other.public()]), [other_id]);
+    assert_eq!(known(&[root.public(), other.public()]), [other_id, release]);
 }
 
 /// Each byte of the file is changed: whoever trusts the root gets the same programs for the same devices,

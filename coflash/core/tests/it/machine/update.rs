@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use canopen::{Frame, NodeId};
+use canopen::{CobId, Frame, NodeId};
 use coboot_can::Adapter;
 use coboot_can::AdapterError;
 use coflash_core::device::scan::ScanOptions;
@@ -12,8 +12,9 @@ use coflash_core::machine::{
     plan, run, Bad, DeviceFault, Good, Outcome, Package, Plan, PlanError, RunOptions, Todo,
 };
 use coflash_core::update::many::ManyOptions;
-use coflash_core::update::{DeviceState, Event};
+use coflash_core::update::{DeviceState, Event, FlashOptions};
 use coflash_core::Error;
+use embedded_can::Frame as _;
 
 use super::packed;
 use kit::fake::{Bus, Deed, Fake, Maker, APPLICATION, BOOTLOADER};
@@ -227,6 +228,194 @@ fn a_device_that_was_exchanged_is_not_written() {
     // Bootloader and application may report a part or not, and their revisions may differ.
     bus.0[0].maker = Some(Box::new(Plate([63, 1234, 3, 0])));
     assert_eq!(words(&carried_out(&mut bus, &package, &plan))[0].2, "updated");
+}
+
+/// A device that is exchanged after its comparison with the plan, while others are still compared.
+struct Exchanged {
+    first: Plate,
+    then: Plate,
+    is_first: bool,
+}
+
+impl Maker for Exchanged {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let plate = if self.is_first { &mut self.first } else { &mut self.then };
+        let value = plate.value(at, running);
+        self.is_first &= at != (0x1018, 4);
+        value
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+/// All devices of a program are compared before the first is written. Another type of device that comes after
+/// that is not written, also if the package names nodes alone.
+#[test]
+fn a_device_that_is_exchanged_during_the_run_is_not_written() {
+    let package = package(&[("drive", r#""nodes": [5, 6]"#)]);
+    for count in [1, 2] {
+        let mut bus = Bus((0..count).map(|number| device(5 + number, 1234)).collect());
+        let plan = planned(&mut bus, &package);
+        let (first, then) = (Plate([63, 1234, 2, 1005]), Plate([63, 99, 2, 1005]));
+        bus.0[0].maker = Some(Box::new(Exchanged { first, then, is_first: true }));
+        let outcomes = carried_out(&mut bus, &package, &plan);
+        let its = outcomes.iter().find(|outcome| outcome.node == NodeId::new(5)).unwrap();
+        let Err(Bad::Failed(failed)) = &its.result else { panic!("{:?}", words(&outcomes)) };
+        assert!(matches!(failed.error, Error::WrongTarget { .. }), "{:?}", failed.error);
+        assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
+    }
+}
+
+/// A device whose bootloader reports less than its application: 0 is no report.
+struct Sparse {
+    bootloader: Plate,
+    application: Plate,
+}
+
+impl Maker for Sparse {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        let is_application = running == APPLICATION;
+        if is_application { &mut self.application } else { &mut self.bootloader }.value(at, running)
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+#[test]
+fn a_bootloader_without_an_identity_of_its_own_is_no_other_device() {
+    let nodes = r#""nodes": [5]"#;
+    // On trial the vendor-ID of a program is compared with that of the bootloader, which CiA 301 demands.
+    for (bootloader, entry) in
+        [([0; 4], format!("{nodes}, \"trial_run\": false")), ([63, 0, 0, 0], nodes.to_owned())]
+    {
+        let package = package(&[("drive", &entry)]);
+        for (in_plan, in_run) in [
+            (APPLICATION, APPLICATION),
+            (APPLICATION, BOOTLOADER),
+            (BOOTLOADER, BOOTLOADER),
+            (BOOTLOADER, APPLICATION),
+        ] {
+            let mut bus = Bus(vec![device(5, 1234)]);
+            let application = Plate([63, 1234, 2, 1005]);
+            bus.0[0].maker = Some(Box::new(Sparse { bootloader: Plate(bootloader), application }));
+            bus.0[0].running = Some(in_plan);
+            let plan = planned(&mut bus, &package);
+            bus.0[0].running = Some(in_run);
+            let outcomes = carried_out(&mut bus, &package, &plan);
+            assert_eq!(words(&outcomes)[0].2, "updated", "{bootloader:?}, {in_plan:X}h, {in_run:X}h");
+        }
+    }
+}
+
+/// A request to a node from another tool on the bus.
+fn request_to(node: u8) -> Frame {
+    Frame::of(CobId::new(0x600 + u16::from(node)).unwrap(), &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0])
+}
+
+/// The requests of a comparison would break a transfer of another tool, too.
+#[test]
+fn a_device_of_another_tool_is_not_asked() {
+    let package = package(&[("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234)]);
+    let plan = planned(&mut bus, &package);
+    let asked = bus.0[0].log.len();
+    bus.0[0].inject(request_to(5));
+    let outcomes = words(&carried_out(&mut bus, &package, &plan));
+    assert_eq!(outcomes[0], (Some(5), 0, "60000012h untouched".to_owned()));
+    assert_eq!(outcomes[1], (Some(6), 0, "updated".to_owned()));
+    assert_eq!(bus.0[0].log.len(), asked, "{:?}", bus.0[0].log);
+    // The user says that it does not matter.
+    bus.0[0].inject(request_to(5));
+    let options = RunOptions::default().flash(FlashOptions::default().alone(false));
+    let outcomes = words(&run(&mut bus, &package, &plan, &options, &|_, _, _| {}));
+    assert_eq!(outcomes[0], (Some(5), 0, "updated".to_owned()));
+}
+
+/// A scan asks all nodes, and ends their transfers: it does not begin while another tool is heard.
+#[test]
+fn no_plan_is_made_while_another_tool_talks_to_a_node() {
+    let package = package(&[("drive", DRIVES)]);
+    let mut bus = Bus(vec![device(5, 1234), device(6, 1234)]);
+    let alone = ScanOptions::default().alone(true);
+    // Nothing but a heartbeat: a plan.
+    bus.0[0].inject(Frame::of(CobId::new(0x705).unwrap(), &[5]));
+    assert_eq!(plan(&mut bus, &package, &alone, &Arc::default()).unwrap().updates(), 2);
+    for fake in &mut bus.0 {
+        fake.log.clear();
+    }
+    bus.0[1].inject(request_to(77));
+    let error = plan(&mut bus, &package, &alone, &Arc::default()).unwrap_err();
+    let PlanError::Bus(error @ Error::NotAlone { .. }) = error else { panic!("{error}") };
+    let words = "another tool is using node 77: it sends SDO requests, the last one for 1F57h/1";
+    assert_eq!(error.to_string(), words);
+    assert!(bus.0.iter().all(|fake| fake.log.is_empty()));
+    bus.0[1].inject(request_to(77));
+    assert_eq!(planned(&mut bus, &package).updates(), 2);
+}
+
+/// A device whose answers are too short.
+struct Short(Bus);
+
+impl Adapter for Short {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        self.0.send(frame)
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let frame = self.0.receive(timeout)?;
+        let is_its = |frame: &Frame| frame.cob_id() == CobId::new(0x585);
+        Ok(frame.map(|frame| {
+            if is_its(&frame) {
+                Frame::of(CobId::new(0x585).unwrap(), &frame.data()[..4])
+            } else {
+                frame
+            }
+        }))
+    }
+
+    fn now(&self) -> Duration {
+        self.0.now()
+    }
+}
+
+/// It is on the bus, and nobody looks for its plug.
+#[test]
+fn a_device_that_answers_wrongly_is_not_absent() {
+    let package = package(&[("drive", r#""nodes": [5, 6, 7]"#)]);
+    let mut bus = Short(Bus(vec![device(5, 1234), device(6, 1234)]));
+    let plan = planned(&mut bus, &package);
+    assert_eq!(steps(&plan), [(6, "drive", "update")]);
+    let outcomes = words(&carried_out(&mut bus, &package, &plan));
+    let expected = [(Some(5), "6000040Eh"), (Some(7), "60000013h"), (Some(6), "updated")];
+    assert_eq!(outcomes, expected.map(|(node, word)| (node, 0, word.to_owned())));
+    let said = plan.to_string();
+    assert!(said.contains("drive: node 5 answers, but with frames of 4 bytes where SDO has 8\n"), "{said}");
+    assert!(said.contains("drive: node 7 is not on the bus\n"), "{said}");
+}
+
+/// The user wants the last comparison, which the package does not.
+#[test]
+fn the_option_verify_is_for_packages_too() {
+    let package = package(&[("drive", r#""nodes": [5]"#)]);
+    let mut bus = Bus(vec![device(5, 1234)]);
+    let plan = planned(&mut bus, &package);
+    let options = RunOptions::default().flash(FlashOptions::default().verify(true));
+    let outcomes = run(&mut bus, &package, &plan, &options, &|_, _, _| {});
+    // This application reports another CRC than its program has.
+    let Err(Bad::Failed(failed)) = &outcomes[0].result else { panic!("{:?}", words(&outcomes)) };
+    assert!(matches!(failed.error, Error::WrongCrc { .. }), "{:?}", failed.error);
 }
 
 /// A device without power costs the others nothing, and gets nothing more after a program that failed.
