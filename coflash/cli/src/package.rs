@@ -1,5 +1,7 @@
 //! `coflash package`, and the update of a machine with a package: `coflash flash machine.cpk`.
 
+use std::collections::btree_map::Entry;
+use std::collections::BTreeMap;
 use std::io::{self, BufRead as _, IsTerminal as _, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -7,6 +9,7 @@ use canopen::NodeId;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, Args, Command, FromArgMatches};
 use coboot_can::Link;
+use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::file::limit;
 use coflash_core::machine::{
@@ -50,12 +53,20 @@ impl MakePackage {
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.recipe;
         let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-        let Recipe { name, release, parts } = Recipe::read(&text, path.parent().unwrap_or(Path::new("")))
-            .map_err(|fault| Failure::recipe(path, &fault))?;
+        let Recipe { name, release, parts, images } =
+            Recipe::read(&text, path.parent().unwrap_or(Path::new("")))
+                .map_err(|fault| Failure::recipe(path, &fault))?;
         let keys = self.key.iter().map(|path| signing_key(path)).collect::<Result<Vec<_>, _>>()?;
         let certificates =
             self.cert.iter().map(|path| keys::certificate(path)).collect::<Result<Vec<_>, _>>()?;
         let of = |certificate: &[u8; CERTIFICATE]| seal::wire::Certificate(certificate).key();
+        let mut rest = certificates.as_slice();
+        while let Some(first) = rest.split_off_first() {
+            if rest.iter().any(|other| of(other) == of(first)) {
+                let advice = "give each key one certificate, and --cert once for it";
+                return Err(Failure::usage("two certificates belong to one key", advice));
+            }
+        }
         let pairs: Vec<_> = keys
             .iter()
             .map(|key| (key, certificates.iter().find(|its| of(its) == key.public().bytes()).copied()))
@@ -69,17 +80,24 @@ impl MakePackage {
         let bytes =
             machine::make(name, release, &parts, &pairs).map_err(|fault| Failure::package(path, &fault))?;
         let output = self.output.clone().unwrap_or_else(|| path.with_extension("cpk"));
-        if output == *path {
-            return Err(Failure::usage(
-                "the package would replace its recipe",
-                "name the package with --output",
-            ));
+        let advice = "name the package with --output";
+        if is_same(&output, path) {
+            return Err(Failure::usage("the package would replace its recipe", advice));
+        }
+        if images.iter().any(|image| is_same(&output, image)) {
+            return Err(Failure::usage("the package would replace an image of its recipe", advice));
         }
         keys::write(&output, &bytes)?;
         let package = Package::parse(&bytes).map_err(|fault| Failure::package(&output, &fault))?;
         show(context, "package", &output, &Checked { package, known: None });
         Ok(())
     }
+}
+
+/// Whether two paths lead to one file, which there is.
+fn is_same(one: &Path, other: &Path) -> bool {
+    let real = |path: &Path| path.canonicalize().ok();
+    real(one).is_some_and(|one| real(other) == Some(one))
 }
 
 /// Whether a file is one for a machine: by its ending, or because it begins as a package. A file with this
@@ -311,6 +329,23 @@ pub(super) struct Given<'a> {
     pub(super) not_alone: bool,
 }
 
+impl Given<'_> {
+    /// Locks these nodes too, unless the user has said that others do not matter.
+    fn lock(
+        &self,
+        context: &Context,
+        nodes: impl Iterator<Item = NodeId>,
+        locks: &mut BTreeMap<NodeId, Lock>,
+    ) -> Result<(), Failure> {
+        for node in nodes.filter(|_| !self.not_alone) {
+            if let Entry::Vacant(free) = locks.entry(node) {
+                free.insert(context.lock(self.bus.as_deref(), node)?);
+            }
+        }
+        Ok(())
+    }
+}
+
 impl Machine {
     /// Updates the machine: scan, plan, confirmation, and the run.
     pub(super) fn run(&self, context: &Context, path: &Path, given: &Given<'_>) -> Result<(), Failure> {
@@ -326,8 +361,12 @@ impl Machine {
             ));
         };
         let flag = cancelled()?;
+        // Before the scan, which ends the transfers of all nodes. The others are known after it.
+        let mut locks = BTreeMap::new();
+        let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
+        given.lock(context, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
         let waiting = context.waiting("all nodes were asked, and had time to answer");
-        let scan = ScanOptions::default().timing(given.patience.timing());
+        let scan = ScanOptions::default().timing(given.patience.timing()).alone(!given.not_alone);
         let plan = machine::plan(&mut *adapter, &package, &scan, &flag).map_err(|error| match error {
             PlanError::Bus(error) => Failure::from(error),
             PlanError::Package(fault) => Failure::package(path, &fault),
@@ -337,9 +376,7 @@ impl Machine {
         if plan.updates() > 0 {
             self.confirm(context, &plan)?;
         }
-        let locks = plan.nodes().filter(|_| !given.not_alone);
-        let _locks =
-            locks.map(|node| context.lock(given.bus.as_deref(), node)).collect::<Result<Vec<_>, _>>()?;
+        given.lock(context, plan.nodes(), &mut locks)?;
         let nodes: Vec<NodeId> = plan.nodes().collect();
         let board = Board::new(out, &nodes);
         let show = |node: NodeId, _, event| {

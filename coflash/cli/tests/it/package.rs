@@ -32,7 +32,7 @@ fn the_documentations_example_is_a_recipe() {
     fs::write(folder.join("drive.cbs"), sealed).unwrap();
     // The files of the tests are linked for 08010000h, where that board has something else.
     let text = text.replace("board = \"stm32f407g-disc1\"", "");
-    let Recipe { name, release, parts } = recipe(&text, &folder).unwrap();
+    let Recipe { name, release, parts, .. } = recipe(&text, &folder).unwrap();
     assert_eq!((name.as_deref(), release.as_deref()), (Some("Press 4"), Some("2026-11")));
     let package = Package::parse(&make(name, release, &parts, &[]).unwrap()).unwrap();
     let shown: Vec<(&str, String)> =
@@ -132,6 +132,9 @@ fn the_command_makes_and_shows_a_package() {
     // A root of the configuration is for packages, and any other file has nothing to do with it.
     let config = folder.write("coflash.toml", format!("trust = '{public}'\nnode = 5\n").as_bytes());
     let config = config.to_str().unwrap();
+    // The same file by another path.
+    fs::create_dir(folder.join("aside")).unwrap();
+    let (aside, image) = (key("aside/../line.toml"), key("aside/../b.blk"));
     // Another file with the name of a package does not get past this root.
     let named = folder.join("x.CPK");
     fs::copy(data("plain-400.blk"), &named).unwrap();
@@ -141,6 +144,9 @@ fn the_command_makes_and_shows_a_package() {
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
         (&["package", recipe, "--key", &root, "--cert", &cert], 2, "belongs to none of the keys"),
         (&["package", recipe, "-o", recipe], 2, "replace its recipe"),
+        (&["package", recipe, "-o", &aside], 2, "replace its recipe"),
+        (&["package", recipe, "-o", &image], 2, "replace an image of its recipe"),
+        (&["package", recipe, "--key", &release, "--cert", &cert, "--cert", &cert], 2, "belong to one key"),
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),
         (&["flash", package, "--no-trial"], 2, "--no-trial has no meaning beside a package"),

@@ -54,6 +54,8 @@ pub struct Recipe {
     pub release: Option<String>,
     /// The programs, in the order of the update.
     pub parts: Vec<Part>,
+    /// The file of each.
+    pub images: Vec<PathBuf>,
 }
 
 /// An error in a recipe, with its place.
@@ -79,11 +81,12 @@ impl Recipe {
             return Err(RecipeFault::Line(1, "it names no program: write a [[program]] for each".to_owned()));
         }
         let mut parts = Vec::new();
+        let images = file.programs.iter().map(|row| folder.join(&row.image)).collect();
         for (number, row) in (1..).zip(file.programs) {
             let part = row.part(file.board.as_deref(), folder);
             parts.push(part.map_err(|what| RecipeFault::Program(number, what))?);
         }
-        Ok(Self { name: file.name, release: file.release, parts })
+        Ok(Self { name: file.name, release: file.release, parts, images })
     }
 }
 

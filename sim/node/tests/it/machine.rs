@@ -182,6 +182,36 @@ fn an_absent_node_and_one_of_another_type_are_said_and_the_others_go_on() {
     assert!(panel[0x2_0000..].iter().all(|byte| *byte == 0xFF), "nothing was written to the other device");
 }
 
+/// Another tool, on this computer or on another one, is updating a node: the scan of a package does not begin, and
+/// breaks nothing.
+#[test]
+fn a_package_does_not_break_the_update_of_another_tool() {
+    let folder = folder("machine-two-tools");
+    let nodes = Nodes::start(&folder, &["--node", "21", "--stand-in"]);
+    let coflash = Coflash::new(&folder, &nodes);
+    folder.write("one.toml", b"board = 'stm32f407g-disc1'\n[[program]]\nimage = 'valve.bin'\nnodes = [21]\n");
+    coflash.done(&["package", "one.toml"]);
+    let mut long = program(4);
+    long.resize(600 * 1024, 4);
+    folder.write("long.bin", &long);
+    let other = ["flash", "long.bin", "-I", "binary", "--board", "stm32f407g-disc1", "--node", "21"];
+    let elsewhere = folder.path("elsewhere");
+    std::fs::create_dir_all(&elsewhere).unwrap();
+    for (locks, how) in [
+        (folder.path(""), "another coflash on this computer, process "),
+        (elsewhere, "another tool is using node 21"),
+    ] {
+        let first = coflash.spawn(&[&other[..], &["-v", "--from-start"]].concat());
+        first.await_text("10 %");
+        let done = coflash.spawn_at(&["flash", "one.cpk", "--yes"], &locks).wait();
+        assert_eq!(done.exit, 6, "{}{}", done.out, done.err);
+        assert!(done.err.contains(how) && done.err.contains("[0x60000012]"), "{}", done.err);
+        assert!(!done.out.contains("node 21"), "{}", done.out);
+        let done = first.wait();
+        assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    }
+}
+
 /// Once the tool is killed, once it gets Ctrl-C, and once a device loses its power, each in the middle of the
 /// drives. The next run goes on: the panel is not written again, and all end with their programs.
 #[cfg(unix)]
