@@ -1,43 +1,19 @@
 //! What a session notices besides its transfers: it reports silence of the node, and stops if
 //! another tool uses the node.
 
-use std::sync::atomic::AtomicBool;
-use std::sync::{Arc, MutexGuard, PoisonError};
+use std::sync::{MutexGuard, PoisonError};
 use std::time::Duration;
 
-use canopen::{CobId, NodeId};
-use coboot_can::Adapter;
-
-use super::watch::{object_of, Silence, Watch, SILENCE};
+use super::watch::{Silence, Watch, LISTEN, SILENCE};
 use super::Session;
 use crate::device::doing::Doing;
 use crate::device::error::{Error, Intruder};
-use crate::device::listen::listen;
 
 /// How long a request of another tool counts.
 const FRESH: Duration = Duration::from_secs(2);
-/// Another tool that is working with a node sends requests at least this often: during the erase of
-/// a sector, four times a second.
-const LISTEN: Duration = Duration::from_millis(300);
 /// How long to wait for a moment without requests of others: the start-up procedure of a CANopen
 /// master (CiA 302-2) is some ten reads, each of which may take a few hundred milliseconds.
 const PEACE: Duration = Duration::from_secs(3);
-
-/// Checks whether another tool is using any node of a bus, before anything is sent to it: listens as long as
-/// [`Session::ensure_alone`].
-///
-/// # Errors
-/// [`Error::NotAlone`], [`Error::Adapter`] or [`Error::Cancelled`].
-pub fn ensure_bus_alone(adapter: &mut dyn Adapter, cancelled: &Arc<AtomicBool>) -> Result<(), Error> {
-    let mut heard = None;
-    listen(adapter, LISTEN, cancelled, &mut |frame| {
-        let mut nodes = (1..=127).filter_map(NodeId::new);
-        let asked = nodes.find(|node| frame.cob_id() == Some(CobId::sdo_request(*node)));
-        heard = asked.map(|node| Error::NotAlone { node, who: Intruder::Requests(object_of(frame)) });
-        heard.is_some()
-    })?;
-    heard.map_or(Ok(()), Err)
-}
 
 impl<'a> Session<'a> {
     /// Reports silence to `hook` while it lasts, once for each silence.

@@ -24,7 +24,7 @@ mod together;
 mod transfer;
 mod watch;
 
-pub(super) use self::attention::ensure_bus_alone;
+pub(super) use self::watch::ensure_bus_alone;
 use self::watch::Watch;
 pub use self::watch::{Silence, SILENCE};
 

@@ -1,6 +1,8 @@
 //! What a session observes besides its transfers: how long its node has been silent, and whether
 //! another tool talks to the node.
 
+use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::emcy::code;
@@ -9,8 +11,14 @@ use canopen::program::{PROGRAM_CONTROL, PROGRAM_DATA};
 use canopen::{Address, CobId, Frame, NodeId};
 
 use crate::device::doing::Doing;
+use crate::device::error::{Error, Intruder};
+use crate::device::listen::listen;
 use coboot_can::echo::Echoes;
+use coboot_can::Adapter;
 
+/// Another tool that is working with a node sends requests at least this often: during the erase of
+/// a sector, four times a second.
+pub(super) const LISTEN: Duration = Duration::from_millis(300);
 /// A silence of this length is reported while it lasts.
 pub const SILENCE: Duration = Duration::from_secs(2);
 /// The most requests for which an adapter may still return the echo: more than two sub-blocks of a
@@ -113,8 +121,24 @@ impl Watch {
     }
 }
 
+/// Checks whether another tool is using any node of a bus, before anything is sent to it: listens as long as
+/// a session does for its node.
+///
+/// # Errors
+/// [`Error::NotAlone`], [`Error::Adapter`] or [`Error::Cancelled`].
+pub fn ensure_bus_alone(adapter: &mut dyn Adapter, cancelled: &Arc<AtomicBool>) -> Result<(), Error> {
+    let mut heard = None;
+    listen(adapter, LISTEN, cancelled, &mut |frame| {
+        let mut nodes = (1..=127).filter_map(NodeId::new);
+        let asked = nodes.find(|node| frame.cob_id() == Some(CobId::sdo_request(*node)));
+        heard = asked.map(|node| Error::NotAlone { node, who: Intruder::Requests(object_of(frame)) });
+        heard.is_some()
+    })?;
+    heard.map_or(Ok(()), Err)
+}
+
 /// The object of a request; none for a segment, which does not name it.
-pub(super) fn object_of(frame: &Frame) -> Option<Address> {
+fn object_of(frame: &Frame) -> Option<Address> {
     let [command, low, high, sub, ..] = *frame.exactly::<8>()?;
     let initiates = matches!(command >> 5, 1 | 2 | 4 | 5 | 6) && high >= 0x10;
     initiates.then(|| Address::new(u16::from_le_bytes([low, high]), sub))
