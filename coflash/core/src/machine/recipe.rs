@@ -1,6 +1,7 @@
 //! The recipe of a package, `machine.toml`: which files become which programs of which devices.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use seal::wire::BOOTLOADER;
 use serde::Deserialize;
@@ -11,7 +12,7 @@ use crate::device::Dialect;
 use crate::file::board::{self, in_folder};
 use crate::file::convert::{program_of, Options, Region};
 use crate::file::judge::judge;
-use crate::file::sealed::carried;
+use crate::file::sealed::{carried, SealedFile};
 use crate::file::{block_file, limit, ram_image, read, AddressRange, Format, Place};
 use crate::update::dialect::is_data;
 use crate::update::{line_of, NewBootloader, Payload};
@@ -160,9 +161,9 @@ fn content(
         return Ok((new.into(), bytes));
     }
     if format == Some(Format::Sealed) {
-        let file = crate::file::sealed::SealedFile::for_program(bytes.clone(), number);
+        let file = SealedFile::for_program(bytes.clone(), number);
         let file = file.map_err(|refusal| said(&format!("{refusal}: {}", refusal.advice())))?;
-        return Ok((std::sync::Arc::new(file).into(), bytes));
+        return Ok((Arc::new(file).into(), bytes));
     }
     let layout = board.map(board::named).transpose().map_err(|error| error.to_string())?;
     let region: Option<AddressRange> = match layout {
@@ -183,5 +184,5 @@ fn content(
             .map_err(|fault| said(&format!("the image {fault}: {}", fault.advice())))?;
     }
     let bytes = block_file::emit(&program);
-    Ok((std::sync::Arc::new(program).into(), bytes))
+    Ok((Arc::new(program).into(), bytes))
 }
