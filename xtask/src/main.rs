@@ -130,8 +130,10 @@ const JOBS: &[Job] = jobs! {
 };
 
 fn main() -> ExitCode {
-    // The programs that a job has started get the signal from the terminal, too.
+    // The programs that a job has started get the signal from the terminal, too. What they print of it comes
+    // before the last line.
     let interrupted = ctrlc::set_handler(|| {
+        std::thread::sleep(std::time::Duration::from_millis(300));
         eprintln!("\nxtask: interrupted. What is built so far is kept; the same command goes on from there.");
         std::process::exit(130);
     });

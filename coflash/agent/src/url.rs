@@ -1,7 +1,13 @@
 //! The URLs of the server: whether a link belongs to it, and so may get the token; and where a
-//! redirect leads.
+//! redirect leads. The syntax is that of RFC 3986, by the crate `fluent-uri`.
 
 use std::net::Ipv4Addr;
+
+use fluent_uri::pct_enc::{encoder, EString};
+use fluent_uri::{Uri, UriRef};
+
+/// The longest URL, in characters.
+const MOST: usize = 4096;
 
 /// The server: scheme, host, port, and the path before the tenant.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -12,32 +18,25 @@ pub(super) struct Server {
     local: bool,
 }
 
-/// An absolute URL in two parts.
-struct Parts<'u> {
-    /// Scheme, host and port in one form: in small letters, with the port.
-    origin: String,
-    /// From the first slash after the host on.
-    rest: &'u str,
-    host: String,
-}
-
 impl Server {
     /// The server of a URL like `https://hawkbit.example.com/path`.
     ///
     /// # Errors
     /// In words, if it is no such URL.
-    pub(super) fn parse(url: &str) -> Result<Self, String> {
-        let wrong = |what: &str| format!("'{url}' is no URL of a server: {what}");
-        let parts = split(url).ok_or_else(|| wrong("it must be like https://hawkbit.example.com"))?;
-        if parts.rest.contains(['?', '#']) {
+    pub(super) fn parse(text: &str) -> Result<Self, String> {
+        let wrong = |what: &str| format!("'{text}' is no URL of a server: {what}");
+        let (url, origin) =
+            requested(text).ok_or_else(|| wrong("it must be like https://hawkbit.example.com"))?;
+        if url.has_query() || url.has_fragment() {
             return Err(wrong("it must end with the path"));
         }
+        let host = url.authority().map(|authority| authority.host().to_ascii_lowercase()).unwrap_or_default();
         Ok(Self {
-            plain: parts.origin.starts_with("http:"),
-            local: matches!(parts.host.as_str(), "localhost" | "[::1]")
-                || parts.host.parse().is_ok_and(|address: Ipv4Addr| address.is_loopback()),
-            path: parts.rest.trim_end_matches('/').to_string(),
-            origin: parts.origin,
+            plain: origin.starts_with("http:"),
+            local: matches!(host.as_str(), "localhost" | "[::1]")
+                || host.parse().is_ok_and(|address: Ipv4Addr| address.is_loopback()),
+            path: url.path().as_str().trim_end_matches('/').to_string(),
+            origin,
         })
     }
 
@@ -60,11 +59,12 @@ impl Server {
     /// The absolute form of a link, and whether it leads to this server. `None` if it is no URL
     /// that can be requested.
     pub(super) fn resolve(&self, link: &str) -> Option<(String, bool)> {
-        if link.starts_with('/') && !link.starts_with("//") && is_clean(link) {
-            return Some((format!("{}{link}", self.origin), true));
-        }
-        let own = split(link)?.origin == self.origin;
-        Some((link.split('#').next().unwrap_or(link).to_string(), own))
+        let absolute = match link.starts_with('/') && !link.starts_with("//") {
+            true => format!("{}{link}", self.origin),
+            false => link.to_string(),
+        };
+        let (url, origin) = requested(&absolute)?;
+        Some((url.strip_fragment().as_str().to_string(), origin == self.origin))
     }
 }
 
@@ -74,10 +74,10 @@ impl Server {
 /// # Errors
 /// In words, for what is no URL that can be requested, and for a way from https to http.
 pub(super) fn redirected(from: &str, location: &str) -> Result<String, &'static str> {
-    let to = join(from, location)
+    let (to, is_tls) = join(from, location)
         .ok_or("the server redirects to what is no URL of a server: check its address and its proxy")?;
-    let is_tls = |url: &str| split(url).is_some_and(|parts| parts.origin.starts_with("https:"));
-    match is_tls(from) && !is_tls(&to) {
+    let was_tls = requested(from).is_some_and(|(_, origin)| origin.starts_with("https:"));
+    match was_tls && !is_tls {
         true => Err("the server redirects from https to http, which is not followed: \
                      let it, or the proxy before it, redirect to https"),
         false => Ok(to),
@@ -85,109 +85,34 @@ pub(super) fn redirected(from: &str, location: &str) -> Result<String, &'static 
 }
 
 /// The URL that a reference names where `base` was asked for (RFC 3986 section 5.2), without a
-/// fragment. `None` if it is none that can be requested.
-fn join(base: &str, reference: &str) -> Option<String> {
-    let reference = reference.split('#').next().unwrap_or(reference);
-    let (origin, rest) = cut(base)?;
-    let (path, _) = query_of(rest);
-    let absolute = match reference.as_bytes() {
-        [] => base.to_string(),
-        [b'/', b'/', ..] => format!("{}{reference}", &origin[..=origin.find(':')?]),
-        [b'/', ..] => format!("{origin}{reference}"),
-        [b'?', ..] => format!("{origin}{path}{reference}"),
-        _ if has_scheme(reference) => reference.to_string(),
-        _ => {
-            let folder = path.rfind('/').map_or("/", |at| &path[..=at]);
-            format!("{origin}{folder}{reference}")
-        }
-    };
-    let (origin, rest) = cut(&absolute)?;
-    let (path, query) = query_of(rest);
-    Some(format!("{origin}{}{query}", without_dots(path)))
+/// fragment, and whether it is https. `None` if it is none that can be requested.
+fn join(base: &str, reference: &str) -> Option<(String, bool)> {
+    let url = UriRef::parse(reference).ok()?.resolve_against(&Uri::parse(base).ok()?).ok()?;
+    let (url, origin) = requested(url.strip_fragment().as_str())?;
+    Some((url.as_str().to_string(), origin.starts_with("https:")))
 }
 
-/// An absolute URL in two: up to the host, and from its path on.
-fn cut(url: &str) -> Option<(&str, &str)> {
-    let rest = split(url)?.rest.len();
-    Some(url.split_at(url.len() - rest))
-}
-
-/// A path, and the query after it.
-fn query_of(rest: &str) -> (&str, &str) {
-    rest.split_at(rest.find('?').unwrap_or(rest.len()))
-}
-
-/// Whether a reference begins with a scheme (RFC 3986 section 3.1).
-fn has_scheme(reference: &str) -> bool {
-    reference.split_once(':').is_some_and(|(scheme, _)| {
-        scheme.starts_with(|c: char| c.is_ascii_alphabetic())
-            && scheme.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"+-.".contains(&byte))
-    })
-}
-
-/// A path without the segments `.` and `..` (RFC 3986 section 5.2.4).
-fn without_dots(path: &str) -> String {
-    let mut kept = Vec::new();
-    let mut segments = path.strip_prefix('/').unwrap_or(path).split('/').peekable();
-    while let Some(segment) = segments.next() {
-        match segment {
-            "." => {}
-            ".." => drop(kept.pop()),
-            segment => kept.push(segment),
-        }
-        if segments.peek().is_none() && matches!(segment, "." | "..") {
-            kept.push("");
-        }
-    }
-    format!("/{}", kept.join("/"))
-}
-
-/// Whether a text has only characters that a URL may have.
-fn is_clean(text: &str) -> bool {
-    text.len() <= MOST && text.bytes().all(|byte| byte.is_ascii_graphic() && !b"\"<>\\^`{|}".contains(&byte))
-}
-
-/// The longest URL.
-const MOST: usize = 4096;
-
-fn split(url: &str) -> Option<Parts<'_>> {
-    if !is_clean(url) {
-        return None;
-    }
-    let (scheme, behind) = url.split_once("://")?;
-    let scheme = scheme.to_ascii_lowercase();
-    let port = match scheme.as_str() {
-        "http" => "80",
-        "https" => "443",
+/// A URL that can be requested, and its origin in one form: scheme and host in small letters, with
+/// the port. A user name before the host is refused: it would be a password in a configuration, or a
+/// disguise in a link.
+fn requested(text: &str) -> Option<(Uri<&str>, String)> {
+    let url = Uri::parse(text).ok().filter(|_| text.len() <= MOST)?;
+    let scheme = url.scheme().as_str().to_ascii_lowercase();
+    let usual = match scheme.as_str() {
+        "http" => 80,
+        "https" => 443,
         _ => return None,
     };
-    let end = behind.find(['/', '?', '#']).unwrap_or(behind.len());
-    let (host, rest) = behind.split_at(end);
-    // A user name before the host would be a password in a configuration, or a disguise in a link.
-    if host.contains('@') {
-        return None;
-    }
-    let (name, given) = match host.rsplit_once(':') {
-        Some((name, given)) if !given.contains(']') => (name, given),
-        _ => (host, ""),
-    };
-    let given = if given.is_empty() { port } else { given };
-    if name.is_empty() || given.parse::<u16>().is_err() {
-        return None;
-    }
-    let host = name.to_ascii_lowercase();
-    Some(Parts { origin: format!("{scheme}://{host}:{given}"), rest, host })
+    let authority = url.authority().filter(|authority| !authority.has_userinfo())?;
+    let host = Some(authority.host().to_ascii_lowercase()).filter(|host| !host.is_empty())?;
+    let port = authority.port_to_u16().ok()?.unwrap_or(usual);
+    Some((url, format!("{scheme}://{host}:{port}")))
 }
 
 /// A text as one segment of a path.
-fn encoded(segment: &str) -> String {
-    let mut out = String::new();
-    for byte in segment.bytes() {
-        match byte {
-            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'_' | b'.' | b'~' => out.push(char::from(byte)),
-            byte => out.push_str(&format!("%{byte:02X}")),
-        }
-    }
+fn encoded(segment: &str) -> EString<encoder::Path> {
+    let mut out = EString::new();
+    out.encode_str::<encoder::Data>(segment);
     out
 }
 
@@ -232,7 +157,7 @@ mod tests {
             ("./g", "http://a/b/c/g"),
             ("g/", "http://a/b/c/g/"),
             ("/g", "http://a/g"),
-            ("//g", "http://g/"),
+            ("//g", "http://g"),
             ("?y", "http://a/b/c/d;p?y"),
             ("g?y", "http://a/b/c/g?y"),
             ("#s", "http://a/b/c/d;p?q"),
@@ -258,7 +183,7 @@ mod tests {
             ("g/../h", "http://a/b/c/h"),
             ("g;x=1/../y", "http://a/b/c/y"),
             ("g?y/../x", "http://a/b/c/g?y/../x"),
-            ("https://h", "https://h/"),
+            ("https://h", "https://h"),
             ("HTTP://h:80/x?y", "HTTP://h:80/x?y"),
         ] {
             assert_eq!(redirected("http://a/b/c/d;p?q", reference).as_deref(), Ok(url), "{reference}");
