@@ -68,7 +68,7 @@ mod write;
 
 /// Converts firmware and downloads it over CANopen.
 #[derive(Debug, Parser)]
-#[command(name = "coflash", version, max_term_width = 100)]
+#[command(name = "coflash", version = env!("COFLASH_VERSION"), max_term_width = 100)]
 struct Cli {
     /// The CAN bus: socketcan:INTERFACE (on Linux), slcan:PORT@BITRATE,
     /// slcan:tcp://HOST:PORT@BITRATE, peak:CHANNEL@BITRATE, kvaser:NUMBER@BITRATE,

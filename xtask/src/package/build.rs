@@ -1,11 +1,12 @@
 //! Builds the programs with cargo, so that the same sources give the same bytes in every folder.
 
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::{env, fs};
 
 use super::notices;
-use super::release::{Release, LINUX};
+use super::release::{Release, LINUX, VERSION};
 use crate::{files, process, setup, workspace, Outcome};
 
 /// Cargo's profile of the released programs.
@@ -28,7 +29,7 @@ pub fn program(root: &Path, target_dir: &Path, target: &str) -> Outcome<PathBuf>
     Ok(target_dir.join(target).join(PROFILE).join("coflash").with_extension(extension))
 }
 
-/// Builds the wheel for the Python of this system.
+/// Builds the wheel for the Python of this system: the package, and the program for the command line.
 pub fn wheel(release: &Release) -> Outcome {
     for old in files::within(&release.dist)?.iter().filter(|file| files::is(file, "whl")) {
         let _ = fs::remove_file(old);
@@ -37,7 +38,27 @@ pub fn wheel(release: &Release) -> Outcome {
     maturin.args(["-m", "maturin", "build", "--profile", PROFILE, "--locked", "--quiet", "--manifest-path"]);
     maturin.arg(workspace::root().join("coflash/python/Cargo.toml")).arg("--out").arg(&release.dist);
     maturin.arg("--target-dir").arg(&release.build).env("SOURCE_DATE_EPOCH", &release.epoch);
-    process::run(reproducible(&mut maturin, workspace::root()))
+    process::run(reproducible(&mut maturin, workspace::root()))?;
+    with_program(release, &release.wheel()?)
+}
+
+/// Puts the program for Linux into a wheel. It is built apart, since maturin takes either a library or
+/// programs from a crate.
+fn with_program(release: &Release, wheel: &Path) -> Outcome {
+    let stage = release.empty("wheel")?;
+    let tool = |words: &[&OsStr]| {
+        let mut tool = Command::new(setup::python());
+        tool.args(["-m", "wheel"]).args(words).env("SOURCE_DATE_EPOCH", &release.epoch);
+        process::output(&mut tool)
+    };
+    tool(&["unpack".as_ref(), "--dest".as_ref(), stage.as_ref(), wheel.as_ref()])?;
+    // PEP 427: what is in `NAME.data/scripts` goes to the programs of the environment.
+    let name = format!("coflash-{}", VERSION);
+    let folder = stage.join(&name);
+    let program = program(workspace::root(), &release.build, LINUX)?;
+    files::copy(&program, &folder.join(format!("{name}.data/scripts/coflash")))?;
+    tool(&["pack".as_ref(), "--dest-dir".as_ref(), release.dist.as_ref(), folder.as_ref()])?;
+    files::remove(&stage)
 }
 
 /// The program for Linux, and beside it the files for other folders of a system: `man`,

@@ -94,14 +94,15 @@ pub fn debian(release: &Release, root: &Path) -> Outcome {
     Ok(())
 }
 
-/// The wheel updates a node, in an environment of its own.
+/// The wheel updates a node, in an environment of its own, and has the program.
 pub fn wheel(release: &Release, root: &Path) -> Outcome {
-    let wheel = files::within(&release.dist)?.into_iter().find(|file| files::is(file, "whl"));
-    let wheel = wheel.ok_or("target/dist has no wheel; `cargo xtask package python` makes it.")?;
     process::run(Command::new("python3").args(["-m", "venv"]).arg(root.join("venv")))?;
     let python = root.join("venv/bin/python");
-    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index"];
-    process::run(Command::new(&python).args(pip).arg(wheel))?;
+    // By its name, as from the registry.
+    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--find-links"];
+    process::run(Command::new(&python).args(pip).arg(&release.dist).arg("coflash"))?;
+    let said = process::output(Command::new(root.join("venv/bin/coflash")).arg("--version"))?;
+    said_in(&said, VERSION, "coflash --version")?;
     process::run(process::cargo("build").args(["--quiet", "--package", "coboot-node"]))?;
     let node = workspace::target_dir().join("debug/coboot-node");
     files::write(&root.join("program.bin"), sample())?;

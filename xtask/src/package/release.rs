@@ -45,6 +45,12 @@ impl Release {
         self.file("-x86_64-windows.exe")
     }
 
+    /// The wheel, whose name has the oldest C library that it runs on.
+    pub fn wheel(&self) -> Outcome<PathBuf> {
+        let wheel = files::within(&self.dist)?.into_iter().find(|file| files::is(file, "whl"));
+        wheel.ok_or_else(|| "target/dist has no wheel; `cargo xtask package python` makes it.".to_owned())
+    }
+
     /// An empty folder with this name among the intermediate files.
     pub fn empty(&self, name: &str) -> Outcome<PathBuf> {
         let folder = self.build.join(name);

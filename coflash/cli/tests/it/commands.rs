@@ -2,7 +2,7 @@
 
 use std::fs;
 use std::io::Write;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::tool::{coflash, data, folder, run, snapshot};
@@ -31,6 +31,15 @@ fn on(fake: impl Fn() -> Fake, arguments: &[&str]) -> (crate::tool::Done, Value,
     assert_eq!(words.exit, json.exit, "{}{}", words.err, json.out);
     let value = serde_json::from_str(&json.out).unwrap_or_else(|error| panic!("{error}: {}", json.out));
     (words, value, fake)
+}
+
+/// The commit as git says it, from the folder of the sources.
+#[test]
+fn the_version_has_the_commit() {
+    let git = Command::new("git").args(["rev-parse", "HEAD"]).output().unwrap();
+    let commit = String::from_utf8(git.stdout).unwrap();
+    let version = concat!("coflash ", env!("CARGO_PKG_VERSION"));
+    assert_eq!(coflash(&["--version"]).out, format!("{version} ({})\n", &commit[..12]));
 }
 
 #[test]
