@@ -4,7 +4,7 @@ use std::fs;
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 /// The bytes of a file.
 pub fn bytes(file: &Path) -> Outcome<Vec<u8>> {

@@ -11,7 +11,7 @@ use std::{env, fs};
 
 use crate::args::Args;
 use crate::workspace::TARGET;
-use crate::{files, process, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask setup

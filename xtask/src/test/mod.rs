@@ -16,8 +16,8 @@ use self::programs::Program;
 use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
 use crate::{
-    attack, build, chips, evidence, examples, files, fuzz, opinion, powercut, process, reproduce, setup,
-    workspace, Outcome,
+    attack, build, chips, evidence, examples, files, fuzz, opinion, outcome::Outcome, powercut, process,
+    reproduce, setup, workspace,
 };
 
 mod plan;

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::{process, workspace, Outcome};
+use crate::{outcome::Outcome, process, workspace};
 
 /// A test program: a crate's own tests, or its tests from outside.
 #[derive(Clone, Debug, PartialEq, Eq)]
