@@ -333,6 +333,10 @@ fn python_environment() -> Outcome {
     if python_environment_is_there() {
         return Ok(());
     }
+    let _alone = files::lock("python", "Another job makes the Python environment of this clone.")?;
+    if python_environment_is_there() {
+        return Ok(());
+    }
     let home = workspace::target_dir().join("python");
     println!("Making a Python environment in {} ...", workspace::shown(&home));
     process::run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&home))?;
