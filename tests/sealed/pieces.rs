@@ -1,5 +1,5 @@
 //! A sealed image in pieces, on the model of the flash: in the blocks of a block file, of any size and
-//! with one that is not right (on the emulated chip: `sealed_blocks.rs`), slowly, and with a manifest
+//! with one that is not right (on the emulated chip: `blocks.rs`), slowly, and with a manifest
 //! that the owner has signed and that is not true.
 
 use boot_core::flash::FlashFault;

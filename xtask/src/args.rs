@@ -3,7 +3,7 @@
 
 use std::ops::RangeInclusive;
 
-use crate::Outcome;
+use crate::outcome::Outcome;
 
 /// The arguments after `cargo xtask JOB`.
 pub struct Args {

@@ -14,7 +14,7 @@ use serde_json::Value;
 
 use crate::args::Args;
 use crate::process::list;
-use crate::{files, modules, ordered, process, rooms, workspace, Outcome};
+use crate::{files, modules, ordered, outcome::Outcome, process, rooms, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask arrows

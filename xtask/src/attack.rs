@@ -7,7 +7,7 @@ use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, evidence, process, Outcome};
+use crate::{build, evidence, outcome::Outcome, process};
 
 pub const HELP: &str = "\
 usage: cargo xtask attack [--frames N | --silicon N] [--seed S]

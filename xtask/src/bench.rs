@@ -4,7 +4,7 @@ use serde_json::{json, Value};
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, evidence, process, workspace, Outcome};
+use crate::{build, evidence, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask bench [--json] [--board BOARD]

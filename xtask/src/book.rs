@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use crate::args::Args;
-use crate::{files, links, process, setup, workspace, Outcome};
+use crate::{files, links, outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask docs

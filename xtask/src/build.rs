@@ -12,7 +12,7 @@ use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{self, Part};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{files, process, ram_image, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, ram_image, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]

@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{arrows, lint, process, workspace, Outcome};
+use crate::{arrows, lint, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask check

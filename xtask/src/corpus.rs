@@ -6,7 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
-use crate::{files, workspace, Outcome};
+use crate::{files, outcome::Outcome, workspace};
 
 /// The most bytes of what the fuzzer has found that are kept for a target, and of one input.
 const KEPT: usize = 96 * 1024;

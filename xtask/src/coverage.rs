@@ -8,7 +8,7 @@ use serde_json::{json, Value};
 use crate::args::Args;
 use crate::process::list;
 use crate::setup::{self, Part};
-use crate::{evidence, files, process, workspace, Outcome};
+use crate::{evidence, files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask coverage

@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask demo [--sealed | --renew] [--trace FILE] [--board BOARD]

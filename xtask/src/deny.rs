@@ -4,7 +4,7 @@ use std::process::Command;
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{process, workspace, Outcome};
+use crate::{outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask deny [--advisories]

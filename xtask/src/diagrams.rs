@@ -6,7 +6,7 @@ use std::process::Command;
 use sha2::{Digest, Sha256};
 
 use crate::args::Args;
-use crate::{files, process, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask diagrams

@@ -5,7 +5,7 @@ use shared_abi::layout;
 use crate::args::Args;
 use crate::product::Product;
 use crate::setup::{self, Part};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask eds [--product FILE|NAME] [--board BOARD] [--out FOLDER]

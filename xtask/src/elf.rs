@@ -4,7 +4,7 @@ use object::elf::{FileHeader32, PT_LOAD, SHF_ALLOC, SHT_NOBITS};
 use object::read::elf::{FileHeader, ProgramHeader, SectionHeader};
 use object::LittleEndian;
 
-use crate::Outcome;
+use crate::outcome::Outcome;
 
 /// A piece of the image from the program headers (only `PT_LOAD`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,7 +4,7 @@ use shared_abi::layout;
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, process, workspace, Outcome};
+use crate::{build, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask emulate [--board BOARD] [--log[=WAY] | --virtual-can] [OPTIONS]

@@ -13,7 +13,7 @@ use std::process::Command;
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{files, process, toolchain, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask evidence [--release]

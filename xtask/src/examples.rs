@@ -9,7 +9,7 @@ use shared_abi::layout::{stm32f407g_disc1, Layout};
 use crate::args::Args;
 use crate::build::report;
 use crate::setup::{self, Part};
-use crate::{files, process, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask examples [NAME...]

@@ -1,10 +1,10 @@
 //! Files and folders, with errors that name the path.
 
-use std::fs;
+use std::fs::{self, File};
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
 
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 /// The bytes of a file.
 pub fn bytes(file: &Path) -> Outcome<Vec<u8>> {
@@ -44,6 +44,20 @@ pub fn remove(folder: &Path) -> Outcome {
         Err(error) if error.kind() != ErrorKind::NotFound => Err(failed("removed", folder)(error)),
         _ => Ok(()),
     }
+}
+
+/// Waits until no other job in this clone has the lock of this name. It is held as long as the file is
+/// open; `busy` is printed for the wait.
+pub fn lock(name: &str, busy: &str) -> Outcome<File> {
+    let path = workspace::target_dir().join(name).with_extension("lock");
+    make(&workspace::target_dir())?;
+    let file = File::options().create(true).truncate(false).write(true).open(&path);
+    let file = file.map_err(failed("locked", &path))?;
+    if file.try_lock().is_err() {
+        println!("{busy} This one waits for its end; Ctrl-C gives up.");
+        file.lock().map_err(failed("locked", &path))?;
+    }
+    Ok(file)
 }
 
 /// What is in a folder, sorted.

@@ -3,7 +3,7 @@
 
 use std::fmt::Write;
 
-use crate::{files, Outcome};
+use crate::{files, outcome::Outcome};
 
 /// Bits of a frame with 8 bytes of data: 111 with the intermission, and stuff bits as code has
 /// them on average.

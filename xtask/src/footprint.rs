@@ -7,7 +7,7 @@ use std::{cmp, fs};
 use shared_abi::geometry::Region;
 
 use crate::elf::Elf;
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 /// Reads an ELF file.
 ///

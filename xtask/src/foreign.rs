@@ -3,7 +3,7 @@
 use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
-use crate::{build, process, Outcome};
+use crate::{build, outcome::Outcome, process};
 
 pub const HELP: &str = "\
 usage: cargo xtask foreign NAME=FILE.elf...

@@ -10,7 +10,7 @@ use std::{env, fs, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, files, process, setup, workspace, Outcome};
+use crate::{corpus, evidence, files, outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]

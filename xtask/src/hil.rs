@@ -15,7 +15,7 @@ use serde_json::{json, Value};
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, files, process, workspace, Outcome};
+use crate::{build, files, outcome::Outcome, process, workspace};
 use bench::{Bench, Done, HANDS};
 use coflash::Coflash;
 use command::CommandLine;

@@ -4,7 +4,7 @@ use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask layout [--board BOARD] [--ld IMAGE | --toml]

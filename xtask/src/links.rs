@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
-use crate::{files, workspace, Outcome};
+use crate::{files, outcome::Outcome, workspace};
 
 /// The pages outside `docs/` and `examples/`.
 pub const ELSEWHERE: [&str; 6] = [

@@ -2,7 +2,7 @@
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, files, process, product, words, workspace, Outcome};
+use crate::{build, files, outcome::Outcome, process, product, words, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD]

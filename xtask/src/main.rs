@@ -42,6 +42,7 @@ mod mutants;
 mod new_board;
 mod opinion;
 mod ordered;
+mod outcome;
 mod package;
 mod pairs;
 mod parts;
@@ -63,9 +64,7 @@ mod words;
 mod workspace;
 
 use args::Args;
-
-/// The result of a job: nothing, or a message with the error and its remedy.
-type Outcome<T = ()> = Result<T, String>;
+use outcome::Outcome;
 
 /// One job.
 struct Job {

@@ -15,11 +15,13 @@ pub type Graph = BTreeMap<Module, BTreeSet<Module>>;
 /// Reads the graph from the sources of a crate: the path of each below `src/`, and its text.
 /// `krate` is the name of the library in the code of a binary beside it.
 pub fn graph(krate: &str, sources: &[(String, String)]) -> Graph {
+    let has_library = sources.iter().any(|(path, _)| path == "lib.rs");
     let mut modules: Vec<(Module, &str)> =
-        sources.iter().filter_map(|(path, text)| Some((module(path)?, text.as_str()))).collect();
+        sources.iter().filter_map(|(path, text)| Some((module(path, has_library)?, text.as_str()))).collect();
     modules.retain(|(module, _)| module.last().is_none_or(|name| name != "tests"));
     let known: BTreeSet<Module> = modules.iter().map(|(module, _)| module.clone()).collect();
-    let krate = krate.replace('-', "_");
+    // Without `lib.rs` the name is that of another file, or of nothing.
+    let krate = if has_library { krate.replace('-', "_") } else { String::new() };
     let programs: Vec<Module> = sources.iter().filter_map(|(path, _)| program(path)).collect();
     let mut graph = Graph::new();
     for (own, text) in &modules {
@@ -41,15 +43,16 @@ fn program(path: &str) -> Option<Module> {
     Some(path.strip_suffix("/main.rs")?.split('/').map(str::to_owned).collect())
 }
 
-/// The module of a file; `None` for the root of a binary, which no other file can use.
-fn module(path: &str) -> Option<Module> {
+/// The module of a file; `None` for the root of a program beside a library, and of a program in one
+/// file: no other file can use it.
+fn module(path: &str, has_library: bool) -> Option<Module> {
     let path = path.strip_suffix(".rs")?;
     let mut parts: Module = path.split('/').map(str::to_owned).collect();
     let is_in_bin = parts.len() == 2 && parts[0] == "bin";
-    if is_in_bin || parts.last().is_some_and(|last| last == "main") {
+    if is_in_bin || path == "main" && has_library {
         return None;
     }
-    if parts.last().is_some_and(|last| last == "mod" || last == "lib" && path == "lib") {
+    if path == "lib" || parts.last().is_some_and(|last| ["main", "mod"].contains(&last.as_str())) {
         parts.pop();
     }
     Some(parts)
@@ -180,8 +183,11 @@ fn resolve(
             }
         }
         "crate" => {
-            at = root.to_vec();
             rest = &rest[1..];
+            let first = &rest[..rest.len().min(1)];
+            // A program takes files of the folder above it by `#[path]`.
+            let is_above = known.contains(first) && !known.contains(&[root, first].concat());
+            at = if is_above { Module::new() } else { root.to_vec() };
         }
         name if name == krate => {
             at.clear();
@@ -218,7 +224,7 @@ mod tests {
             .map(|file| ((*file).to_owned(), if *file == own { text.to_owned() } else { String::new() }))
             .collect();
         let graph = graph("my-crate", &sources);
-        graph[&module(own).unwrap()].iter().map(|module| module.join("::")).collect()
+        graph[&module(own, true).unwrap()].iter().map(|module| module.join("::")).collect()
     }
 
     #[test]

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{coverage, evidence, files, process, workspace, Outcome};
+use crate::{coverage, evidence, files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask mutants [--package NAME] [--in-diff BASE] [--shard K/N] [OPTIONS]

@@ -3,7 +3,7 @@
 use new_board::Choices;
 
 use crate::args::Args;
-use crate::{files, workspace, Outcome};
+use crate::{files, outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask new-board NAME --chip CHIP [--crystal HZ] [--can N] [--pins TX,RX] [--led PIN] [--strap PIN]

@@ -9,7 +9,7 @@ use serde_json::Value;
 use crate::modules::without_comments;
 use crate::process::list;
 use crate::workspace::{self, TARGET};
-use crate::{files, process, Outcome};
+use crate::{files, outcome::Outcome, process};
 
 /// The paths at the top level.
 const TOP_LEVEL: [&str; 6] = ["Cargo.toml", "bootloader", "app-template", "shared-abi", "linker", "tests"];

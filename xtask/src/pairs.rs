@@ -9,7 +9,7 @@ use crate::footprint::Flash;
 use crate::product::Product;
 use crate::setup::{self, Part};
 use crate::size::{budgets, within};
-use crate::{build, files, workspace, Outcome};
+use crate::{build, files, outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask pairs [--spread | --board BOARD]

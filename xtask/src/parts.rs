@@ -7,7 +7,7 @@ use addr2line::gimli::{Dwarf, EndianSlice, Error, LittleEndian};
 use addr2line::Context;
 use object::{Object, ObjectSection};
 
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 /// The part for long runs of zeros: statics that start as zero.
 pub const ZEROS: &str = "(zeros)";

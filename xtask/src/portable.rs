@@ -1,7 +1,7 @@
 //! `cargo xtask portable`: checks that the code of the host tools compiles for other systems.
 
 use crate::args::Args;
-use crate::{process, setup, workspace, Outcome};
+use crate::{outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask portable [--strict]

@@ -8,7 +8,7 @@ use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
 use crate::setup::{self, Part};
-use crate::{build, evidence, process, workspace, Outcome};
+use crate::{build, evidence, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask powercut [--full] [--every-way] [--scenario NAME] [--json] [--reproduce POINT]

@@ -8,8 +8,8 @@ use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 
+use crate::outcome::Outcome;
 use crate::workspace;
-use crate::Outcome;
 
 /// The cargo that started this program, on this workspace, in the caller's folder.
 pub fn cargo(subcommand: &str) -> Command {

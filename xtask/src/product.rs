@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::{workspace, Outcome};
+use crate::{outcome::Outcome, workspace};
 
 /// A product of a bootloader.
 #[derive(Clone, Debug, PartialEq, Eq)]

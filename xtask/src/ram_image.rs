@@ -5,7 +5,7 @@ use crc::{Crc, CRC_32_ISO_HDLC};
 use shared_abi::ram_image::{Header, MAGIC};
 
 use crate::elf::{Elf, Section};
-use crate::Outcome;
+use crate::outcome::Outcome;
 
 /// The linker's section with the header.
 pub const HEADER: &str = ".ram_image";

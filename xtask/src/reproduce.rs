@@ -8,7 +8,7 @@ use serde_json::json;
 use crate::args::Args;
 use crate::elf::{Elf, Segment};
 use crate::setup::{self, Part};
-use crate::{evidence, files, process, toolchain, workspace, Outcome};
+use crate::{evidence, files, outcome::Outcome, process, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask reproduce [--board BOARD]

@@ -252,11 +252,25 @@ mod tests {
             ("main.rs", "mod services;"),
             ("services.rs", ""),
             ("resident/main.rs", "mod stage; mod storing; fn main() { stage::run() }"),
-            ("resident/stage.rs", "use crate::storing;"),
+            ("resident/stage.rs", "use crate::services::X;\nuse crate::storing;"),
             ("resident/storing.rs", "use crate::stage::Stage;"),
         ]);
         let words = "these files use each other in a circle: resident::stage -> resident::storing";
         assert_eq!(broken("bootloader", &all), [format!("bootloader: {words}")]);
+    }
+
+    /// `main.rs` is a file like others, unless a library beside it is what `crate::` means.
+    #[test]
+    fn a_program_and_its_files_do_not_use_each_other() {
+        let main = |path, more: &[_]| {
+            let uses =
+                [(path, "mod a; use a::f;"), ("a.rs", "use crate::X;"), ("bin/b/a.rs", "use super::Y;")];
+            broken("x", &sources(&[&uses, more].concat()))
+        };
+        let words = |circle: &str| format!("x: these files use each other in a circle: {circle}");
+        assert_eq!(main("main.rs", &[]), [words("(root) -> a")]);
+        assert_eq!(main("bin/b/main.rs", &[]), [words("bin::b -> bin::b::a")]);
+        assert_eq!(main("main.rs", &[("lib.rs", "pub struct X;")]), [""; 0]);
     }
 
     #[test]

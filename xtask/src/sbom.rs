@@ -15,7 +15,7 @@ use sha2::{Digest, Sha512_256};
 
 use crate::args::Args;
 use crate::process::list;
-use crate::{build, evidence, files, process, setup, workspace, Outcome};
+use crate::{build, evidence, files, outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask sbom [--board BOARD]

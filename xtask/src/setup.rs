@@ -11,7 +11,7 @@ use std::{env, fs};
 
 use crate::args::Args;
 use crate::workspace::TARGET;
-use crate::{files, process, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask setup
@@ -330,6 +330,10 @@ fn python_environment_is_there() -> bool {
 }
 
 fn python_environment() -> Outcome {
+    if python_environment_is_there() {
+        return Ok(());
+    }
+    let _alone = files::lock("python", "Another job makes the Python environment of this clone.")?;
     if python_environment_is_there() {
         return Ok(());
     }

@@ -11,7 +11,7 @@ use crate::args::Args;
 use crate::elf::Elf;
 use crate::footprint::{kib, read, Flash};
 use crate::setup::{self, Part};
-use crate::{build, evidence, parts, ram_image, toolchain, workspace, Outcome};
+use crate::{build, evidence, outcome::Outcome, parts, ram_image, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD] [--image IMAGE]

@@ -3,7 +3,7 @@
 use std::env;
 use std::process::{Command, Stdio};
 
-use crate::{process, workspace, Outcome};
+use crate::{outcome::Outcome, process, workspace};
 
 /// The file that names the toolchain of a release, for rustup and for us. Size and bytes of the
 /// firmware depend on it (docs/adr/0018-toolchain-of-a-release.md).

@@ -3,7 +3,7 @@
 use std::fs;
 use std::process::Command;
 
-use crate::{process, workspace, Outcome};
+use crate::{outcome::Outcome, process, workspace};
 
 /// Pages about the past, which keep their words.
 const PAST: [&str; 2] = ["CHANGELOG.md", "docs/adr/"];

@@ -8,7 +8,7 @@ use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
-use crate::Outcome;
+use crate::outcome::Outcome;
 
 /// The target of the firmware: Armv7E-M with the single-precision FPU.
 pub const TARGET: &str = "thumbv7em-none-eabihf";

@@ -7,10 +7,10 @@ use core::sync::atomic::{AtomicU32, Ordering};
 use bsp::clock::HSI;
 use cortex_m::peripheral::syst::SystClkSource;
 use cortex_m::peripheral::SYST;
-use rtic_monotonics::Monotonic;
+use rtic_monotonics::systick::SystickBackend;
+use rtic_monotonics::TimerQueueBackend;
 
 use super::ON;
-use crate::Mono;
 
 /// The largest reload value of the timer (ARMv7-M B3.3.4): a second of HSI, longer than all that is waited for.
 const FULL: u32 = 0xFF_FFFF;
@@ -54,9 +54,9 @@ pub fn longest() -> u32 {
 /// Time in us: the milliseconds of the monotonic, and the count of its timer, which runs down once in each.
 fn now() -> u32 {
     loop {
-        let ms = Mono::now().ticks();
+        let ms = SystickBackend::now();
         let left = SYST::get_current() / ((SYST::get_reload() + 1) / 1000);
-        if Mono::now().ticks() == ms {
+        if SystickBackend::now() == ms {
             return ms.wrapping_mul(1000).wrapping_add(999 - left);
         }
     }

@@ -1,10 +1,11 @@
 //! A program on RTIC with a CANopen stack of its own (`stack.rs`), which asks `coboot-app` for the
-//! objects of the bootloader's world (`objects.rs`).
+//! objects of the bootloader's world (`objects.rs`). `device.rs` says which device it is.
 //!
 //! Priority 2 serves the bus, 1 is the application's.
 #![no_std]
 #![no_main]
 
+mod device;
 mod objects;
 mod stack;
 
@@ -12,20 +13,16 @@ use core::panic::PanicInfo;
 
 use bxcan::filter::{BankConfig, ListEntry16};
 use bxcan::{Can, Data, Fifo, Frame, Id, StandardId};
-use coboot_app::layout::Layout;
 use coboot_app::{Bootloader, Next, ReentryPath};
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{exception, ExceptionFrame};
 use rtic_monotonics::systick::prelude::*;
 use stm32f4xx_hal::pac::{CAN1, RCC};
 
+use crate::device::{LAYOUT, PRODUCT_CODE, VENDOR_ID};
 use crate::objects::Objects;
 use crate::stack::{Event, Node};
 
-/// 1018h/1 to 3: those of the bootloader.
-const VENDOR_ID: u32 = 0;
-const PRODUCT_CODE: u32 = 0x4007_D151;
-const REVISION: u32 = 0x0001_0000;
 const VERSION: u32 = if cfg!(feature = "version-2") { 2 } else { 1 };
 const HEARTBEAT_MS: u32 = 500;
 /// How often the protocol looks at the clock, in ms.
@@ -33,8 +30,6 @@ const TICK_MS: u32 = 2;
 /// Number of checks whether the crystal runs: some 100 ms at 16 MHz.
 const PATIENCE: u32 = 200_000;
 
-/// Where everything is on this board: `build.rs` names it.
-static LAYOUT: Layout = coboot_app::layout!();
 coboot_app::label!(vendor_id: VENDOR_ID, product_code: PRODUCT_CODE, version: VERSION);
 
 systick_monotonic!(Mono, 1_000);

@@ -7,8 +7,8 @@ use coboot_app::program_control::{DEVICE_STATE, FLASH_STATUS, PROGRAM_CONTROL, P
 use coboot_app::warm_start::BootRequest;
 use coboot_app::{Abort, Answer, Bootloader, Next, ProgramControl, Start};
 
+use crate::device::{LAYOUT, PRODUCT_CODE, REVISION, VENDOR_ID};
 use crate::stack::{AbortCode, Confirmation, Dictionary, Value};
-use crate::{LAYOUT, PRODUCT_CODE, REVISION, VENDOR_ID};
 
 /// 2000h, an object of the application: half the period of the LED, in ms.
 pub static BLINK_MS: AtomicU16 = AtomicU16::new(500);

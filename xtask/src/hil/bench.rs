@@ -9,7 +9,7 @@ use shared_abi::layout::Layout;
 
 use super::coflash::Coflash;
 use super::command::CommandLine;
-use crate::Outcome;
+use crate::outcome::Outcome;
 
 /// The time for a probe: 128 KiB at the slowest speed that is in use.
 const PROBE: Duration = Duration::from_secs(120);

@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde_json::Value;
 
 use super::command::within;
-use crate::{files, process, Outcome};
+use crate::{files, outcome::Outcome, process};
 
 /// The time for any call. The longest one is a download in segments at 10 kbit/s.
 const LIMIT: Duration = Duration::from_secs(600);

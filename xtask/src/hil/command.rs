@@ -3,7 +3,7 @@
 use std::process::Command;
 use std::time::Duration;
 
-use crate::{process, Outcome};
+use crate::{outcome::Outcome, process};
 
 /// A command line with placeholders. No shell reads it; quotes keep words together.
 pub struct CommandLine {

@@ -8,7 +8,7 @@ use serde_json::Value;
 
 use super::bench::{Bench, Done, Hand};
 use super::coflash::{between, Answer, Heard};
-use crate::{files, process, Outcome};
+use crate::{files, outcome::Outcome, process};
 
 /// A step: its name in the report, and what carries it out. The error says why it failed and what to do.
 pub type Step = (&'static str, fn(&mut Bench) -> Outcome<Done>);

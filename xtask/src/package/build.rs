@@ -7,7 +7,7 @@ use std::{env, fs};
 
 use super::notices;
 use super::release::{Release, LINUX, VERSION};
-use crate::{files, process, setup, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, setup, workspace};
 
 /// Cargo's profile of the released programs.
 pub const PROFILE: &str = "dist";

@@ -12,7 +12,7 @@ use object::{Architecture, LittleEndian, Object as _};
 
 use super::build;
 use super::release::{package_crates, Release, LINUX, SUMS, VERSION};
-use crate::{files, process, setup, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, setup, workspace};
 
 /// Checks the sums, with the program that users have for it.
 pub fn sums(dist: &Path) -> Outcome {

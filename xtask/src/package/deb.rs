@@ -5,7 +5,7 @@ use std::process::Command;
 
 use super::build;
 use super::release::{Release, LINUX, VERSION};
-use crate::{files, process, setup, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, setup, workspace};
 
 /// The version of cargo-deb that the job installs.
 const CARGO_DEB: &str = "3.8.0";

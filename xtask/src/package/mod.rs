@@ -17,7 +17,7 @@ use sha2::{Digest, Sha256};
 
 use self::release::{package_crates, Release, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
-use crate::{files, process, sbom, setup, toolchain, workspace, Outcome};
+use crate::{files, outcome::Outcome, process, sbom, setup, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask package [--check] [--draft] [PART ...]

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::{files, process, Outcome};
+use crate::{files, outcome::Outcome, process};
 
 /// Parts that are not crates, by name, with the file of the licence.
 const OTHERS: [(&str, &str); 1] =

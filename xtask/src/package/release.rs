@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::Command;
 
 use crate::process::list;
-use crate::{files, process, Outcome};
+use crate::{files, outcome::Outcome, process};
 
 /// Linux; the program does not need a C library of the system.
 pub const LINUX: &str = "x86_64-unknown-linux-musl";

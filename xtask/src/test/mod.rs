@@ -6,7 +6,6 @@
 //! | `programs.rs` | builds the test programs and lists their tests |
 //! | `runner.rs` | runs them, and sums up |
 
-use std::fs::File;
 use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
@@ -16,8 +15,8 @@ use self::programs::Program;
 use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
 use crate::{
-    attack, build, chips, evidence, examples, files, fuzz, opinion, powercut, process, reproduce, setup,
-    workspace, Outcome,
+    attack, build, chips, evidence, examples, files, fuzz, opinion, outcome::Outcome, powercut, process,
+    reproduce, setup, workspace,
 };
 
 mod plan;
@@ -115,7 +114,8 @@ pub fn run(mut args: Args) -> Outcome {
     let tier = stages.iter().map(|stage| stage.tier).max().unwrap_or(Tier::Product);
     room()?;
     setup::prepare(tier.needs())?;
-    let _alone = alone()?;
+    // No other run uses the build results of this clone.
+    let _alone = files::lock("tests", "Another `cargo xtask test` runs in this clone.")?;
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
         let own = if chosen_board {
@@ -169,21 +169,6 @@ pub fn run(mut args: Args) -> Outcome {
         1 => Err("1 test failed; its output is above.".into()),
         failed => Err(format!("{failed} tests failed; their output is above.")),
     }
-}
-
-/// Waits until no other run uses the build results of this clone.
-fn alone() -> Outcome<File> {
-    let path = workspace::target_dir().join("tests.lock");
-    let wrong = |error: std::io::Error| format!("{} cannot be locked: {error}.", workspace::shown(&path));
-    files::make(&workspace::target_dir())?;
-    let file = File::options().create(true).truncate(false).write(true).open(&path).map_err(wrong)?;
-    if file.try_lock().is_err() {
-        println!(
-            "Another `cargo xtask test` runs in this clone. This one waits for its end; Ctrl-C gives up."
-        );
-        file.lock().map_err(wrong)?;
-    }
-    Ok(file)
 }
 
 /// Checks that the disk has room for a run from an empty folder, unless there are results already.

@@ -5,7 +5,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-use crate::{process, workspace, Outcome};
+use crate::{outcome::Outcome, process, workspace};
 
 /// A test program: a crate's own tests, or its tests from outside.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -83,6 +83,7 @@ impl Program {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::files;
 
     /// Messages in cargo's form ("External tools" in its book), shortened.
     #[test]
@@ -108,5 +109,23 @@ mod tests {
         assert_eq!(name(message("coflash#0.1.0", "bin", "coflash", false)), None);
         assert_eq!(of_message("{\"reason\":\"build-finished\"}"), None);
         assert_eq!(of_message("no JSON"), None);
+    }
+
+    /// `test = false` saves a link, and would let a test rest in silence.
+    #[test]
+    fn what_cargo_builds_no_tests_of_has_none() {
+        let metadata = process::metadata().unwrap();
+        let targets =
+            process::list(&metadata, "packages").flat_map(|package| process::list(package, "targets"));
+        let kinds = ["lib", "bin", "cdylib"];
+        let without =
+            |target: &&Value| kinds.iter().any(|kind| target["kind"][0] == **kind) && target["test"] == false;
+        for target in targets.filter(without) {
+            let folder = Path::new(target["src_path"].as_str().unwrap()).parent().unwrap();
+            for file in files::below(folder, &[]).unwrap() {
+                let is_test = |line: &str| line.trim() == "#[test]";
+                assert!(!files::text(&file).unwrap().lines().any(is_test), "{}", file.display());
+            }
+        }
     }
 }

@@ -13,7 +13,7 @@ use serde_json::{json, Value};
 
 use super::plan::{SLOW, WAITING};
 use super::programs::Program;
-use crate::{process, Outcome};
+use crate::{outcome::Outcome, process};
 
 /// After this time the tests of a module count as hanging, on the wall clock.
 const PATIENCE: Duration = Duration::from_secs(900);

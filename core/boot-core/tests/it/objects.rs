@@ -414,8 +414,7 @@ fn a_device_that_stores_nothing_says_so() {
 fn with_choices<C: Choices>(flash: &mut ModelFlash) -> Bootloader<'static, &mut ModelFlash, Journal, 1, C> {
     let parameters = Journal::open(flash, CONFIG.layout.parameters);
     let (buffer, sealed) = leaked(256);
-    let node = kit::bench::node();
-    Bootloader::new(&CONFIG, 0, node, &BootReport::NONE, parameters, flash, buffer, sealed)
+    Boot::new(&CONFIG, kit::bench::node()).with(parameters, flash, buffer, sealed)
 }
 
 // --- emergencies, identity, the second server

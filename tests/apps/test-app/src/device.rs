@@ -15,7 +15,7 @@ use canopen::slave::SlaveDevice;
 use canopen::{AbortCode, BitRate, Instant, NodeId};
 use coboot_app::{renewal, Start};
 
-use crate::{debugger, VERSION};
+use crate::debugger;
 
 /// Whether this is a lift device.
 const LIFT: bool = cfg!(feature = "lift");
@@ -45,8 +45,8 @@ pub struct Device {
 
 impl Device {
     /// As [`Application::new`].
-    pub fn new(start: &Start, bit_rate: BitRate) -> Self {
-        let mut application = Application::new(start, bit_rate, VERSION);
+    pub fn new(start: &Start, bit_rate: BitRate, software_version: &'static str) -> Self {
+        let mut application = Application::new(start, bit_rate, software_version);
         if LIFT {
             // The bootloader of a lift is node 126, whatever the node-ID of this program.
             application.control = application.control.clone().answering_itself();

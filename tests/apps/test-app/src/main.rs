@@ -62,7 +62,7 @@ mod app {
     use rtic_monotonics::fugit::ExtU32;
     use rtic_monotonics::Monotonic;
 
-    use super::Mono;
+    use super::{Mono, VERSION};
     use crate::debugger::{self, Debugger};
     use crate::device::Device;
 
@@ -117,7 +117,7 @@ mod app {
         );
         let node_id = start.node_id.and_then(NodeId::new);
         let bit_rate = BitRate::from_bits_per_second(start.bit_rate).unwrap_or(DEFAULT_BIT_RATE);
-        let device = Device::new(&start, bit_rate);
+        let device = Device::new(&start, bit_rate, VERSION);
         let config = slave::Config {
             node: node::Config {
                 heartbeat_ms: HEARTBEAT_MS,

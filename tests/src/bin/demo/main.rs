@@ -6,24 +6,19 @@
 
 mod renew;
 mod sealed;
+mod steps;
 
 use std::fs::File;
 use std::io::BufWriter;
 use std::process::ExitCode;
 
-use canopen::program::{ProgramControl, DEVICE_NAME, PROGRAM_ID, SOFTWARE_VERSION};
-use canopen::Address;
+use canopen::program::ProgramControl;
 use coboot_tests::bench::{Bench, BIT_RATE, NODE};
 use coboot_tests::firmware;
 use coboot_tests::sealed_board::open_board;
-use coflash_core::file::block_file::BlockFile;
-use coflash_core::file::Program;
-use coflash_core::update::{flash, Event, FlashOptions};
 use emulator::candump;
-use emulator::time::Time;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
+use steps::{chapter, convert, install, introduce, print_line, Outcome};
 
 const USAGE: &str =
     "usage: demo [--sealed | --renew] [--trace FILE]    (run it as `cargo xtask demo`, which builds everything first)";
@@ -133,26 +128,6 @@ fn main_job(bench: &mut Bench) -> Outcome<()> {
     Ok(())
 }
 
-fn chapter(title: &str) {
-    println!("\n{title}");
-}
-
-fn print_line(at: Time, what: &str) {
-    println!("  {:>9.3} s  {what}", at.0 as f64 / 1e12);
-}
-
-/// The device's information.
-fn introduce(bench: &mut Bench) -> Outcome<()> {
-    let mut session = bench.session();
-    let Some(running) = session.device_type()? else { return Err("the device does not answer".into()) };
-    let name = session.read_text(Address::new(DEVICE_NAME, 0))?;
-    let version = session.read_text(Address::new(SOFTWARE_VERSION, 0))?;
-    let crc = session.read_number(Address::new(PROGRAM_ID, 1))?;
-    let what = if running.is_bootloader() { "the bootloader answers" } else { "the application answers" };
-    print_line(bench.time(), &format!("{what}: \"{name}\", version \"{version}\", program CRC {crc:08X}h"));
-    Ok(())
-}
-
 /// Waits for a heartbeat and prints it.
 fn heartbeat(bench: &mut Bench) -> Outcome<()> {
     let from = bench.time();
@@ -166,49 +141,5 @@ fn heartbeat(bench: &mut Bench) -> Outcome<()> {
         _ => "in an unexpected state",
     };
     print_line(beat.0, &format!("heartbeat: {state}"));
-    Ok(())
-}
-
-/// An application's ELF file as the blocks for the device.
-fn convert(image: &str) -> Program {
-    let file = firmware::blocks(image);
-    let (size, crc) = (file.size(), file.crc());
-    println!(
-        "               {image} converted: {size} bytes in {} blocks, CRC {crc:08X}h",
-        BlockFile::of(&file).blocks().len()
-    );
-    file
-}
-
-/// The whole procedure, printed step by step.
-fn install(bench: &mut Bench, file: &Program) -> Outcome<()> {
-    let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stdout());
-    // The rate and the remaining time use the wall clock.
-    let style = ProgressStyle::with_template(
-        "               {bar:36} {bytes} of {total_bytes}, {bytes_per_sec}, {eta} left",
-    )?;
-    bar.set_style(style.progress_chars("=> "));
-    let clock = bench.clock();
-    let mut complete = false;
-    let outcome = flash(&mut bench.session(), file, &FlashOptions::default(), &mut |event| match event {
-        Event::Progress { done, total } => {
-            bar.set_length(total as u64);
-            bar.set_position(done as u64);
-            if done == total && !complete {
-                complete = true;
-                bar.finish();
-                print_line(clock.get(), &format!("all {total} bytes are in the device"));
-            }
-        }
-        // The report below shows the end.
-        Event::Done(_) => {}
-        event => print_line(clock.get(), &event.to_string()),
-    });
-    let report = outcome?;
-    let rate = f64::from(report.program_size) / report.took.as_secs_f64() / 1024.0;
-    print_line(
-        bench.time(),
-        &format!("the update took {:.1} s on the bus ({rate:.1} KiB/s)", report.took.as_secs_f64()),
-    );
     Ok(())
 }

@@ -14,7 +14,7 @@ use coflash_core::file::read::{read, Firmware, Format};
 use coflash_core::update::{renew, Event, FlashOptions, NewBootloader};
 use emulator::machine::{Cut, FlashCut};
 
-use super::{chapter, convert, install, introduce, print_line, Outcome};
+use crate::steps::{chapter, convert, install, introduce, print_line, Outcome};
 
 /// A bootloader is exchanged over CAN; a broken one ends by itself; the power fails.
 pub fn tell(bench: &mut Bench) -> Outcome<()> {

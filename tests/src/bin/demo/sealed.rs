@@ -8,7 +8,7 @@ use coboot_tests::sealed_board::{key, provision, release, root, sealer, write, C
 use coflash_core::device::Transfers;
 use coflash_core::file::sealed::Sealer;
 
-use super::{chapter, introduce, print_line, Outcome};
+use crate::steps::{chapter, introduce, print_line, Outcome};
 
 /// The board gets its keys; it accepts valid images, and refuses all others.
 pub fn tell(bench: &mut Bench) -> Outcome<()> {
