@@ -766,6 +766,32 @@ fn a_load_by_the_data_cache_is_stale_after_an_erase_until_the_flush() {
     assert_eq!(run(false, 1 << 10), true_words);
 }
 
+/// RM0090 section 3.6.4, programming and caches: code that ran from flash and is erased and programmed anew stays in
+/// the instruction cache until ICRST. A fetch of it is reported on a chip that keeps such lines.
+#[test]
+fn a_fetch_of_code_that_was_erased_after_it_ran_is_reported_until_the_flush() {
+    // ICEN; DCEN and PRFTEN.
+    const ICEN: u32 = 1 << 9;
+    const OTHERS: u32 = 1 << 10 | 1 << 8;
+    let run = |stale_lines, acr, flushes| {
+        let silicon = Silicon { stale_lines, ..TYPICAL };
+        let options = Options { silicon, ..Options::default() };
+        let mut machine = machine_in_ram(&programs::RUNS_BY_THE_CACHE, acr, options);
+        put(&mut machine, ARGUMENT + 4, flushes);
+        // movs r0, #1; bx lr
+        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
+        machine.run_until(ms(300));
+        assert_eq!(words(&machine, 2), [1, 2], "the emulator runs the new code");
+        machine.reports().to_vec()
+    };
+    let [report] = &run(true, ICEN, 0)[..] else { panic!("one report") };
+    assert_eq!((report.access, report.address, report.pc), (Access::Fetch, 0x0800_4000, 0x0800_4000));
+    assert!(report.what.contains("ICRST"), "{}", report.what);
+    assert_eq!(run(true, ICEN, 1), []);
+    assert_eq!(run(true, OTHERS, 0), []);
+    assert_eq!(run(false, ICEN, 0), []);
+}
+
 #[test]
 fn the_power_can_be_cut_at_a_flash_operation() {
     for (when, erased) in [(Cut::Before, false), (Cut::After, true)] {
