@@ -80,7 +80,7 @@ const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000,
 /// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
-/// The lowest supply for programming and erasing by parallelism x8, x16, x32, in mV (RM0090 table 7). x64
+/// The lowest supply for programming and erasing by parallelism x8, x16, x32, in mV (RM0090 table 13). x64
 /// needs the external voltage, too, which no board here has.
 const SUPPLY: [u32; 3] = [1_800, 2_100, 2_700];
 
@@ -475,7 +475,7 @@ impl Flash {
         }
     }
 
-    /// nWRP: a zero protects the sector (section 3.6.5).
+    /// nWRP: a zero protects the sector (section 3.7.4).
     fn is_protected(&self, sector: Sector) -> bool {
         if self.is_shut {
             return true;
@@ -727,19 +727,19 @@ impl Flash {
         Ok(())
     }
 
-    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1).
+    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.7.1).
     #[must_use]
     pub fn option_bytes(&self) -> [u8; 16] {
         self.options.bytes()
     }
 
-    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.9.9).
+    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.7.1).
     #[must_use]
     pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
         self.options.low_power_is_reset(is_standby)
     }
 
-    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
+    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.7.1).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
         self.options.hardware_watchdog()
@@ -842,7 +842,7 @@ impl Peripheral for Flash {
         }
     }
 
-    /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not
+    /// System reset: an operation that runs is broken off (section 3.6: its contents are not
     /// protected).
     fn reset(&mut self) {
         self.empty_caches();
@@ -898,7 +898,7 @@ mod tests {
         assert_eq!(flash.take_changed(), [(8, 4), (8, 4)]);
     }
 
-    /// RM0090 table 7: 8 bits from 1.8 V on, 16 from 2.1 V, 32 from 2.7 V, 64 with VPP alone.
+    /// RM0090 table 13: 8 bits from 1.8 V on, 16 from 2.1 V, 32 from 2.7 V, 64 with VPP alone.
     #[test]
     fn each_width_needs_its_supply() {
         for (psize, lowest) in [(0, Some(1_800)), (1, Some(2_100)), (2, Some(2_700)), (3, None)] {
@@ -1126,7 +1126,7 @@ mod tests {
         flash
     }
 
-    /// RM0090 section 3.6.2: the register, then OPTSTRT, then BSY.
+    /// RM0090 section 3.7.2: the register, then OPTSTRT, then BSY.
     #[test]
     fn option_bytes_take_their_time_and_protect_then() {
         let mut flash = with_open_options();

@@ -853,7 +853,7 @@ fn interrupts_during_an_erase_need_their_vectors_in_ram() {
     assert!(counters.flash_stalls >= 1);
 }
 
-/// RM0090 section 3.5.1: a bus error.
+/// RM0090 section 3.6.1: a bus error.
 #[test]
 fn a_wrong_key_is_a_fault() {
     let mut machine = machine(&programs::WRONG_KEY);
@@ -912,7 +912,7 @@ fn the_right_keys_open_flash_and_option_bytes() {
     assert_eq!(machine.reports(), []);
 }
 
-/// RM0090 sections 3.5.1 and 3.6.2: after a wrong key each key, right or wrong, is a bus error.
+/// RM0090 sections 3.6.1 and 3.7.2: after a wrong key each key, right or wrong, is a bus error.
 #[test]
 fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
@@ -997,7 +997,7 @@ fn a_precise_fault_under_faultmask_locks_up_otherwise() {
     assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
 }
 
-/// RM0090 section 3.6.2: programmed option bytes are loaded at the next reset; these protect
+/// RM0090 section 3.7.2: programmed option bytes are loaded at the next reset; these protect
 /// sectors 0 and 1.
 #[test]
 fn a_program_protects_sectors_by_its_option_bytes() {
@@ -1098,7 +1098,7 @@ fn the_chip_says_who_it_is() {
     assert_eq!(word(&machine, 0x0000_0000), STACK, "flash is aliased at 0");
 }
 
-/// RM0090 section 3.8 and table 18: blocks of 32 bytes from 1FFF_7800h on, a lock byte for each from 1FFF_7A00h on; no
+/// RM0090 section 3.8 and table 19: blocks of 32 bytes from 1FFF_7800h on, a lock byte for each from 1FFF_7A00h on; no
 /// erase. A program here cannot program them.
 #[test]
 fn one_time_programmable_bytes_are_a_debug_probes_to_program() {
