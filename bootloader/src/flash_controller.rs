@@ -41,7 +41,7 @@ impl FlashController {
     /// Takes the controller.
     ///
     /// The caches of the flash must be off while it is programmed: they would return the old words
-    /// (section 3.5.4). They are off after a reset. A bootloader that runs from RAM does not need
+    /// (section 3.6.4). They are off after a reset. A bootloader that runs from RAM does not need
     /// them.
     ///
     /// # Safety
@@ -69,7 +69,7 @@ impl FlashController {
         self.registers.optcr().read().bits()
     }
 
-    /// Whether the option bytes start the watchdog at each reset (WDG_SW, section 3.6.2).
+    /// Whether the option bytes start the watchdog at each reset (WDG_SW, section 3.7.1).
     pub fn starts_watchdog(&self) -> bool {
         self.registers.optcr().read().wdg_sw().bit_is_clear()
     }

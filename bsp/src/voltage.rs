@@ -5,7 +5,7 @@
 pub const RANGE: core::ops::RangeInclusive<u32> = 1_800..=3_600;
 
 /// The lowest supply, in mV, at which 4, 2 and 1 bytes of the flash are programmed or erased at a time
-/// (RM0090 table 7, RM0390 table 6).
+/// (RM0090 table 13, RM0390 table 6).
 const NEEDS: [(u32, u32); 3] = [(4, 2_700), (2, 2_100), (1, 1_800)];
 
 /// The thresholds of the voltage detector from `PLS` = 0 on, in mV: the highest one of a falling and of a
@@ -64,7 +64,7 @@ const fn needs(supply_mv: u32) -> (u32, u32) {
 mod tests {
     use super::*;
 
-    /// RM0090 table 7: words from 2.7 V on, half-words from 2.1 V, bytes from 1.8 V.
+    /// RM0090 table 13: words from 2.7 V on, half-words from 2.1 V, bytes from 1.8 V.
     #[test]
     fn the_width_follows_from_the_supply() {
         for (mv, width) in

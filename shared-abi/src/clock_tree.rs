@@ -21,7 +21,7 @@ pub struct ClockTree {
     pub apb1: u32,
     /// Divider of APB2.
     pub apb2: u32,
-    /// Wait states of the flash at this clock and the board's supply (RM0090 table 10, RM0402, RM0430).
+    /// Wait states of the flash at this clock and the board's supply (RM0090 table 11, RM0402, RM0430).
     pub wait_states: u32,
 }
 
@@ -238,7 +238,7 @@ mod tests {
         assert!(tree.check(&Line::F413.limits()).unwrap_err().contains("every 25 MHz"));
     }
 
-    /// RM0090 table 10: at 2.4 V 168 MHz need 6 wait states (24 MHz each); below 2.1 V 160 MHz are the most, with
+    /// RM0090 table 11: at 2.4 V 168 MHz need 6 wait states (24 MHz each); below 2.1 V 160 MHz are the most, with
     /// 7 (20 MHz each). RM0430, F413: 20 MHz each at 2.4 V.
     #[test]
     fn a_lower_supply_needs_more_wait_states() {

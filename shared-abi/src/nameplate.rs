@@ -10,7 +10,7 @@ use crate::geometry::OTP;
 
 /// Identifies a nameplate ("CBNP" read as little-endian bytes).
 pub const MAGIC: u32 = u32::from_le_bytes(*b"CBNP");
-/// The blocks of the OTP bytes (RM0090 section 3.8, table 18).
+/// The blocks of the OTP bytes (RM0090 section 3.8, table 19).
 pub const BLOCKS: usize = OTP.size as usize / size_of::<Nameplate>();
 
 /// The words of a block.

@@ -58,7 +58,7 @@ pub(crate) fn start_watchdog(chip: &mut impl Registers) {
     chip.write(KR, 0xAAAA);
 }
 
-/// Clocks, peripherals and flash interface as after a reset (RM0090 sections 3.8.1 and 7.3). Returns
+/// Clocks, peripherals and flash interface as after a reset (RM0090 sections 3.9.1 and 7.3). Returns
 /// whether they are; if a clock does not follow, only a reset helps.
 #[must_use]
 pub(crate) fn release_peripherals(chip: &mut impl Registers) -> bool {

@@ -102,7 +102,7 @@ fn nameplate_byte_for_byte() {
     assert_eq!(offset_of!(Nameplate, serial_number), 16);
     assert_eq!(offset_of!(Nameplate, reserved), 20);
     assert_eq!(offset_of!(Nameplate, check), 28);
-    // RM0090 table 18: blocks of 32 bytes from 1FFF_7800h on, the last at 1FFF_79E0h.
+    // RM0090 table 19: blocks of 32 bytes from 1FFF_7800h on, the last at 1FFF_79E0h.
     assert_eq!((OTP.base, OTP.end(), nameplate::BLOCKS), (0x1FFF_7800, 0x1FFF_7A00, 16));
     let [mut with, mut without] = [[0; 32]; 2];
     for (made, plate) in [(&mut with, 123_456), (&mut without, 0)] {

@@ -16,7 +16,7 @@ use shared_abi::label::Label;
 
 use crate::options::set_switches;
 
-/// RM0090 section 3.8, table 18.
+/// RM0090 section 3.8, table 19.
 const OTP: u32 = 0x1FFF_7800;
 const NODE: u8 = 42;
 

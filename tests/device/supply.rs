@@ -143,7 +143,7 @@ fn a_device_that_its_supply_resets_in_the_middle_of_an_update_is_reachable() {
     }
 }
 
-/// The width of all that is programmed follows from the board's supply (RM0090 table 7).
+/// The width of all that is programmed follows from the board's supply (RM0090 table 13).
 #[test]
 fn a_word_is_programmed_as_wide_as_the_supply_allows() {
     let mut bench = Bench::new();

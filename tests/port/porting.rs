@@ -228,7 +228,7 @@ fn a_sealed_product_with_the_rom_loader_is_not_built() {
     assert!(!refused.status.success() && text(&refused).contains(says), "{}", text(&refused));
 }
 
-/// RM0090 table 7: below 2.7 V the flash is programmed by half-words, below 2.1 V by bytes; table 10: the wait
+/// RM0090 table 13: below 2.7 V the flash is programmed by half-words, below 2.1 V by bytes; table 11: the wait
 /// states, and 160 MHz at most below 2.1 V.
 #[test]
 fn a_board_with_a_low_supply_programs_no_wider_than_its_flash_takes() {

@@ -146,7 +146,7 @@ fn log(bench: &mut Bench) -> Log {
     }
 }
 
-/// RM0090 sections 3.5.1 and 3.6.2: locked until the next reset, and a bus error for every key,
+/// RM0090 sections 3.6.1 and 3.7.2: locked until the next reset, and a bus error for every key,
 /// even the right one. The core's registers are as after a reset (PM0214 section 4.4: CCR has
 /// STKALIGN, the others are 0).
 #[test]

@@ -60,6 +60,7 @@ pub fn play_on(scenario: &Scenario, silicon: Silicon, seed: u64) {
     bench.power_on();
     bench.await_boot_up(100);
     (scenario.play)(&mut bench, &mut Random(seed));
+    bench.assert_nothing_unmodelled();
 }
 
 fn install(bench: &mut Bench, image: &str) {

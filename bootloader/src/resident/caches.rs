@@ -10,7 +10,7 @@ pub struct Caches {
     before: u32,
 }
 
-/// `ICEN`, `DCEN` of the access control register (section 3.8.1).
+/// `ICEN`, `DCEN` of the access control register (section 3.9.1).
 const CACHES: u32 = 0b11 << 9;
 /// `PRFTEN`. The boot stage does not use it: the first revision of the chip cannot prefetch.
 const PREFETCH: u32 = 1 << 8;

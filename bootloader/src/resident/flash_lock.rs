@@ -1,7 +1,7 @@
 //! The flash lock: it locks flash and option bytes until the next reset, so that a sealed program
 //! cannot change after its verification at installation.
 //!
-//! A wrong key locks them (RM0090 sections 3.5.1 and 3.6.2): the chip locks FLASH_CR and
+//! A wrong key locks them (RM0090 sections 3.6.1 and 3.7.2): the chip locks FLASH_CR and
 //! FLASH_OPTCR, and answers with a bus error. This bus error must have no effect:
 //!
 //! - without the write buffer (`DISDEFWBUF`) the fault is precise; under FAULTMASK with `BFHFNMIGN`

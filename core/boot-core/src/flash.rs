@@ -7,7 +7,7 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::crc;
 
-/// Why a flash operation failed, as the controller reports it (RM0090 section 3.8.4, `FLASH_SR`).
+/// Why a flash operation failed, as the controller reports it (RM0090 section 3.9.5, `FLASH_SR`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[repr(u8)]
 pub enum FlashFault {

@@ -198,7 +198,7 @@ impl Line {
     }
 
     /// By how many MHz a wait state of the flash raises the core's clock at this supply: "Number of wait
-    /// states according to CPU clock frequency" (RM0090 tables 10 and 11, RM0402, RM0430, RM0390, RM0386).
+    /// states according to CPU clock frequency" (RM0090 tables 11 and 12, RM0402, RM0430, RM0390, RM0386).
     const fn mhz_per_wait_state(self, supply_mv: u32) -> u32 {
         let [from_2700, from_2400, from_2100, below] = match self {
             Self::F412 => [30, 24, 18, 16],

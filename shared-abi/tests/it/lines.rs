@@ -27,7 +27,7 @@ fn clocks_are_those_of_the_datasheets() {
     }
 }
 
-/// Wait states at a lower supply: RM0090 tables 10 and 11 (F405 to F439), RM0390, RM0386: 24, 22 and 20 MHz
+/// Wait states at a lower supply: RM0090 tables 11 and 12 (F405 to F439), RM0390, RM0386: 24, 22 and 20 MHz
 /// each; RM0402 (F412): 24, 18, 16; RM0430 (F413, F423): 20, 18, 16. With seven of them, F405 to F417 reach
 /// 160 MHz below 2.1 V.
 #[test]

@@ -1151,6 +1151,22 @@ impl Chip {
         }
     }
 
+    /// The CPU is about to run a straight run of code.
+    pub fn fetch(&mut self, address: u32, size: u32) {
+        if !self.flash.caches_code() {
+            return;
+        }
+        let flash = self.geometry.flash;
+        let behind = self.behind_alias(address).unwrap_or(address);
+        if !flash.contains(behind, 1) {
+            return;
+        }
+        let Some(old) = self.flash.fetch(behind - flash.base, size) else { return };
+        let what = "the instruction cache has this line from before it was erased or programmed, and was not flushed \
+                    (FLASH_ACR.ICRST while ICEN is clear): the chip may run the old code";
+        self.report(Access::Fetch, flash.base + old, 16, 0, address, what.into());
+    }
+
     /// The CPU is about to load from the flash array.
     pub fn load_flash(&mut self, address: u32, size: u32) {
         let address = self.behind_alias(address).unwrap_or(address);

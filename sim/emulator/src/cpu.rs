@@ -1286,6 +1286,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
     let state = uc.get_data_mut();
     let chip = &mut state.chip;
     if single {
+        chip.fetch(address, size);
         chip.slice.block = (address, size);
         return;
     }
@@ -1321,6 +1322,7 @@ fn on_block(uc: &mut Unicorn<'_, State>, address: u32, size: u32) {
             cycles += state.notes.cache.fetch(address, size, block.instructions, chip.flash.acr());
         }
     }
+    chip.fetch(address, size);
     state.notes.located = 0;
     chip.slice.block = (address, size);
     chip.clock.cycles += cycles;

@@ -40,8 +40,9 @@ pub struct Silicon {
     pub can_sticks: bool,
     /// How far the times of the flash are from the typical to the worst of the datasheet, in thousandths.
     pub flash_slowness_permille: u32,
-    /// Whether the data cache of the flash interface keeps its lines over an erase, so that software which does
-    /// not flush it reads old data (RM0090 section 3.6.4). Most programs never meet one.
+    /// Whether the caches of the flash interface keep their lines over an erase, so that software which does not
+    /// flush them reads old data, and runs old code, which is reported (RM0090 section 3.6.4). Most programs never
+    /// meet one.
     pub stale_lines: bool,
 }
 
@@ -129,8 +130,7 @@ impl fmt::Display for Silicon {
             "LSI {lsi_hz} Hz, HSI {hsi_hz} Hz, LSI periods per write to the watchdog: {iwdg_update_periods}, SysTick \
              after a reset: {systick_value:06X}h, reset flags after Standby: {flags}, crystal: {crystal_start_us} µs, \
              INAK and SLAK: {can_mode_us} µs, CAN registers stand still in sleep: {can_sleeps_deeply}, CAN sticks \
-             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its data cache: \
-             {stale_lines}"
+             on a busy bus: {can_sticks}, flash: {slowness} ‰ from typical to worst, stale lines of its caches: {stale_lines}"
         )
     }
 }

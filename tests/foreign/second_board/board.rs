@@ -172,7 +172,7 @@ impl Chip {
         None
     }
 
-    /// A store to the flash: programs if PG is set and the size is PSIZE (section 3.6.3). Otherwise
+    /// A store to the flash: programs if PG is set and the size is PSIZE (section 3.6.4). Otherwise
     /// the chip would report an error, which is not there: it ends the run.
     fn program(&mut self, address: u32, size: u32, value: u32) -> Option<(u32, u32)> {
         let cr = self.value(FLASH_CR);

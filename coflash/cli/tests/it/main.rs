@@ -124,7 +124,7 @@ fn convert_of_a_block_file_says_which_crc_it_keeps() {
 }
 
 /// The bytes of `tests/abi/layout.rs`, whose check word comes from an implementation in another language; addresses of
-/// RM0090 section 3.8, table 18.
+/// RM0090 section 3.8, table 19.
 #[test]
 fn a_nameplate_goes_into_its_block() {
     const PLATE: [u8; 32] =

@@ -6,6 +6,7 @@
 
 mod cells;
 mod data_cache;
+mod fetched_lines;
 mod lock;
 mod options;
 
@@ -22,6 +23,7 @@ use crate::time::{Span, Time};
 use cells::{carry_out, weak_bits};
 pub use cells::{Cells, Cut, Operation};
 use data_cache::DataCache;
+use fetched_lines::FetchedLines;
 use lock::Lock;
 use options::{OptionBytes, Request};
 
@@ -78,7 +80,7 @@ const ERASE_MASS: [(u64, u64); 4] = [(16_000, 32_000), (11_000, 22_000), (8_000,
 /// worst).
 const PROGRAM: (u64, u64) = (16, 100);
 
-/// The lowest supply for programming and erasing by parallelism x8, x16, x32, in mV (RM0090 table 7). x64
+/// The lowest supply for programming and erasing by parallelism x8, x16, x32, in mV (RM0090 table 13). x64
 /// needs the external voltage, too, which no board here has.
 const SUPPLY: [u32; 3] = [1_800, 2_100, 2_700];
 
@@ -158,6 +160,8 @@ pub struct Flash {
     supply: u32,
     /// The data cache, on a chip whose lines become stale.
     data_cache: Option<DataCache>,
+    /// The instruction cache, on the same.
+    fetched: Option<FetchedLines>,
     /// The operations that have started since somebody wants to know them.
     log: Option<Vec<Operation>>,
     /// Usage.
@@ -190,6 +194,7 @@ impl Flash {
             redraw_at: Time(0),
             supply: NOMINAL,
             data_cache: silicon.stale_lines.then(DataCache::default),
+            fetched: silicon.stale_lines.then(FetchedLines::default),
             log: None,
             counters: FlashCounters::default(),
         }
@@ -224,6 +229,26 @@ impl Flash {
         if let Some(cache) = self.data_cache.as_mut().filter(|cache| cache.is_enabled()) {
             cache.load(offset, len, self.array.bytes_mut(), &mut self.changed);
         }
+    }
+
+    /// Whether each fetch from the array has to be noticed ([`Self::fetch`]).
+    #[must_use]
+    pub fn caches_code(&self) -> bool {
+        self.fetched.as_ref().is_some_and(FetchedLines::is_enabled)
+    }
+
+    /// The CPU fetches code from the array. Returns the offset of the first line of it that the instruction cache
+    /// has from before an operation changed the array.
+    pub fn fetch(&mut self, offset: u32, len: u32) -> Option<u32> {
+        self.fetched.as_mut().filter(|lines| lines.is_enabled())?.fetch(offset, len)
+    }
+
+    /// An operation has changed this range of the array.
+    fn note_change(&mut self, offset: u32, len: u32) {
+        if let Some(lines) = &mut self.fetched {
+            lines.note(offset, len);
+        }
+        self.changed.push((offset, len));
     }
 
     /// The array has its true bytes, whatever the data cache has.
@@ -373,7 +398,7 @@ impl Flash {
 
     /// The power fails now: the running operation is torn. `seed` chooses how.
     pub fn lose_power(&mut self, seed: u64) {
-        self.empty_data_cache();
+        self.empty_caches();
         self.is_shut = false;
         if let Some(running) = self.running.take() {
             self.tear(&running.operation, Cut::Torn { seed });
@@ -382,10 +407,13 @@ impl Flash {
         self.power_failed = false;
     }
 
-    fn empty_data_cache(&mut self) {
+    fn empty_caches(&mut self) {
         self.show_array();
         if let Some(cache) = &mut self.data_cache {
             cache.reset();
+        }
+        if let Some(lines) = &mut self.fetched {
+            *lines = FetchedLines::default();
         }
     }
 
@@ -447,7 +475,7 @@ impl Flash {
         }
     }
 
-    /// nWRP: a zero protects the sector (section 3.6.5).
+    /// nWRP: a zero protects the sector (section 3.7.4).
     fn is_protected(&self, sector: Sector) -> bool {
         if self.is_shut {
             return true;
@@ -608,7 +636,7 @@ impl Flash {
                 if self.options.program(*optcr) {
                     self.array.bytes_mut().fill(0xFF);
                     self.unstable.clear();
-                    self.changed.push((0, self.geometry.flash.size));
+                    self.note_change(0, self.geometry.flash.size);
                 }
             }
         }
@@ -645,7 +673,10 @@ impl Flash {
 
     fn carry_out(&mut self, operation: &Operation, until: Cut) {
         let array = self.array.bytes_mut();
-        self.changed.extend(carry_out(operation, self.geometry, until, array, &mut self.unstable));
+        let ranges = carry_out(operation, self.geometry, until, array, &mut self.unstable);
+        for (offset, len) in ranges {
+            self.note_change(offset, len);
+        }
     }
 
     fn write_key(&mut self, value: u32) -> Result<(), Unmodelled> {
@@ -696,19 +727,19 @@ impl Flash {
         Ok(())
     }
 
-    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.6.1).
+    /// The sixteen option bytes as they read at 1FFF_C000 (section 3.7.1).
     #[must_use]
     pub fn option_bytes(&self) -> [u8; 16] {
         self.options.bytes()
     }
 
-    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.9.9).
+    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.7.1).
     #[must_use]
     pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
         self.options.low_power_is_reset(is_standby)
     }
 
-    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
+    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.7.1).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
         self.options.hardware_watchdog()
@@ -754,6 +785,9 @@ impl Peripheral for Flash {
                     cache.control(self.acr);
                 }
                 self.show_lines();
+                if let Some(lines) = &mut self.fetched {
+                    lines.control(self.acr);
+                }
                 Ok(())
             }
             0x04 | 0x08 => {
@@ -808,10 +842,10 @@ impl Peripheral for Flash {
         }
     }
 
-    /// System reset: an operation that runs is broken off (section 3.4.1: its contents are not
+    /// System reset: an operation that runs is broken off (section 3.6: its contents are not
     /// protected).
     fn reset(&mut self) {
-        self.empty_data_cache();
+        self.empty_caches();
         if let Some(running) = self.running.take() {
             // A fixed seed: a reset is no power failure, but leaves the same kind of half-done
             // work.
@@ -864,7 +898,7 @@ mod tests {
         assert_eq!(flash.take_changed(), [(8, 4), (8, 4)]);
     }
 
-    /// RM0090 table 7: 8 bits from 1.8 V on, 16 from 2.1 V, 32 from 2.7 V, 64 with VPP alone.
+    /// RM0090 table 13: 8 bits from 1.8 V on, 16 from 2.1 V, 32 from 2.7 V, 64 with VPP alone.
     #[test]
     fn each_width_needs_its_supply() {
         for (psize, lowest) in [(0, Some(1_800)), (1, Some(2_100)), (2, Some(2_700)), (3, None)] {
@@ -1092,7 +1126,7 @@ mod tests {
         flash
     }
 
-    /// RM0090 section 3.6.2: the register, then OPTSTRT, then BSY.
+    /// RM0090 section 3.7.2: the register, then OPTSTRT, then BSY.
     #[test]
     fn option_bytes_take_their_time_and_protect_then() {
         let mut flash = with_open_options();

@@ -319,7 +319,7 @@ fn the_control_socket_switches_power_and_takes_no_rubbish() {
     board.interrupt();
 }
 
-/// Unlocks the flash (RM0090 section 3.5.1), sets PG with a width of a byte, and stores 0 at
+/// Unlocks the flash (RM0090 section 3.6.1), sets PG with a width of a byte, and stores 0 at
 /// 0801_0000h: ldr r0, [pc, #20]; ldr r1, [pc, #24]; ldr r2, [pc, #24]; str r1, [r0, #4]; str r2, [r0,
 /// #4]; movs r1, #1; str r1, [r0, #16]; ldr r3, [pc, #20]; movs r4, #0; strb r4, [r3]; b .; nop; the
 /// flash interface, two keys, the address

@@ -766,6 +766,32 @@ fn a_load_by_the_data_cache_is_stale_after_an_erase_until_the_flush() {
     assert_eq!(run(false, 1 << 10), true_words);
 }
 
+/// RM0090 section 3.6.4, programming and caches: code that ran from flash and is erased and programmed anew stays in
+/// the instruction cache until ICRST. A fetch of it is reported on a chip that keeps such lines.
+#[test]
+fn a_fetch_of_code_that_was_erased_after_it_ran_is_reported_until_the_flush() {
+    // ICEN; DCEN and PRFTEN.
+    const ICEN: u32 = 1 << 9;
+    const OTHERS: u32 = 1 << 10 | 1 << 8;
+    let run = |stale_lines, acr, flushes| {
+        let silicon = Silicon { stale_lines, ..TYPICAL };
+        let options = Options { silicon, ..Options::default() };
+        let mut machine = machine_in_ram(&programs::RUNS_BY_THE_CACHE, acr, options);
+        put(&mut machine, ARGUMENT + 4, flushes);
+        // movs r0, #1; bx lr
+        machine.load_bin(0x0800_4000, &[0x01, 0x20, 0x70, 0x47]).unwrap();
+        machine.run_until(ms(300));
+        assert_eq!(words(&machine, 2), [1, 2], "the emulator runs the new code");
+        machine.reports().to_vec()
+    };
+    let [report] = &run(true, ICEN, 0)[..] else { panic!("one report") };
+    assert_eq!((report.access, report.address, report.pc), (Access::Fetch, 0x0800_4000, 0x0800_4000));
+    assert!(report.what.contains("ICRST"), "{}", report.what);
+    assert_eq!(run(true, ICEN, 1), []);
+    assert_eq!(run(true, OTHERS, 0), []);
+    assert_eq!(run(false, ICEN, 0), []);
+}
+
 #[test]
 fn the_power_can_be_cut_at_a_flash_operation() {
     for (when, erased) in [(Cut::Before, false), (Cut::After, true)] {
@@ -827,7 +853,7 @@ fn interrupts_during_an_erase_need_their_vectors_in_ram() {
     assert!(counters.flash_stalls >= 1);
 }
 
-/// RM0090 section 3.5.1: a bus error.
+/// RM0090 section 3.6.1: a bus error.
 #[test]
 fn a_wrong_key_is_a_fault() {
     let mut machine = machine(&programs::WRONG_KEY);
@@ -886,7 +912,7 @@ fn the_right_keys_open_flash_and_option_bytes() {
     assert_eq!(machine.reports(), []);
 }
 
-/// RM0090 sections 3.5.1 and 3.6.2: after a wrong key each key, right or wrong, is a bus error.
+/// RM0090 sections 3.6.1 and 3.7.2: after a wrong key each key, right or wrong, is a bus error.
 #[test]
 fn after_a_wrong_key_the_right_ones_are_bus_errors_until_the_next_reset() {
     let mut machine = machine(&programs::STORES_OF_A_SCRIPT);
@@ -971,7 +997,7 @@ fn a_precise_fault_under_faultmask_locks_up_otherwise() {
     assert_eq!(machine.run_until(ms(1)), Stop::Lockup);
 }
 
-/// RM0090 section 3.6.2: programmed option bytes are loaded at the next reset; these protect
+/// RM0090 section 3.7.2: programmed option bytes are loaded at the next reset; these protect
 /// sectors 0 and 1.
 #[test]
 fn a_program_protects_sectors_by_its_option_bytes() {
@@ -1072,7 +1098,7 @@ fn the_chip_says_who_it_is() {
     assert_eq!(word(&machine, 0x0000_0000), STACK, "flash is aliased at 0");
 }
 
-/// RM0090 section 3.8 and table 18: blocks of 32 bytes from 1FFF_7800h on, a lock byte for each from 1FFF_7A00h on; no
+/// RM0090 section 3.8 and table 19: blocks of 32 bytes from 1FFF_7800h on, a lock byte for each from 1FFF_7A00h on; no
 /// erase. A program here cannot program them.
 #[test]
 fn one_time_programmable_bytes_are_a_debug_probes_to_program() {

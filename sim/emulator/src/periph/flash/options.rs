@@ -1,18 +1,19 @@
-//! The option bytes, FLASH_OPTCR and, on a chip with two banks, FLASH_OPTCR1 (RM0090 sections 3.6, 3.9.9
-//! and 3.9.11).
+//! The option bytes, FLASH_OPTCR and, on a chip with two banks, FLASH_OPTCR1 (RM0090 sections 3.7 and
+//! 3.9.9 to 3.9.11).
 //!
 //! The chip loads the register from the option bytes at reset. A program changes the register, and
 //! OPTSTRT erases the option bytes and programs them from it. They are not part of the array: a
 //! reset, the loss of power and a mass erase leave them.
 //!
 //! **Read-out protection.** Level 2 is for good: the option bytes can no longer be changed. Going
-//! from level 1 to level 0 erases the whole array (section 3.6.3). From level 1 on a debugger that
+//! from level 1 to level 0 erases the whole array (section 3.7.3). From level 1 on a debugger that
 //! connects shuts the flash; with level 2 none can. Programs boot from flash here, so that what the
 //! levels deny code that booted from elsewhere is not modelled.
 //!
 //! **Proprietary code read-out protection** (PCROP, section 3.7.5). With SPRMOD a one of nWRP keeps the
 //! data bus out of its sector, and code runs from it. Only the way from level 1 to level 0, with its
-//! erase, takes the protection back.
+//! erase, takes the protection back. That section names the STM32F42x and F43x alone; of the other lines ST's HAL says that
+//! they have it (`OB_PCROP_SELECTED` in `stm32f4xx_hal_flash_ex.h`), all but the STM32F405, F407, F415 and F417.
 
 use shared_abi::geometry::{Geometry, Line};
 
@@ -223,7 +224,7 @@ impl OptionBytes {
         self.lock = Lock::default();
     }
 
-    /// The level of read-out protection, 0 to 2 (section 3.6.3).
+    /// The level of read-out protection, 0 to 2 (section 3.7.3).
     #[must_use]
     pub fn level(&self) -> u8 {
         level_of(self.programmed)
@@ -288,7 +289,7 @@ impl OptionBytes {
         }
     }
 
-    /// The sixteen bytes as they read at 1FFF_C000 (section 3.6.1): each value with its complement.
+    /// The sixteen bytes as they read at 1FFF_C000 (section 3.7.1): each value with its complement.
     #[must_use]
     pub fn bytes(&self) -> [u8; 16] {
         let mut bytes = [0xFF; 16];
@@ -301,13 +302,13 @@ impl OptionBytes {
         bytes
     }
 
-    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.9.9).
+    /// Option bit nRST_STDBY or nRST_STOP clear: the deep sleep is a reset (section 3.7.1).
     #[must_use]
     pub fn low_power_is_reset(&self, is_standby: bool) -> bool {
         self.programmed & (if is_standby { 1 << 7 } else { 1 << 6 }) == 0
     }
 
-    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.6.2).
+    /// Option bit WDG_SW clear: the watchdog starts by itself after reset (section 3.7.1).
     #[must_use]
     pub fn hardware_watchdog(&self) -> bool {
         self.programmed & 1 << 5 == 0
@@ -338,7 +339,7 @@ mod tests {
         options
     }
 
-    /// RM0090 sections 3.9.9 (reset value 0FFF AAEDh) and 3.6.1.
+    /// RM0090 sections 3.9.9 (reset value 0FFF AAEDh) and 3.7.1.
     #[test]
     fn from_the_factory_nothing_is_protected() {
         let options = OptionBytes::default();

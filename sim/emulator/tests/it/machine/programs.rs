@@ -73,5 +73,6 @@ programs! {
     TIME_IN_A_BLOCK,
     COUNTS_DOWN,
     LOADS_BY_THE_CACHE,
+    RUNS_BY_THE_CACHE,
     LOADS_HIDDEN_CODE,
 }

@@ -104,7 +104,7 @@ fn a_chip_waits_for_its_supply_at_power_on() {
     assert_eq!(word(&machine, OUT), 42);
 }
 
-/// RM0090 table 10: at 2.4 to 2.7 V 24 MHz for each wait state.
+/// RM0090 table 11: at 2.4 to 2.7 V 24 MHz for each wait state.
 #[test]
 fn a_lower_supply_needs_more_wait_states() {
     let mut machine = machine(&programs::SCALES_THE_CLOCK);
