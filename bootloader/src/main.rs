@@ -49,7 +49,7 @@ mod app {
     use boot_core::canopen::sdo::server::Config as SdoConfig;
     use boot_core::canopen::slave::{self, Output, Slave, SlaveDevice};
     use boot_core::canopen::{BitRate, CobId, Frame, Instant, NodeId};
-    use boot_core::control::{Renewal, Room, Sealed, Step};
+    use boot_core::control::{Renewal, Sealed, SealedMemory, Step};
     use boot_core::store::NodeParameters;
     use bsp::clock::Source;
     use bsp::debugger::{self, Debugger};
@@ -177,7 +177,7 @@ mod app {
         }
     }
 
-    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [Room; product::SEALED as usize] = [const { Room::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS]), own: [Own; product::HAS_NAMEPLATE as usize] = [const { Own::NONE }; product::HAS_NAMEPLATE as usize]])]
+    #[init(local = [queue: Queue<Frame, RX_QUEUE> = Queue::new(), blocks: [u8; PRODUCT.block_buffer] = [0; PRODUCT.block_buffer], room: [SealedMemory; product::SEALED as usize] = [const { SealedMemory::new() }; product::SEALED as usize], store: StoreState = StoreState([0; STORE_STATE_WORDS]), own: [Own; product::HAS_NAMEPLATE as usize] = [const { Own::NONE }; product::HAS_NAMEPLATE as usize]])]
     fn init(mut cx: init::Context) -> (Shared, Local) {
         // First: with a watchdog, whatever the chip does not do from here on ends in a reset.
         let watchdog = Watchdog::new(cx.device.IWDG);
@@ -229,7 +229,7 @@ mod app {
             parameters,
             flash,
             cx.local.blocks,
-            cx.local.room.first_mut().map_or(Sealed::NONE, Room::sealed),
+            cx.local.room.first_mut().map_or(Sealed::NONE, SealedMemory::sealed),
         );
         bootloader.confirm(report.returned);
         bootloader.set_clock_source(match clock {

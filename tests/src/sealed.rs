@@ -8,7 +8,7 @@ use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
-use boot_core::control::{Policy, Room, Step};
+use boot_core::control::{Policy, SealedMemory, Step};
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances};
 use boot_core::flash::{run, Flash};
@@ -463,7 +463,7 @@ impl Device {
         let parameters = Journal::open(&flash, self.setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
         let mut buffer = vec![0; self.buffer];
-        let mut room = Box::<Room>::default();
+        let mut room = Box::<SealedMemory>::default();
         let boot = Boot::new(&self.setup.config, node);
         let node: Box<dyn Node + '_> = match self.setup.programs() {
             1 => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, &mut buffer, room.sealed())),

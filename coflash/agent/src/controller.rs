@@ -25,7 +25,7 @@ pub(super) enum Step {
     Save(Record),
     /// The device is to be asked for its attributes, while other steps go on; the answer goes to
     /// [`Controller::looked`].
-    Look,
+    AskDevice,
     /// The device is to be flashed, while other steps go on; the answer goes to
     /// [`Controller::flashed`].
     Flash(Flash),
@@ -374,7 +374,7 @@ impl Controller {
         }
         if self.query == DeviceQuery::Wanted && !matches!(self.work, Work::Flashing { .. }) {
             self.query = DeviceQuery::Asked;
-            return Step::Look;
+            return Step::AskDevice;
         }
         if !self.unsaved {
             if let Work::Flashing { task, started: started @ false, .. } = &mut self.work {

@@ -285,7 +285,7 @@ fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
                     let piece = download::fetch(&shared.client, &device.token, &wanted, &path, &pause);
                     controller.fetched(shared.began.elapsed(), piece);
                 }
-                Step::Look => {
+                Step::AskDevice => {
                     let sender = sender.clone();
                     scope.spawn(move || {
                         let _ = sender.send(Heard::Looked(shared.devices.look(device)));

@@ -168,7 +168,7 @@ enum Recovery {
     /// Not bus-off.
     None,
     /// Bus-off; with ABOM clear the software has to go through initialisation mode first.
-    Held,
+    NeedsInit,
     /// Counts recessive sequences.
     Counting { since: Time, left: u32 },
 }
@@ -572,7 +572,7 @@ impl BxCan {
         self.mode = Mode::Resting(rest);
         self.leaving = None;
         if self.bus_off() {
-            self.recovery = Recovery::Held;
+            self.recovery = Recovery::NeedsInit;
         }
     }
 
@@ -841,7 +841,7 @@ impl BxCan {
             self.recovery = if self.mcr & mcr::ABOM != 0 {
                 Recovery::Counting { since: now, left: RECOVERY_SEQUENCES }
             } else {
-                Recovery::Held
+                Recovery::NeedsInit
             };
         }
         let new = self.esr_flags() & !before;
@@ -963,7 +963,10 @@ impl Peripheral for BxCan {
                     return Ok(());
                 }
                 self.mcr = value & mcr::KEPT;
-                if self.mcr & mcr::ABOM != 0 && self.mode == Mode::Normal && self.recovery == Recovery::Held {
+                if self.mcr & mcr::ABOM != 0
+                    && self.mode == Mode::Normal
+                    && self.recovery == Recovery::NeedsInit
+                {
                     self.recovery = Recovery::Counting { since: now, left: RECOVERY_SEQUENCES };
                 }
                 self.follow_mode_bits(now);
@@ -1189,7 +1192,7 @@ impl BxCan {
                 return;
             }
             self.mode = Mode::Normal;
-            if self.recovery == Recovery::Held {
+            if self.recovery == Recovery::NeedsInit {
                 self.recovery = Recovery::Counting { since: now, left: RECOVERY_SEQUENCES - 1 };
             }
             return;

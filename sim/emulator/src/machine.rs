@@ -59,7 +59,7 @@ enum Activity {
     /// The core domain has no supply: only a reset or a wake-up ends it.
     Standby,
     /// The supply is too low: it holds the chip in reset.
-    Held,
+    InReset,
     LockedUp,
 }
 
@@ -219,7 +219,7 @@ impl Machine {
     /// Whether the supply is too low, so that it holds the chip in reset.
     #[must_use]
     pub fn is_held_in_reset(&self) -> bool {
-        self.activity == Activity::Held
+        self.activity == Activity::InReset
     }
 
     /// The supply takes the chip into reset, or out of it.
@@ -230,7 +230,7 @@ impl Machine {
                     self.lose_ram(1_000);
                 }
                 self.cpu.chip_mut().hold_in_reset();
-                self.activity = Activity::Held;
+                self.activity = Activity::InReset;
             }
             Change::Rises { powered_down, ram_lost } => {
                 if ram_lost > 0 {
@@ -423,7 +423,7 @@ impl Machine {
                 self.skip_to(target);
                 Entry::Taken
             }
-            Activity::Sleeps | Activity::Standby | Activity::Held | Activity::LockedUp | Activity::Off => {
+            Activity::Sleeps | Activity::Standby | Activity::InReset | Activity::LockedUp | Activity::Off => {
                 let target = self.cpu.chip().next_stop();
                 self.skip_to(target);
                 Entry::Taken

@@ -80,12 +80,12 @@ pub enum Change {
 /// The reset by the supply.
 #[derive(Clone, Debug, Default)]
 pub struct Supervisor {
-    held: Option<Held>,
+    held: Option<InReset>,
 }
 
 /// The chip is held in reset.
 #[derive(Clone, Copy, Debug, Default)]
-struct Held {
+struct InReset {
     powered_down: bool,
     /// Since when the RAM has no supply.
     dark_since: Option<Time>,
@@ -107,7 +107,7 @@ impl Supervisor {
             if mv >= falling {
                 return None;
             }
-            self.held = Some(Held::default());
+            self.held = Some(InReset::default());
             self.watch(mv, level, now);
             return Some(Change::Falls);
         };

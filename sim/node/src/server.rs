@@ -47,7 +47,7 @@ enum Mode {
     /// The client sends and receives frames.
     Raw,
     /// The client receives frames from `until` on; these messages wait for it.
-    Held { until: Instant, messages: String },
+    Delayed { until: Instant, messages: String },
 }
 
 /// The server. Its threads read, and live as long as the process.
@@ -117,7 +117,7 @@ impl Server {
             ("echo", _) => "< echo >".to_owned(),
             (_, Mode::NoBus) => format!("< error open a bus first: open {} >", self.bus),
             ("rawmode", Mode::Open) => {
-                client.mode = Mode::Held { until: Instant::now() + HOLD, messages: String::new() };
+                client.mode = Mode::Delayed { until: Instant::now() + HOLD, messages: String::new() };
                 "< ok >".to_owned()
             }
             ("rawmode", _) => "< ok >".to_owned(),
@@ -157,7 +157,7 @@ impl Server {
                 _ if from == Some(*number) => {}
                 Mode::NoBus | Mode::Open => {}
                 Mode::Raw => listeners.push(*number),
-                Mode::Held { messages, .. } => messages.push_str(&message),
+                Mode::Delayed { messages, .. } => messages.push_str(&message),
             }
         }
         for number in listeners {
@@ -171,7 +171,7 @@ impl Server {
         let mut due = Vec::new();
         let mut next: Option<Instant> = None;
         for (number, client) in &mut self.clients {
-            let Mode::Held { until, messages } = &mut client.mode else { continue };
+            let Mode::Delayed { until, messages } = &mut client.mode else { continue };
             if *until <= now {
                 due.push((*number, std::mem::take(messages)));
                 client.mode = Mode::Raw;

@@ -6,7 +6,7 @@
 //! install a program.
 #![cfg_attr(fuzzing, no_main)]
 
-use boot_core::control::{Downloader, Policy, Room, Step};
+use boot_core::control::{Downloader, Policy, SealedMemory, Step};
 use boot_core::store::Journal;
 use canopen::program::{FlashError, FlashStatus, ProgramControl};
 use coboot_fuzz::Input;
@@ -25,7 +25,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let mut flash = ModelFlash::new(&CHIP);
     let mut buffer = [0; BUFFER];
     let journal = Journal::open(&flash, LAYOUT.parameters);
-    let mut room = Room::new();
+    let mut room = SealedMemory::new();
     let mut device: Downloader<'_, _, 1> =
         Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     let mut input = Input::new(bytes);
@@ -110,7 +110,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
 
     let mut buffer = [0; BUFFER];
     let journal = Journal::open(&flash, LAYOUT.parameters);
-    let mut room = Room::new();
+    let mut room = SealedMemory::new();
     let mut device: Downloader<'_, _, 1> =
         Downloader::new(&LAYOUT, &Policy::DEFAULT, journal, &flash, &mut buffer, room.sealed());
     device.command(1, ProgramControl::Clear).expect("CLEAR");

@@ -10,7 +10,7 @@
 use std::sync::OnceLock;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Extras};
-use boot_core::control::{Policy, Room, Step as Work};
+use boot_core::control::{Policy, SealedMemory, Step as Work};
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::{Journal, NodeParameters};
@@ -223,7 +223,7 @@ struct Host {
 /// One life of the device, from reset to reset; returns whether there are bytes left.
 fn live(flash: &mut ModelFlash, input: &mut Input<'_>, host: &mut Host) -> bool {
     let mut buffer = [0; 256];
-    let mut room = Box::<Room>::default();
+    let mut room = Box::<SealedMemory>::default();
     let device = Boot::new(&CONFIG, STORED).on(flash, &mut buffer, room.sealed());
     let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());
     let mut world = World { device, slave, now: 0, answers: Default::default() };
@@ -313,7 +313,7 @@ fn judge(flash: &ModelFlash) {
 /// The flash that 2006h reports, as a probe sees it after a reset.
 fn is_in_flash(flash: &mut ModelFlash) {
     let mut buffer = [0; 256];
-    let mut room = Box::<Room>::default();
+    let mut room = Box::<SealedMemory>::default();
     let mut bytes = [0; 8];
     {
         let mut device = Boot::new(&CONFIG, STORED).on::<_, 1>(&mut *flash, &mut buffer, room.sealed());
@@ -358,7 +358,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     }
     let file = &files()[0];
     let mut buffer = [0; 256];
-    let mut room = Box::<Room>::default();
+    let mut room = Box::<SealedMemory>::default();
     {
         let device = Boot::new(&CONFIG, STORED).on(&mut flash, &mut buffer, room.sealed());
         let slave = Slave::new(DEVICE.lss_address(), Some(node()), BitRate::K125, slave::Config::default());

@@ -11,7 +11,7 @@
 use std::sync::OnceLock;
 
 use boot_core::bootloader::{entries, entry_count, Bootloader, Config};
-use boot_core::control::{Policy, Room, Step};
+use boot_core::control::{Policy, SealedMemory, Step};
 use boot_core::crc::CrcKind;
 use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
@@ -164,7 +164,11 @@ fn hostile(file: &[u8], payload_too: bool, input: &mut Input<'_>) -> Vec<u8> {
 
 type Sealed<'b, 'f> = Bootloader<'b, &'f mut ModelFlash, Journal, 1>;
 
-fn device<'b, 'f>(flash: &'f mut ModelFlash, buffer: &'b mut [u8], room: &'b mut Room) -> Sealed<'b, 'f> {
+fn device<'b, 'f>(
+    flash: &'f mut ModelFlash,
+    buffer: &'b mut [u8],
+    room: &'b mut SealedMemory,
+) -> Sealed<'b, 'f> {
     let node = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
     Boot::new(&CONFIG, node).on(flash, buffer, room.sealed())
 }
@@ -251,7 +255,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
     let until = if kind & 4 != 0 { input.byte().map(|at| usize::from(at) * 16) } else { None };
     let mut flash = ModelFlash::new(&CHIP);
     flash.poke(LAYOUT.key_block().base, key_block);
-    let mut room = Box::<Room>::default();
+    let mut room = Box::<SealedMemory>::default();
     let mut buffer = [0; 256];
     let mut target = device(&mut flash, &mut buffer, &mut room);
     settle(&mut target);
@@ -276,7 +280,7 @@ coboot_fuzz::target!(|bytes: &[u8]| {
 
     // A signed file may have raised counter and epoch beyond those of the good one.
     if !signed && is_eighth(bytes) {
-        let mut room = Box::<Room>::default();
+        let mut room = Box::<SealedMemory>::default();
         let mut buffer = [0; 256];
         let mut target = device(&mut flash, &mut buffer, &mut room);
         settle(&mut target);

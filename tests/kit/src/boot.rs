@@ -1,7 +1,7 @@
 //! The one way to make a bootloader in a test: what it starts from, and then the flash.
 
 use boot_core::bootloader::{Bootloader, Choices, Config};
-use boot_core::control::{Room, Sealed};
+use boot_core::control::{Sealed, SealedMemory};
 use boot_core::flash::Flash;
 use boot_core::store::{Journal, NodeParameters, Parameters};
 use shared_abi::boot_report::{BootReport, Reason};
@@ -62,6 +62,6 @@ const TAKES_SEALED: &str = "COBOOT_TAKES_SEALED";
 #[must_use]
 pub fn leaked(buffer: usize) -> (&'static mut [u8], Sealed<'static>) {
     let takes_sealed = std::env::var_os(TAKES_SEALED).is_some();
-    let sealed = if takes_sealed { Box::leak(Box::<Room>::default()).sealed() } else { Sealed::NONE };
+    let sealed = if takes_sealed { Box::leak(Box::<SealedMemory>::default()).sealed() } else { Sealed::NONE };
     (vec![0; buffer].leak(), sealed)
 }

@@ -8,7 +8,7 @@ use boot_core::canopen::device::Device as Identity;
 use boot_core::canopen::lss::LssDevice;
 use boot_core::canopen::od::{Address, Entry, Objects};
 use boot_core::canopen::{AbortCode, BitRate, NodeId};
-use boot_core::control::{Erase, Policy, Room, Step};
+use boot_core::control::{Erase, Policy, SealedMemory, Step};
 use boot_core::crc::CrcKind;
 use boot_core::crc32;
 use boot_core::decision::{self, decide, Autostart, BootDecision, Circumstances};
@@ -268,7 +268,7 @@ impl Device {
     fn host_of<R>(&mut self, config: &'static Config, talk: impl FnOnce(&mut Host<'_, '_>) -> R) -> R {
         let (parameters, node) = (self.parameters(), self.node());
         let flash = Chip { flash: &mut self.flash, bug: self.bug };
-        let (mut buffer, mut room) = ([0; 256], Room::new());
+        let (mut buffer, mut room) = ([0; 256], SealedMemory::new());
         let node = Boot::new(config, node).with(parameters, flash, &mut buffer, room.sealed());
         talk(&mut Host { node })
     }

@@ -586,12 +586,12 @@ fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
 fn attributes_are_sent_when_the_server_asks_and_the_device_answers() {
     let mut drive = Drive::new();
     drive.poll(&[("configData", "/x")]);
-    assert_eq!(drive.next(), Step::Look);
+    assert_eq!(drive.next(), Step::AskDevice);
     // The device takes its time: other steps go on, and it is not asked twice.
     drive.poll(&[("configData", "/x")]);
     drive.controller.looked(Err("node 5 does not answer".into()));
     drive.poll(&[("configData", "/x")]);
-    assert_eq!(drive.next(), Step::Look);
+    assert_eq!(drive.next(), Step::AskDevice);
     drive.controller.looked(Ok(vec![("software".into(), "1.0.0".into())]));
     let Request::Put(path, body) = drive.asks() else { panic!() };
     assert_eq!((path.as_str(), &body["data"]["software"]), ("configData", &json!("1.0.0")));
@@ -602,7 +602,7 @@ fn attributes_are_sent_when_the_server_asks_and_the_device_answers() {
     drive.poll(&[("deploymentBase", "/d"), ("configData", "/x")]);
     drive.poll(&[("deploymentBase", "/d"), ("configData", "/x")]);
     drive.controller.flashed(drive.now, Flashed::Done(vec![]));
-    assert!(matches!(drive.next(), Step::Look | Step::Ask(_)));
+    assert!(matches!(drive.next(), Step::AskDevice | Step::Ask(_)));
 }
 
 #[test]
@@ -712,7 +712,7 @@ fn no_course_of_answers_brings_it_out_of_step() {
                     }
                     drive.controller.saved(drive.now, if fails { Err(String::new()) } else { Ok(()) });
                 }
-                Step::Look => {
+                Step::AskDevice => {
                     assert!(!looking);
                     looking = true;
                 }

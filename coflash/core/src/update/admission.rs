@@ -43,7 +43,7 @@ enum Question<'f> {
     /// Whether it takes sealed images, and this one is not too old.
     TakesSealed(&'f SealedFile),
     /// Whether the program has room in its region.
-    Room(&'f SealedFile),
+    Size(&'f SealedFile),
 }
 
 /// Asks what runs in the device, a bootloader or an application.
@@ -69,7 +69,7 @@ pub(super) fn admit<'f>(
             Question::Place(program),
         ],
         Content::Sealed(file) => {
-            vec![Question::Manifest(file), Question::TakesSealed(file), Question::Room(file)]
+            vec![Question::Manifest(file), Question::TakesSealed(file), Question::Size(file)]
         }
     };
     let is_sealed_in_blocks = matches!(content, Content::Sealed(_)) && options.blocks.is_some();
@@ -121,7 +121,7 @@ impl Question<'_> {
             Self::Place(program) => admit_place(session, program, dialect, number),
             Self::Manifest(file) => admit_manifest(session, file, number),
             Self::TakesSealed(file) => takes_sealed(session, file),
-            Self::Room(file) => admit_room(session, file.head().size(), number),
+            Self::Size(file) => admit_size(session, file.head().size(), number),
         }
     }
 }
@@ -186,11 +186,11 @@ fn admit_age(session: &mut Session<'_>, file: &SealedFile, challenge: &Challenge
 }
 
 /// Checks the size of a sealed image; returns whether the device has reported its room.
-fn admit_room(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool, Error> {
+fn admit_size(session: &mut Session<'_>, size: u32, program: u8) -> Result<bool, Error> {
     match program_region(session, program)? {
         None => Ok(false),
         Some(region) if size > region.size => {
-            Err(refused(&Refusal::Room { image: size, device: region.size }))
+            Err(refused(&Refusal::TooLarge { image: size, device: region.size }))
         }
         Some(_) => Ok(true),
     }

@@ -46,7 +46,7 @@ use rights::Rights;
 
 pub use crate::policy::{AppInfo, Erase, Policy, Renewal, Verdict};
 pub use crate::programmer::Step;
-pub use sealed::{Room, Sealed};
+pub use sealed::{Sealed, SealedMemory};
 
 /// One program in the form of the objects 1F50h–1F57h.
 #[derive(Clone, Copy, Debug)]

@@ -6,18 +6,18 @@ use crate::unseal::{Unsealer, Workshop};
 
 /// The memory of a device that takes sealed images. It is large, and therefore not a part of the
 /// bootloader's structure.
-pub struct Room {
+pub struct SealedMemory {
     access: Access,
     workshop: Workshop,
 }
 
-impl Default for Room {
+impl Default for SealedMemory {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl Room {
+impl SealedMemory {
     /// The memory for one image at a time. All of it is zero, so that it takes no flash.
     #[must_use]
     pub const fn new() -> Self {
@@ -30,8 +30,8 @@ impl Room {
     }
 }
 
-/// Whether a device takes sealed images: it does if it has a [`Room`] for them.
-pub struct Sealed<'b>(Option<&'b mut Room>);
+/// Whether a device takes sealed images: it does if it has a [`SealedMemory`] for them.
+pub struct Sealed<'b>(Option<&'b mut SealedMemory>);
 
 impl<'b> Sealed<'b> {
     /// For a device that takes no sealed images.

@@ -24,7 +24,7 @@ struct Device {
     ids: Vec<Option<u8>>,
     stored: Option<(Option<NodeId>, Option<BitRate>)>,
     outcome: Option<Result<(), StoreError>>,
-    /// Room for data of the domain.
+    /// SealedMemory for data of the domain.
     space: Option<usize>,
     cancelled: u32,
 }

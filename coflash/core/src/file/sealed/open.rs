@@ -200,7 +200,7 @@ pub enum Refusal {
     },
     /// It is too large.
     #[error("the program has {image} bytes, and the device has room for {device}")]
-    Room {
+    TooLarge {
         /// Size of the image in bytes.
         image: u32,
         /// Size of the flash in bytes.
@@ -288,7 +288,7 @@ impl Refusal {
             Self::Product { .. } | Self::Program { .. } | Self::UniqueId | Self::Hardware { .. } => {
                 Fault::WrongProduct
             }
-            Self::Room { .. } => Fault::Address,
+            Self::TooLarge { .. } => Fault::Address,
             Self::Counter { .. } | Self::Epoch { .. } => Fault::Rollback,
             Self::Root(_) | Self::NoCertificate | Self::Test | Self::Kek | Self::WrongKek(_) => Fault::Key,
             Self::Certificate(_)
@@ -319,7 +319,7 @@ impl Refusal {
             Self::Hardware { .. } => {
                 "seal the program for this revision (--hardware), if it supports that revision"
             }
-            Self::Room { .. } => {
+            Self::TooLarge { .. } => {
                 "make the program smaller: --compress makes the file smaller, not the program"
             }
             Self::Counter { .. } => {
@@ -565,7 +565,7 @@ impl<'a> Sealed<'a> {
                 Refusal::UniqueId
             }
             Fault::WrongProduct => Refusal::Hardware { mask: head.hardware(), device: device.revision },
-            Fault::Address => Refusal::Room { image: head.size(), device: device.room },
+            Fault::Address => Refusal::TooLarge { image: head.size(), device: device.room },
             Fault::Rollback if head.counter() < device.counter => {
                 Refusal::Counter { image: head.counter(), device: device.counter }
             }

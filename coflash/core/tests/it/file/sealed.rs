@@ -254,7 +254,7 @@ fn the_device_tells_which_rule_is_broken() {
             Refusal::Hardware { mask: 1, device: 33 },
             Fault::WrongProduct,
         ),
-        (Device { room: Some(999), ..good }, Refusal::Room { image: 1000, device: 999 }, Fault::Address),
+        (Device { room: Some(999), ..good }, Refusal::TooLarge { image: 1000, device: 999 }, Fault::Address),
         (Device { counter: 8, ..good }, Refusal::Counter { image: 7, device: 8 }, Fault::Rollback),
         (Device { epoch: 4, ..good }, Refusal::Epoch { image: 3, device: 4 }, Fault::Rollback),
         (Device { roots: &[], ..good }, Refusal::Root(root().public().id()), Fault::Key),

@@ -47,7 +47,7 @@ enum State {
     /// The initiate must be sent.
     Begin,
     /// Servers have not answered the initiate yet; with their block size, once it is known.
-    Begun {
+    Initiated {
         missing: Servers,
         crc: bool,
         blksize: Option<u8>,
@@ -137,7 +137,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
             }
             match &mut self.state {
                 // Its transfer has ended, so it must get no more segments.
-                State::Begun { .. } | State::Blocks(_) | State::End { .. } => self.break_off(server),
+                State::Initiated { .. } | State::Blocks(_) | State::End { .. } => self.break_off(server),
                 // The end of a download is each server's own.
                 State::Ended { missing, refused } if *missing & server != 0 => {
                     *missing &= !server;
@@ -150,7 +150,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         }
         let is_new = match (&mut self.state, response) {
             (
-                State::Begun { missing, crc, blksize },
+                State::Initiated { missing, crc, blksize },
                 Some(Response::InitiateBlockDownload { at, crc: checks, blksize: granted }),
             ) if at == self.at => {
                 // One server decides for all: the end carries one CRC, and a sub-block one size.
@@ -202,7 +202,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
     /// Goes on if all servers have answered.
     fn proceed(&mut self) {
         match self.state {
-            State::Begun { missing: 0, crc, blksize: Some(blksize) } => {
+            State::Initiated { missing: 0, crc, blksize: Some(blksize) } => {
                 let sub_block = SubBlock::new(crc, blksize);
                 self.state = State::Blocks(Sent { sub_block, missing: self.servers, range: None, blksize });
             }
@@ -238,7 +238,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         let servers = self.servers;
         let bytes = match &mut self.state {
             State::Begin => {
-                self.state = State::Begun { missing: servers, crc: false, blksize: None };
+                self.state = State::Initiated { missing: servers, crc: false, blksize: None };
                 let size = u32::try_from(data.len()).ok();
                 Request::InitiateBlockDownload { at: self.at, crc: true, size }.emit()
             }
@@ -253,7 +253,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
                 self.state = State::Done(*result);
                 Request::Abort(self.at, code).emit()
             }
-            State::Begun { .. } | State::Blocks(_) | State::Ended { .. } => return self.wait(now),
+            State::Initiated { .. } | State::Blocks(_) | State::Ended { .. } => return self.wait(now),
             State::Done(result) => return GroupStep::Done(*result),
         };
         self.moved = now;
@@ -268,7 +268,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
             _ => false,
         };
         let others_have_answered = match self.state {
-            State::Begun { blksize, .. } => blksize.is_some(),
+            State::Initiated { blksize, .. } => blksize.is_some(),
             State::Ended { missing, .. } => missing != self.servers,
             _ => others_have_all,
         };
@@ -280,7 +280,7 @@ impl<D: AsRef<[u8]>> GroupDownload<D> {
         match self.state {
             State::Blocks(sent) if others_have_all => self.next_sub_block(sent),
             State::Ended { missing, refused } => self.end_without(missing | refused, AbortCode::TIMEOUT),
-            State::Begun { missing, .. } | State::Blocks(Sent { missing, .. }) => {
+            State::Initiated { missing, .. } | State::Blocks(Sent { missing, .. }) => {
                 let result = GroupResult { missing, ended: false };
                 self.state = State::Break { result, code: AbortCode::TIMEOUT };
             }
