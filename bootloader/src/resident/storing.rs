@@ -14,7 +14,8 @@ pub fn store(
     key: Key,
     value: Value,
 ) -> Result<(), StoreError> {
-    // The caches would return the old words.
+    // A word is read back to see what the cells have become; the data cache would return what was written
+    // (RM0090 section 3.6.4).
     // SAFETY: the owner of the flash also owns its caches.
     let _caches = unsafe { Caches::off() };
     parameters.store(key, value);

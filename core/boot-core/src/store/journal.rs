@@ -113,10 +113,10 @@ impl Journal {
         let [mut other, mut valid] = regions;
         let (mut header, mut newer, mut sequence) = (Header::Absent, false, 0);
         for region in regions {
-            let Some([_, found, inverted, format, ..]) = sound_slot(flash, region.base, HEADER_MAGIC) else {
+            let Some([tag, found, inverted, format, ..]) = sound_slot(flash, region.base) else {
                 continue;
             };
-            if inverted != !found {
+            if (tag, inverted) != (HEADER_MAGIC, !found) {
                 continue;
             }
             if format > FORMAT {
@@ -147,8 +147,9 @@ impl Journal {
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
-            if let Some(slot) = sound_slot(flash, at, tag) {
-                return Some(slot);
+            match sound_slot(flash, at) {
+                Some(slot) if slot[0] == tag => return Some(slot),
+                _ => {}
             }
         }
         None
@@ -284,8 +285,11 @@ impl Journal {
     /// previous one might be copied.
     fn collect<F: Flash>(&mut self, flash: &F) {
         while self.storing.from < self.free {
-            let tag = flash.read_word(self.storing.from);
+            let sound = sound_slot(flash, self.storing.from);
             self.storing.from += SLOT_SIZE;
+            // A slot that is no record is no reason to look for one: with many of them, as in a damaged
+            // region, a store would take minutes.
+            let Some([tag, ..]) = sound else { continue };
             let mut copy = first_slot(&self.other);
             while copy < self.storing.to && flash.read_word(copy) != tag {
                 copy += SLOT_SIZE;
@@ -349,13 +353,13 @@ fn read_slot<F: Flash>(flash: &F, at: u32) -> Slot {
     found
 }
 
-/// The slot at an address, if it is a valid record of this tag. It is read once: bits left between
-/// 0 and 1 by a power cut may read differently the next time.
-fn sound_slot<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
+/// The slot at an address, if it is a valid record. It is read once: bits left between 0 and 1 by a
+/// power cut may read differently the next time.
+fn sound_slot<F: Flash>(flash: &F, at: u32) -> Option<Slot> {
     let found = read_slot(flash, at);
-    let [found_tag, a, b, c, d, ..] = found;
+    let [tag, a, b, c, d, ..] = found;
     let sound = slot(tag, [a, b, c, d]);
-    (found_tag == tag && found[..MARK_WORD] == sound[..MARK_WORD]).then_some(sound)
+    (found[..MARK_WORD] == sound[..MARK_WORD]).then_some(sound)
 }
 
 const fn first_slot(region: &Region) -> u32 {

@@ -518,6 +518,28 @@ fn to_open_a_journal_takes_a_look_at_each_byte_and_no_more() {
     }
 }
 
+/// A region that was damaged: behind its header and a record there is nothing but slots that are no records. A
+/// store copies the record, and looks at each slot a few times, not at all of them for each.
+#[test]
+fn a_store_in_a_region_full_of_what_is_no_record_looks_at_each_slot_a_few_times() {
+    let region = LAYOUT.parameters[0];
+    for damage in [0x00, 0x55, 0xFE] {
+        let mut flash = ModelFlash::new(LAYOUT.chip);
+        flash.poke(region.base, &vec![damage; region.size as usize]);
+        flash.poke(region.base, &header(1));
+        flash.poke(region.base + SLOT, &record(Key::NODE, [1, 2, 3, 4]));
+        let mut journal = Journal::open(&flash, LAYOUT.parameters);
+        flash.bytes_read.set(0);
+        store(&mut flash, &mut journal, Key::CRASH_COUNT, [7; 4]).unwrap();
+        let looks = flash.bytes_read.get() / region.size as usize;
+        assert!(looks < 8, "{damage:02X}h: {looks} times");
+        let again = Journal::open(&flash, LAYOUT.parameters);
+        for (key, value) in [(Key::NODE, [1, 2, 3, 4]), (Key::CRASH_COUNT, [7; 4])] {
+            assert_eq!(again.get(&flash, key), Some(value), "{damage:02X}h");
+        }
+    }
+}
+
 // --- flash that does not take everything
 
 /// A flash of which some places lose a bit of each word that is programmed.
