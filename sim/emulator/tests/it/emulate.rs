@@ -5,6 +5,8 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
+use crate::assembler::assemble;
+
 fn emulate(args: &[&str]) -> Output {
     Command::new(env!("CARGO_BIN_EXE_emulate")).args(args).output().expect("the command starts")
 }
@@ -16,28 +18,22 @@ fn folder(name: &str) -> PathBuf {
     folder
 }
 
-/// Initial SP, reset vector, then `code` from 0800_0008 on.
-fn program(folder: &Path, code: &[u16]) -> String {
+/// Initial SP, reset vector, then the code of `emulate/NAME.s` from 0800_0008h on.
+fn program(folder: &Path, name: &str) -> String {
     let mut bytes = Vec::new();
     bytes.extend(0x2000_1000_u32.to_le_bytes());
     bytes.extend(0x0800_0009_u32.to_le_bytes());
-    bytes.extend(code.iter().flat_map(|half| half.to_le_bytes()));
+    bytes.extend(assemble(&format!("emulate/{name}.s"), 0x0800_0008).code);
     let path = folder.join("program.bin");
     std::fs::write(&path, bytes).unwrap();
     format!("{}@08000000", path.display())
 }
 
-/// b .
-const FOREVER: &[u16] = &[0xE7FE];
-
-/// ldr r0, [pc, #4]; ldr r1, [r0]; b .; nop; .word 4000_6800 (CAN2)
-const READS_CAN2: &[u16] = &[0x4801, 0x6801, 0xE7FE, 0xBF00, 0x6800, 0x4000];
-
 #[test]
 fn runs_for_the_time_it_is_told() {
     let folder = folder("time");
     let trace = folder.join("trace.log");
-    let image = program(&folder, FOREVER);
+    let image = program(&folder, "forever");
     let args =
         ["--bootloader", &image, "--speed", "max", "--for", "0.25", "--trace", trace.to_str().unwrap()];
     let output = emulate(&args);
@@ -65,7 +61,7 @@ fn runs_for_the_time_it_is_told() {
 fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
     const MAP: &str = include_str!("../../../../examples/no-stack/board.toml");
     let folder = folder("board");
-    let image = program(&folder, FOREVER);
+    let image = program(&folder, "forever");
     let board = |text: &str| {
         let file = folder.join("my.toml");
         std::fs::write(&file, text).unwrap();
@@ -98,7 +94,7 @@ fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
 /// nothing is.
 #[test]
 fn prints_the_chip_that_was_chosen() {
-    let image = program(&folder("silicon"), FOREVER);
+    let image = program(&folder("silicon"), "forever");
     let lines = |args: &[&str]| -> Vec<String> {
         let output = emulate(&[&[&image, "--speed", "max", "--for", "0.01"], args].concat());
         assert!(output.status.success(), "{output:?}");
@@ -126,7 +122,7 @@ fn prints_the_chip_that_was_chosen() {
 
 #[test]
 fn says_what_is_not_modelled_with_address_and_program_counter() {
-    let image = program(&folder("unmodelled"), READS_CAN2);
+    let image = program(&folder("unmodelled"), "reads_can2");
     let output = emulate(&[&image, "--speed", "max", "--for", "0.01"]);
     let text = String::from_utf8(output.stdout).unwrap();
     let line = text.lines().nth(1).unwrap_or_default();
@@ -137,7 +133,7 @@ fn says_what_is_not_modelled_with_address_and_program_counter() {
 #[test]
 fn refuses_with_a_reason() {
     let folder = folder("refusals");
-    let image = program(&folder, FOREVER);
+    let image = program(&folder, "forever");
     let file = |name: &str, bytes: &[u8]| {
         let path = folder.join(name);
         std::fs::write(&path, bytes).unwrap();
@@ -186,7 +182,7 @@ fn refuses_with_a_reason() {
 #[test]
 #[cfg(unix)]
 fn serves_clients_until_ctrl_c() {
-    let image = program(&folder("clients"), FOREVER);
+    let image = program(&folder("clients"), "forever");
     let mut child = Command::new(env!("CARGO_BIN_EXE_emulate"))
         .args([&image, "--socketcand", "127.0.0.1:0", "-v"])
         .stdout(Stdio::piped())
@@ -218,7 +214,7 @@ fn serves_clients_until_ctrl_c() {
 
 #[test]
 fn a_reader_that_leaves_is_no_error() {
-    let image = program(&folder("pipe"), FOREVER);
+    let image = program(&folder("pipe"), "forever");
     let mut child = Command::new(env!("CARGO_BIN_EXE_emulate"))
         .args([&image, "--speed", "max", "--for", "0.1"])
         .stdout(Stdio::piped())
@@ -300,7 +296,7 @@ const COMMANDS_AT: &str = "commands are taken at ";
 #[test]
 #[cfg(unix)]
 fn the_control_socket_switches_power_and_takes_no_rubbish() {
-    let image = program(&folder("control"), FOREVER);
+    let image = program(&folder("control"), "forever");
     let mut board = Running::start(&[&image, "--control", "127.0.0.1:0"]);
     let address = board.after(COMMANDS_AT);
     let (mut one, mut other) = (Control::connect(&address), Control::connect(&address));
@@ -319,15 +315,6 @@ fn the_control_socket_switches_power_and_takes_no_rubbish() {
     board.interrupt();
 }
 
-/// Unlocks the flash (RM0090 section 3.6.1), sets PG with a width of a byte, and stores 0 at
-/// 0801_0000h: ldr r0, [pc, #20]; ldr r1, [pc, #24]; ldr r2, [pc, #24]; str r1, [r0, #4]; str r2, [r0,
-/// #4]; movs r1, #1; str r1, [r0, #16]; ldr r3, [pc, #20]; movs r4, #0; strb r4, [r3]; b .; nop; the
-/// flash interface, two keys, the address
-const PROGRAMS_A_BYTE: &[u16] = &[
-    0x4805, 0x4906, 0x4A06, 0x6041, 0x6042, 0x2101, 0x6101, 0x4B05, 0x2400, 0x701C, 0xE7FE, 0xBF00, 0x3C00,
-    0x4002, 0x0123, 0x4567, 0x89AB, 0xCDEF, 0x0000, 0x0801,
-];
-
 #[test]
 #[cfg(unix)]
 fn the_flash_file_keeps_what_was_programmed() {
@@ -335,7 +322,7 @@ fn the_flash_file_keeps_what_was_programmed() {
     let file = folder.join("flash.bin");
     let _ = std::fs::remove_file(&file);
     let path = file.to_str().unwrap();
-    let image = program(&folder, PROGRAMS_A_BYTE);
+    let image = program(&folder, "programs_a_byte");
     let output = emulate(&[&image, "--flash", path, "--speed", "max", "--for", "0.01"]);
     assert!(output.status.success(), "{output:?}");
     let kept = std::fs::read(&file).unwrap();
@@ -379,18 +366,12 @@ fn gdb(address: &str, commands: &[&str]) -> String {
     [output.stderr, output.stdout].map(|text| String::from_utf8_lossy(&text).into_owned()).concat()
 }
 
-/// movs r0, #0; ldr r1, [pc, #16]; loop: adds r0, #1; str r0, [r1]; bl add; b loop; add: adds r2, #3; bx
-/// lr; nop; .word 2000_0000
-#[cfg(feature = "gdb")]
-const COUNTS: &[u16] =
-    &[0x2000, 0x4904, 0x3001, 0x6008, 0xF000, 0xF801, 0xE7FA, 0x3203, 0x4770, 0xBF00, 0x0000, 0x2000];
-
 /// gdb with breakpoints, steps, memory, registers, and a reset; the virtual time is stopped while
 /// the machine is halted.
 #[test]
 #[cfg(all(unix, feature = "gdb"))]
 fn gdb_stops_steps_looks_and_changes() {
-    let image = program(&folder("gdb"), COUNTS);
+    let image = program(&folder("gdb"), "counts");
     let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
     let control = board.after(COMMANDS_AT);
     let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();
@@ -463,7 +444,7 @@ const NOISE: &[u8] = b"$#+-cmMgGsXZzvqk,;:0123456789abcdef\x03\xFF}*";
 #[test]
 #[cfg(all(unix, feature = "gdb"))]
 fn a_debugger_that_hangs_up_or_sends_rubbish_does_no_harm() {
-    let image = program(&folder("gdb-rubbish"), COUNTS);
+    let image = program(&folder("gdb-rubbish"), "counts");
     let mut board = Running::start(&[&image, "--gdb", "127.0.0.1:0", "--control", "127.0.0.1:0"]);
     let control = board.after(COMMANDS_AT);
     let address = board.after("gdb reaches the board by `target remote ").trim_end_matches('`').to_owned();

@@ -1102,11 +1102,7 @@ fn the_chip_says_who_it_is() {
 /// erase. A program here cannot program them.
 #[test]
 fn one_time_programmable_bytes_are_a_debug_probes_to_program() {
-    // movw r0, #7820h; movt r0, #1FFFh; str r0, [r0]; ldr r1, [r0]; movs r2, #1; lsls r2, r2, #29; str r1, [r2];
-    // b . (ARMv7-M A7.7)
-    let code: [u16; 10] = [0xF647, 0x0020, 0xF6C1, 0x70FF, 0x6000, 0x6801, 0x2201, 0x0752, 0x6011, 0xE7FE];
-    let program = Program { base: 0x0800_0200, vectors: Vec::new(), code: bytes(&code) };
-    let mut machine = machine(&program);
+    let mut machine = machine(&programs::STORES_TO_OTP);
     assert_eq!(machine.run_until(ms(1)), Stop::Deadline);
     let reports: Vec<_> = machine.reports().iter().map(|report| (report.access, report.address)).collect();
     assert_eq!(reports, [(Access::Write, 0x1FFF_7820)]);

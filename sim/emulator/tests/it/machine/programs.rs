@@ -75,4 +75,5 @@ programs! {
     LOADS_BY_THE_CACHE,
     RUNS_BY_THE_CACHE,
     LOADS_HIDDEN_CODE,
+    STORES_TO_OTP,
 }

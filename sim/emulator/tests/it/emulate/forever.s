@@ -1,0 +1,4 @@
+// Runs on the spot.
+.syntax unified
+.thumb
+    b .
