@@ -21,7 +21,7 @@ use tokio_io_timeout::TimeoutStream;
 use super::events::Readers;
 use super::guard::Guard;
 use super::guests::{Guest, Guests};
-use super::http::{router, Site};
+use super::http::{engineers, router, Page, Site};
 use super::shared::{Order, Shared};
 use super::upload::Room;
 use super::worker;
@@ -150,6 +150,7 @@ impl Server {
             // This is the first order, so there is room for it.
             let _ = shared.order(Order::Open(bus));
         }
+        let Page { files, view, routes } = engineers();
         let site = Site {
             own_boards: Arc::default(),
             shared: shared.clone(),
@@ -157,8 +158,9 @@ impl Server {
             kinds: self.options.kinds.clone(),
             room: Room::new(self.options.body_timeout),
             reading: Arc::new(Semaphore::new(1)),
+            view,
         };
-        let app = router(site, self.guard);
+        let app = router(site, self.guard, files, routes);
         let Options { write_timeout, head_timeout, .. } = self.options;
         let (listener, times) = (self.listener, Times { write_timeout, head_timeout });
         let left = self.runtime.block_on(async {
