@@ -36,6 +36,7 @@ mod keys;
 mod legacy;
 mod lss;
 mod many;
+mod memory;
 mod monitor;
 mod nameplate;
 mod nmt;

@@ -1,0 +1,405 @@
+//! The state of a station, and what its page shows of it.
+
+use std::sync::{Arc, Mutex};
+
+use canopen::NodeId;
+use coflash_core::machine::{Foreign, Good, Outcome, Plan, Todo};
+use serde::Serialize;
+use serde_json::{json, Value};
+
+use super::message::Message;
+use super::report::{Of, Report};
+use super::{trouble, Service};
+use crate::shared::{lock, Shared};
+use crate::state;
+
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &[
+    "closed",
+    "opening",
+    "lost",
+    "ready",
+    "searching",
+    "planned",
+    "complete",
+    "none",
+    "working",
+    "good",
+    "bad",
+    "adapter-lost",
+    "adapter-failed",
+    "internal",
+    "hint-closed",
+    "hint-ready",
+    "hint-planned",
+    "hint-none",
+    "hint-working",
+    "hint-good",
+    "hint-bad",
+    "state-has",
+    "state-due",
+    "state-left-out",
+    "state-waiting",
+    "state-working",
+    "state-updated",
+    "state-failed",
+];
+
+/// What is being done, and the devices of it.
+#[derive(Clone, Debug, Default)]
+pub(super) enum Stage {
+    /// The bus was not searched yet.
+    #[default]
+    Waiting,
+    Searching,
+    /// A plan that nobody has confirmed yet.
+    Planned {
+        /// Its number: a page confirms the plan that it shows.
+        number: u64,
+        plan: Arc<Plan>,
+    },
+    Working(Vec<Row>),
+    Ended(Vec<Row>),
+}
+
+#[derive(Debug, Default)]
+pub(super) struct State {
+    pub(super) stage: Stage,
+    /// The number of plans since the start.
+    pub(super) plans: u64,
+    /// Why the last search or update was not carried out.
+    pub(super) message: Option<Message>,
+    /// That of the machine that is being updated or was updated last.
+    pub(super) device_number: String,
+    /// The names of the saved reports of the last update.
+    saved: Vec<String>,
+    /// The number of reports that could not be saved.
+    unsaved: usize,
+    /// Why.
+    why: Option<Message>,
+}
+
+/// A device, or one that is missing.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Row {
+    pub(super) node: Option<u8>,
+    /// 1008h.
+    pub(super) name: Option<String>,
+    /// 1018h/1 to 4.
+    pub(super) identity: [Option<u32>; 4],
+    pub(super) state: RowState,
+    pub(super) steps: Vec<Step>,
+    /// What went wrong.
+    pub(super) trouble: Option<Message>,
+    /// The key of what is in the device after that.
+    pub(super) left: Option<&'static str>,
+    /// In percent, while it is being written.
+    pub(super) percent: Option<usize>,
+}
+
+/// A program of a device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Step {
+    #[serde(skip)]
+    entry: usize,
+    pub(super) program: String,
+    pub(super) from: Option<String>,
+    pub(super) to: String,
+    pub(super) state: RowState,
+}
+
+/// The state of a device or of one of its programs, with its key in the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub(super) enum RowState {
+    /// It has its program already.
+    #[serde(rename = "state-has")]
+    Has,
+    /// It would get its program.
+    #[serde(rename = "state-due")]
+    Due,
+    /// It would get its program, and the user has left it out.
+    #[serde(rename = "state-left-out")]
+    LeftOut,
+    #[serde(rename = "state-waiting")]
+    Waiting,
+    #[serde(rename = "state-working")]
+    Working,
+    #[serde(rename = "state-updated")]
+    Updated,
+    #[serde(rename = "state-failed")]
+    Failed,
+}
+
+pub(super) struct Station {
+    pub(super) service: Service,
+    state: Mutex<State>,
+    /// The reports that are not saved yet; locked while they are written.
+    unsaved: Mutex<Vec<Report>>,
+}
+
+impl Station {
+    pub(super) fn new(service: Service) -> Self {
+        Self { service, state: Mutex::default(), unsaved: Mutex::default() }
+    }
+
+    /// Changes the state. The caller has all pages notified.
+    pub(super) fn change<R>(&self, change: impl FnOnce(&mut State) -> R) -> R {
+        change(&mut lock(&self.state))
+    }
+
+    /// The plan with this number, if it is the one that can be confirmed.
+    pub(super) fn plan(&self, wanted: u64) -> Option<Arc<Plan>> {
+        match &lock(&self.state).stage {
+            Stage::Planned { number, plan } if *number == wanted => Some(plan.clone()),
+            _ => None,
+        }
+    }
+
+    /// Keeps reports, and saves them.
+    pub(super) fn keep(&self, reports: Vec<Report>) {
+        self.change(|state| state.saved.clear());
+        lock(&self.unsaved).extend(reports);
+        self.save();
+    }
+
+    /// Saves the reports that are not saved yet. Returns whether all are.
+    pub(super) fn save(&self) -> bool {
+        let mut unsaved = lock(&self.unsaved);
+        let mut saved = Vec::new();
+        let mut why = None;
+        unsaved.retain(|report| match self.service.folder.save(&report.name(), &report.contents()) {
+            Ok(name) => {
+                saved.push(name);
+                false
+            }
+            Err(error) => {
+                why = Some(super::report::unsaved(&error, self.service.folder.path()));
+                true
+            }
+        });
+        let left = unsaved.len();
+        self.change(|state| {
+            state.saved.extend(saved);
+            (state.unsaved, state.why) = (left, why);
+        });
+        left == 0
+    }
+
+    /// The reports that are not saved, one a line; none if all are.
+    pub(super) fn unsaved_words(&self) -> Option<String> {
+        let unsaved = lock(&self.unsaved);
+        let lines: Vec<String> = unsaved.iter().map(Report::line).collect();
+        let folder = self.service.folder.path().display();
+        let all = || format!("these reports could not be saved in {folder}:\n{}", lines.join("\n"));
+        (!lines.is_empty()).then(all)
+    }
+
+    /// A report that could not be saved, for the browser to save.
+    pub(super) fn unsaved(&self, number: usize) -> Option<Report> {
+        lock(&self.unsaved).get(number).cloned()
+    }
+
+    /// What the page shows.
+    pub(super) fn view(&self, shown: &state::State) -> Value {
+        use state::Connection;
+        let own = lock(&self.state);
+        let adapter = &shown.adapter;
+        let (mut rows, mut number, mut foreign): (_, _, &[Foreign]) = (Vec::new(), None, &[]);
+        match &own.stage {
+            Stage::Waiting | Stage::Searching => {}
+            Stage::Planned { number: its, plan } => {
+                rows = self::rows(plan);
+                (number, foreign) = (Some(*its), &plan.foreign);
+            }
+            Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
+        }
+        let due = rows.iter().filter(|row| row.state == RowState::Due).count();
+        if matches!(own.stage, Stage::Working(_)) {
+            rows.iter_mut().for_each(|row| row.advance(&shown.updates));
+        }
+        let is_busy = shown.task.is_some();
+        let is_good = |row: &Row| !matches!(row.state, RowState::Failed);
+        let (station, hint) = match (&own.stage, adapter.state) {
+            (Stage::Searching, _) if is_busy => ("searching", None),
+            (Stage::Working(_), _) if is_busy => ("working", Some("hint-working")),
+            (Stage::Ended(rows), _) if rows.iter().all(is_good) => ("good", Some("hint-good")),
+            // An update without a task was ended by an internal error.
+            (Stage::Ended(_) | Stage::Working(_), _) => ("bad", Some("hint-bad")),
+            (_, Connection::Closed) => ("closed", Some("hint-closed")),
+            (_, Connection::Opening) => ("opening", None),
+            (_, Connection::Lost) => ("lost", None),
+            (Stage::Waiting | Stage::Searching, Connection::Open) => ("ready", Some("hint-ready")),
+            (Stage::Planned { .. }, Connection::Open) if due > 0 => ("planned", Some("hint-planned")),
+            (Stage::Planned { plan, .. }, Connection::Open) if plan.devices.is_empty() => {
+                ("none", Some("hint-none"))
+            }
+            (Stage::Planned { .. }, Connection::Open) if rows.iter().all(is_good) => {
+                ("complete", Some("hint-good"))
+            }
+            (Stage::Planned { .. }, Connection::Open) => ("bad", Some("hint-bad")),
+        };
+        let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
+        let message = match (&adapter.words, &own.message, notice) {
+            (Some(words), _, _) => Some(Message::new("adapter-lost").detail(words)),
+            (None, Some(message), _) => Some(message.clone()),
+            (None, None, Some(notice)) if adapter.state == Connection::Closed => {
+                Some(Message::new("adapter-failed").detail(&notice.words))
+            }
+            (None, None, Some(notice)) => Some(Message::new("internal").detail(&notice.words)),
+            (None, None, None) => None,
+        };
+        json!({
+            "station": station,
+            "hint": hint,
+            "message": message,
+            "adapter": adapter.url,
+            "open": adapter.state == Connection::Open,
+            "busy": is_busy,
+            "cancelling": shown.task.as_ref().is_some_and(|task| task.cancelling),
+            "plan": number,
+            "plans": own.plans,
+            "device_number": own.device_number,
+            "rows": rows,
+            "foreign": foreign,
+            "saved": own.saved,
+            "unsaved": own.unsaved,
+            "why": own.why,
+        })
+    }
+}
+
+/// Changes the state, and notifies all pages.
+pub(super) fn change<R>(shared: &Shared, station: &Station, change: impl FnOnce(&mut State) -> R) -> R {
+    shared.change(|_| station.change(change))
+}
+
+/// The devices of a plan, and what is missing.
+pub(super) fn rows(plan: &Plan) -> Vec<Row> {
+    let devices = plan.devices.iter().map(|device| {
+        let steps = device.steps.iter().map(|step| Step {
+            entry: step.entry,
+            program: step.program.clone(),
+            from: step.from.clone(),
+            to: step.to.clone(),
+            state: match step.todo {
+                Todo::Has => RowState::Has,
+                Todo::Update => RowState::Due,
+                Todo::Leave(_) => RowState::Failed,
+            },
+        });
+        let mut row = Row {
+            node: Some(device.node.get()),
+            name: device.name.clone(),
+            identity: device.identity,
+            state: RowState::Has,
+            steps: steps.collect(),
+            trouble: device.steps.iter().find_map(|step| match &step.todo {
+                Todo::Leave(fault) => Some(trouble::of_device(fault)),
+                Todo::Has | Todo::Update => None,
+            }),
+            left: None,
+            percent: None,
+        };
+        row.sum();
+        row
+    });
+    let missing = plan.missing.iter().map(|missing| Row {
+        node: missing.node.map(NodeId::get),
+        name: None,
+        identity: [None; 4],
+        state: RowState::Failed,
+        steps: Vec::new(),
+        trouble: Some(trouble::of_device(&missing.fault)),
+        left: None,
+        percent: None,
+    });
+    devices.chain(missing).collect()
+}
+
+impl Row {
+    /// The state of the device, from those of its programs.
+    fn sum(&mut self) {
+        let all = [RowState::Due, RowState::Failed, RowState::Updated, RowState::Has];
+        let first = all.into_iter().find(|state| self.steps.iter().any(|step| step.state == *state));
+        self.state = first.unwrap_or(self.state);
+    }
+
+    /// Takes a device into the update, or leaves it out.
+    pub(super) fn choose(&mut self, is_chosen: bool) {
+        let next = if is_chosen { RowState::Waiting } else { RowState::LeftOut };
+        let due = self.steps.iter_mut().map(|step| &mut step.state).chain([&mut self.state]);
+        due.filter(|state| **state == RowState::Due).for_each(|state| *state = next);
+    }
+
+    /// Shows how far its update is.
+    fn advance(&mut self, updates: &[state::Update]) {
+        let update = updates.iter().find(|update| Some(update.node) == self.node);
+        let Some(update) = update.filter(|_| self.state == RowState::Waiting) else { return };
+        if update.phase != state::Phase::Waiting {
+            self.state = RowState::Working;
+            self.percent = (update.done * 100).checked_div(update.total);
+        }
+    }
+
+    /// Whether an outcome belongs to this row.
+    fn is_of(&self, outcome: &Outcome) -> bool {
+        self.node.is_some()
+            && self.node == outcome.node.map(NodeId::get)
+            && self.steps.iter().any(|step| step.entry == outcome.entry)
+    }
+}
+
+/// Notes what became of the devices.
+pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
+    for outcome in outcomes {
+        // What is missing has no step, and is known from the plan.
+        let Some(row) = rows.iter_mut().find(|row| row.is_of(outcome)) else { continue };
+        let state = match &outcome.result {
+            Ok(Good::Had) => RowState::Has,
+            Ok(Good::Updated(_)) => RowState::Updated,
+            Err(bad) => {
+                // The first reason counts: the programs after it were not begun.
+                if row.trouble.is_none() {
+                    let (message, left) = trouble::of_outcome(bad);
+                    (row.trouble, row.left) = (Some(message), left);
+                }
+                RowState::Failed
+            }
+        };
+        row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|step| step.state = state);
+        row.sum();
+    }
+}
+
+/// The reports of an update: one for each device that has a node-ID and was not left out.
+pub(super) fn reports(rows: &[Row], of: &Arc<Of>) -> Vec<Report> {
+    let of_node = rows.iter().filter(|row| row.node.is_some() && row.state != RowState::LeftOut);
+    of_node.map(|row| Report::new(row.clone(), of.clone())).collect()
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A device that got its program.
+    pub(in super::super) fn row(node: u8, name: &str) -> Row {
+        let step = Step {
+            entry: 0,
+            program: "drive".to_owned(),
+            from: None,
+            to: "1.2".to_owned(),
+            state: RowState::Updated,
+        };
+        Row {
+            node: Some(node),
+            name: Some(name.to_owned()),
+            identity: [Some(1), Some(2), Some(3), Some(0x100 + u32::from(node))],
+            state: RowState::Updated,
+            steps: vec![step],
+            trouble: None,
+            left: None,
+            percent: None,
+        }
+    }
+}
