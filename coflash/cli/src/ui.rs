@@ -15,7 +15,8 @@ use super::package::{self, Trusted, Typed};
 /// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
 ///
 /// With --service the page is for people who update machines: it takes this one package, has nothing
-/// else to choose, and saves a report about each device.
+/// else to choose, and saves a report about each device in the folder of --report-dir; without it, in
+/// coflash-reports in the home folder.
 ///
 /// The command prints the URL of the page, which contains a random token: anyone with the URL can
 /// do everything that the page offers. Ctrl-C ends the command; a running update is ended in an
@@ -33,11 +34,6 @@ pub(super) struct Ui {
     /// Be a service station for the machines of this package.
     #[arg(long, value_name = "PACKAGE")]
     service: Option<PathBuf>,
-
-    /// Save the reports of a service station in this folder; by default coflash-reports in the home
-    /// folder.
-    #[arg(long, value_name = "DIR", requires = "service")]
-    report_dir: Option<PathBuf>,
 
     #[command(flatten)]
     trusted: Trusted,
@@ -89,7 +85,7 @@ impl Ui {
     fn station(&self, context: &Context, path: &Path) -> Result<Service, Failure> {
         let checked = package::read(path, &self.trusted)?;
         checked.signers().iter().for_each(|line| context.out.say(line));
-        let folder = self
+        let folder = context
             .report_dir
             .clone()
             .unwrap_or_else(|| std::env::home_dir().unwrap_or_default().join("coflash-reports"));

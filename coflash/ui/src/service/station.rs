@@ -22,10 +22,12 @@ pub(super) const KEYS: &[&str] = &[
     "ready",
     "searching",
     "planned",
+    "planned-bad",
     "complete",
     "none",
     "working",
     "good",
+    "good-unsaved",
     "bad",
     "adapter-lost",
     "adapter-failed",
@@ -33,9 +35,11 @@ pub(super) const KEYS: &[&str] = &[
     "hint-closed",
     "hint-ready",
     "hint-planned",
+    "hint-planned-bad",
     "hint-none",
     "hint-working",
     "hint-good",
+    "hint-good-unsaved",
     "hint-bad",
     "state-has",
     "state-due",
@@ -223,14 +227,19 @@ impl Station {
         let (station, hint) = match (&own.stage, adapter.state) {
             (Stage::Searching, _) if is_busy => ("searching", None),
             (Stage::Working(_), _) if is_busy => ("working", Some("hint-working")),
-            (Stage::Ended(rows), _) if rows.iter().all(is_good) => ("good", Some("hint-good")),
+            (Stage::Ended(rows), _) if !rows.iter().all(is_good) => ("bad", Some("hint-bad")),
+            (Stage::Ended(_), _) if own.unsaved > 0 => ("good-unsaved", Some("hint-good-unsaved")),
+            (Stage::Ended(_), _) => ("good", Some("hint-good")),
             // An update without a task was ended by an internal error.
-            (Stage::Ended(_) | Stage::Working(_), _) => ("bad", Some("hint-bad")),
+            (Stage::Working(_), _) => ("bad", Some("hint-bad")),
             (_, Connection::Closed) => ("closed", Some("hint-closed")),
             (_, Connection::Opening) => ("opening", None),
             (_, Connection::Lost) => ("lost", None),
             (Stage::Waiting | Stage::Searching, Connection::Open) => ("ready", Some("hint-ready")),
-            (Stage::Planned { .. }, Connection::Open) if due > 0 => ("planned", Some("hint-planned")),
+            (Stage::Planned { .. }, Connection::Open) if due > 0 && rows.iter().all(is_good) => {
+                ("planned", Some("hint-planned"))
+            }
+            (Stage::Planned { .. }, Connection::Open) if due > 0 => ("planned-bad", Some("hint-planned-bad")),
             (Stage::Planned { plan, .. }, Connection::Open) if plan.devices.is_empty() => {
                 ("none", Some("hint-none"))
             }

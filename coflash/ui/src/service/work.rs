@@ -13,7 +13,7 @@ use coflash_core::Error;
 
 use super::message::Message;
 use super::report::{unsaved, Entered, Of};
-use super::station::{change, note, reports, rows, RowState, Stage, Station};
+use super::station::{change, note, reports, rows, Stage, Station};
 use super::trouble;
 use crate::frames::wall;
 use crate::shared::{Shared, Work};
@@ -54,15 +54,15 @@ impl Work for Search {
     }
 }
 
-/// Why a search or an update was not carried out.
+/// Keeps why a search or an update was not carried out. The page shows that, and not the notice.
 fn refused(station: &Station, shared: &Shared, stage: Stage, message: Message) -> Notice {
-    let words = message.original();
+    let notice = Notice::done(message.original());
     change(shared, station, |own| {
         own.device_number.clear();
         own.stage = stage;
         own.message = Some(message);
     });
-    Notice::failed(words, "see the message on the page")
+    notice
 }
 
 fn search(station: &Station, link: &mut Link, shared: &Shared) -> Result<Plan, Message> {
@@ -171,7 +171,6 @@ impl Work for Update {
             missing: self.plan.missing.iter().map(|missing| trouble::of_device(&missing.fault)).collect(),
         };
         station.keep(reports(&rows, &Arc::new(of)));
-        let failed = rows.iter().filter(|row| row.state == RowState::Failed).count();
         shared.change(|state| {
             for update in &mut state.updates {
                 let row = rows.iter().find(|row| row.node == Some(update.node));
@@ -181,9 +180,7 @@ impl Work for Update {
             }
             station.change(|own| own.stage = Stage::Ended(rows));
         });
-        match failed {
-            0 => Notice::done("the machine is updated"),
-            failed => Notice::failed(format!("{failed} devices failed"), "see the message of each device"),
-        }
+        // How it went is in the rows.
+        Notice::done("the update has ended")
     }
 }

@@ -8,7 +8,7 @@ const MARKS = {
   "state-has": "✓", "state-due": "→", "state-left-out": "–", "state-waiting": "…", "state-working": "", "state-updated": "✓",
   "state-failed": "✗",
 };
-const BANNER = { good: "✓", complete: "✓", bad: "✗", none: "✗", lost: "✗", searching: "", working: "" };
+const BANNER = { good: "✓", complete: "✓", bad: "✗", none: "✗", lost: "✗", searching: "", working: "", "planned-bad": "!", "good-unsaved": "!" };
 /** The server sends something each second; after so many milliseconds of silence it is taken for lost. */
 const SILENCE = 6000;
 
@@ -67,7 +67,7 @@ function show(next) {
   }
   if (state.open && !before?.open) changes = false;
   const from = before?.station;
-  if (from === "working" && ["good", "bad"].includes(state.station)) play(state.station === "good");
+  if (from === "working" && ["good", "good-unsaved", "bad"].includes(state.station)) play(state.station === "good");
   // An update that was not begun leaves the number to be used.
   if (from === "working" && state.plan !== null && $("device-number").value === "") enter($("device-number"), sent);
   banner();
@@ -120,7 +120,8 @@ function buttons() {
   const isPlanned = state.plan !== null;
   const due = state.rows.filter((row) => row.state === "state-due").length;
   text($("search"), state.plans === 0 ? t("search") : t("search-again"));
-  $("search").disabled = state.busy || !state.open;
+  $("search").hidden = state.busy;
+  $("search").disabled = !state.open;
   $("search").classList.toggle("main", !isPlanned || state.station === "none");
   $("update").hidden = !isPlanned || state.station === "none" || state.busy;
   text($("update"), due === 0 ? t("save-report")
@@ -169,7 +170,7 @@ function row(one) {
     : el("span", { class: "mark", "aria-hidden": "true" }, MARKS[one.state]);
   if (isChoice) box.checked = chosen.has(one.node);
   const step = (step) => el("li", {},
-    el("span", {}, step.program), " ",
+    el("span", {}, `${step.program}: `),
     el("span", { class: "version" }, step.from ?? t("no-program"), el("span", { class: "arrow" }, " → "), el("strong", {}, step.to)),
     one.steps.length > 1 ? el("span", { class: "faint" }, ` · ${t(step.state)}`) : null);
   return el("li", { class: "device", "data-state": one.state, "data-node": one.node },
