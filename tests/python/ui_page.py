@@ -477,11 +477,27 @@ def looks(bench):
         for scheme in ["light", "dark"]:
             page = bench.page(url, width, height, color_scheme=scheme)
             expect(page.locator("#rows tr")).to_have_count(2)
-            expect(page.locator("#frame-rows tr").first).to_be_visible()
-            bench.picture(page, f"{width}-{scheme}")
-            if (width, scheme) == (390, "dark"):
-                bench.picture(page, "small", 1500)
-            readable(page, width, f"{width} {scheme}")
+            # On a narrow screen the parts are behind tabs, and none of them is long.
+            tabs = page.locator("#tabs button").all() if width == 390 else [None]
+            for tab in tabs:
+                name = f"{width}-{scheme}"
+                if tab:
+                    tab.click()
+                    name += f"-{tab.get_attribute('data-tab')}"
+                    tall = page.evaluate("document.documentElement.scrollHeight")
+                    assert tall <= 2500, f"{name}: {tall}"
+                if tab is None or name.endswith("bus"):
+                    expect(page.locator("#frame-rows tr").first).to_be_visible()
+                bench.picture(page, name)
+                if name == "390-dark-update":
+                    bench.picture(page, "small", 1500)
+                readable(page, width, name)
+            if width == 390:
+                # What leads to another part opens it.
+                page.get_by_role("button", name="Update", exact=True).click()
+                page.get_by_role("button", name="More about node 5").click()
+                page.get_by_role("button", name="Use its address for LSS").click()
+                expect(page.get_by_label("New node-ID")).to_be_focused()
             page.context.close()
     # The tab key moves through all elements, in the order of the page, and then out of it.
     page = bench.page(url)
@@ -735,6 +751,46 @@ def service_full(bench):
 
 
 @scenario
+def service_adapters(bench):
+    """The adapter of the last time is chosen, with its bit rate; one whose bit rate the system sets has none here."""
+    package = bench.package((bench.image("drive"), f"vendor = {VENDOR}\nproduct = {PRODUCT}"))
+    _, url = bench.ui(None, "--service", package, "--report-dir", bench.folder / "reports")
+    page = bench.page(url, locale="en-GB")
+    # Adapters that this machine does not have.
+    found = [{"url": "socketcan:can9", "words": "CAN interface"}, {"url": "slcan:/dev/none@500k", "words": "Serial adapter"}]
+
+    def told(route):
+        answer = route.fetch()
+        route.fulfill(response=answer, json={**answer.json(), "adapters": found, "last": "slcan:/dev/none@250k"})
+
+    page.route("**/station", told)
+    page.reload()
+    expect(page.get_by_label("Adapter")).to_have_value("slcan:/dev/none")
+    expect(page.get_by_label("Bit rate")).to_have_value("250k")
+    expect(page.locator("#address")).to_be_hidden()
+
+    def asked():
+        with page.expect_request("**/open") as request:
+            page.get_by_role("button", name="Connect").click()
+        return request.value.post_data_json["url"]
+
+    assert asked() == "slcan:/dev/none@250k"
+    expect(page.locator("#message")).to_contain_text("The adapter cannot be opened.")
+    expect(page.locator("#message")).to_contain_text("/dev/none")
+    page.get_by_label("Bit rate").select_option("1M")
+    assert asked() == "slcan:/dev/none@1M"
+    page.get_by_label("Adapter").select_option("socketcan:can9")
+    expect(page.get_by_label("Bit rate")).to_be_hidden()
+    assert asked() == "socketcan:can9"
+    page.get_by_label("Adapter").select_option("Another address …")
+    page.get_by_role("textbox", name="Address").fill("slcan:/dev/other@125k")
+    assert asked() == "slcan:/dev/other@125k"
+    # The server has no such adapter.
+    expect(page.locator("#message")).to_contain_text("/dev/other")
+    stationed(page, "closed")
+
+
+@scenario
 def service_looks(bench):
     """A good, a bad and a foreign device at three widths, light and dark, in both languages: nothing is cut off."""
     port = bench.free_port()
@@ -752,7 +808,7 @@ def service_looks(bench):
         elif step == "working":
             first.get_by_role("button", name="Update 1 device").click()
             writing(first)
-            bench.picture(first, "service-working")
+            bench.picture(first, "service", 830)
             continue
         elif step == "ended":
             stationed(first, "bad")

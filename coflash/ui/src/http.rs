@@ -108,7 +108,7 @@ impl From<Refusal> for Refused {
 }
 
 /// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 12] = [
+const FILES: [(&str, &str, &str); 13] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("style.css", CSS, include_str!("page/style.css")),
@@ -119,6 +119,7 @@ const FILES: [(&str, &str, &str); 12] = [
     ("dom.js", SCRIPT, include_str!("page/dom.js")),
     ("kept.js", SCRIPT, include_str!("page/kept.js")),
     ("reports.js", SCRIPT, include_str!("page/reports.js")),
+    ("tabs.js", SCRIPT, include_str!("page/tabs.js")),
     ("uPlot.css", CSS, include_str!("page/uPlot.min.css")),
     ("uPlot.js", SCRIPT, include_str!("page/uPlot.iife.min.js")),
 ];
