@@ -107,6 +107,11 @@ fn a_service_station_keeps_what_it_cannot_save() {
 }
 
 #[test]
+fn a_service_station_offers_the_adapter_and_the_bit_rate_of_the_last_time() {
+    with_nodes("service_adapters");
+}
+
+#[test]
 fn a_service_station_is_readable_in_both_languages() {
     with_nodes("service_looks");
 }

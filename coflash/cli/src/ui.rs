@@ -23,6 +23,10 @@ use super::package::{self, Trusted, Typed};
 /// orderly way.
 #[derive(Debug, Args)]
 pub(super) struct Ui {
+    // The first one: the parser takes each value out as it reads it.
+    #[command(flatten)]
+    typed: Typed,
+
     /// The port on 127.0.0.1; by default a free one.
     #[arg(long, value_name = "PORT", default_value = "0", hide_default_value = true)]
     port: u16,
@@ -37,9 +41,6 @@ pub(super) struct Ui {
 
     #[command(flatten)]
     trusted: Trusted,
-
-    #[command(flatten)]
-    typed: Typed,
 }
 
 impl Ui {

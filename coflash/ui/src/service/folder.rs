@@ -20,7 +20,7 @@ impl Folder {
     /// It cannot be made, or no file can be written into it.
     pub(super) fn new(path: &Path) -> io::Result<Self> {
         fs::create_dir_all(path)?;
-        let folder = Self(path.canonicalize()?);
+        let folder = Self(std::path::absolute(path)?);
         folder.check(1)?;
         Ok(folder)
     }

@@ -9,7 +9,7 @@ use coflash_core::file::inspect::Date;
 use serde::Deserialize;
 
 use super::message::Message;
-use super::station::{Row, RowState};
+use super::row::{Row, RowState, Step};
 use super::words::Language;
 
 /// The keys of this module, for the test of the table.
@@ -152,7 +152,7 @@ impl Report {
         if row.steps.is_empty() {
             return vec![line(Default::default())];
         }
-        let of_step = |step: &super::station::Step| {
+        let of_step = |step: &Step| {
             let (from, to) = (step.from.clone().unwrap_or_default(), step.to.clone());
             line([step.program.clone(), from, to, word(step.state).to_owned()])
         };
@@ -283,7 +283,27 @@ fn csv_cell(cell: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::station::tests::row;
+
+    /// A device that got its program.
+    fn row(node: u8, name: &str) -> Row {
+        let step = Step {
+            entry: 0,
+            program: "drive".to_owned(),
+            from: None,
+            to: "1.2".to_owned(),
+            state: RowState::Updated,
+        };
+        Row {
+            node: Some(node),
+            name: Some(name.to_owned()),
+            identity: [Some(1), Some(2), Some(3), Some(0x100 + u32::from(node))],
+            state: RowState::Updated,
+            steps: vec![step],
+            trouble: None,
+            left: None,
+            percent: None,
+        }
+    }
 
     fn report(name: &str, entered: Entered) -> Report {
         let of = Of {

@@ -63,7 +63,7 @@ impl Language {
 mod tests {
     use std::collections::BTreeSet;
 
-    use super::super::{report, requests, station, trouble, work};
+    use super::super::{report, requests, row, station, trouble, work};
     use super::*;
 
     const PAGE: &str = include_str!("page/service.html");
@@ -100,7 +100,7 @@ mod tests {
             used.extend(after(PAGE, attribute));
         }
         used.extend(after(SCRIPT, " t(\"").into_iter().chain(after(SCRIPT, "(t(\"")));
-        for keys in [station::KEYS, trouble::KEYS, report::KEYS, work::KEYS, requests::KEYS] {
+        for keys in [station::KEYS, row::KEYS, trouble::KEYS, report::KEYS, work::KEYS, requests::KEYS] {
             used.extend(keys);
         }
         let known: BTreeSet<&str> = TEXTS.keys().map(String::as_str).collect();

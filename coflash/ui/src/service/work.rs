@@ -13,7 +13,8 @@ use coflash_core::Error;
 
 use super::message::Message;
 use super::report::{unsaved, Entered, Of};
-use super::station::{change, note, reports, rows, Stage, Station};
+use super::row::{note, rows, Row};
+use super::station::{change, reports, Stage, Station};
 use super::trouble;
 use crate::frames::wall;
 use crate::shared::{Shared, Work};
@@ -104,7 +105,7 @@ pub(super) fn is_due(device: &machine::Device) -> bool {
 
 impl Update {
     /// The devices, with those that are written.
-    fn rows(&self) -> Vec<super::station::Row> {
+    fn rows(&self) -> Vec<Row> {
         let mut rows = rows(&self.plan);
         for row in &mut rows {
             let node = row.node.and_then(NodeId::new);

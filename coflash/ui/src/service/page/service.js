@@ -311,9 +311,9 @@ function offer() {
 function start() {
   $("search").addEventListener("click", () => ask("search"));
   $("save").addEventListener("click", () => ask("save"));
+  // A browser allows sounds from a click on.
+  document.addEventListener("click", () => (sound ??= new AudioContext()));
   $("update").addEventListener("click", async () => {
-    // A browser allows sounds from a click on.
-    sound ??= new AudioContext();
     const [operator, order, number] = FIELDS.map((id) => $(id).value.trim());
     const nodes = [...chosen].sort((a, b) => a - b);
     sent = number;
