@@ -108,7 +108,7 @@ impl From<Refusal> for Refused {
 }
 
 /// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 13] = [
+const FILES: [(&str, &str, &str); 14] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("style.css", CSS, include_str!("page/style.css")),
@@ -117,6 +117,7 @@ const FILES: [(&str, &str, &str); 13] = [
     ("bus.js", SCRIPT, include_str!("page/bus.js")),
     ("devices.js", SCRIPT, include_str!("page/devices.js")),
     ("dom.js", SCRIPT, include_str!("page/dom.js")),
+    ("events.js", SCRIPT, include_str!("page/events.js")),
     ("kept.js", SCRIPT, include_str!("page/kept.js")),
     ("reports.js", SCRIPT, include_str!("page/reports.js")),
     ("tabs.js", SCRIPT, include_str!("page/tabs.js")),

@@ -28,13 +28,14 @@ use crate::state::Notice;
 #[cfg(test)]
 pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
 
-const FILES: [(&str, &str, &str); 7] = [
+const FILES: [(&str, &str, &str); 8] = [
     ("", HTML, include_str!("page/service.html")),
     ("service.css", CSS, include_str!("page/service.css")),
     ("service.js", SCRIPT, include_str!("page/service.js")),
     ("words.json", "application/json", TABLE),
     ("icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
     ("dom.js", SCRIPT, include_str!("../page/dom.js")),
+    ("events.js", SCRIPT, include_str!("../page/events.js")),
     ("kept.js", SCRIPT, include_str!("../page/kept.js")),
 ];
 

@@ -1,6 +1,7 @@
 // The page of a service station. The server decides; the page shows it in the user's language and sends requests.
 
 import { $, el, text } from "./dom.js";
+import { follow } from "./events.js";
 import { keep, keepField, kept } from "./kept.js";
 
 const FIELDS = ["operator", "order", "device-number"];
@@ -9,8 +10,6 @@ const MARKS = {
   "state-failed": "✗",
 };
 const BANNER = { good: "✓", complete: "✓", bad: "✗", none: "✗", lost: "✗", searching: "", working: "", "planned-bad": "!", "good-unsaved": "!" };
-/** The server sends something each second; after so many milliseconds of silence it is taken for lost. */
-const SILENCE = 6000;
 
 let words = {};
 let language = kept("language") ?? (navigator.language.toLowerCase().startsWith("de") ? "de" : "en");
@@ -250,35 +249,6 @@ function barcodes() {
   });
 }
 
-function listen() {
-  let source = null;
-  let watch = 0;
-  const lost = (isLost) => ($("lost").hidden = !isLost);
-  const alive = () => {
-    clearTimeout(watch);
-    watch = setTimeout(() => {
-      lost(true);
-      open();
-    }, SILENCE);
-  };
-  const open = () => {
-    source?.close();
-    source = new EventSource("events");
-    source.onopen = () => lost(false);
-    source.onmessage = (event) => {
-      alive();
-      const told = JSON.parse(event.data);
-      if (told.state) show(told.state);
-    };
-    source.onerror = () => {
-      lost(true);
-      alive();
-    };
-    alive();
-  };
-  open();
-}
-
 /** The adapters, with the one of the last time chosen. */
 function offer() {
   const [list, rate] = [$("adapter-list"), $("rate")];
@@ -342,4 +312,4 @@ function start() {
 offer();
 start();
 translate();
-listen();
+follow("events", (told) => { if (told.state) show(told.state); }, (how) => ($("lost").hidden = how === null));
