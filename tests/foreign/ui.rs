@@ -40,6 +40,8 @@ fn script(scenario: &str) -> (Command, Folder) {
     for variable in ["COFLASH_BUS", "COFLASH_CONFIG"] {
         command.env_remove(variable);
     }
+    // A service station remembers its adapter there.
+    command.env("XDG_STATE_HOME", &*folder);
     (command, folder)
 }
 
@@ -92,6 +94,26 @@ fn single_steps_and_lss_by_keys_alone() {
 #[test]
 fn the_page_is_readable_wide_and_narrow_in_light_and_dark() {
     with_nodes("looks");
+}
+
+#[test]
+fn a_service_station_updates_a_machine_by_keys_and_barcodes_and_remembers_its_adapter() {
+    with_nodes("service");
+}
+
+#[test]
+fn a_service_station_keeps_what_it_cannot_save() {
+    with_nodes("service_full");
+}
+
+#[test]
+fn a_service_station_offers_the_adapter_and_the_bit_rate_of_the_last_time() {
+    with_nodes("service_adapters");
+}
+
+#[test]
+fn a_service_station_is_readable_in_both_languages() {
+    with_nodes("service_looks");
 }
 
 #[test]

@@ -8,6 +8,7 @@ shows. What a person does is done by the browser's own input: keys, clicks and d
 
 import argparse
 import contextlib
+import csv
 import os
 import re
 import shutil
@@ -64,10 +65,10 @@ class Bench:
                              *options, until=f"127.0.0.1:{port}")
         return node
 
-    def ui(self, bus=None):
+    def ui(self, bus=None, *options):
         """Starts the server; returns the program and the URL."""
         bus = ["--bus", bus] if bus else []
-        program, line = self.spawn(self.arguments.coflash, *bus, "ui", "--no-open", until="http://127.0.0.1:")
+        program, line = self.spawn(self.arguments.coflash, *bus, "ui", "--no-open", *options, until="http://127.0.0.1:")
         return program, re.search(r"http://127\.0\.0\.1:\d+/[0-9a-f]{32}/", line)[0]
 
     def page(self, url, width=1280, height=900, **options):
@@ -80,7 +81,7 @@ class Bench:
         page.on("console", lambda message: self.complaint(message.text) if message.type == "error" else None)
         page.on("pageerror", lambda error: self.complaint(str(error)))
         page.goto(url)
-        expect(page.locator("#version")).to_contain_text("version")
+        expect(page.locator("#version")).not_to_be_empty()
         return page
 
     def complaint(self, words):
@@ -96,6 +97,16 @@ class Bench:
         subprocess.run([self.arguments.coflash, "--quiet", "convert", "-I", "binary", "--board", "stm32f407g-disc1",
                         "--vid", hex(vendor), "--pid", hex(product), raw, blocks], check=True)
         return blocks
+
+    def package(self, *programs):
+        """A package for a machine: the programs with what its recipe says of each."""
+        recipe, package = self.folder / "machine.toml", self.folder / "machine.cpk"
+        lines = ["name = 'Press 4'", "release = '2026-11'"]
+        for image, more in programs:
+            lines += ["[[program]]", f"image = '{image.name}'", more]
+        recipe.write_text("\n".join(lines))
+        subprocess.run([self.arguments.coflash, "--quiet", "package", recipe, "-o", package], check=True)
+        return package
 
     def picture(self, page, name, height=None):
         """Saves a screenshot: a number of pixels from the top, or the whole page."""
@@ -436,6 +447,23 @@ def single_steps(bench):
     idle(page)
 
 
+def readable(page, width, where):
+    """Nothing is cut off, all text has its contrast, and all fields have names."""
+    wide = page.evaluate("document.documentElement.scrollWidth")
+    assert wide <= width, f"{where}: the page is {wide} wide"
+    out = page.evaluate(
+        "width => [...document.querySelectorAll('main *:not(.hidden, .hidden *, .hidden-input, thead, thead *)')]"
+        ".filter(e => e.checkVisibility() && !e.closest('pre, #frames, #plot') && e.getBoundingClientRect().right"
+        " > width + 1).map(e => e.outerHTML.slice(0, 80))", width)
+    assert out == [], f"{where}: {out}"
+    thin = page.evaluate(CONTRAST)
+    assert thin == [], f"{where}: {thin}"
+    nameless = page.evaluate(
+        "[...document.querySelectorAll('input, select, button, progress')].filter(e => e.checkVisibility()"
+        " && !(e.labels?.length || e.ariaLabel || e.textContent.trim())).map(e => e.outerHTML.slice(0, 80))")
+    assert nameless == [], f"{where}: {nameless}"
+
+
 @scenario
 def looks(bench):
     """No part is cut off at 1280 and 390 pixels, light and dark; fields have names; no key trap."""
@@ -449,23 +477,27 @@ def looks(bench):
         for scheme in ["light", "dark"]:
             page = bench.page(url, width, height, color_scheme=scheme)
             expect(page.locator("#rows tr")).to_have_count(2)
-            expect(page.locator("#frame-rows tr").first).to_be_visible()
-            bench.picture(page, f"{width}-{scheme}")
-            if (width, scheme) == (390, "dark"):
-                bench.picture(page, "small", 1500)
-            wide = page.evaluate("document.documentElement.scrollWidth")
-            assert wide <= width, f"{width}: the page is {wide} wide"
-            out = page.evaluate(
-                "width => [...document.querySelectorAll('main *:not(.hidden, .hidden *, .hidden-input, thead, thead *)')]"
-                ".filter(e => e.checkVisibility() && !e.closest('pre, #frames, #plot') && e.getBoundingClientRect().right"
-                " > width + 1).map(e => e.outerHTML.slice(0, 80))", width)
-            assert out == [], out
-            thin = page.evaluate(CONTRAST)
-            assert thin == [], f"{width} {scheme}: {thin}"
-            nameless = page.evaluate(
-                "[...document.querySelectorAll('input, select, button, progress')].filter(e => e.checkVisibility()"
-                " && !(e.labels?.length || e.ariaLabel || e.textContent.trim())).map(e => e.outerHTML.slice(0, 80))")
-            assert nameless == [], nameless
+            # On a narrow screen the parts are behind tabs, and none of them is long.
+            tabs = page.locator("#tabs button").all() if width == 390 else [None]
+            for tab in tabs:
+                name = f"{width}-{scheme}"
+                if tab:
+                    tab.click()
+                    name += f"-{tab.get_attribute('data-tab')}"
+                    tall = page.evaluate("document.documentElement.scrollHeight")
+                    assert tall <= 2500, f"{name}: {tall}"
+                if tab is None or name.endswith("bus"):
+                    expect(page.locator("#frame-rows tr").first).to_be_visible()
+                bench.picture(page, name)
+                if name == "390-dark-update":
+                    bench.picture(page, "small", 1500)
+                readable(page, width, name)
+            if width == 390:
+                # What leads to another part opens it.
+                page.get_by_role("button", name="Update", exact=True).click()
+                page.get_by_role("button", name="More about node 5").click()
+                page.get_by_role("button", name="Use its address for LSS").click()
+                expect(page.get_by_label("New node-ID")).to_be_focused()
             page.context.close()
     # The tab key moves through all elements, in the order of the page, and then out of it.
     page = bench.page(url)
@@ -509,6 +541,285 @@ CONTRAST = """() => {
   return bad;
 }"""
 
+
+def stationed(page, name):
+    """Waits until the station has this state."""
+    expect(page.locator("#banner")).to_have_attribute("data-station", name)
+
+
+def writing(page):
+    """Waits until a device is being written: a part of its program is transferred."""
+    page.wait_for_function("() => document.querySelector('progress')?.value > 2")
+
+
+def reach(page, name):
+    """Moves to the button or field with this name or id by the tab key."""
+    for _ in range(40):
+        here = page.evaluate("[document.activeElement.id, document.activeElement.textContent.trim()]")
+        if name in here:
+            return
+        page.keyboard.press("Tab")
+    raise AssertionError(f"{name!r} is not reached")
+
+
+def press(page, name):
+    """Moves to a button by the tab key, and presses it: one click of a person."""
+    reach(page, name)
+    page.keyboard.press("Enter")
+
+
+# Counts the tones that a page plays.
+TONES = """() => {
+  window.tones = 0;
+  const create = AudioContext.prototype.createOscillator;
+  AudioContext.prototype.createOscillator = function () { window.tones += 1; return create.call(this); };
+}"""
+
+
+def away(folder):
+    """Puts a file in the place of a folder: as good as a full disk, also for root."""
+    folder.rename(folder.with_suffix(".away"))
+    folder.write_text("")
+
+
+def back(folder):
+    """Puts the folder back."""
+    folder.unlink()
+    folder.with_suffix(".away").rename(folder)
+
+
+def reports(bench):
+    """The rows of all saved tables of reports, by their files' names."""
+    rows = {}
+    for path in sorted((bench.folder / "reports").glob("*.csv")):
+        with open(path, newline="", encoding="utf-8") as file:
+            rows[path.stem] = list(csv.DictReader(file))
+        assert path.with_suffix(".html").is_file(), path
+    return rows
+
+
+@scenario
+def service(bench):
+    """A machine is updated by keys alone, in three presses; a barcode goes into its field; the reports are saved."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    package = bench.package((bench.image("drive", size=120 * 1024), f"vendor = {VENDOR}\nproduct = {PRODUCT}\ncount = 2"))
+    options = ["--service", package, "--report-dir", bench.folder / "reports"]
+    _, url = bench.ui(None, *options)
+    page = bench.page(url, locale="de-AT")
+    page.evaluate(TONES)
+    stationed(page, "closed")
+    assert page.locator("html").get_attribute("lang") == "de"
+    expect(page.locator("#package")).to_have_text("Paket: Press 4 2026-11 (machine.cpk) · Nicht signiert")
+    page_words = page.locator("body").inner_text()
+    for word in ["LSS", "Erase", "Löschen", "stm32", "Board"]:
+        assert word not in page_words, word
+    reach(page, "adapter-list")
+    page.keyboard.press("End")
+    reach(page, "address")
+    page.keyboard.type(f"socketcand://127.0.0.1:{port}/can0")
+    # The first press.
+    page.keyboard.press("Enter")
+    stationed(page, "ready")
+    expect(page.locator("#state")).to_have_text("Bereit")
+    reach(page, "operator")
+    page.keyboard.type("Jörg")
+    # A reader of barcodes sends characters and Enter, whatever has the focus: it presses no button.
+    page.keyboard.press("Tab")
+    page.keyboard.type("A-77\n")
+    assert page.evaluate("document.activeElement.id") == "device-number"
+    reach(page, "Geräte suchen")
+    page.keyboard.type("4711\n")
+    for name, value in [("operator", "Jörg"), ("order", "A-77"), ("device-number", "4711")]:
+        expect(page.locator(f"#{name}")).to_have_value(value)
+    stationed(page, "ready")
+    # The second press.
+    press(page, "Geräte suchen")
+    stationed(page, "planned")
+    expect(page.locator(".device")).to_have_count(2)
+    expect(page.locator('.device[data-node="5"]')).to_contain_text("00000100h")
+    expect(page.locator('.device[data-node="5"]')).to_contain_text("drive: kein Programm → CRC ")
+    # A number that is read again replaces the last one.
+    reach(page, "2 Geräte updaten")
+    page.keyboard.type("4712\n")
+    expect(page.locator("#device-number")).to_have_value("4712")
+    # Enter leads to the button; it is pressed by a person.
+    assert page.evaluate("document.activeElement.id") == "update"
+    assert not reports(bench), reports(bench)
+    # The third press.
+    page.keyboard.press("Enter")
+    stationed(page, "working")
+    expect(page.locator('.device[data-state="state-working"]').first).to_contain_text("%")
+    expect(page.locator("#device-number")).to_have_value("")
+    stationed(page, "good")
+    expect(page.locator("#number")).to_have_text("Gerätenummer: 4712")
+    expect(page.locator("#saved-count")).to_have_text("2 Berichte sind gespeichert:")
+    assert page.evaluate("window.tones") == 2, page.evaluate("window.tones")
+    saved = reports(bench)
+    assert [rows[0]["serial_number"] for rows in saved.values()] == ["00000100h", "00000101h"], saved
+    for rows in saved.values():
+        (row,) = rows
+        assert (row["result"], row["program"], row["from"]) == ("updated", "drive", ""), row
+        assert (row["operator"], row["order"], row["device_number"]) == ("Jörg", "A-77", "4712"), row
+        assert (row["package"], row["release"], row["file"]) == ("Press 4", "2026-11", "machine.cpk"), row
+    # The report is that of a user with this language, and needs no script.
+    html = next((bench.folder / "reports").glob("*.html"))
+    report = page.context.new_page()
+    report.goto(html.as_uri())
+    expect(report.locator("h1")).to_have_text("Bericht über ein Update")
+    expect(report.locator("body")).to_contain_text("4712")
+    bench.picture(report, "service-report")
+    report.close()
+    # What is done is not done again.
+    page.bring_to_front()
+    press(page, "Erneut suchen")
+    stationed(page, "complete")
+    expect(page.locator('.device[data-state="state-has"]')).to_have_count(2)
+    expect(page.locator(".device input")).to_have_count(0)
+    # The language is a matter of a key; what was entered stays.
+    press(page, "English")
+    expect(page.locator("#state")).to_have_text("Nothing to do: every device has its program")
+    expect(page.locator("#operator")).to_have_value("Jörg")
+    page.reload()
+    expect(page.locator("#state")).to_have_text("Nothing to do: every device has its program")
+    page.context.close()
+    # The next start has the adapter of this one, and an English browser has its language.
+    _, url = bench.ui(None, *options)
+    page = bench.page(url, locale="en-GB")
+    stationed(page, "ready")
+    expect(page.locator("#state")).to_have_text("Ready")
+    expect(page.locator("#adapter-name")).to_have_text(f"socketcand://127.0.0.1:{port}/can0")
+
+
+@scenario
+def service_full(bench):
+    """Without room for the reports no device is changed; a closed browser loses nothing."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    package = bench.package((bench.image("drive", size=300 * 1024), f"vendor = {VENDOR}\nproduct = {PRODUCT}"))
+    folder = bench.folder / "reports"
+    bus = f"socketcand://127.0.0.1:{port}/can0"
+    program, url = bench.ui(bus, "--service", package, "--report-dir", folder)
+    page = bench.page(url, locale="en-GB")
+    stationed(page, "ready")
+    page.get_by_role("button", name="Search the devices").click()
+    stationed(page, "planned")
+    away(folder)
+    page.get_by_label("Device number").fill("4711")
+    page.get_by_role("button", name="Update 2 devices").click()
+    expect(page.locator("#message")).to_contain_text("Reports cannot be saved in")
+    expect(page.locator("#message")).to_contain_text("until then no device is changed")
+    stationed(page, "planned")
+    expect(page.locator("#device-number")).to_have_value("4711")
+    back(folder)
+    page.get_by_label("Update node 6").uncheck()
+    page.get_by_role("button", name="Update 1 device").click()
+    # The disk is full in mid-update, and the browser is closed.
+    writing(page)
+    away(folder)
+    page.context.close()
+    page = bench.page(url, locale="en-GB")
+    stationed(page, "good-unsaved")
+    expect(page.locator("#unsaved")).to_contain_text("Reports that are not saved: 1.")
+    expect(page.locator('.device[data-node="6"]')).to_have_attribute("data-state", "state-left-out")
+    bench.picture(page, "service-unsaved")
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Take report 1 with the browser").click()
+    assert "00000100h" in Path(download.value.path()).read_text(), download.value.suggested_filename
+    # It stays through another search, and is saved when there is room again.
+    page.get_by_role("button", name="Search again").click()
+    stationed(page, "planned")
+    expect(page.locator("#unsaved")).to_be_visible()
+    back(folder)
+    page.get_by_role("button", name="Save again").click()
+    expect(page.locator("#unsaved")).to_be_hidden()
+    expect(page.locator("#message")).to_be_hidden()
+    (rows,) = reports(bench).values()
+    assert (rows[0]["device_number"], rows[0]["serial_number"]) == ("4711", "00000100h"), rows
+    # Stopping asks first, and the outcome is kept, too.
+    page.get_by_role("button", name="Update 1 device").click()
+    writing(page)
+    page.get_by_role("button", name="Stop").click()
+    assert page.evaluate("document.activeElement.textContent") == "Go on"
+    page.get_by_role("button", name="Stop the update").click()
+    stationed(page, "bad")
+    expect(page.locator('.device[data-node="6"]')).to_contain_text("It was stopped.")
+    assert sorted(row[0]["result"] for row in reports(bench).values()) == ["failed", "had", "updated"], reports(bench)
+    program.send_signal(signal.SIGINT)
+    assert program.wait(timeout=60) == 0
+    expect(page.locator("#lost")).to_be_visible()
+
+
+@scenario
+def service_adapters(bench):
+    """The adapter of the last time is chosen, with its bit rate; one whose bit rate the system sets has none here."""
+    package = bench.package((bench.image("drive"), f"vendor = {VENDOR}\nproduct = {PRODUCT}"))
+    _, url = bench.ui(None, "--service", package, "--report-dir", bench.folder / "reports")
+    page = bench.page(url, locale="en-GB")
+    # Adapters that this machine does not have.
+    found = [{"url": "socketcan:can9", "words": "CAN interface"}, {"url": "slcan:/dev/none@500k", "words": "Serial adapter"}]
+
+    def told(route):
+        answer = route.fetch()
+        route.fulfill(response=answer, json={**answer.json(), "adapters": found, "last": "slcan:/dev/none@250k"})
+
+    page.route("**/station", told)
+    page.reload()
+    expect(page.get_by_label("Adapter")).to_have_value("slcan:/dev/none")
+    expect(page.get_by_label("Bit rate")).to_have_value("250k")
+    expect(page.locator("#address")).to_be_hidden()
+
+    def asked():
+        with page.expect_request("**/open") as request:
+            page.get_by_role("button", name="Connect").click()
+        return request.value.post_data_json["url"]
+
+    assert asked() == "slcan:/dev/none@250k"
+    expect(page.locator("#message")).to_contain_text("The adapter cannot be opened.")
+    expect(page.locator("#message")).to_contain_text("/dev/none")
+    page.get_by_label("Bit rate").select_option("1M")
+    assert asked() == "slcan:/dev/none@1M"
+    page.get_by_label("Adapter").select_option("socketcan:can9")
+    expect(page.get_by_label("Bit rate")).to_be_hidden()
+    assert asked() == "socketcan:can9"
+    page.get_by_label("Adapter").select_option("Another address …")
+    page.get_by_role("textbox", name="Address").fill("slcan:/dev/other@125k")
+    assert asked() == "slcan:/dev/other@125k"
+    # The server has no such adapter.
+    expect(page.locator("#message")).to_contain_text("/dev/other")
+    stationed(page, "closed")
+
+
+@scenario
+def service_looks(bench):
+    """A good, a bad and a foreign device at three widths, light and dark, in both languages: nothing is cut off."""
+    port = bench.free_port()
+    bench.nodes(port, *TWO)
+    package = bench.package(
+        (bench.image("drive", size=200 * 1024), f"nodes = [5]\nvendor = {VENDOR}\nproduct = {PRODUCT}"),
+        (bench.image("valve", vendor=0x63, product=2), "nodes = [9]\nvendor = 0x63\nproduct = 2"))
+    _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", package, "--report-dir", bench.folder / "reports")
+    kinds = [(width, scheme, locale) for width in (1280, 800, 390) for scheme in ("light", "dark") for locale in ("en-GB", "de-DE")]
+    first = bench.page(url, locale="en-GB")
+    for step in ["ready", "bad", "working", "ended"]:
+        if step == "bad":
+            first.get_by_role("button", name="Search the devices").click()
+            stationed(first, "planned-bad")
+        elif step == "working":
+            first.get_by_role("button", name="Update 1 device").click()
+            writing(first)
+            bench.picture(first, "service", 830)
+            continue
+        elif step == "ended":
+            stationed(first, "bad")
+            expect(first.locator("#message")).to_be_hidden()
+        for width, scheme, locale in kinds:
+            page = bench.page(url, width, 844 if width == 390 else 900, color_scheme=scheme, locale=locale)
+            expect(page.locator("#banner")).to_have_attribute("data-station", re.compile("ready|bad"))
+            assert page.locator("html").get_attribute("lang") == locale[:2]
+            bench.picture(page, f"service-{step}-{width}-{scheme}-{locale[:2]}")
+            readable(page, width, f"{step} {width} {scheme} {locale}")
+            page.context.close()
 
 @scenario
 def emulated(bench):

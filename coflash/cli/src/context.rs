@@ -24,6 +24,8 @@ pub(super) struct Context {
     pub(super) sdo_response: Option<u16>,
     /// The configuration file that `--config` or `COFLASH_CONFIG` names.
     pub(super) config: Option<PathBuf>,
+    /// The value of `--report-dir`.
+    pub(super) report_dir: Option<PathBuf>,
     pub(super) out: Output,
 }
 

@@ -36,6 +36,7 @@ mod keys;
 mod legacy;
 mod lss;
 mod many;
+mod memory;
 mod monitor;
 mod nameplate;
 mod nmt;
@@ -240,6 +241,7 @@ impl Cli {
             sdo_request: self.sdo_request,
             sdo_response: self.sdo_response,
             config: self.config.clone(),
+            report_dir: self.report_dir.clone(),
             out: self.output,
         }
     }
@@ -352,6 +354,7 @@ fn shell_line(context: &Context, words: Vec<String>) -> Result<(), Failure> {
         sdo_request: line.sdo_request.or(context.sdo_request),
         sdo_response: line.sdo_response.or(context.sdo_response),
         config: context.config.clone(),
+        report_dir: context.report_dir.clone(),
         out: line.out.or(context.out),
     };
     cli.command.run(&line)

@@ -113,13 +113,13 @@ pub(super) fn is_package(path: &Path) -> bool {
 }
 
 /// A package, and which of its signers belong to the roots that the user has named, if any was named.
-struct Checked {
-    package: Package,
-    known: Option<Vec<Signer>>,
+pub(super) struct Checked {
+    pub(super) package: Package,
+    pub(super) known: Option<Vec<Signer>>,
 }
 
 /// Reads and checks a package.
-fn read(path: &Path, trusted: &Trusted) -> Result<Checked, Failure> {
+pub(super) fn read(path: &Path, trusted: &Trusted) -> Result<Checked, Failure> {
     let roots = trusted.trust.iter().map(|path| public_key(path)).collect::<Result<Vec<_>, _>>()?;
     let package =
         Package::parse(&super::file::bytes(path)?).map_err(|fault| Failure::package(path, &fault))?;
@@ -197,7 +197,7 @@ fn show(context: &Context, command: &str, path: &Path, checked: &Checked) {
 
 impl Checked {
     /// Who has signed it, a line for each.
-    fn signers(&self) -> Vec<String> {
+    pub(super) fn signers(&self) -> Vec<String> {
         let line = |signer: &Signer| {
             let whose = match signer.certificate() {
                 Some(certificate) => format!("certified by root {:08X}h", certificate.root_id()),

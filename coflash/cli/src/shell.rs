@@ -1,7 +1,6 @@
 //! `coflash shell`: runs several commands one after another.
 
 use std::io::IsTerminal;
-use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 use clap::Args;
@@ -10,6 +9,7 @@ use rustyline::DefaultEditor;
 
 use super::context::Context;
 use super::device::cancelled;
+use super::memory;
 use super::output::Failure;
 
 /// Reads commands from the keyboard or from standard input and runs them.
@@ -28,7 +28,7 @@ impl Shell {
     /// Reads commands and runs each of them with `command`.
     pub(super) fn run(&self, context: &Context, command: Runner) -> Result<(), Failure> {
         let interactive = std::io::stdin().is_terminal();
-        let history = interactive.then(history_file).flatten();
+        let history = interactive.then(|| memory::file("history")).flatten();
         let mut editor = DefaultEditor::new()
             .map_err(|error| Failure::system(format!("the line editor does not start: {error}")))?;
         if let Some(history) = &history {
@@ -90,14 +90,6 @@ fn split(line: &str) -> Result<Vec<String>, Failure> {
     }
     words.extend(word);
     Ok(words)
-}
-
-fn history_file() -> Option<PathBuf> {
-    let state = std::env::var_os("XDG_STATE_HOME").map(PathBuf::from);
-    let home = || std::env::home_dir().map(|home| home.join(".local").join("state"));
-    let folder = state.filter(|path| path.is_absolute()).or_else(home)?.join("coflash");
-    std::fs::create_dir_all(&folder).ok()?;
-    Some(folder.join("history"))
 }
 
 #[cfg(test)]

@@ -1,20 +1,32 @@
 //! `coflash ui`: the page in the browser.
 
+use std::path::{Path, PathBuf};
+
 use clap::Args;
-use coflash_ui::{Options, Server};
+use coflash_ui::{Options, Server, Service};
 use serde_json::json;
 
 use super::context::Context;
 use super::device::cancelled;
+use super::memory;
 use super::output::Failure;
+use super::package::{self, Trusted, Typed};
 
 /// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
+///
+/// With --service the page is for people who update machines: it takes this one package, has nothing
+/// else to choose, and saves a report about each device in the folder of --report-dir; without it, in
+/// coflash-reports in the home folder.
 ///
 /// The command prints the URL of the page, which contains a random token: anyone with the URL can
 /// do everything that the page offers. Ctrl-C ends the command; a running update is ended in an
 /// orderly way.
 #[derive(Debug, Args)]
 pub(super) struct Ui {
+    // The first one: the parser takes each value out as it reads it.
+    #[command(flatten)]
+    typed: Typed,
+
     /// The port on 127.0.0.1; by default a free one.
     #[arg(long, value_name = "PORT", default_value = "0", hide_default_value = true)]
     port: u16,
@@ -22,6 +34,13 @@ pub(super) struct Ui {
     /// Print the URL without opening a browser.
     #[arg(long)]
     no_open: bool,
+
+    /// Be a service station for the machines of this package.
+    #[arg(long, value_name = "PACKAGE")]
+    service: Option<PathBuf>,
+
+    #[command(flatten)]
+    trusted: Trusted,
 }
 
 impl Ui {
@@ -39,6 +58,10 @@ impl Ui {
             (None, None) => None,
             (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),
         };
+        self.typed.check(self.service.is_some())?;
+        if let Some(path) = &self.service {
+            options.service = Some(self.station(context, path)?);
+        }
         let server = Server::new(options).map_err(|error| {
             Failure::system(format!("port {} of 127.0.0.1 cannot be served: {error}", self.port))
         })?;
@@ -53,9 +76,26 @@ impl Ui {
             .run(&end)
             .map_err(|error| Failure::system(format!("the page cannot be served: {error}")))?;
         match left {
-            Some(words) => context.out.warn(format_args!("an update was running: {words}")),
+            Some(words) => context.out.warn(words),
             None => context.out.say("the page has ended"),
         }
         Ok(())
+    }
+
+    /// The service station for a package, which is checked as by `flash`.
+    fn station(&self, context: &Context, path: &Path) -> Result<Service, Failure> {
+        let checked = package::read(path, &self.trusted)?;
+        checked.signers().iter().for_each(|line| context.out.say(line));
+        let folder = context
+            .report_dir
+            .clone()
+            .unwrap_or_else(|| std::env::home_dir().unwrap_or_default().join("coflash-reports"));
+        let service =
+            Service::new(checked.package, path, checked.known.is_some(), &folder).map_err(|error| {
+                let what = format!("reports cannot be saved in {}: {error}", folder.display());
+                Failure::usage(what, "name another folder with --report-dir")
+            })?;
+        context.out.say(format_args!("reports are saved in {}", service.report_dir().display()));
+        Ok(service.memory(memory::file("service-bus")))
     }
 }

@@ -18,6 +18,7 @@ use tokio::time::sleep;
 
 use super::frames::wall;
 use super::shared::{lock, Shared};
+use super::state::State;
 
 /// The shortest time between two events.
 const PACE: Duration = Duration::from_millis(150);
@@ -45,8 +46,12 @@ impl Drop for Place {
     }
 }
 
+/// What a page gets of the state.
+pub(super) type View = Arc<dyn Fn(&State) -> Value + Send + Sync>;
+
 struct Reader {
     shared: Arc<Shared>,
+    view: View,
     changed: watch::Receiver<u64>,
     arrived: watch::Receiver<u64>,
     /// The number of the last frame that was sent to this reader, if it wants frames.
@@ -61,6 +66,7 @@ struct Reader {
 /// A stream for one more reader; `None` if there are too many.
 pub(super) fn stream(
     shared: Arc<Shared>,
+    view: View,
     readers: &Readers,
     frames: bool,
 ) -> Option<Sse<impl Stream<Item = Result<Event, Infallible>>>> {
@@ -76,6 +82,7 @@ pub(super) fn stream(
         second: 0,
         version: 0,
         shared,
+        view,
         _place: place,
     };
     Some(Sse::new(stream::unfold(reader, |mut reader| async {
@@ -101,7 +108,7 @@ impl Reader {
         let version = *self.changed.borrow_and_update();
         if version != self.version {
             self.version = version;
-            value["state"] = self.shared.look(|state| json!(state));
+            value["state"] = self.shared.look(|state| (self.view)(state));
         }
         let now = wall().as_secs();
         let frames = lock(&self.shared.frames);

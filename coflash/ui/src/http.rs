@@ -17,7 +17,7 @@ use shared_abi::layout::{self, Layout};
 use tokio::sync::Semaphore;
 
 use super::adapters;
-use super::events::{self, Readers};
+use super::events::{self, Readers, View};
 use super::firmware::{self, FILE_MAX};
 use super::frames::candump;
 use super::guard::{guard, Guard};
@@ -49,10 +49,20 @@ pub(super) struct Site {
     pub(super) reading: Arc<Semaphore>,
     /// The boards of the user's files; the last one can be chosen.
     pub(super) own_boards: Arc<Mutex<Vec<&'static Layout>>>,
+    /// What the page gets of the state.
+    pub(super) view: View,
+}
+
+/// A page: its files, what it gets of the state, and its own requests.
+pub(super) struct Page {
+    /// Name, type and content.
+    pub(super) files: &'static [(&'static str, &'static str, &'static str)],
+    pub(super) view: View,
+    pub(super) routes: Router<Site>,
 }
 
 /// An error in place of the requested answer.
-struct Refused(StatusCode, Notice);
+pub(super) struct Refused(pub(super) StatusCode, pub(super) Notice);
 
 impl IntoResponse for Refused {
     fn into_response(self) -> Response {
@@ -60,17 +70,17 @@ impl IntoResponse for Refused {
     }
 }
 
-type Answer = Result<Response, Refused>;
+pub(super) type Answer = Result<Response, Refused>;
 
-fn json_response(status: StatusCode, value: &Value) -> Response {
+pub(super) fn json_response(status: StatusCode, value: &Value) -> Response {
     (status, [(header::CONTENT_TYPE, "application/json")], value.to_string()).into_response()
 }
 
-fn done() -> Answer {
+pub(super) fn done() -> Answer {
     Ok(json_response(StatusCode::OK, &json!({})))
 }
 
-fn bad(words: impl Into<String>, advice: &str) -> Refused {
+pub(super) fn bad(words: impl Into<String>, advice: &str) -> Refused {
     Refused(StatusCode::BAD_REQUEST, Notice::failed(words, advice))
 }
 
@@ -97,8 +107,8 @@ impl From<Refusal> for Refused {
     }
 }
 
-/// The files of the page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 12] = [
+/// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
+const FILES: [(&str, &str, &str); 14] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("style.css", CSS, include_str!("page/style.css")),
@@ -107,45 +117,57 @@ const FILES: [(&str, &str, &str); 12] = [
     ("bus.js", SCRIPT, include_str!("page/bus.js")),
     ("devices.js", SCRIPT, include_str!("page/devices.js")),
     ("dom.js", SCRIPT, include_str!("page/dom.js")),
+    ("events.js", SCRIPT, include_str!("page/events.js")),
     ("kept.js", SCRIPT, include_str!("page/kept.js")),
     ("reports.js", SCRIPT, include_str!("page/reports.js")),
+    ("tabs.js", SCRIPT, include_str!("page/tabs.js")),
     ("uPlot.css", CSS, include_str!("page/uPlot.min.css")),
     ("uPlot.js", SCRIPT, include_str!("page/uPlot.iife.min.js")),
 ];
-const HTML: &str = "text/html; charset=utf-8";
-const CSS: &str = "text/css; charset=utf-8";
-const SCRIPT: &str = "text/javascript; charset=utf-8";
+pub(super) const HTML: &str = "text/html; charset=utf-8";
+pub(super) const CSS: &str = "text/css; charset=utf-8";
+pub(super) const SCRIPT: &str = "text/javascript; charset=utf-8";
 
-/// All routes, behind the guard.
-pub(super) fn router(site: Site, who: Guard) -> Router {
-    let at = |name: &str| format!("/{}/{name}", who.token);
+/// The page for engineers.
+pub(super) fn engineers() -> Page {
+    let routes = Router::new()
+        .route("/adapters", get(list))
+        .route("/trace", get(trace))
+        .route("/firmware", post(take_file))
+        .route("/readback", get(readback))
+        .route("/open", post(open))
+        .route("/close", post(close))
+        .route("/settings", post(settings))
+        .route("/scan", post(scan))
+        .route("/update", post(update))
+        .route("/step", post(step))
+        .route("/fastscan", post(fastscan))
+        .route("/assign", post(assign));
+    Page { files: &FILES, view: Arc::new(|state| json!(state)), routes }
+}
+
+/// All requests to a page, behind the guard.
+pub(super) fn router(
+    site: Site,
+    who: Guard,
+    files: &[(&str, &'static str, &'static str)],
+    routes: Router<Site>,
+) -> Router {
     let mut router = Router::new();
-    for (name, kind, content) in FILES {
-        router =
-            router.route(&at(name), get(move || async move { ([(header::CONTENT_TYPE, kind)], content) }));
+    for (name, kind, content) in files.iter().copied() {
+        let file = get(move || async move { ([(header::CONTENT_TYPE, kind)], content) });
+        router = router.route(&format!("/{}/{name}", who.token), file);
     }
+    let routes = routes.route("/events", get(take_events)).route("/cancel", post(cancel));
     router
-        .route(&at("events"), get(take_events))
-        .route(&at("adapters"), get(list))
-        .route(&at("trace"), get(trace))
-        .route(&at("firmware"), post(take_file))
-        .route(&at("readback"), get(readback))
-        .route(&at("open"), post(open))
-        .route(&at("close"), post(close))
-        .route(&at("settings"), post(settings))
-        .route(&at("scan"), post(scan))
-        .route(&at("update"), post(update))
-        .route(&at("step"), post(step))
-        .route(&at("fastscan"), post(fastscan))
-        .route(&at("assign"), post(assign))
-        .route(&at("cancel"), post(cancel))
+        .nest(&format!("/{}", who.token), routes)
         .layer(DefaultBodyLimit::max(BODY_MAX))
         .layer(middleware::from_fn_with_state(who, guard))
         .with_state(site)
 }
 
 /// Parses a JSON body. A form of a foreign page cannot send one.
-fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
+pub(super) fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> Result<T, Refused> {
     let kind = headers.get(header::CONTENT_TYPE).and_then(|kind| kind.to_str().ok()).unwrap_or_default();
     if kind.split(';').next() != Some("application/json") {
         return Err(Refused(
@@ -164,7 +186,7 @@ struct Wanted {
 }
 
 async fn take_events(State(site): State<Site>, Query(wanted): Query<Wanted>) -> Answer {
-    match events::stream(site.shared, &site.readers, wanted.frames != 0) {
+    match events::stream(site.shared, site.view, &site.readers, wanted.frames != 0) {
         Some(stream) => Ok(stream.into_response()),
         None => Err(Refused(
             StatusCode::SERVICE_UNAVAILABLE,
@@ -187,7 +209,7 @@ async fn list(State(site): State<Site>) -> Response {
 }
 
 /// A file for the user to save.
-fn download(name: &str, kind: &'static str, content: impl IntoResponse) -> Response {
+pub(super) fn download(name: &str, kind: &'static str, content: impl IntoResponse) -> Response {
     let disposition = format!("attachment; filename=\"{name}\"");
     ([(header::CONTENT_TYPE, kind.to_string()), (header::CONTENT_DISPOSITION, disposition)], content)
         .into_response()
@@ -213,12 +235,12 @@ async fn readback(State(site): State<Site>) -> Answer {
 }
 
 #[derive(Deserialize)]
-struct Open {
-    url: String,
+pub(super) struct Open {
+    pub(super) url: String,
 }
 
 /// Refuses to change the adapter during a task.
-fn idle(site: &Site) -> Result<(), Refused> {
+pub(super) fn idle(site: &Site) -> Result<(), Refused> {
     match site.shared.look(|state| state.task.as_ref().map(|task| task.words.clone())) {
         Some(words) => Err(Refusal::Busy(words).into()),
         None => Ok(()),
@@ -365,7 +387,7 @@ struct Update {
     start: bool,
 }
 
-fn node_id(number: u8) -> Result<NodeId, Refused> {
+pub(super) fn node_id(number: u8) -> Result<NodeId, Refused> {
     NodeId::new(number).ok_or_else(|| bad(format!("{number} is not a node-ID"), "node-IDs are 1 to 127"))
 }
 

@@ -1,11 +1,11 @@
-//! The tasks of the page.
+//! The tasks of the engineer's page.
 
 use std::sync::Arc;
 
 use canopen::NodeId;
 
 use super::firmware::Loaded;
-use super::state::{State, Task, Update};
+use super::state::{State, Update};
 use coflash_core::device::lss::{BitRate, LssAddress};
 
 /// A task.
@@ -41,7 +41,7 @@ pub(super) enum Step {
 
 impl Job {
     /// Enters the task as the running one.
-    pub(super) fn enter(&self, state: &mut State) {
+    pub(super) fn entered(&self, state: &mut State) {
         let (kind, words) = match self {
             Self::Scan => ("scan", "searching the bus".to_string()),
             Self::Update { nodes, file, .. } => {
@@ -63,7 +63,6 @@ impl Job {
             Self::Fastscan => ("lss", "searching for a device without a node-ID".to_string()),
             Self::Assign { .. } => ("lss", "setting node-ID and bit rate".to_string()),
         };
-        state.notice = None;
-        state.task = Some(Task { kind, words, cancelling: false, percent: None });
+        state.begin(kind, words);
     }
 }

@@ -19,6 +19,7 @@
 //! | `worker` | the thread that owns the bus |
 //! | `job` | what can be done |
 //! | `work` | how it is done, by `coflash-core` |
+//! | `service` | another page: for people who update machines |
 //! | `firmware` | the file that was dropped on the page |
 //! | `frames` | what goes over the bus, in words, counted, and as a log |
 //! | `load` | how long a frame keeps the bus busy |
@@ -35,6 +36,7 @@ mod http;
 mod job;
 mod load;
 mod server;
+mod service;
 mod shared;
 mod state;
 mod upload;
@@ -42,6 +44,7 @@ mod work;
 mod worker;
 
 pub use self::server::{Options, Server};
+pub use self::service::Service;
 
 /// The example on the crate's page compiles and runs.
 #[cfg(doctest)]

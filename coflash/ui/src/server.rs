@@ -21,7 +21,8 @@ use tokio_io_timeout::TimeoutStream;
 use super::events::Readers;
 use super::guard::Guard;
 use super::guests::{Guest, Guests};
-use super::http::{router, Site};
+use super::http::{engineers, router, Page, Site};
+use super::service::Service;
 use super::shared::{Order, Shared};
 use super::upload::Room;
 use super::worker;
@@ -49,6 +50,8 @@ pub struct Options {
     pub sdo_ids: Option<(u16, u16)>,
     /// The kinds of adapters that the page offers.
     pub kinds: Vec<Kind>,
+    /// A page for people who update machines, in place of the one for engineers.
+    pub service: Option<Service>,
     /// How long a reader may accept no data before it is dropped.
     pub write_timeout: Duration,
     /// How long the header of a request may take to arrive.
@@ -64,6 +67,7 @@ impl Default for Options {
             port: 0,
             sdo_ids: None,
             kinds: Kind::ALL.to_vec(),
+            service: None,
             write_timeout: Duration::from_secs(10),
             head_timeout: Duration::from_secs(10),
             body_timeout: Duration::from_secs(10),
@@ -133,10 +137,9 @@ impl Server {
     }
 
     /// Serves until `end` is set. A running task is cancelled first: its transfer is aborted, and
-    /// the result describes the state of the devices.
+    /// the result describes the state of the devices, and what was not saved of a service station.
     ///
     /// # Errors
-    /// The thread of the bus does not start.
     /// The thread for the bus does not start.
     pub fn run(mut self, end: &AtomicBool) -> io::Result<Option<String>> {
         let shared = self.shared.clone();
@@ -146,10 +149,18 @@ impl Server {
             let work = move || orders.iter().for_each(|orders| worker::run(&shared, orders, sdo_ids));
             thread::Builder::new().name("bus".to_string()).spawn(work)?
         };
-        if let Some(bus) = self.options.bus.take() {
+        let last_bus = self.options.service.as_ref().and_then(Service::last_bus);
+        if let Some(bus) = self.options.bus.take().or(last_bus) {
             // This is the first order, so there is room for it.
             let _ = shared.order(Order::Open(bus));
         }
+        let (Page { files, view, routes }, at_end) = match self.options.service.take() {
+            None => (engineers(), None),
+            Some(service) => {
+                let (page, at_end) = service.open();
+                (page, Some(at_end))
+            }
+        };
         let site = Site {
             own_boards: Arc::default(),
             shared: shared.clone(),
@@ -157,8 +168,9 @@ impl Server {
             kinds: self.options.kinds.clone(),
             room: Room::new(self.options.body_timeout),
             reading: Arc::new(Semaphore::new(1)),
+            view,
         };
-        let app = router(site, self.guard);
+        let app = router(site, self.guard, files, routes);
         let Options { write_timeout, head_timeout, .. } = self.options;
         let (listener, times) = (self.listener, Times { write_timeout, head_timeout });
         let left = self.runtime.block_on(async {
@@ -172,7 +184,9 @@ impl Server {
         if shared.order(Order::End).is_ok() && shared.look(|state| state.task.is_none()) {
             let _ = worker.join();
         }
-        Ok(left)
+        let unsaved = at_end.and_then(|at_end| at_end.save());
+        let words: Vec<String> = left.into_iter().chain(unsaved).collect();
+        Ok((!words.is_empty()).then(|| words.join("\n")))
     }
 }
 
@@ -194,7 +208,7 @@ async fn end_in_order(shared: &Shared) -> Option<String> {
         let devices = state.updates.iter().map(|update| format!("node {}: {}", update.node, update.words));
         devices.collect::<Vec<_>>().join("\n")
     });
-    Some(words).filter(|words| !words.is_empty())
+    Some(words).filter(|words| !words.is_empty()).map(|words| format!("an update was running: {words}"))
 }
 
 /// Returns when the flag is set.

@@ -6,10 +6,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use tokio::sync::watch;
 
+use coboot_can::Link;
+
 use super::firmware::Loaded;
 use super::frames::Frames;
-use super::job::Job;
-use super::state::{Connection, State};
+use super::state::{Connection, Notice, State};
 
 /// An order for the thread of the bus.
 pub(super) enum Order {
@@ -20,7 +21,16 @@ pub(super) enum Order {
     /// End.
     End,
     /// Run this task. [`Shared::begin`] has entered it as the running one.
-    Run(Job),
+    Run(Box<dyn Work>),
+}
+
+/// A task for the thread of the bus. Each page has its own.
+pub(super) trait Work: Send {
+    /// Enters the task as the running one.
+    fn enter(&self, state: &mut State);
+
+    /// Carries it out, and returns its result.
+    fn run(self: Box<Self>, link: &mut Link, shared: &Shared) -> Notice;
 }
 
 /// Why a task does not start, in words for people.
@@ -79,11 +89,11 @@ impl Shared {
         look(&lock(&self.state))
     }
 
-    /// Starts a job if no other task is running.
+    /// Starts a task if no other one is running.
     ///
     /// # Errors
     /// [`Refusal`]; then nothing has changed.
-    pub(super) fn begin(&self, job: Job) -> Result<(), Refusal> {
+    pub(super) fn begin(&self, work: impl Work + 'static) -> Result<(), Refusal> {
         self.change(|state| {
             if let Some(task) = &state.task {
                 return Err(Refusal::Busy(task.words.clone()));
@@ -91,9 +101,9 @@ impl Shared {
             if state.adapter.state != Connection::Open {
                 return Err(Refusal::NotReady("no adapter is open"));
             }
-            job.enter(state);
+            work.enter(state);
             self.cancelled.store(false, Ordering::Relaxed);
-            self.order(Order::Run(job)).inspect_err(|_| state.task = None)
+            self.order(Order::Run(Box::new(work))).inspect_err(|_| state.task = None)
         })
     }
 

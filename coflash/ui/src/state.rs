@@ -296,6 +296,12 @@ impl State {
         }
     }
 
+    /// Enters a task as the running one.
+    pub(super) fn begin(&mut self, kind: &'static str, words: String) {
+        self.notice = None;
+        self.task = Some(Task { kind, words, cancelling: false, percent: None });
+    }
+
     pub(super) fn notice(&mut self, notice: Notice) {
         self.notices += 1;
         self.notice = Some(notice);

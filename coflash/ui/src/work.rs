@@ -1,5 +1,4 @@
-//! Runs the tasks of the page: the only module of the page's server that calls the rest of the
-//! library.
+//! Runs the tasks of the engineer's page, by `coflash-core`.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,8 +9,8 @@ use canopen::{program, Address, NodeId};
 use super::firmware::Loaded;
 use super::frames::wall;
 use super::job::{Job, Step};
-use super::shared::{lock, Shared};
-use super::state::{Notice, Phase, Readback, Report};
+use super::shared::{lock, Shared, Work};
+use super::state::{Notice, Phase, Readback, Report, State};
 use coboot_can::Link;
 use coflash_core::device::lss::{self, BitRate, LssAddress, Master};
 use coflash_core::device::{info, scan, Error, ScanOptions, Session, Timing};
@@ -22,21 +21,26 @@ use coflash_core::update::{self, steps, Event, FlashOptions, ManyOptions};
 /// The most devices in an update at the same time.
 const AT_ONCE: usize = 8;
 
-/// Runs a job and returns its result.
-pub(super) fn run(job: Job, link: &mut Link, shared: &Shared) -> Notice {
-    let done = match job {
-        Job::Scan => search(link, shared),
-        Job::Update { nodes, file, program, trial, start } => {
-            let options = FlashOptions::default().program(program).trial_run(trial).start(start);
-            return update_all(link, shared, &nodes, &file, options);
-        }
-        Job::Step { node, program, step } => step_of(link, shared, node, program, step),
-        Job::Fastscan => fastscan(link, shared),
-        Job::Assign { address, node, bit_rate, store } => {
-            assign(link, shared, &address, node, bit_rate, store)
-        }
-    };
-    done.unwrap_or_else(|error| Notice::error(&error))
+impl Work for Job {
+    fn enter(&self, state: &mut State) {
+        self.entered(state);
+    }
+
+    fn run(self: Box<Self>, link: &mut Link, shared: &Shared) -> Notice {
+        let done = match *self {
+            Self::Scan => search(link, shared),
+            Self::Update { nodes, file, program, trial, start } => {
+                let options = FlashOptions::default().program(program).trial_run(trial).start(start);
+                return update_all(link, shared, &nodes, &file, options);
+            }
+            Self::Step { node, program, step } => step_of(link, shared, node, program, step),
+            Self::Fastscan => fastscan(link, shared),
+            Self::Assign { address, node, bit_rate, store } => {
+                assign(link, shared, &address, node, bit_rate, store)
+            }
+        };
+        done.unwrap_or_else(|error| Notice::error(&error))
+    }
 }
 
 /// The notice for a task that needs frames behind a gateway.

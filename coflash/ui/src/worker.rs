@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 use super::frames::Tap;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
-use super::work;
 use coboot_can::{bit_rate_of, AdapterError, Link, SdoIds};
 use coflash_core::device::Timing;
 
@@ -51,9 +50,9 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Optio
                 shared.change(|state| state.adapter = Adapter::default());
                 Bus::Closed
             }
-            (Ok(Order::Run(job)), Bus::Open { url, mut link }) => {
+            (Ok(Order::Run(work)), Bus::Open { url, mut link }) => {
                 // After an internal error the page must not wait forever.
-                let done = catch_unwind(AssertUnwindSafe(|| work::run(job, &mut link, shared)));
+                let done = catch_unwind(AssertUnwindSafe(|| work.run(&mut link, shared)));
                 let notice = done.unwrap_or_else(|_| {
                     Notice::failed(
                         "there was an internal error of coflash",

@@ -163,6 +163,11 @@ fn the_command_makes_and_shows_a_package() {
         (&["flash", &data("plain-400.blk"), "--trust", &public], 2, "only the signers of a package"),
         (&["flash", &data("plain-400.blk"), "--yes"], 2, "only the update with a package is confirmed"),
         (&["flash", package, "--trust", &public], 3, "[0x60000408]"),
+        // A service station takes the same packages, before there is any page.
+        (&["ui", "--service", package, "--trust", &public], 3, "[0x60000408]"),
+        (&["ui", "--service", package, "--config", config], 3, "[0x60000408]"),
+        (&["ui", "--service", named], 3, "[0x60000400]"),
+        (&["ui", "--trust", &public], 2, "only the signers of a package"),
     ] {
         let done = coflash(words);
         assert_eq!(done.exit, exit, "{words:?}: {}", done.err);

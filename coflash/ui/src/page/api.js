@@ -1,6 +1,7 @@
 // Requests to the server, and its stream of events.
 
 import { $, notice, text } from "./dom.js";
+import { follow } from "./events.js";
 
 /** Asks the server for something. Shows a refusal to the user; true if there was none. */
 export async function ask(what, value) {
@@ -34,55 +35,18 @@ async function send(what, options) {
   return false;
 }
 
-/** The server sends something each second; after so many milliseconds of silence it is taken for lost. */
-const SILENCE = 6000;
+const LOST = {
+  lost: "The connection to coflash is lost; the page tries again. An update that was running goes on without the page.",
+  ended: "coflash ui has ended or was restarted: open the URL that it prints. The page tries again.",
+};
 
 /** Has `take` called with each event, and `renew` when they begin anew. */
 export function listen(take, renew) {
-  let source = null;
-  let watch = 0;
-  const say = (words) => {
-    $("lost").hidden = words === null;
-    if (words !== null) text($("lost"), words);
+  const say = (how) => {
+    $("lost").hidden = how === null;
+    if (how !== null) text($("lost"), LOST[how]);
   };
-  const lost = "The connection to coflash is lost; the page tries again. An update that was running goes on without the page.";
-  const alive = () => {
-    clearTimeout(watch);
-    watch = setTimeout(() => {
-      say(lost);
-      open();
-    }, SILENCE);
-  };
-  const open = () => {
-    source?.close();
-    source = new EventSource("events?frames=1");
-    source.onopen = () => {
-      say(null);
-      renew();
-      alive();
-    };
-    source.onmessage = (event) => {
-      alive();
-      take(JSON.parse(event.data));
-    };
-    source.onerror = () => {
-      say(lost);
-      // The browser does not retry after a refusal: the server has another token, or too many pages.
-      if (source.readyState === EventSource.CLOSED) {
-        say("coflash ui has ended or was restarted: open the URL that it prints. The page tries again.");
-      }
-      alive();
-    };
-    alive();
-  };
+  const events = follow("events?frames=1", take, say, renew);
   // A browser has few connections for each server: a hidden page frees its connection for others.
-  document.addEventListener("visibilitychange", () => {
-    if (document.hidden) {
-      clearTimeout(watch);
-      source?.close();
-    } else {
-      open();
-    }
-  });
-  open();
+  document.addEventListener("visibilitychange", () => (document.hidden ? events.close() : events.open()));
 }

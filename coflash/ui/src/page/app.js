@@ -6,6 +6,7 @@ import * as devices from "./devices.js";
 import { $, el, facts, hex, notice, number, text } from "./dom.js";
 import { keepField, kept } from "./kept.js";
 import * as reports from "./reports.js";
+import * as tabs from "./tabs.js";
 
 let fileMax = 32 * 1024 * 1024;
 /** The last notice of the server that was shown; null until the page has got its first state. */
@@ -172,6 +173,7 @@ function forms() {
 }
 
 ["trial", "start", "bit-rate", "filter"].forEach(keepField);
+tabs.start();
 bus.start();
 devices.start();
 reports.start();

@@ -3,6 +3,7 @@
 import { ask } from "./api.js";
 import { $, el, facts, hex, text } from "./dom.js";
 import { keep, kept } from "./kept.js";
+import * as tabs from "./tabs.js";
 
 /** Nodes that the user has chosen. */
 const chosen = new Set(kept("chosen"));
@@ -134,6 +135,7 @@ export function start() {
   $("use-address").addEventListener("click", () => {
     state.devices?.[opened]?.identity.forEach((part, index) => ($(`lss-${index}`).value = hex(part)));
     $("device").close();
+    tabs.open("lss");
     $("lss-node").focus();
   });
 }

@@ -1,6 +1,8 @@
 //! The server of `coflash ui` without a browser: access control, and hostile requests. Requests are
 //! written byte by byte, because no library would send them.
 
+mod service;
+
 use std::io::{ErrorKind, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,0 +1,177 @@
+//! The requests of the page of a station, and their answers.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use axum::body::Bytes;
+use axum::extract::{Query, State};
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::Response;
+use axum::routing::{get, post};
+use axum::{Extension, Router};
+use canopen::NodeId;
+use coflash_core::machine::version;
+use serde::Deserialize;
+use serde_json::json;
+
+use super::report::Entered;
+use super::station::{change, Stage, Station};
+use super::words::TABLE;
+use super::work::{is_due, Search, Update};
+use crate::adapters;
+use crate::http::{bad, body, done, download, idle, json_response, node_id};
+use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
+use crate::shared::Order;
+use crate::state::Notice;
+
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
+
+const FILES: [(&str, &str, &str); 8] = [
+    ("", HTML, include_str!("page/service.html")),
+    ("service.css", CSS, include_str!("page/service.css")),
+    ("service.js", SCRIPT, include_str!("page/service.js")),
+    ("words.json", "application/json", TABLE),
+    ("icon.svg", "image/svg+xml", include_str!("../page/icon.svg")),
+    ("dom.js", SCRIPT, include_str!("../page/dom.js")),
+    ("events.js", SCRIPT, include_str!("../page/events.js")),
+    ("kept.js", SCRIPT, include_str!("../page/kept.js")),
+];
+
+/// The page of this station.
+pub(super) fn page(station: &Arc<Station>) -> Page {
+    let routes = Router::new()
+        .route("/station", get(tell))
+        .route("/open", post(open))
+        .route("/search", post(search))
+        .route("/update", post(update))
+        .route("/save", post(save))
+        .route("/report", get(report))
+        .layer(Extension(station.clone()));
+    let view = {
+        let station = station.clone();
+        Arc::new(move |state: &crate::state::State| station.view(state))
+    };
+    Page { files: &FILES, view, routes }
+}
+
+/// What does not change while the station runs, and the adapters.
+async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Response {
+    let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
+    let service = &station.service;
+    let manifest = service.package.manifest();
+    let signature = match (service.is_trusted, service.package.signers()) {
+        (true, _) => "signature-good",
+        (false, []) => "signature-none",
+        (false, _) => "signature-unknown",
+    };
+    let programs = service.package.programs().map(|(entry, program)| {
+        json!({ "name": entry.name, "version": version(program), "nodes": entry.nodes, "count": entry.count })
+    });
+    let value = json!({
+        "adapters": found,
+        "last": service.last_bus(),
+        "package": {
+            "file": service.file,
+            "name": manifest.name,
+            "release": manifest.release,
+            "signature": signature,
+            "programs": programs.collect::<Vec<_>>(),
+        },
+        "folder": service.report_dir().display().to_string(),
+        "version": env!("CARGO_PKG_VERSION"),
+    });
+    json_response(StatusCode::OK, &value)
+}
+
+/// Another adapter leads to another bus: its devices are not those of the plan.
+async fn open(
+    State(site): State<Site>,
+    Extension(station): Extension<Arc<Station>>,
+    headers: HeaderMap,
+    bytes: Bytes,
+) -> Answer {
+    let Open { url } = body(&headers, &bytes)?;
+    idle(&site)?;
+    site.shared.order(Order::Open(url.trim().to_owned()))?;
+    change(&site.shared, &station, |own| {
+        own.message = None;
+        own.stage = Stage::Waiting;
+    });
+    done()
+}
+
+async fn search(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Answer {
+    site.shared.begin(Search(station))?;
+    done()
+}
+
+/// A plan that the user has confirmed.
+#[derive(Deserialize)]
+struct Confirmed {
+    /// The number of the plan that the page shows.
+    plan: u64,
+    /// The devices that get their programs.
+    nodes: Vec<u8>,
+    #[serde(flatten)]
+    entered: Entered,
+}
+
+async fn update(
+    State(site): State<Site>,
+    Extension(station): Extension<Arc<Station>>,
+    headers: HeaderMap,
+    bytes: Bytes,
+) -> Answer {
+    let Confirmed { plan: number, nodes, entered } = body(&headers, &bytes)?;
+    idle(&site)?;
+    if !entered.is_text() {
+        return Err(bad(
+            "a field of the report has more than 100 characters, or control characters",
+            "enter it again",
+        ));
+    }
+    let Some(plan) = station.plan(number) else {
+        let notice =
+            Notice::failed("there is a newer plan, or none", "look at the devices, and confirm again");
+        return Err(Refused(StatusCode::CONFLICT, notice));
+    };
+    let nodes = nodes.into_iter().map(node_id).collect::<Result<BTreeSet<NodeId>, Refused>>()?;
+    let due: BTreeSet<NodeId> =
+        plan.devices.iter().filter(|device| is_due(device)).map(|it| it.node).collect();
+    if let Some(node) = nodes.difference(&due).next() {
+        return Err(bad(format!("the plan writes nothing to node {node}"), "choose devices of the plan"));
+    }
+    if plan.devices.is_empty() || (nodes.is_empty() && !due.is_empty()) {
+        return Err(bad("no device is chosen", "choose one of the plan"));
+    }
+    site.shared.begin(Update { station, number, plan, nodes, entered })?;
+    done()
+}
+
+/// Tries again to save the reports.
+async fn save(State(site): State<Site>, Extension(station): Extension<Arc<Station>>) -> Answer {
+    let saving = station.clone();
+    let _ = tokio::task::spawn_blocking(move || saving.save()).await;
+    change(&site.shared, &station, |_| {});
+    done()
+}
+
+#[derive(Deserialize)]
+struct Wanted {
+    number: usize,
+}
+
+/// A report that could not be saved, for the browser to save.
+async fn report(
+    Extension(station): Extension<Arc<Station>>,
+    Query(Wanted { number }): Query<Wanted>,
+) -> Answer {
+    let Some(report) = station.unsaved(number) else {
+        let notice = Notice::failed("there is no such report", "it may have been saved meanwhile");
+        return Err(Refused(StatusCode::NOT_FOUND, notice));
+    };
+    let [(ending, html), _] = report.contents();
+    Ok(download(&format!("{}.{ending}", report.name()), "text/html; charset=utf-8", html))
+}

@@ -1,0 +1,170 @@
+//! The devices of a plan or an update, as the page and the reports have them.
+
+use canopen::NodeId;
+use coflash_core::machine::{Good, Outcome, Plan, Todo};
+use serde::Serialize;
+
+use super::message::Message;
+use super::trouble;
+use crate::state;
+
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &[
+    "state-has",
+    "state-due",
+    "state-left-out",
+    "state-waiting",
+    "state-working",
+    "state-updated",
+    "state-failed",
+];
+
+/// A device, or one that is missing.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Row {
+    pub(super) node: Option<u8>,
+    /// 1008h.
+    pub(super) name: Option<String>,
+    /// 1018h/1 to 4.
+    pub(super) identity: [Option<u32>; 4],
+    pub(super) state: RowState,
+    pub(super) steps: Vec<Step>,
+    /// What went wrong.
+    pub(super) trouble: Option<Message>,
+    /// The key of what is in the device after that.
+    pub(super) left: Option<&'static str>,
+    /// In percent, while it is being written.
+    pub(super) percent: Option<usize>,
+}
+
+/// A program of a device.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Step {
+    #[serde(skip)]
+    pub(super) entry: usize,
+    pub(super) program: String,
+    pub(super) from: Option<String>,
+    pub(super) to: String,
+    pub(super) state: RowState,
+}
+
+/// The state of a device or of one of its programs, with its key in the table.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub(super) enum RowState {
+    /// It has its program already.
+    #[serde(rename = "state-has")]
+    Has,
+    /// It would get its program.
+    #[serde(rename = "state-due")]
+    Due,
+    /// It would get its program, and the user has left it out.
+    #[serde(rename = "state-left-out")]
+    LeftOut,
+    #[serde(rename = "state-waiting")]
+    Waiting,
+    #[serde(rename = "state-working")]
+    Working,
+    #[serde(rename = "state-updated")]
+    Updated,
+    #[serde(rename = "state-failed")]
+    Failed,
+}
+
+/// The devices of a plan, and what is missing.
+pub(super) fn rows(plan: &Plan) -> Vec<Row> {
+    let devices = plan.devices.iter().map(|device| {
+        let steps = device.steps.iter().map(|step| Step {
+            entry: step.entry,
+            program: step.program.clone(),
+            from: step.from.clone(),
+            to: step.to.clone(),
+            state: match step.todo {
+                Todo::Has => RowState::Has,
+                Todo::Update => RowState::Due,
+                Todo::Leave(_) => RowState::Failed,
+            },
+        });
+        let mut row = Row {
+            node: Some(device.node.get()),
+            name: device.name.clone(),
+            identity: device.identity,
+            state: RowState::Has,
+            steps: steps.collect(),
+            trouble: device.steps.iter().find_map(|step| match &step.todo {
+                Todo::Leave(fault) => Some(trouble::of_device(fault)),
+                Todo::Has | Todo::Update => None,
+            }),
+            left: None,
+            percent: None,
+        };
+        row.sum();
+        row
+    });
+    let missing = plan.missing.iter().map(|missing| Row {
+        node: missing.node.map(NodeId::get),
+        name: None,
+        identity: [None; 4],
+        state: RowState::Failed,
+        steps: Vec::new(),
+        trouble: Some(trouble::of_device(&missing.fault)),
+        left: None,
+        percent: None,
+    });
+    devices.chain(missing).collect()
+}
+
+impl Row {
+    /// The state of the device, from those of its programs.
+    fn sum(&mut self) {
+        let all = [RowState::Due, RowState::Failed, RowState::Updated, RowState::Has];
+        let first = all.into_iter().find(|state| self.steps.iter().any(|step| step.state == *state));
+        self.state = first.unwrap_or(self.state);
+    }
+
+    /// Takes a device into the update, or leaves it out.
+    pub(super) fn choose(&mut self, is_chosen: bool) {
+        let next = if is_chosen { RowState::Waiting } else { RowState::LeftOut };
+        let due = self.steps.iter_mut().map(|step| &mut step.state).chain([&mut self.state]);
+        due.filter(|state| **state == RowState::Due).for_each(|state| *state = next);
+    }
+
+    /// Shows how far its update is.
+    pub(super) fn advance(&mut self, updates: &[state::Update]) {
+        let update = updates.iter().find(|update| Some(update.node) == self.node);
+        let Some(update) = update.filter(|_| self.state == RowState::Waiting) else { return };
+        if update.phase != state::Phase::Waiting {
+            self.state = RowState::Working;
+            self.percent = (update.done * 100).checked_div(update.total);
+        }
+    }
+
+    /// Whether an outcome belongs to this row.
+    fn is_of(&self, outcome: &Outcome) -> bool {
+        self.node.is_some()
+            && self.node == outcome.node.map(NodeId::get)
+            && self.steps.iter().any(|step| step.entry == outcome.entry)
+    }
+}
+
+/// Notes what became of the devices.
+pub(super) fn note(rows: &mut [Row], outcomes: &[Outcome]) {
+    for outcome in outcomes {
+        // What is missing has no step, and is known from the plan.
+        let Some(row) = rows.iter_mut().find(|row| row.is_of(outcome)) else { continue };
+        let state = match &outcome.result {
+            Ok(Good::Had) => RowState::Has,
+            Ok(Good::Updated(_)) => RowState::Updated,
+            Err(bad) => {
+                // The first reason counts: the programs after it were not begun.
+                if row.trouble.is_none() {
+                    let (message, left) = trouble::of_outcome(bad);
+                    (row.trouble, row.left) = (Some(message), left);
+                }
+                RowState::Failed
+            }
+        };
+        row.steps.iter_mut().filter(|step| step.entry == outcome.entry).for_each(|step| step.state = state);
+        row.sum();
+    }
+}

@@ -1,0 +1,231 @@
+//! The state of a station, and what its page shows of it.
+
+use std::sync::{Arc, Mutex};
+
+use coflash_core::machine::{Foreign, Plan};
+use serde_json::{json, Value};
+
+use super::message::Message;
+use super::report::{self, Of, Report};
+use super::row::{self, Row, RowState};
+use super::setup::Service;
+use crate::shared::{lock, Shared};
+use crate::state;
+
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &[
+    "closed",
+    "opening",
+    "lost",
+    "ready",
+    "searching",
+    "planned",
+    "planned-bad",
+    "complete",
+    "none",
+    "working",
+    "good",
+    "good-unsaved",
+    "bad",
+    "adapter-lost",
+    "adapter-failed",
+    "internal",
+    "hint-closed",
+    "hint-ready",
+    "hint-planned",
+    "hint-planned-bad",
+    "hint-none",
+    "hint-working",
+    "hint-good",
+    "hint-good-unsaved",
+    "hint-bad",
+];
+
+/// What is being done, and the devices of it.
+#[derive(Clone, Debug, Default)]
+pub(super) enum Stage {
+    /// The bus was not searched yet.
+    #[default]
+    Waiting,
+    Searching,
+    /// A plan that nobody has confirmed yet.
+    Planned {
+        /// Its number: a page confirms the plan that it shows.
+        number: u64,
+        plan: Arc<Plan>,
+    },
+    Working(Vec<Row>),
+    Ended(Vec<Row>),
+}
+
+#[derive(Debug, Default)]
+pub(super) struct State {
+    pub(super) stage: Stage,
+    /// The number of plans since the start.
+    pub(super) plans: u64,
+    /// Why the last search or update was not carried out.
+    pub(super) message: Option<Message>,
+    /// That of the machine that is being updated or was updated last.
+    pub(super) device_number: String,
+    /// The names of the saved reports of the last update.
+    saved: Vec<String>,
+    /// The number of reports that could not be saved.
+    unsaved: usize,
+    /// Why.
+    why: Option<Message>,
+}
+
+pub(super) struct Station {
+    pub(super) service: Service,
+    state: Mutex<State>,
+    /// The reports that are not saved yet; locked while they are written.
+    unsaved: Mutex<Vec<Report>>,
+}
+
+impl Station {
+    pub(super) fn new(service: Service) -> Self {
+        Self { service, state: Mutex::default(), unsaved: Mutex::default() }
+    }
+
+    /// Changes the state. The caller has all pages notified.
+    pub(super) fn change<R>(&self, change: impl FnOnce(&mut State) -> R) -> R {
+        change(&mut lock(&self.state))
+    }
+
+    /// The plan with this number, if it is the one that can be confirmed.
+    pub(super) fn plan(&self, wanted: u64) -> Option<Arc<Plan>> {
+        match &lock(&self.state).stage {
+            Stage::Planned { number, plan } if *number == wanted => Some(plan.clone()),
+            _ => None,
+        }
+    }
+
+    /// Keeps reports, and saves them.
+    pub(super) fn keep(&self, reports: Vec<Report>) {
+        self.change(|state| state.saved.clear());
+        lock(&self.unsaved).extend(reports);
+        self.save();
+    }
+
+    /// Saves the reports that are not saved yet. Returns whether all are.
+    pub(super) fn save(&self) -> bool {
+        let mut unsaved = lock(&self.unsaved);
+        let mut saved = Vec::new();
+        let mut why = None;
+        unsaved.retain(|report| match self.service.folder.save(&report.name(), &report.contents()) {
+            Ok(name) => {
+                saved.push(name);
+                false
+            }
+            Err(error) => {
+                why = Some(report::unsaved(&error, self.service.folder.path()));
+                true
+            }
+        });
+        let left = unsaved.len();
+        self.change(|state| {
+            state.saved.extend(saved);
+            (state.unsaved, state.why) = (left, why);
+        });
+        left == 0
+    }
+
+    /// The reports that are not saved, one a line; none if all are.
+    pub(super) fn unsaved_words(&self) -> Option<String> {
+        let unsaved = lock(&self.unsaved);
+        let lines: Vec<String> = unsaved.iter().map(Report::line).collect();
+        let folder = self.service.folder.path().display();
+        let all = || format!("these reports could not be saved in {folder}:\n{}", lines.join("\n"));
+        (!lines.is_empty()).then(all)
+    }
+
+    /// A report that could not be saved, for the browser to save.
+    pub(super) fn unsaved(&self, number: usize) -> Option<Report> {
+        lock(&self.unsaved).get(number).cloned()
+    }
+
+    /// What the page shows.
+    pub(super) fn view(&self, shown: &state::State) -> Value {
+        use state::Connection;
+        let own = lock(&self.state);
+        let adapter = &shown.adapter;
+        let (mut rows, mut number, mut foreign): (_, _, &[Foreign]) = (Vec::new(), None, &[]);
+        match &own.stage {
+            Stage::Waiting | Stage::Searching => {}
+            Stage::Planned { number: its, plan } => {
+                rows = row::rows(plan);
+                (number, foreign) = (Some(*its), &plan.foreign);
+            }
+            Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
+        }
+        let due = rows.iter().filter(|row| row.state == RowState::Due).count();
+        if matches!(own.stage, Stage::Working(_)) {
+            rows.iter_mut().for_each(|row| row.advance(&shown.updates));
+        }
+        let is_busy = shown.task.is_some();
+        let is_good = |row: &Row| !matches!(row.state, RowState::Failed);
+        let (station, hint) = match (&own.stage, adapter.state) {
+            (Stage::Searching, _) if is_busy => ("searching", None),
+            (Stage::Working(_), _) if is_busy => ("working", Some("hint-working")),
+            (Stage::Ended(rows), _) if !rows.iter().all(is_good) => ("bad", Some("hint-bad")),
+            (Stage::Ended(_), _) if own.unsaved > 0 => ("good-unsaved", Some("hint-good-unsaved")),
+            (Stage::Ended(_), _) => ("good", Some("hint-good")),
+            // An update without a task was ended by an internal error.
+            (Stage::Working(_), _) => ("bad", Some("hint-bad")),
+            (_, Connection::Closed) => ("closed", Some("hint-closed")),
+            (_, Connection::Opening) => ("opening", None),
+            (_, Connection::Lost) => ("lost", None),
+            (Stage::Waiting | Stage::Searching, Connection::Open) => ("ready", Some("hint-ready")),
+            (Stage::Planned { .. }, Connection::Open) if due > 0 && rows.iter().all(is_good) => {
+                ("planned", Some("hint-planned"))
+            }
+            (Stage::Planned { .. }, Connection::Open) if due > 0 => ("planned-bad", Some("hint-planned-bad")),
+            (Stage::Planned { plan, .. }, Connection::Open) if plan.devices.is_empty() => {
+                ("none", Some("hint-none"))
+            }
+            (Stage::Planned { .. }, Connection::Open) if rows.iter().all(is_good) => {
+                ("complete", Some("hint-good"))
+            }
+            (Stage::Planned { .. }, Connection::Open) => ("bad", Some("hint-bad")),
+        };
+        let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
+        let message = match (&adapter.words, &own.message, notice) {
+            (Some(words), _, _) => Some(Message::new("adapter-lost").detail(words)),
+            (None, Some(message), _) => Some(message.clone()),
+            (None, None, Some(notice)) if adapter.state == Connection::Closed => {
+                Some(Message::new("adapter-failed").detail(&notice.words))
+            }
+            (None, None, Some(notice)) => Some(Message::new("internal").detail(&notice.words)),
+            (None, None, None) => None,
+        };
+        json!({
+            "station": station,
+            "hint": hint,
+            "message": message,
+            "adapter": adapter.url,
+            "open": adapter.state == Connection::Open,
+            "busy": is_busy,
+            "cancelling": shown.task.as_ref().is_some_and(|task| task.cancelling),
+            "plan": number,
+            "plans": own.plans,
+            "device_number": own.device_number,
+            "rows": rows,
+            "foreign": foreign,
+            "saved": own.saved,
+            "unsaved": own.unsaved,
+            "why": own.why,
+        })
+    }
+}
+
+/// Changes the state, and notifies all pages.
+pub(super) fn change<R>(shared: &Shared, station: &Station, change: impl FnOnce(&mut State) -> R) -> R {
+    shared.change(|_| station.change(change))
+}
+
+/// The reports of an update: one for each device that has a node-ID and was not left out.
+pub(super) fn reports(rows: &[Row], of: &Arc<Of>) -> Vec<Report> {
+    let of_node = rows.iter().filter(|row| row.node.is_some() && row.state != RowState::LeftOut);
+    of_node.map(|row| Report::new(row.clone(), of.clone())).collect()
+}

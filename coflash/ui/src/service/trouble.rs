@@ -1,0 +1,106 @@
+//! Which message an error has: what a person at the machine can do about it.
+
+use coflash_core::device::Error;
+use coflash_core::machine::{Bad, DeviceFault};
+use coflash_core::update::DeviceState;
+
+use super::message::Message;
+
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &[
+    "trouble-adapter",
+    "trouble-cancelled",
+    "trouble-no-answer",
+    "trouble-refused",
+    "trouble-busy",
+    "trouble-other-device",
+    "trouble-password",
+    "trouble-not-alone",
+    "trouble-no-start",
+    "trouble-renewal",
+    "trouble-crc",
+    "trouble-other",
+    "trouble-absent",
+    "trouble-mute",
+    "trouble-too-few",
+    "trouble-exchanged",
+    "trouble-earlier",
+    "left-untouched",
+    "left-old",
+    "left-unknown",
+    "left-none",
+    "left-new",
+];
+
+/// The message of an error.
+pub(super) fn of_error(error: &Error) -> Message {
+    let key = match error {
+        Error::Adapter(_) => "trouble-adapter",
+        Error::Cancelled => "trouble-cancelled",
+        Error::NoAnswer { .. } | Error::ShortAnswer { .. } => "trouble-no-answer",
+        Error::Refused { .. } | Error::Failed { .. } | Error::Protocol { .. } => "trouble-refused",
+        Error::Busy { .. } => "trouble-busy",
+        Error::WrongTarget { .. }
+        | Error::SealedOnly { .. }
+        | Error::NoProgram { .. }
+        | Error::OtherRegion { .. }
+        | Error::OtherIdentity { .. }
+        | Error::NotInDialect { .. } => "trouble-other-device",
+        Error::NoPassword { .. } => "trouble-password",
+        Error::NotAlone { .. } | Error::Occupied { .. } => "trouble-not-alone",
+        Error::NoBootloader { .. }
+        | Error::TrialFailed { .. }
+        | Error::StartFailed { .. }
+        | Error::ProgramEnded { .. }
+        | Error::FellSilent { .. } => "trouble-no-start",
+        Error::NotRenewable { .. }
+        | Error::RenewalFailed { .. }
+        | Error::SilentOnTrial { .. }
+        | Error::Unconfirmable { .. }
+        | Error::FirstFailed { .. } => "trouble-renewal",
+        Error::WrongCrc { .. } => "trouble-crc",
+        Error::Lss { .. } => "trouble-other",
+    };
+    Message::new(key).detail(error).number(error.number())
+}
+
+/// The message of a device that was not begun.
+pub(super) fn of_device(fault: &DeviceFault) -> Message {
+    let message = match fault {
+        DeviceFault::Absent { .. } => Message::new("trouble-absent"),
+        DeviceFault::Mute { .. } => Message::new("trouble-mute"),
+        DeviceFault::TooFew { program, expected, found } => Message::new("trouble-too-few")
+            .value("program", program)
+            .value("expected", expected)
+            .value("found", found),
+        DeviceFault::OtherDevice { .. } => Message::new("trouble-other-device"),
+        DeviceFault::Exchanged { .. } => Message::new("trouble-exchanged"),
+        DeviceFault::EarlierFailed { .. } => Message::new("trouble-earlier"),
+        // The library may have more of them one day.
+        _ => Message::new("trouble-other"),
+    };
+    message.detail(fault).number(fault.number())
+}
+
+/// The message of a bad outcome, and the key of what is in the device now, if it was begun.
+pub(super) fn of_outcome(bad: &Bad) -> (Message, Option<&'static str>) {
+    match bad {
+        Bad::Left(fault) => (of_device(fault), None),
+        Bad::Failed(failed) => {
+            let message =
+                of_error(&failed.error).detail(format!("{}. The device: {}", failed.error, failed.left));
+            (message, Some(left(failed.left.state)))
+        }
+    }
+}
+
+const fn left(state: DeviceState) -> &'static str {
+    match state {
+        DeviceState::Untouched => "left-untouched",
+        DeviceState::Called => "left-old",
+        DeviceState::Postponed => "left-unknown",
+        DeviceState::Erased => "left-none",
+        DeviceState::Written | DeviceState::Unreleased | DeviceState::Released => "left-new",
+    }
+}

@@ -1,0 +1,110 @@
+//! The texts of the service station in each language: one table, which the page reads as well.
+
+use std::collections::BTreeMap;
+use std::sync::LazyLock;
+
+use serde::Deserialize;
+
+use super::message::Message;
+
+/// The table. A text has names in braces where a value is filled in.
+pub(super) const TABLE: &str = include_str!("page/words.json");
+
+/// A language of the page and of the reports.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Language {
+    /// English.
+    #[default]
+    En,
+    /// German.
+    De,
+}
+
+/// A text in each language.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Text {
+    en: String,
+    de: String,
+}
+
+/// The tests read the table, so it has its form.
+static TEXTS: LazyLock<BTreeMap<String, Text>> =
+    LazyLock::new(|| serde_json::from_str(TABLE).unwrap_or_default());
+
+impl Language {
+    /// Its code (ISO 639-1).
+    pub(super) const fn code(self) -> &'static str {
+        match self {
+            Self::En => "en",
+            Self::De => "de",
+        }
+    }
+
+    /// The text with this key.
+    pub(super) fn text(self, key: &'static str) -> &'static str {
+        TEXTS.get(key).map_or(key, |text| match self {
+            Self::En => &text.en,
+            Self::De => &text.de,
+        })
+    }
+
+    /// A message in this language.
+    pub(super) fn message(self, message: &Message) -> String {
+        let text = self.text(message.key).to_owned();
+        let fill =
+            |text: String, (name, value): (&&str, &String)| text.replace(&format!("{{{name}}}"), value);
+        message.values.iter().fold(text, fill)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::super::{report, requests, row, station, trouble, work};
+    use super::*;
+
+    const PAGE: &str = include_str!("page/service.html");
+    const SCRIPT: &str = include_str!("page/service.js");
+
+    /// The names in braces of a text.
+    fn names(text: &str) -> BTreeSet<&str> {
+        text.split('{').skip(1).map(|rest| rest.split('}').next().unwrap()).collect()
+    }
+
+    /// The keys that follow these words in a source.
+    fn after<'a>(source: &'a str, words: &str) -> Vec<&'a str> {
+        source.split(words).skip(1).map(|rest| rest.split('"').next().unwrap()).collect()
+    }
+
+    /// Each text is there in each language and takes the same values.
+    #[test]
+    fn both_languages_have_each_text() {
+        assert!(serde_json::from_str::<BTreeMap<String, Text>>(TABLE).is_ok_and(|table| !table.is_empty()));
+        for (key, Text { en, de }) in &*TEXTS {
+            assert!(!en.trim().is_empty() && !de.trim().is_empty(), "{key}");
+            assert_eq!(names(en), names(de), "{key}");
+        }
+        // A key that is there twice would hide a text.
+        let lines: Vec<&str> = TABLE.lines().filter_map(|line| line.trim().strip_prefix('"')).collect();
+        assert_eq!(lines.len(), TEXTS.len(), "one text a line, and no key twice");
+    }
+
+    /// Each key of the page and of the server is in the table, and the table has no other one.
+    #[test]
+    fn each_key_is_in_the_table_and_each_text_is_used() {
+        let mut used: BTreeSet<&str> = BTreeSet::new();
+        for attribute in ["data-t=\"", "data-t-label=\"", "data-t-placeholder=\""] {
+            used.extend(after(PAGE, attribute));
+        }
+        used.extend(after(SCRIPT, " t(\"").into_iter().chain(after(SCRIPT, "(t(\"")));
+        for keys in [station::KEYS, row::KEYS, trouble::KEYS, report::KEYS, work::KEYS, requests::KEYS] {
+            used.extend(keys);
+        }
+        let known: BTreeSet<&str> = TEXTS.keys().map(String::as_str).collect();
+        assert_eq!(used.difference(&known).collect::<Vec<_>>(), Vec::<&&str>::new(), "not in the table");
+        assert_eq!(known.difference(&used).collect::<Vec<_>>(), Vec::<&&str>::new(), "not used");
+    }
+}

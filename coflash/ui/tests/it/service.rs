@@ -1,0 +1,354 @@
+//! The service station of `coflash ui --service`, without a browser.
+
+use std::fs;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use canopen::{Frame, NodeId};
+use coflash_core::device::lock::Lock;
+use coflash_core::machine::{make, Package, Recipe};
+use coflash_ui::Service;
+use embedded_can::{Frame as _, StandardId};
+use kit::fake::{Bus, Deed, Fake, Maker, APPLICATION};
+use kit::folder::Folder;
+use serde_json::{json, Value};
+
+use super::{Ui, HEX};
+
+/// The identity of a device; the serial number can change behind the tool's back.
+struct Plate {
+    product: u32,
+    serial: Arc<Mutex<u32>>,
+}
+
+impl Maker for Plate {
+    fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
+        let value = match at {
+            (0x1018, 1) => 63,
+            (0x1018, 2) => self.product,
+            (0x1018, 3) => 2,
+            (0x1018, 4) => *self.serial.lock().unwrap(),
+            _ => return None,
+        };
+        Some(Ok(value.to_le_bytes().to_vec()))
+    }
+
+    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        None
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        None
+    }
+}
+
+/// A device with another program; its serial number is 1000 and its node-ID.
+fn device(node: u8, product: u32) -> (Fake, Arc<Mutex<u32>>) {
+    let mut fake = Fake::new(APPLICATION).at(node, 1);
+    let serial = Arc::new(Mutex::new(1000 + u32::from(node)));
+    fake.maker = Some(Box::new(Plate { product, serial: serial.clone() }));
+    fake.crc_of_application = Some(0x1234_5678);
+    fake.erase_time = Duration::from_millis(30);
+    (fake, serial)
+}
+
+/// The package of these programs in a recipe, with one image.
+fn package(folder: &Folder, programs: &str) -> Package {
+    folder.write("app.hex", HEX);
+    let Recipe { name, release, parts, .. } =
+        Recipe::read(&format!("name = 'Press 4'\n{programs}"), folder).unwrap();
+    Package::parse(&make(name, release, &parts, &[]).unwrap()).unwrap()
+}
+
+const DRIVES: &str =
+    "[[program]]\nname = 'drive'\nimage = 'app.hex'\nnodes = [5, 6]\nvendor = 63\nproduct = 1234\n";
+
+/// A station with the reports, and what it remembers, in this folder.
+fn station(folder: &Folder, package: Package, bus: Option<String>) -> Ui {
+    let service = Service::new(package, "press.cpk".as_ref(), false, &folder.join("reports")).unwrap();
+    let service = service.memory(Some(folder.join("bus")));
+    Ui::with(|options| (options.bus, options.service) = (bus, Some(service)))
+}
+
+/// Searches, and returns the state with the plan.
+#[track_caller]
+fn planned(ui: &Ui) -> Value {
+    ui.until("the adapter", |state| state["open"] == true && state["busy"] == false);
+    assert_eq!(ui.post("search", &json!({})).status, 200);
+    ui.until("the plan", |state| !state["plan"].is_null() && state["busy"] == false)
+}
+
+/// Confirms a plan for these nodes.
+fn confirm(ui: &Ui, plan: &Value, nodes: &[u8]) -> super::Answer {
+    ui.post("update", &confirmed(plan, nodes))
+}
+
+fn confirmed(plan: &Value, nodes: &[u8]) -> Value {
+    json!({
+        "plan": plan["plan"], "nodes": nodes, "operator": "Jörg", "order": "A-77", "device_number": "4711",
+        "language": "de",
+    })
+}
+
+#[track_caller]
+fn ended(ui: &Ui) -> Value {
+    ui.until("the end", |state| {
+        let station = state["station"].as_str().unwrap();
+        state["busy"] == false && ["good", "good-unsaved", "bad"].contains(&station)
+    })
+}
+
+/// Node-ID and state of each row.
+fn rows(state: &Value) -> Vec<(u64, &str)> {
+    let of = |row: &'_ Value| row["node"].as_u64().unwrap_or(0);
+    let rows = state["rows"].as_array().unwrap();
+    rows.iter().map(|row| (of(row), row["state"].as_str().unwrap())).collect()
+}
+
+/// The files of the reports with this ending, and their texts.
+fn saved(folder: &Folder, ending: &str) -> Vec<(String, String)> {
+    let paths = fs::read_dir(folder.join("reports")).unwrap().map(|entry| entry.unwrap().path());
+    let mut paths: Vec<PathBuf> =
+        paths.filter(|path| path.extension().is_some_and(|its| its == ending)).collect();
+    paths.sort();
+    let name = |path: &PathBuf| path.file_name().unwrap().to_string_lossy().into_owned();
+    paths.iter().map(|path| (name(path), fs::read_to_string(path).unwrap())).collect()
+}
+
+/// There is no way to a file, to LSS, to an erase or to the board list, and the guard is that of every page.
+#[test]
+fn a_station_has_nothing_but_its_package() {
+    let folder = kit::folder!("service-routes");
+    let ui = station(&folder, package(&folder, DRIVES), None);
+    for what in ["firmware", "settings", "step", "fastscan", "assign", "scan", "close"] {
+        assert_eq!(ui.post(what, &json!({})).status, 404, "{what}");
+    }
+    for what in ["adapters", "trace", "readback", "app.js", "index.html"] {
+        assert_eq!(ui.get(what).status, 404, "{what}");
+    }
+    let host = ui.host_line();
+    for (what, body) in [("search", &b"{}"[..]), ("update", b"{}"), ("open", b"{}"), ("save", b"{}")] {
+        assert_eq!(ui.request("POST", &format!("/{what}"), &[&host], body).status, 403, "{what}");
+        let lines = [host.as_str(), "Origin: http://evil.example", "Content-Type: application/json"];
+        assert_eq!(ui.request("POST", &format!("{}{what}", ui.path), &lines, body).status, 403, "{what}");
+    }
+    // A form of another page cannot send JSON.
+    let lines = [host.as_str(), "Content-Type: text/plain"];
+    assert_eq!(ui.request("POST", &format!("{}update", ui.path), &lines, b"{}").status, 415);
+    let long = json!({ "operator": "x".repeat(70_000) });
+    assert_eq!(ui.post("update", &long).status, 413);
+    for what in ["", "service.js", "service.css", "words.json", "station", "dom.js", "kept.js"] {
+        let answer = ui.get(what);
+        assert_eq!(answer.status, 200, "{what}");
+        assert!(answer.head.contains("default-src 'none'"), "{what}: {}", answer.head);
+    }
+    let page = ui.get("").body;
+    assert!(page.split("<script").skip(1).all(|script| script.trim_start().starts_with("src=\"")), "{page}");
+    assert!(!page.contains("style=") && !page.contains("<style") && !page.contains("https://"), "{page}");
+    // Without an adapter nothing begins.
+    assert_eq!(ui.post("search", &json!({})).status, 409);
+    assert_eq!(ui.until("the state", |_| true)["station"], "closed");
+    let told = ui.get("station").json();
+    assert_eq!(told["package"]["name"], "Press 4");
+    assert_eq!(told["package"]["signature"], "signature-none");
+    assert_eq!(told["last"], Value::Null);
+}
+
+/// Two devices of which one has its program, one that is missing, and a foreign one. Each has its outcome, and what is
+/// confirmed is what was shown.
+#[test]
+fn a_machine_is_updated_and_each_device_has_its_report() {
+    let folder = kit::folder!("service-update");
+    let programs = format!("{DRIVES}[[program]]\nname = 'panel'\nimage = 'app.hex'\nnodes = [9]\n");
+    let package = package(&folder, &programs);
+    let crc = package.programs().next().unwrap().1.crc();
+    let (mut has, _) = device(6, 1234);
+    has.crc_of_application = Some(crc);
+    let (bus, server) = kit::fake::serve(Bus(vec![device(5, 1234).0, has, device(20, 99).0]));
+    let ui = station(&folder, package, Some(bus.clone()));
+    let plan = planned(&ui);
+    assert_eq!(rows(&plan), [(5, "state-due"), (6, "state-has"), (9, "state-failed")]);
+    assert_eq!(plan["station"], "planned-bad");
+    assert_eq!(plan["rows"][0]["identity"][3], 1005);
+    assert_eq!(plan["rows"][0]["steps"][0]["from"], "CRC 12345678h");
+    assert_eq!(plan["rows"][2]["trouble"]["key"], "trouble-absent");
+    assert_eq!(plan["rows"][2]["trouble"]["number"], 0x6000_0013);
+    assert_eq!(plan["foreign"][0]["node"], 20);
+    for (nodes, status) in
+        [(&[][..], 400), (&[6], 400), (&[5, 20], 400), (&[9], 400), (&[0], 400), (&[128], 400)]
+    {
+        assert_eq!(confirm(&ui, &plan, nodes).status, status, "{nodes:?}");
+    }
+    for (name, value) in [("operator", "a\nb"), ("order", "\u{1b}[2J"), ("device_number", &"x".repeat(101))] {
+        let mut wrong = confirmed(&plan, &[5]);
+        wrong[name] = value.into();
+        assert_eq!(ui.post("update", &wrong).status, 400, "{name}");
+    }
+    // Another page has searched again: its plan is the one to look at.
+    let newer = planned(&ui);
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 409);
+    assert!(saved(&folder, "csv").is_empty());
+    assert_eq!(confirm(&ui, &newer, &[5]).status, 200);
+    let state = ended(&ui);
+    assert_eq!(rows(&state), [(5, "state-updated"), (6, "state-has"), (9, "state-failed")]);
+    assert_eq!((&state["station"], &state["message"]), (&json!("bad"), &Value::Null));
+    assert_eq!((&state["unsaved"], state["saved"].as_array().unwrap().len()), (&json!(0), 3));
+    // It cannot be confirmed a second time.
+    assert_eq!(confirm(&ui, &newer, &[5]).status, 409);
+    let reports = saved(&folder, "csv");
+    let results = [("updated", "5"), ("had", "6"), ("failed", "9")];
+    for ((name, text), (result, node)) in reports.iter().zip(results) {
+        assert!(name.contains(&format!("_node-{node}")), "{name}");
+        let line = text.lines().nth(1).unwrap();
+        assert!(
+            line.contains(&format!(",{result},{node},")) && line.contains(",Jörg,A-77,4711,Press 4,"),
+            "{line}"
+        );
+    }
+    assert!(
+        reports[0].1.contains(",0000003Fh,000004D2h,00000002h,000003EDh,drive,CRC 12345678h,"),
+        "{}",
+        reports[0].1
+    );
+    assert!(reports[2].1.contains(",0x60000013,"), "{}", reports[2].1);
+    let pages = saved(&folder, "html");
+    assert_eq!(pages.len(), 3);
+    assert!(pages.iter().all(|(_, page)| page.contains("lang=\"de\"") && page.contains("4711")), "{pages:?}");
+    // The adapter is that of the next start.
+    assert_eq!(fs::read_to_string(folder.join("bus")).unwrap(), bus);
+    assert_eq!(ui.finish(), None);
+    let fakes = server.join().unwrap().0;
+    assert_eq!(fakes.iter().map(|fake| !fake.blocks.is_empty()).collect::<Vec<_>>(), [true, false, false]);
+    let (next, _server) = kit::fake::serve(Bus(vec![device(5, 1234).0]));
+    fs::write(folder.join("bus"), format!("{next}\n")).unwrap();
+    let ui = station(&folder, self::package(&folder, DRIVES), None);
+    assert_eq!(ui.until("the adapter", |state| state["open"] == true)["adapter"], json!(next));
+}
+
+/// Somebody puts another device to the node while the plan is on the screen.
+#[test]
+fn a_device_that_is_exchanged_in_mid_plan_gets_nothing() {
+    let folder = kit::folder!("service-exchanged");
+    let (five, serial) = device(5, 1234);
+    let (bus, server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
+    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let plan = planned(&ui);
+    assert_eq!(plan["station"], "planned");
+    *serial.lock().unwrap() = 4711;
+    assert_eq!(confirm(&ui, &plan, &[5, 6]).status, 200);
+    let state = ended(&ui);
+    assert_eq!(rows(&state), [(5, "state-failed"), (6, "state-updated")]);
+    assert_eq!(state["rows"][0]["trouble"]["key"], "trouble-exchanged");
+    let reports = saved(&folder, "csv");
+    assert!(reports[0].1.contains("0x6000040C") && reports[1].1.contains(",updated,6,"), "{reports:?}");
+    ui.finish();
+    let fakes = server.join().unwrap().0;
+    assert!(fakes[0].blocks.is_empty() && !fakes[1].blocks.is_empty());
+}
+
+/// A second station of this computer holds its nodes, and one of another computer is heard on the bus.
+#[test]
+fn a_second_station_is_waited_for() {
+    let folder = kit::folder!("service-second");
+    let (bus, _server) = kit::fake::serve(Bus(vec![device(5, 1234).0, device(6, 1234).0]));
+    let ui = station(&folder, package(&folder, DRIVES), Some(bus.clone()));
+    ui.until("the adapter", |state| state["open"] == true);
+    let refused = |ui: &Ui| {
+        assert_eq!(ui.post("search", &json!({})).status, 200);
+        let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+        assert_eq!(state["message"]["key"], "trouble-not-alone", "{state}");
+        assert_eq!((&state["message"]["number"], &state["plan"]), (&json!(0x6000_0012), &Value::Null));
+    };
+    let held = Lock::of(&bus, NodeId::new(6).unwrap()).unwrap();
+    refused(&ui);
+    drop(held);
+    let plan = planned(&ui);
+    assert!(plan["message"].is_null(), "{plan}");
+    // It begins when this plan is on the screen: the plan stays, and can be confirmed when the other one is done.
+    let held = Lock::of(&bus, NodeId::new(5).unwrap()).unwrap();
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    assert_eq!((&state["message"]["key"], &state["plan"]), (&json!("trouble-not-alone"), &plan["plan"]));
+    drop(held);
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+    assert_eq!(rows(&ended(&ui)), [(5, "state-updated"), (6, "state-left-out")]);
+    assert_eq!(saved(&folder, "csv").len(), 1);
+
+    let mut noisy = device(5, 1234).0;
+    for number in 0..3000 {
+        // A read of 1F57h/1 by somebody else.
+        let id = StandardId::new(0x600 + 77).unwrap();
+        let request = Frame::new(id, &[0x40, 0x57, 0x1F, 1, 0, 0, 0, 0]).unwrap();
+        noisy.later(Duration::from_millis(40) * number, request);
+    }
+    let (bus, server) = kit::fake::serve(Bus(vec![noisy]));
+    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    ui.until("the adapter", |state| state["open"] == true);
+    refused(&ui);
+    ui.finish();
+    assert!(server.join().unwrap().0[0].log.is_empty(), "nobody was asked");
+}
+
+/// A file in the place of the folder is as good as a full disk, also for root.
+#[test]
+fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
+    let folder = kit::folder!("service-full");
+    let (bus, server) = kit::fake::serve(Bus(vec![device(5, 1234).0, device(6, 1234).0]));
+    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let plan = planned(&ui);
+    let (reports, away) = (folder.join("reports"), folder.join("away"));
+    fs::rename(&reports, &away).unwrap();
+    fs::write(&reports, "").unwrap();
+    assert_eq!(confirm(&ui, &plan, &[5, 6]).status, 200);
+    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    assert_eq!((&state["message"]["key"], &state["plan"]), (&json!("not-saved"), &plan["plan"]));
+    assert_eq!(rows(&state), [(5, "state-due"), (6, "state-due")]);
+    // The disk becomes full during the update.
+    fs::remove_file(&reports).unwrap();
+    fs::rename(&away, &reports).unwrap();
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+    ui.until("the update", |state| state["rows"][0]["percent"].is_u64());
+    fs::rename(&reports, &away).unwrap();
+    fs::write(&reports, "").unwrap();
+    let state = ended(&ui);
+    assert_eq!((&state["station"], &state["unsaved"]), (&json!("good-unsaved"), &json!(1)));
+    assert_eq!(state["why"]["key"], "not-saved");
+    // A browser may save it, and it is still kept.
+    let report = ui.get("report?number=0");
+    assert!(report.status == 200 && report.body.contains("000003EDh"), "{}", report.body);
+    assert!(report.head.contains("content-disposition: attachment"), "{}", report.head);
+    assert_eq!(ui.get("report?number=1").status, 404);
+    assert_eq!(ui.post("save", &json!({})).status, 200);
+    assert_eq!(ui.until("still not saved", |_| true)["unsaved"], 1);
+    // No other device is changed until it is saved, and a search does not lose it.
+    let plan = planned(&ui);
+    assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
+    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    assert_eq!(state["unsaved"], 1);
+    // The end of the server says what is lost with it.
+    let words = ui.finish().expect("a report is not saved");
+    assert!(
+        words.contains("could not be saved") && words.contains("000003EDh") && words.contains("4711"),
+        "{words}"
+    );
+    let fakes = server.join().unwrap().0;
+    assert!(!fakes[0].blocks.is_empty() && fakes[1].blocks.is_empty());
+}
+
+/// The end of the server in mid-update: the outcome is saved.
+#[test]
+fn the_end_of_the_server_saves_the_outcome() {
+    let folder = kit::folder!("service-end");
+    let (mut five, _) = device(5, 1234);
+    five.erase_time = Duration::from_secs(3600);
+    let (bus, _server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
+    let ui = station(&folder, package(&folder, DRIVES), Some(bus));
+    let plan = planned(&ui);
+    assert_eq!(confirm(&ui, &plan, &[5]).status, 200);
+    ui.until("the update", |state| state["rows"][0]["state"] == "state-working");
+    let words = ui.finish().expect("an update was running");
+    assert!(words.starts_with("an update was running: node 5: cancelled"), "{words}");
+    let reports = saved(&folder, "csv");
+    assert!(reports.len() == 1 && reports[0].1.contains(",failed,5,"), "{reports:?}");
+}
