@@ -99,7 +99,8 @@ pub fn wheel(release: &Release, root: &Path) -> Outcome {
     process::run(Command::new("python3").args(["-m", "venv"]).arg(root.join("venv")))?;
     let python = root.join("venv/bin/python");
     // By its name, as from the registry.
-    let pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--find-links"];
+    let pip =
+        ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--find-links"];
     process::run(Command::new(&python).args(pip).arg(&release.dist).arg("coflash"))?;
     let said = process::output(Command::new(root.join("venv/bin/coflash")).arg("--version"))?;
     said_in(&said, VERSION, "coflash --version")?;
