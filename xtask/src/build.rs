@@ -8,11 +8,10 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
-use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{self, Part};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{files, outcome::Outcome, process, ram_image, workspace};
+use crate::{elf, files, outcome::Outcome, process, ram_image, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]
@@ -315,11 +314,12 @@ fn rust_lld() -> Outcome<PathBuf> {
     Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
 
-/// Builds a bootloader for examination; returns its ELF file.
-pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
+/// Builds a bootloader; returns what it takes of each of [`bootloader_flash`], in bytes.
+pub fn bootloader_size(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u32>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
-    ram_image::seal(built(board, "bootloader")?)
+    let file = ram_image::seal(built(board, "bootloader")?)?;
+    elf::used(&elf::segments(&file)?, &bootloader_flash(board))
 }
 
 /// The folders with the files of the boards.
@@ -417,12 +417,13 @@ fn put(board: &Layout, variant: &Variant, name: &str, file: &[u8]) -> Outcome {
 
 /// Prints the size of an image.
 pub fn report(image: &Path, regions: &[Region]) -> Outcome {
-    let flash = Flash::of(&footprint::read(image)?, regions)
-        .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
+    let file = files::bytes(image)?;
+    let used = elf::segments(&file).and_then(|segments| elf::used(&segments, regions));
+    let used = used.map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.
     let used: Vec<_> =
-        flash.used.iter().map(|(region, bytes)| format!("{bytes} of {}", region.size)).collect();
+        used.iter().zip(regions).map(|(bytes, region)| format!("{bytes} of {}", region.size)).collect();
     eprintln!("  {:<52} {} bytes", workspace::shown(image), used.join(" + "));
     Ok(())
 }
