@@ -45,10 +45,6 @@ pub enum Part {
     Browser,
     /// Another emulated CPU to compare ours with.
     Qemu,
-    /// Formatter and linter.
-    Lint,
-    /// What counts the lines that tests reach.
-    Coverage,
     /// The package for Debian.
     Deb,
     /// The program for Windows: a linker for it.
@@ -73,7 +69,6 @@ pub fn run(args: Args) -> Outcome {
         Part::Python,
         Part::Gdb,
         Part::Browser,
-        Part::Lint,
     ])?;
     println!("Everything is there.");
     Ok(())
@@ -88,14 +83,6 @@ pub fn prepare(parts: &[Part]) -> Outcome {
     }
     if parts.contains(&Part::Firmware) {
         rust_target(TARGET)?;
-    }
-    if parts.contains(&Part::Lint) {
-        component("rustfmt", process::succeeds("rustfmt", &["--version"]))?;
-        component("clippy", process::succeeds("clippy-driver", &["--version"]))?;
-    }
-    if parts.contains(&Part::Coverage) {
-        let installed = process::output(Command::new("rustup").args(["component", "list", "--installed"]));
-        component("llvm-tools", installed.is_ok_and(|list| list.contains("llvm-tools")))?;
     }
     if parts.contains(&Part::Python) {
         python_environment()?;
@@ -196,7 +183,7 @@ impl Part {
             Self::Windows => &["gcc-mingw-w64-x86-64"],
             Self::Qemu => &["qemu-system-arm"],
             Self::Python if !python_environment_is_there() => &["python3", "python3-venv"],
-            Self::Python | Self::Firmware | Self::Lint | Self::Coverage => &[],
+            Self::Python | Self::Firmware => &[],
         }
     }
 }
@@ -289,20 +276,6 @@ pub fn tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
     Ok(program)
 }
 
-/// Installs a component of the Rust toolchain if it is missing.
-fn component(name: &str, is_there: bool) -> Outcome {
-    if is_there {
-        return Ok(());
-    }
-    println!("Adding {name} to the Rust toolchain ...");
-    process::run(Command::new("rustup").args(["component", "add", name])).map_err(|_| {
-        format!(
-            "{name} could not be added. With rustup and a connection, this line does it:\n\n    \
-             rustup component add {name}"
-        )
-    })
-}
-
 /// The interpreter of the Python environment.
 pub fn python() -> PathBuf {
     workspace::target_dir().join("python/bin/python")
@@ -356,7 +329,7 @@ mod tests {
     #[test]
     fn only_what_a_part_needs_and_is_missing_is_installed_and_once() {
         let nothing = |_: &str| false;
-        assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
+        assert_eq!(missing_packages(&[Part::Firmware], nothing), Vec::<&str>::new());
         assert_eq!(
             missing_packages(&[Part::Emulator, Part::Emulator], nothing),
             ["build-essential", "clang", "cmake", "libclang-dev", "make", "pkg-config"]
