@@ -23,7 +23,7 @@ target/evidence/fuzz.json.
   --inputs N      how many inputs each target tries, in place of a time
   --target NAMES  these alone, with commas between them
   --keep          afterwards, makes the smallest corpus that covers as much, and puts the shortest
-                  inputs of it into tests/fuzz/corpus, one file for each target
+                  inputs of it into tests/fuzz/corpus, one archive for each target
   --replay        runs no fuzzer: every input of tests/fuzz/corpus and target/fuzz/corpus once, with
                   the Rust that builds the rest; it needs no nightly toolchain
 
@@ -76,9 +76,9 @@ fn replay_all(targets: &[String]) -> Outcome {
     Ok(())
 }
 
-/// The file with the kept inputs of a target.
+/// The archive with the kept inputs of a target.
 fn kept_file(target: &str) -> PathBuf {
-    folder().join("corpus").join(target)
+    folder().join("corpus").join(format!("{target}.tar.gz"))
 }
 
 /// The folder of what the fuzzer has found in this clone, and of what it has begun with.

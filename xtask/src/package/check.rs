@@ -15,7 +15,7 @@ pub fn sums(dist: &Path) -> Outcome {
 
 /// The sources build without a connection, and give the same program as the repository.
 pub fn source(release: &Release, root: &Path) -> Outcome {
-    unpack(&release.source(), root)?;
+    files::unpack(&release.source(), root)?;
     let sources = root.join(format!("coboot-{VERSION}"));
     let theirs = build::program(&sources, &root.join("target"), LINUX)?;
     let ours = build::program(workspace::root(), &release.build, LINUX)?;
@@ -36,7 +36,7 @@ pub fn source(release: &Release, root: &Path) -> Outcome {
 }
 
 pub fn linux(release: &Release, root: &Path) -> Outcome {
-    unpack(&release.linux(), root)?;
+    files::unpack(&release.linux(), root)?;
     let folder = root.join(format!("coflash-{VERSION}"));
     for file in ["LICENSE-MIT", "LICENSE-APACHE", "README.md", "THIRD-PARTY.txt", "udev/70-coflash.rules"] {
         there(&folder.join(file))?;
@@ -196,10 +196,6 @@ fn runs_on_windows(said: &str) -> Outcome {
         Some(foreign) => Err(format!("the program for Windows needs {foreign}, which no Windows has.")),
         None => Ok(()),
     }
-}
-
-fn unpack(archive: &Path, into: &Path) -> Outcome {
-    process::run(Command::new("tar").arg("--extract").arg("--file").arg(archive).arg("--directory").arg(into))
 }
 
 fn there(file: &Path) -> Outcome {

@@ -169,12 +169,7 @@ fn linux(release: &Release) -> Outcome {
         let from = workspace::root().join(file);
         files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
-    let mut tar = Command::new("tar");
-    tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner", "--mode=u+rw,go+r-w"]);
-    tar.arg(format!("--mtime=@{}", release.epoch)).args(["--use-compress-program", "gzip -9n"]);
-    process::run(
-        tar.arg("--directory").arg(&stage).arg("--create").arg("--file").arg(release.linux()).arg(name),
-    )?;
+    files::pack(&stage, &name, &release.epoch, &release.linux())?;
     files::remove(&stage)
 }
 
