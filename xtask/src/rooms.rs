@@ -161,28 +161,6 @@ mod tests {
     }
 
     #[test]
-    fn a_room_uses_what_its_files_name_outside_comments_and_tests() {
-        let graph = graph(&modules::graph(
-            "x",
-            &sources(&[
-                ("lib.rs", "mod a; use crate::a::X;"),
-                ("a/mod.rs", "use crate::b::Y;\n// crate::c\nfn f() { crate::a::g() }"),
-                (
-                    "a/deep.rs",
-                    "fn f() { crate::d::g(super::super::e::h()) }\n#[cfg(test)]\nmod tests { use crate::c::Z; }",
-                ),
-                ("b.rs", ""),
-                ("c.rs", ""),
-                ("d.rs", ""),
-                ("e.rs", ""),
-            ]),
-        ));
-        let uses: Vec<_> = graph["a"].iter().map(String::as_str).collect();
-        assert_eq!(uses, ["b", "d", "e"]);
-        assert!(!graph.contains_key("lib"));
-    }
-
-    #[test]
     fn a_circle_is_found_however_long_and_a_diamond_is_none() {
         let graph_of = |arrows: &[(&str, &str)]| {
             let mut graph = Graph::new();
