@@ -1,11 +1,10 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
-use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
-use std::{env, fs, thread};
+use std::{env, fs, iter, thread};
 
 use serde_json::{json, Value};
 
@@ -124,29 +123,26 @@ pub fn run(mut args: Args) -> Outcome {
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let queue = Mutex::new(VecDeque::from(targets));
-    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
-    let all = || {
-        let mut ended = Vec::new();
-        while let Some(target) = next() {
-            let row = tools.fuzz(&target, &end)?;
-            if keep && !is_failed(&row) {
-                process::output(tools.command("cmin", &target).arg(found(&target)))?;
-                corpus::keep(&found(&target), &kept_file(&target))?;
-            }
-            ended.push(row);
+    let next = AtomicUsize::new(0);
+    let one = |target: &String| -> Outcome<Value> {
+        let row = tools.fuzz(target, &end)?;
+        if keep && !is_failed(&row) {
+            process::output(tools.command("cmin", target).arg(found(target)))?;
+            corpus::keep(&found(target), &kept_file(target))?;
         }
-        Outcome::Ok(ended)
+        Ok(row)
     };
+    let work = || iter::from_fn(|| targets.get(next.fetch_add(1, Ordering::Relaxed))).map(one).collect();
     if is_whole {
         evidence::begin("fuzz")?;
     }
     // A target has one thread.
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let mut ended = thread::scope(|scope| {
-        let workers: Vec<_> = (0..cores).map(|_| scope.spawn(all)).collect();
-        let broken_off = |_| "a part of the fuzzing broke off.".to_owned();
-        workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
+        let workers: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
+        let broken_off = |_| Err("a part of the fuzzing broke off.".to_owned());
+        let ended = workers.into_iter().map(|worker| worker.join().unwrap_or_else(broken_off));
+        ended.collect::<Outcome<Vec<Vec<_>>>>()
     })?
     .concat();
     ended.sort_by_key(|row| row["target"].to_string());
