@@ -119,7 +119,7 @@ pub fn run(mut args: Args) -> Outcome {
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
         let own = if chosen_board {
-            build::boards(&[(board, &[])])?;
+            build::boards(&[(board, "")])?;
             build::tests_args(board)
         } else {
             build_images(Tier::Product)?;
@@ -317,7 +317,7 @@ fn other_chips() -> impl Iterator<Item = &'static Layout> {
 /// programs are compiled for it.
 fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcome {
     if tier == Tier::All {
-        build::boards(&[(board, &[])])?;
+        build::boards(&[(board, "")])?;
     }
     let programs = board_programs(board, tier)?;
     let mut jobs = Vec::new();
