@@ -9,11 +9,8 @@ mod release;
 #[cfg(test)]
 mod workflow;
 
-use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
-
-use sha2::{Digest, Sha256};
 
 use self::release::{package_crates, Release, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
@@ -194,15 +191,12 @@ fn crates(release: &Release) -> Outcome {
 
 /// Writes SHA256SUMS in the form for `sha256sum --check`.
 fn sums(dist: &Path) -> Outcome {
-    let mut text = String::new();
+    let mut sha256sum = Command::new("sha256sum");
     for file in files::within(dist)?.iter().filter(|file| !file.ends_with(SUMS)) {
-        let bytes = files::bytes(file)?;
-        let sum: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        let name = file.file_name().unwrap_or_default().to_string_lossy();
-        let _ = writeln!(text, "{sum}  {name}");
-        println!("{:>9} KiB  {}", bytes.len().div_ceil(1024), workspace::shown(file));
+        println!("{:>9} KiB  {}", files::bytes(file)?.len().div_ceil(1024), workspace::shown(file));
+        sha256sum.args(file.file_name());
     }
-    files::write(&dist.join(SUMS), text)
+    files::write(&dist.join(SUMS), process::output(sha256sum.current_dir(dist))?)
 }
 
 fn git(words: &[&str]) -> Outcome<String> {
