@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
-use std::{env, fs, iter, thread};
+use std::{fs, iter, thread};
 
 use serde_json::{json, Value};
 
@@ -117,7 +117,9 @@ pub fn run(mut args: Args) -> Outcome {
     if replay {
         return replay_all(&targets);
     }
-    toolchain()?;
+    // If there is none, rustup says how to get it.
+    process::output(Command::new("rustup").args(["run", "nightly", "rustc", "--version"]))?;
+    setup::prepare(&[setup::Part::Cpp])?;
     let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
     println!("Building the fuzz targets ...");
     for target in &targets {
@@ -242,23 +244,6 @@ fn targets(folder: &Path) -> Outcome<Vec<String>> {
 
 fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
-}
-
-/// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
-/// compiler, which the fuzzer's library needs.
-fn toolchain() -> Outcome {
-    if !process::succeeds("rustup", &["run", "nightly", "rustc", "--version"]) {
-        return Err("fuzzing needs a nightly toolchain. Run this line and try again:\n\n    \
-                    rustup toolchain install nightly"
-            .into());
-    }
-    let compiler = env::var_os("CXX").unwrap_or_else(|| "c++".into());
-    if !process::succeeds(compiler, &["--version"]) {
-        return Err("the fuzzer's library is C++, and there is no compiler for it. Run this line and try again:\n\n    \
-                    sudo apt-get install -y build-essential"
-            .into());
-    }
-    Ok(())
 }
 
 /// The number of inputs in the fuzzer's output.

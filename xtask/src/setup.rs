@@ -32,6 +32,8 @@ pub enum Part {
     Firmware,
     /// The application in C: a compiler for the chip.
     C,
+    /// The fuzzer: a compiler for C++.
+    Cpp,
     /// The examples in C and C++: two compilers for the chip, and CMake.
     Examples,
     /// The emulator: cmake builds Unicorn from C, libclang makes its bindings, and clang assembles the
@@ -176,6 +178,7 @@ impl Part {
             // header.
             Self::Emulator => &["build-essential", "make", "cmake", "pkg-config", "libclang-dev", "clang"],
             Self::C => &["clang"],
+            Self::Cpp => &["g++"],
             Self::Examples => &["gcc-arm-none-eabi", "clang", "make", "cmake"],
             Self::Gdb => &["gdb-multiarch"],
             Self::Browser => &["chromium"],
