@@ -224,10 +224,7 @@ impl Tools {
         if let Some(runs) = runs {
             let seconds = started.elapsed().as_secs();
             println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-            let files = files::within(&corpus)?.len();
-            return Ok(
-                json!({"target": target, "inputs": runs, "seconds": seconds, "edges": edges(&said), "corpus": files}),
-            );
+            return Ok(json!({"target": target, "inputs": runs, "seconds": seconds}));
         }
         let words = if status.success() { "ran no input" } else { "FAILED" };
         println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
@@ -249,11 +246,6 @@ fn target_dir() -> PathBuf {
 /// The number of inputs in the fuzzer's output.
 fn runs(said: &str) -> Option<u64> {
     said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
-}
-
-/// The covered edges in the fuzzer's last line about them.
-fn edges(said: &str) -> Option<u64> {
-    said.lines().rev().find_map(|line| line.split_once("cov: ")?.1.split(' ').next()?.parse().ok())
 }
 
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
@@ -290,7 +282,6 @@ mod tests {
     fn the_fuzzers_words_are_understood() {
         let said = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
         assert_eq!((runs(said), excerpt(said)), (Some(918_484), String::new()));
-        assert_eq!((edges(said), edges("#2 INITED exec/s: 0")), (Some(741), None));
         let said = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
                     Test unit written to crash-1\n";
         assert_eq!(runs(said), None);
