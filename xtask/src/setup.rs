@@ -354,7 +354,7 @@ mod tests {
     /// The line is CMake's.
     #[test]
     fn what_cmake_noted_in_another_folder_is_removed_and_nothing_else() {
-        let target = workspace::target_dir().join(format!("tmp/cmake-{}", std::process::id()));
+        let target = kit::folder::Folder::below(std::env::temp_dir(), "coboot-cmake");
         let notes = |package: &str| target.join("debug/build").join(package).join("out/build");
         for (package, of) in [("here", notes("here")), ("moved", "/another/clone/out/build".into())] {
             fs::create_dir_all(notes(package)).unwrap();
@@ -365,7 +365,6 @@ mod tests {
         renew_cmake(&target);
         assert!(notes("here").exists() && !notes("moved").exists());
         assert!(notes("moved").with_file_name("library").exists());
-        fs::remove_dir_all(&target).unwrap();
     }
 
     /// Only exact versions, so that every machine runs the same client.

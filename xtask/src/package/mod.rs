@@ -46,24 +46,16 @@ struct Part {
     check: fn(&Release, &Path) -> Outcome,
 }
 
-const fn part(
-    name: &'static str,
-    make: fn(&Release) -> Outcome,
-    check: fn(&Release, &Path) -> Outcome,
-) -> Part {
-    Part { name, make, check }
-}
-
 /// The parts, in the order in which they are made.
 const PARTS: [Part; 7] = [
-    part("source", source, check::source),
-    part("linux", linux, check::linux),
-    part("deb", deb::make, check::debian),
-    part("windows", windows, check::windows),
-    part("python", python, check::wheel),
+    Part { name: "source", make: source, check: check::source },
+    Part { name: "linux", make: linux, check: check::linux },
+    Part { name: "deb", make: deb::make, check: check::debian },
+    Part { name: "windows", make: windows, check: check::windows },
+    Part { name: "python", make: python, check: check::wheel },
     // The job that makes it checks it.
-    part("sbom", bills, |_, _| Ok(())),
-    part("crates", crates, check::crates),
+    Part { name: "sbom", make: bills, check: |_, _| Ok(()) },
+    Part { name: "crates", make: crates, check: check::crates },
 ];
 
 pub fn run(mut args: Args) -> Outcome {

@@ -337,17 +337,17 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
 /// Jobs of the night that end by themselves.
 fn jobs(summary: &mut Summary) -> Outcome {
     type Run = fn(Args) -> Outcome;
-    let all: [(&str, Run, &[&str]); 6] = [
-        ("fuzz --replay", fuzz::run, &["--replay"]),
-        ("powercut", powercut::run, &[]),
-        ("attack", attack::run, &[]),
-        ("opinion", opinion::run, &[]),
-        ("reproduce", reproduce::run, &[]),
-        ("chips", chips::run, &[]),
+    let all: [(&str, Run); 6] = [
+        ("fuzz --replay", fuzz::run),
+        ("powercut", powercut::run),
+        ("attack", attack::run),
+        ("opinion", opinion::run),
+        ("reproduce", reproduce::run),
+        ("chips", chips::run),
     ];
-    for (name, run, words) in all {
+    for (name, run) in all {
         println!("== cargo xtask {name}");
-        let words = words.iter().map(|word| (*word).to_owned());
+        let words = name.split(' ').skip(1).map(str::to_owned);
         runner::count(&format!("cargo xtask {name}"), run(Args::new(words)), summary);
     }
     Ok(())
