@@ -44,7 +44,8 @@ pub fn run(mut args: Args) -> Outcome {
             }
             count += 1;
             let variant = build::Variant::by_name(board, name)?;
-            let used = build::bootloader_size(board, variant.features, &variant.product()?)?;
+            let used = build::bootloader_size(board, variant.features, &variant.product()?)
+                .map_err(|problem| format!("{}, {name}: {problem}", board.board))?;
             let regions = build::bootloader_flash(board);
             for ((bytes, region), budget) in used.iter().zip(regions).zip(budgets(board)) {
                 println!("{:<23}  {name:<25}  {:#010x}  {bytes:>5}  {budget:>5}", board.board, region.base);
