@@ -68,10 +68,12 @@ mod tests {
         let (corpus, file) = (folder.join("corpus"), folder.join("a-target"));
         unpack(&file, corpus.clone()).expect("a target without kept inputs");
         fs::write(corpus.join("b"), "new\n1 1\n").unwrap();
+        fs::write(corpus.join("too-long"), vec![0; LONGEST + 1]).unwrap();
         keep(&corpus, &file).unwrap();
         fs::remove_dir_all(&corpus).unwrap();
         unpack(&file, corpus.clone()).unwrap();
         assert_eq!(fs::read(corpus.join("0000")).unwrap(), b"new\n1 1\n");
+        assert!(!corpus.join("0001").exists());
     }
 
     #[test]
@@ -83,7 +85,6 @@ mod tests {
         files::pack(&folder.join("earlier"), ".", "0", &file).unwrap();
         fs::create_dir_all(&corpus).unwrap();
         fs::write(corpus.join("a"), vec![0; 100]).unwrap();
-        fs::write(corpus.join("b"), vec![0; LONGEST + 1]).unwrap();
         fs::write(corpus.join("c"), "x").unwrap();
         for number in 0..30 {
             fs::write(corpus.join(number.to_string()), vec![1; LONGEST]).unwrap();
