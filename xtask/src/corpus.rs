@@ -53,10 +53,12 @@ pub fn keep(folder: &Path, archive: &Path) -> Outcome {
 
 #[cfg(test)]
 mod tests {
+    use std::process::Command;
+
     use kit::folder::Folder;
 
     use super::*;
-    use crate::workspace;
+    use crate::{process, workspace};
 
     fn folder() -> Folder {
         Folder::below(std::env::temp_dir(), "coboot-corpus")
@@ -100,11 +102,10 @@ mod tests {
 
     #[test]
     fn the_kept_inputs_are_whole_and_few() {
-        let folder = folder();
         for file in files::within(&workspace::root().join("tests/fuzz/corpus")).unwrap() {
             if file.file_name().is_some_and(|name| name != ".gitattributes") {
-                let inputs = unpack(&file, folder.join(file.file_name().unwrap())).unwrap();
-                assert!(!files::within(&inputs).unwrap().is_empty(), "{}", file.display());
+                let names = process::output(Command::new("tar").arg("--list").arg("--file").arg(&file));
+                assert!(names.unwrap().lines().any(|name| name != "./"), "{}", file.display());
                 assert!(file.metadata().unwrap().len() < 200_000, "{}", file.display());
             }
         }
