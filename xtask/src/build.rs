@@ -1,5 +1,6 @@
 //! `cargo xtask build`: builds the images for the chip.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -8,11 +9,10 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::{Image, Layout};
 
 use crate::args::Args;
-use crate::footprint::{self, Flash};
 use crate::product::Product;
 use crate::setup::{self, Part};
 use crate::workspace::{PROFILE, TARGET};
-use crate::{files, outcome::Outcome, process, ram_image, workspace};
+use crate::{elf, files, outcome::Outcome, process, ram_image, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]
@@ -197,8 +197,7 @@ pub fn run(mut args: Args) -> Outcome {
             Some(product) if variant.is_bootloader() => (variant.name_of(product)?, product.clone()),
             _ => (variant.name.to_owned(), variant.product()?),
         };
-        let built = build(board, variant, &product)?;
-        put(board, variant, &name, &finished(variant, built)?)?;
+        image(board, variant, &name, &product)?;
     }
     if in_c {
         c_applications(board)?;
@@ -210,8 +209,7 @@ pub fn run(mut args: Args) -> Outcome {
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
     for name in names {
         let variant = Variant::by_name(board, name)?;
-        let built = build(board, variant, &variant.product()?)?;
-        put(board, variant, variant.name, &finished(variant, built)?)?;
+        image(board, variant, variant.name, &variant.product()?)?;
     }
     Ok(workspace::firmware_dir(board))
 }
@@ -219,27 +217,21 @@ pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
 /// Builds the images with these names for several boards, the applications in C if their name is the last, or
 /// everything where there are no names; several chips at once, since the last step of each image uses only one
 /// core.
-pub fn boards(boards: &[(&Layout, &[&str])]) -> Outcome {
-    let mut chips: Vec<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
-    chips.sort_unstable();
-    chips.dedup();
+pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
+    let build = |(board, names): (&Layout, &str)| {
+        let rust = names.strip_suffix(C_APPLICATION).unwrap_or(names);
+        let all = || Variant::of(board).map(|of| of.name).collect();
+        images(board, &if names.is_empty() { all() } else { rust.split_whitespace().collect::<Vec<_>>() })?;
+        if names.is_empty() || rust != names {
+            c_applications(board)?;
+        }
+        Outcome::Ok(())
+    };
+    let chips: BTreeSet<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     std::thread::scope(|scope| {
-        let builders: Vec<_> = chips
-            .into_iter()
-            .map(|chip| {
-                scope.spawn(move || {
-                    let own = boards.iter().filter(|(board, _)| board.chip.line.name() == chip);
-                    own.copied().try_for_each(|(board, names)| {
-                        match *names {
-                            [] => images(board, &Variant::of(board).map(|of| of.name).collect::<Vec<_>>())?,
-                            [ref rust @ .., C_APPLICATION] => images(board, rust)?,
-                            _ => return images(board, names).map(drop),
-                        };
-                        c_applications(board)
-                    })
-                })
-            })
-            .collect();
+        let of_chip = |chip| boards.iter().copied().filter(move |(board, _)| board.chip.line.name() == chip);
+        let builders: Vec<_> =
+            chips.into_iter().map(|chip| scope.spawn(move || of_chip(chip).try_for_each(build))).collect();
         // A builder that panics has printed the reason.
         builders
             .into_iter()
@@ -315,11 +307,12 @@ fn rust_lld() -> Outcome<PathBuf> {
     Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
 }
 
-/// Builds a bootloader for examination; returns its ELF file.
-pub fn to_look_at(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u8>> {
+/// Builds a bootloader; returns what it takes of each of [`bootloader_flash`], in bytes.
+pub fn bootloader_size(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u32>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
-    ram_image::seal(built(board, "bootloader")?)
+    let file = ram_image::seal(built(board, "bootloader")?)?;
+    elf::used(&elf::segments(&file)?, &bootloader_flash(board))
 }
 
 /// The folders with the files of the boards.
@@ -340,19 +333,12 @@ pub fn chip_feature(board: &Layout) -> String {
 pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
     let features = format!("{},{features}", chip_feature(board));
     let target_dir = target_dir(board).display().to_string();
-    [
-        ["--package", package],
-        ["--target", TARGET],
-        ["--profile", PROFILE],
-        ["--features", features.trim_end_matches(',')],
-        ["--target-dir", &target_dir],
-    ]
-    .concat()
-    .into_iter()
-    .chain(["--no-default-features"])
-    .map(str::to_owned)
-    .chain(board_args(board))
-    .collect()
+    let mut args: Vec<String> = board_args(board).into();
+    let choices =
+        ["--package", package, "--no-default-features", "--features", features.trim_end_matches(',')];
+    let place = ["--target", TARGET, "--profile", PROFILE, "--target-dir", &target_dir];
+    args.extend(choices.into_iter().chain(place).map(str::to_owned));
+    args
 }
 
 /// The arguments for cargo to build the crate of the emulated tests for a board.
@@ -385,31 +371,22 @@ fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -
     cargo
 }
 
-/// Builds an image of a product; returns the linker's ELF file.
-fn build(board: &Layout, variant: &Variant, product: &Product) -> Outcome<Vec<u8>> {
-    process::run(&mut cargo_for(variant.package, board, variant.features, product))?;
-    built(board, variant.package)
-}
-
 /// The ELF file of cargo's last build of a package.
 fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
     files::bytes(&target_dir(board).join(TARGET).join(PROFILE).join(package))
 }
 
-/// The step after the link: a bootloader gets the CRC of its RAM image.
-fn finished(variant: &Variant, built: Vec<u8>) -> Outcome<Vec<u8>> {
+/// Builds an image, puts it into the board's folder under a name, and prints its size. After the link a
+/// bootloader gets the CRC of its RAM image.
+fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Outcome {
+    process::run(&mut cargo_for(variant.package, board, variant.features, product))?;
+    let mut file = built(board, variant.package)?;
     if variant.is_bootloader() {
-        ram_image::seal(built).map_err(|problem| format!("{} gets no CRC: {problem}", variant.name))
-    } else {
-        Ok(built)
+        file = ram_image::seal(file).map_err(|problem| format!("{name} gets no CRC: {problem}"))?;
     }
-}
-
-/// Writes an image into the board's folder, under its name, and prints its size.
-fn put(board: &Layout, variant: &Variant, name: &str, file: &[u8]) -> Outcome {
     let to = workspace::firmware_dir(board).join(format!("{name}.elf"));
     // An unchanged file is not written, so that its time does not change.
-    if fs::read(&to).ok().as_deref() != Some(file) {
+    if fs::read(&to).ok().as_ref() != Some(&file) {
         files::write(&to, file)?;
     }
     report(&to, &variant.regions(board))
@@ -417,12 +394,13 @@ fn put(board: &Layout, variant: &Variant, name: &str, file: &[u8]) -> Outcome {
 
 /// Prints the size of an image.
 pub fn report(image: &Path, regions: &[Region]) -> Outcome {
-    let flash = Flash::of(&footprint::read(image)?, regions)
-        .map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
+    let file = files::bytes(image)?;
+    let used = elf::segments(&file).and_then(|segments| elf::used(&segments, regions));
+    let used = used.map_err(|problem| format!("{}: {problem}", workspace::shown(image)))?;
     // It goes to the standard error like cargo's messages: the standard output belongs to the job,
     // which may print JSON.
     let used: Vec<_> =
-        flash.used.iter().map(|(region, bytes)| format!("{bytes} of {}", region.size)).collect();
+        used.iter().zip(regions).map(|(bytes, region)| format!("{bytes} of {}", region.size)).collect();
     eprintln!("  {:<52} {} bytes", workspace::shown(image), used.join(" + "));
     Ok(())
 }

@@ -1,64 +1,42 @@
-//! The kept inputs of a fuzz target: one file in `tests/fuzz/corpus`, which the fuzzer's folders are
-//! filled from.
-//!
-//! An input is a line with its name and its length, its bytes, and a line feed. A person gives names;
-//! what the fuzzer has found has a number.
+//! The kept inputs of a fuzz target: one archive in `tests/fuzz/corpus`, which the fuzzer's folders are
+//! filled from. A person gives names to inputs; what the fuzzer has found has a number.
 
+use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::{files, outcome::Outcome, workspace};
+use crate::{files, outcome::Outcome};
 
 /// The most bytes of what the fuzzer has found that are kept for a target, and of one input.
 const KEPT: usize = 96 * 1024;
 const LONGEST: usize = 4 * 1024;
 
-/// A name and the bytes of an input.
-type Input = (String, Vec<u8>);
-
-/// The inputs of a file; none if there is no file.
-fn read(file: &Path) -> Outcome<Vec<Input>> {
-    if !file.exists() {
-        return Ok(Vec::new());
-    }
-    let bytes = files::bytes(file)?;
-    let (mut rest, mut inputs) = (&bytes[..], Vec::new());
-    while !rest.is_empty() {
-        let input = next(&mut rest)
-            .ok_or_else(|| format!("{} is damaged after {} inputs.", workspace::shown(file), inputs.len()))?;
-        inputs.push(input);
-    }
-    Ok(inputs)
-}
-
-fn next(rest: &mut &[u8]) -> Option<Input> {
-    let end = rest.iter().position(|byte| *byte == b'\n')?;
-    let (name, length) = std::str::from_utf8(&rest[..end]).ok()?.split_once(' ')?;
-    // The name becomes that of a file.
-    let is_plain = name.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-');
-    let (bytes, behind) = rest[end + 1..].split_at_checked(length.parse().ok()?)?;
-    *rest = behind.strip_prefix(b"\n")?;
-    (is_plain && !name.is_empty()).then(|| (name.to_owned(), bytes.to_vec()))
-}
-
-/// Puts each input into a file in a folder, which it makes; returns the folder.
-pub fn unpack(file: &Path, folder: PathBuf) -> Outcome<PathBuf> {
+/// Puts the inputs of an archive, if there is one, into a folder, which it makes; returns the folder.
+pub fn unpack(archive: &Path, folder: PathBuf) -> Outcome<PathBuf> {
     files::make(&folder)?;
-    for (name, bytes) in read(file)? {
-        files::write(&folder.join(name), bytes)?;
+    if archive.exists() {
+        files::unpack(archive, &folder)?;
     }
     Ok(folder)
 }
 
-/// Puts what the fuzzer has found in a folder into a file, the shortest first, as much as [`KEPT`]
+/// Puts what the fuzzer has found in a folder into an archive, the shortest first, as much as [`KEPT`]
 /// allows. Inputs that a person has named stay there.
-pub fn keep(folder: &Path, file: &Path) -> Outcome {
-    let is_number = |name: &str| name.bytes().all(|byte| byte.is_ascii_digit());
-    let mut inputs: Vec<Input> = read(file)?;
-    inputs.retain(|(name, _)| !is_number(name));
+pub fn keep(folder: &Path, archive: &Path) -> Outcome {
+    let next = folder.with_extension("next");
+    files::remove(&next)?;
+    let mut named = Vec::new();
+    for path in files::within(&unpack(archive, next.clone())?)? {
+        let name = path.file_name().unwrap_or_default().as_encoded_bytes();
+        if name.iter().all(u8::is_ascii_digit) {
+            fs::remove_file(&path).map_err(|error| format!("{}: {error}.", path.display()))?;
+        } else {
+            named.push(files::bytes(&path)?);
+        }
+    }
     let mut found = Vec::new();
     for path in files::within(folder)? {
         let bytes = files::bytes(&path)?;
-        if bytes.len() <= LONGEST && !inputs.iter().any(|(_, named)| *named == bytes) {
+        if bytes.len() <= LONGEST && !named.contains(&bytes) {
             found.push((bytes.len(), bytes));
         }
     }
@@ -67,24 +45,20 @@ pub fn keep(folder: &Path, file: &Path) -> Outcome {
     for (number, (length, bytes)) in found.into_iter().enumerate() {
         let Some(left) = room.checked_sub(length) else { break };
         room = left;
-        inputs.push((format!("{number:04}"), bytes));
+        files::write(&next.join(format!("{number:04}")), bytes)?;
     }
-    let mut text = Vec::new();
-    for (name, bytes) in inputs {
-        text.extend_from_slice(format!("{name} {}\n", bytes.len()).as_bytes());
-        text.extend_from_slice(&bytes);
-        text.push(b'\n');
-    }
-    files::write(file, text)
+    files::pack(&next, ".", "0", archive)?;
+    files::remove(&next)
 }
 
 #[cfg(test)]
 mod tests {
-    use std::fs;
+    use std::process::Command;
 
     use kit::folder::Folder;
 
     use super::*;
+    use crate::{process, workspace};
 
     fn folder() -> Folder {
         Folder::below(std::env::temp_dir(), "coboot-corpus")
@@ -96,51 +70,42 @@ mod tests {
         let (corpus, file) = (folder.join("corpus"), folder.join("a-target"));
         unpack(&file, corpus.clone()).expect("a target without kept inputs");
         fs::write(corpus.join("b"), "new\n1 1\n").unwrap();
+        fs::write(corpus.join("too-long"), vec![0; LONGEST + 1]).unwrap();
         keep(&corpus, &file).unwrap();
         fs::remove_dir_all(&corpus).unwrap();
         unpack(&file, corpus.clone()).unwrap();
         assert_eq!(fs::read(corpus.join("0000")).unwrap(), b"new\n1 1\n");
+        assert!(!corpus.join("0001").exists());
     }
 
     #[test]
     fn what_is_kept_is_short_and_a_persons_seeds_stay() {
         let folder = folder();
         let (corpus, file) = (folder.join("corpus"), folder.join("a-target"));
+        files::write(&folder.join("earlier/by-hand"), "x").unwrap();
+        files::write(&folder.join("earlier/0000"), "an earlier one").unwrap();
+        files::pack(&folder.join("earlier"), ".", "0", &file).unwrap();
         fs::create_dir_all(&corpus).unwrap();
-        fs::write(&file, "by-hand 1\nx\n0000 14\nan earlier one\n").unwrap();
         fs::write(corpus.join("a"), vec![0; 100]).unwrap();
-        fs::write(corpus.join("b"), vec![0; LONGEST + 1]).unwrap();
         fs::write(corpus.join("c"), "x").unwrap();
         for number in 0..30 {
             fs::write(corpus.join(number.to_string()), vec![1; LONGEST]).unwrap();
         }
         keep(&corpus, &file).unwrap();
-        let kept = read(&file).unwrap();
-        let bytes: usize = kept.iter().map(|(_, bytes)| bytes.len()).sum();
-        assert!((KEPT - LONGEST..=KEPT + 1).contains(&bytes), "{bytes}");
-        assert_eq!(kept[0], ("by-hand".to_owned(), b"x".to_vec()));
-        assert_eq!(kept[1], ("0000".to_owned(), vec![0; 100]));
-        assert!(kept[2..].iter().all(|(_, bytes)| bytes.len() == LONGEST));
-    }
-
-    #[test]
-    fn a_damaged_file_is_refused() {
-        let folder = folder();
-        let file = folder.join("a-target");
-        for text in
-            ["a", "a 1", "a 1\n", "a 1\nxx", "a 2\nx\n", "../a 1\nx\n", " 1\nx\n", "a x\nx\n", "a 1\nx\nb"]
-        {
-            fs::write(&file, text).unwrap();
-            assert!(read(&file).is_err(), "{text:?}");
-        }
+        let kept = files::within(&unpack(&file, folder.join("kept")).unwrap()).unwrap();
+        let kept: Vec<_> = kept.iter().map(|file| fs::read(file).unwrap()).collect();
+        assert!((KEPT - LONGEST..=KEPT + 1).contains(&kept.concat().len()), "{}", kept.concat().len());
+        // By their names: what was found, and then by-hand.
+        assert_eq!((&kept[0], kept.last()), (&vec![0; 100], Some(&b"x".to_vec())));
+        assert!(kept[1..kept.len() - 1].iter().all(|bytes| bytes.len() == LONGEST));
     }
 
     #[test]
     fn the_kept_inputs_are_whole_and_few() {
-        let kept = workspace::root().join("tests/fuzz/corpus");
-        for file in files::within(&kept).unwrap() {
+        for file in files::within(&workspace::root().join("tests/fuzz/corpus")).unwrap() {
             if file.file_name().is_some_and(|name| name != ".gitattributes") {
-                assert!(!read(&file).unwrap().is_empty(), "{}", file.display());
+                let names = process::output(Command::new("tar").arg("--list").arg("--file").arg(&file));
+                assert!(names.unwrap().lines().any(|name| name != "./"), "{}", file.display());
                 assert!(file.metadata().unwrap().len() < 200_000, "{}", file.display());
             }
         }

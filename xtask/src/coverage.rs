@@ -37,7 +37,8 @@ pub const SEALED_TESTS: [&str; 4] = ["access::", "dictionary::", "model::", "pie
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    setup::prepare(&[Part::Emulator, Part::Coverage])?;
+    setup::prepare(&[Part::Emulator])?;
+    process::run(Command::new("rustup").args(["component", "add", "llvm-tools"]))?;
     let program = setup::tool("cargo-llvm-cov", VERSION, &[])?;
     evidence::begin("coverage")?;
     let llvm_cov = |words: &[&str]| {

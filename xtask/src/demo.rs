@@ -34,14 +34,6 @@ pub fn run(mut args: Args) -> Outcome {
     };
     build::images(board, &[bootloaders, &["app-v1", "app-v2"]].concat())?;
     let mut demo = build::tests_program(board, "demo");
-    if is_sealed {
-        demo.arg("--sealed");
-    }
-    if renews {
-        demo.arg("--renew");
-    }
-    if let Some(trace) = trace {
-        demo.args(["--trace", &trace]);
-    }
-    process::run(&mut demo)
+    demo.args(is_sealed.then_some("--sealed")).args(renews.then_some("--renew"));
+    process::run(demo.args(trace.iter().flat_map(|file| ["--trace", file])))
 }

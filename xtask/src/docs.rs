@@ -9,12 +9,6 @@ use shared_abi::layout::BOARDS;
 use crate::build::{C_APPLICATION, VARIANTS};
 use crate::{files, process, workspace, JOBS};
 
-/// A block of code in a document that names its source file.
-struct Quote {
-    file: String,
-    lines: Vec<String>,
-}
-
 /// The marker before a quoted block: `<!-- from FILE -->`, followed by a fence.
 const MARKER: &str = "<!-- from ";
 /// A line that stands for omitted lines.
@@ -25,13 +19,14 @@ fn bare(text: &str) -> Vec<String> {
     text.lines().map(|line| line.trim().to_owned()).filter(|line| !line.is_empty()).collect()
 }
 
-fn quotes(document: &str) -> Vec<Quote> {
+/// The blocks of code in a document that name their source files: the file, and the lines.
+fn quotes(document: &str) -> Vec<(String, Vec<String>)> {
     let quote = |behind: &str| {
         let (file, rest) = behind.split_once(" -->").expect("a marker ends with -->");
         let (_, rest) = rest.split_once("```").expect("code follows a marker");
         let (block, _) = rest.split_once("```").expect("the code ends");
         let (_language, code) = block.split_once('\n').expect("the code has lines");
-        Quote { file: file.to_owned(), lines: bare(code) }
+        (file.to_owned(), bare(code))
     };
     document.split(MARKER).skip(1).map(quote).collect()
 }
@@ -54,7 +49,7 @@ fn the_guides_show_code_as_it_is() {
     for name in "application can-driver first-hour flash-driver operating-system porting product".split(' ') {
         let found = quotes(&files::ours(format!("docs/{name}.md")).unwrap());
         assert!(!found.is_empty(), "{name}: no quotes");
-        for Quote { file, lines } in found {
+        for (file, lines) in found {
             let gone = missing(&lines, &files::ours(&file).unwrap());
             assert_eq!(gone, None, "{name} quotes what {file} does not have: copy it from there");
         }
@@ -73,7 +68,7 @@ fn a_quote_that_has_changed_is_found() {
 
 /// Commands that are not part of this repository: of a shell, of the system, of other projects.
 const FOREIGN: &str =
-    "cd export ip apt base64 candump canopend cmake cocomm curl dcfgen npm node openssl pip sha256sum tar tshark unzip west";
+    "cd export ip apt base64 candump canopend cmake cocomm curl dcfgen npm node openssl pip pipx sha256sum tar tshark unzip west";
 /// Cargo's own jobs on pages; their arguments name packages of the workspace.
 const CARGO: [&str; 5] = ["build", "check", "install", "run", "test"];
 

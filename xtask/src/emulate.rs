@@ -32,60 +32,32 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
 
 pub fn run(mut args: Args) -> Outcome {
     let word = args.value("--board")?.unwrap_or_else(|| layout::DEFAULT.board.to_owned());
-    let log = log(&mut args)?;
+    let log = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
     let virtual_can = args.flag("--virtual-can");
+    let (has_bootloader, has_serial) = (args.has("--bootloader"), args.has("--serial"));
     let options = args.rest();
-    let another = options.iter().any(|word| word == "--bootloader" || word.starts_with("--bootloader="));
 
     let mut emulator = process::cargo("run");
     emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board"]);
-    if another {
+    if has_bootloader {
         // The emulator reads the memory map of any board.
         setup::prepare(&[Part::Emulator])?;
         emulator.arg(&word);
     } else {
         let board = workspace::board_named(&word)?;
+        let bootloader = match log {
+            Some(way) => format!("bootloader-log-{way}"),
+            None if virtual_can => "bootloader-virtual-can".to_owned(),
+            None => "bootloader".to_owned(),
+        };
+        // A way that there is not is refused before anything is installed.
+        build::Variant::by_name(board, &bootloader)?;
         setup::prepare(&[Part::Firmware, Part::Emulator])?;
-        let standard = if virtual_can { "bootloader-virtual-can" } else { "bootloader" };
-        let bootloader = log.as_deref().unwrap_or(standard);
-        let dir = build::images(board, &[bootloader])?;
+        let dir = build::images(board, &[&bootloader])?;
         emulator.args([board.board, "--bootloader"]).arg(dir.join(format!("{bootloader}.elf")));
     }
-    if virtual_can && !options.iter().any(|word| word == "--serial" || word.starts_with("--serial=")) {
+    if virtual_can && !has_serial {
         emulator.args(["--serial", "pty"]);
     }
-    emulator.args(options.iter().filter(|word| *word != "--"));
-    process::run(&mut emulator)
-}
-
-/// The ways in which a bootloader can log its work.
-const LOGS: [&str; 3] = ["rtt", "defmt", "uart"];
-
-/// The name of the bootloader for the option `--log`.
-fn log(args: &mut Args) -> Outcome<Option<String>> {
-    let way = if args.flag("--log") { Some(LOGS[0].to_owned()) } else { args.value("--log")? };
-    match way {
-        Some(way) if !LOGS.contains(&&*way) => {
-            Err(format!("--log={way} is no way; there are {}.", LOGS.join(", ")))
-        }
-        way => Ok(way.map(|way| format!("bootloader-log-{way}"))),
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::build::VARIANTS;
-
-    #[test]
-    fn the_ways_of_the_log_have_a_bootloader() {
-        let asked = |words: &str| log(&mut Args::new(words.split_whitespace().map(str::to_owned)));
-        assert_eq!(asked(""), Ok(None));
-        assert_eq!(asked("--log --verbose"), Ok(Some("bootloader-log-rtt".into())));
-        for way in LOGS {
-            let name = asked(&format!("--log={way}")).unwrap().unwrap();
-            assert!(VARIANTS.iter().any(|variant| variant.name == name), "{name}");
-        }
-        assert!(asked("--log=smoke").unwrap_err().ends_with("rtt, defmt, uart."));
-    }
+    process::run(emulator.args(options.iter().filter(|word| *word != "--")))
 }

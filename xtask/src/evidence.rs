@@ -76,8 +76,8 @@ pub fn run(mut args: Args) -> Outcome {
     if !clean {
         println!("The sources have changed since commit {commit}; the page is about that commit.");
     }
-    for (part, known) in PARTS.iter().zip(&results) {
-        println!("  {:<9} {}", part.name, known.verdict);
+    for (part, (verdict, _)) in PARTS.iter().zip(&results) {
+        println!("  {:<9} {verdict}", part.name);
     }
     let page = page(&commit, &results);
     if is_release {
@@ -133,13 +133,8 @@ fn sources() -> (String, bool) {
     }
 }
 
-/// What is known of a part.
-struct Known<'a> {
-    /// The result in words; in bold if it is not good.
-    verdict: String,
-    /// The records of this commit.
-    records: Vec<&'a Value>,
-}
+/// The result of a part in words, in bold if it is not good; and its records of this commit.
+type Known<'a> = (String, Vec<&'a Value>);
 
 /// What the records say of a commit, for each of [`PARTS`].
 fn results<'a>(commit: &str, records: &'a [(String, Value)]) -> Vec<Known<'a>> {
@@ -150,7 +145,7 @@ fn results<'a>(commit: &str, records: &'a [(String, Value)]) -> Vec<Known<'a>> {
         let all: Vec<_> = records.iter().filter(|(name, _)| is_of_part(name)).collect();
         let is_ours = |record: &&Value| record["commit"] == *commit && record["clean"] == true;
         let ours: Vec<_> = all.iter().map(|(_, record)| record).filter(is_ours).collect();
-        Known { verdict: judge(part, &ours, all.len() > ours.len()), records: ours }
+        (judge(part, &ours, all.len() > ours.len()), ours)
     };
     PARTS.iter().map(known).collect()
 }
@@ -186,15 +181,15 @@ fn page(commit: &str, results: &[Known]) -> String {
     let mut page =
         format!("# Evidence\n\nCommit `{commit}`. Every number comes from a run of its sources.\n\n");
     page += "| what | result | date | command |\n|---|---|---|---|\n";
-    for (Part { name, job, .. }, Known { verdict, records }) in PARTS.iter().zip(results) {
+    for (Part { name, job, .. }, (verdict, records)) in PARTS.iter().zip(results) {
         let dates = records.iter().filter_map(|record| record["date"].as_str()?.get(..10));
         let date = dates.max().unwrap_or("–");
         let _ = writeln!(page, "| {name} | {verdict} | {date} | `cargo xtask {job}` |");
     }
     let _ = writeln!(page, "\n{NOT_VERIFIED}");
-    for (Part { name, about, .. }, known) in PARTS.iter().zip(results) {
+    for (Part { name, about, .. }, (_, records)) in PARTS.iter().zip(results) {
         let _ = writeln!(page, "\n## {name}\n\n{about}");
-        for record in &known.records {
+        for record in records {
             let _ = writeln!(page, "\n```json\n{record:#}\n```");
         }
     }
@@ -217,7 +212,7 @@ mod tests {
         let records: Vec<_> =
             records.iter().map(|(name, record)| ((*name).to_owned(), record.clone())).collect();
         let at = PARTS.iter().position(|other| other.name == part).unwrap();
-        results(COMMIT, &records).swap_remove(at).verdict
+        results(COMMIT, &records).swap_remove(at).0
     }
 
     #[test]

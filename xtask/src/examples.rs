@@ -24,21 +24,14 @@ minutes once.
 /// The board of all examples: their pages name it.
 const BOARD: &Layout = &stm32f407g_disc1::LAYOUT;
 
-/// The build tool of an example.
-enum Tools {
-    /// CMake with a toolchain file of `examples/c/cmake/`.
-    Cmake,
-    /// Cargo: the program of this name.
-    Cargo(&'static str),
-}
-
-/// The folders of `examples/`.
-const EXAMPLES: [(&str, Tools); 5] = [
-    ("c", Tools::Cmake),
-    ("cpp", Tools::Cmake),
-    ("no-stack", Tools::Cargo("no-stack")),
-    ("embassy", Tools::Cargo("embassy")),
-    ("rtic", Tools::Cargo("rtic-example")),
+/// The folders of `examples/`: built by cargo, with the name of the program; or by CMake, with a toolchain
+/// file of `examples/c/cmake/`.
+const EXAMPLES: [(&str, Option<&str>); 5] = [
+    ("c", None),
+    ("cpp", None),
+    ("no-stack", Some("no-stack")),
+    ("embassy", Some("embassy")),
+    ("rtic", Some("rtic-example")),
 ];
 /// The name for a new project of the template, which is in the folder no-stack.
 const TEMPLATE: &str = "template";
@@ -73,8 +66,8 @@ fn build(name: &str) -> Outcome {
     let folder = workspace::root().join("examples").join(name_of_folder);
     let work = workspace::target_dir().join("examples");
     let built = match EXAMPLES.iter().find(|(known, _)| *known == name_of_folder) {
-        Some((_, Tools::Cmake)) => by_cmake(&folder, &work.join(name), is_second)?,
-        Some((_, Tools::Cargo(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
+        Some((_, None)) => by_cmake(&folder, &work.join(name), is_second)?,
+        Some((_, Some(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
         None => template(&workspace::root().join("examples/no-stack"), &work)?,
     };
     let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", name));

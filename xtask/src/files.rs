@@ -3,8 +3,9 @@
 use std::fs::{self, File};
 use std::io::{Error, ErrorKind};
 use std::path::{Path, PathBuf};
+use std::process::Command;
 
-use crate::{outcome::Outcome, workspace};
+use crate::{outcome::Outcome, process, workspace};
 
 /// The bytes of a file.
 pub fn bytes(file: &Path) -> Outcome<Vec<u8>> {
@@ -79,6 +80,23 @@ pub fn below(folder: &Path, but: &[&str]) -> Outcome<Vec<PathBuf>> {
         }
     }
     Ok(files)
+}
+
+/// Packs a file or folder of `folder` into an archive. The same contents give the same bytes: all files have
+/// this time, in seconds since 1970.
+pub fn pack(folder: &Path, what: &str, time: &str, archive: &Path) -> Outcome {
+    make(archive.parent().unwrap_or(archive))?;
+    let mut tar = Command::new("tar");
+    tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner", "--mode=u+rw,go+r-w"]);
+    tar.arg(format!("--mtime=@{time}")).args(["--use-compress-program", "gzip -9n", "--create", "--file"]);
+    process::run(tar.arg(archive).arg("--directory").arg(folder).arg(what))
+}
+
+/// Unpacks an archive into a folder.
+pub fn unpack(archive: &Path, folder: &Path) -> Outcome {
+    process::run(
+        Command::new("tar").arg("--extract").arg("--file").arg(archive).arg("--directory").arg(folder),
+    )
 }
 
 /// Whether a path has this extension.

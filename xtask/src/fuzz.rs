@@ -1,11 +1,10 @@
 //! `cargo xtask fuzz`: runs all fuzz targets, as many at a time as there are cores.
 
-use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::{Mutex, PoisonError};
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
-use std::{env, fs, thread};
+use std::{fs, iter, thread};
 
 use serde_json::{json, Value};
 
@@ -23,7 +22,7 @@ target/evidence/fuzz.json.
   --inputs N      how many inputs each target tries, in place of a time
   --target NAMES  these alone, with commas between them
   --keep          afterwards, makes the smallest corpus that covers as much, and puts the shortest
-                  inputs of it into tests/fuzz/corpus, one file for each target
+                  inputs of it into tests/fuzz/corpus, one archive for each target
   --replay        runs no fuzzer: every input of tests/fuzz/corpus and target/fuzz/corpus once, with
                   the Rust that builds the rest; it needs no nightly toolchain
 
@@ -76,9 +75,9 @@ fn replay_all(targets: &[String]) -> Outcome {
     Ok(())
 }
 
-/// The file with the kept inputs of a target.
+/// The archive with the kept inputs of a target.
 fn kept_file(target: &str) -> PathBuf {
-    folder().join("corpus").join(target)
+    folder().join("corpus").join(format!("{target}.tar.gz"))
 }
 
 /// The folder of what the fuzzer has found in this clone, and of what it has begun with.
@@ -118,35 +117,34 @@ pub fn run(mut args: Args) -> Outcome {
     if replay {
         return replay_all(&targets);
     }
-    toolchain()?;
+    // If there is none, rustup says how to get it.
+    process::output(Command::new("rustup").args(["run", "nightly", "rustc", "--version"]))?;
+    setup::prepare(&[setup::Part::Cpp])?;
     let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
     println!("Building the fuzz targets ...");
     for target in &targets {
         process::run(&mut tools.command("build", target))?;
     }
-    let queue = Mutex::new(VecDeque::from(targets));
-    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
-    let all = || {
-        let mut ended = Vec::new();
-        while let Some(target) = next() {
-            let row = tools.fuzz(&target, &end)?;
-            if keep && !is_failed(&row) {
-                process::output(tools.command("cmin", &target).arg(found(&target)))?;
-                corpus::keep(&found(&target), &kept_file(&target))?;
-            }
-            ended.push(row);
+    let next = AtomicUsize::new(0);
+    let one = |target: &String| -> Outcome<Value> {
+        let row = tools.fuzz(target, &end)?;
+        if keep && !is_failed(&row) {
+            process::output(tools.command("cmin", target).arg(found(target)))?;
+            corpus::keep(&found(target), &kept_file(target))?;
         }
-        Outcome::Ok(ended)
+        Ok(row)
     };
+    let work = || iter::from_fn(|| targets.get(next.fetch_add(1, Ordering::Relaxed))).map(one).collect();
     if is_whole {
         evidence::begin("fuzz")?;
     }
     // A target has one thread.
     let cores = thread::available_parallelism().map_or(1, usize::from);
     let mut ended = thread::scope(|scope| {
-        let workers: Vec<_> = (0..cores).map(|_| scope.spawn(all)).collect();
-        let broken_off = |_| "a part of the fuzzing broke off.".to_owned();
-        workers.into_iter().map(|worker| worker.join().map_err(broken_off)?).collect::<Outcome<Vec<_>>>()
+        let workers: Vec<_> = (0..cores).map(|_| scope.spawn(work)).collect();
+        let broken_off = |_| Err("a part of the fuzzing broke off.".to_owned());
+        let ended = workers.into_iter().map(|worker| worker.join().unwrap_or_else(broken_off));
+        ended.collect::<Outcome<Vec<Vec<_>>>>()
     })?
     .concat();
     ended.sort_by_key(|row| row["target"].to_string());
@@ -226,10 +224,7 @@ impl Tools {
         if let Some(runs) = runs {
             let seconds = started.elapsed().as_secs();
             println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-            let files = files::within(&corpus)?.len();
-            return Ok(
-                json!({"target": target, "inputs": runs, "seconds": seconds, "edges": edges(&said), "corpus": files}),
-            );
+            return Ok(json!({"target": target, "inputs": runs, "seconds": seconds}));
         }
         let words = if status.success() { "ran no input" } else { "FAILED" };
         println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
@@ -248,31 +243,9 @@ fn target_dir() -> PathBuf {
     workspace::target_dir().join("fuzz")
 }
 
-/// Checks for the nightly compiler, which the sanitizer and the coverage counters need, and for a C++
-/// compiler, which the fuzzer's library needs.
-fn toolchain() -> Outcome {
-    if !process::succeeds("rustup", &["run", "nightly", "rustc", "--version"]) {
-        return Err("fuzzing needs a nightly toolchain. Run this line and try again:\n\n    \
-                    rustup toolchain install nightly"
-            .into());
-    }
-    let compiler = env::var_os("CXX").unwrap_or_else(|| "c++".into());
-    if !process::succeeds(compiler, &["--version"]) {
-        return Err("the fuzzer's library is C++, and there is no compiler for it. Run this line and try again:\n\n    \
-                    sudo apt-get install -y build-essential"
-            .into());
-    }
-    Ok(())
-}
-
 /// The number of inputs in the fuzzer's output.
 fn runs(said: &str) -> Option<u64> {
     said.lines().find_map(|line| line.strip_prefix("stat::number_of_executed_units:")?.trim().parse().ok())
-}
-
-/// The covered edges in the fuzzer's last line about them.
-fn edges(said: &str) -> Option<u64> {
-    said.lines().rev().find_map(|line| line.split_once("cov: ")?.1.split(' ').next()?.parse().ok())
 }
 
 /// The part of a failed run's output with the reason: the panic with its message, and the place of
@@ -309,7 +282,6 @@ mod tests {
     fn the_fuzzers_words_are_understood() {
         let said = "#918484\tDONE   cov: 741 ft: 3053\nstat::number_of_executed_units: 918484\nstat::average_exec_per_sec:     57405\n";
         assert_eq!((runs(said), excerpt(said)), (Some(918_484), String::new()));
-        assert_eq!((edges(said), edges("#2 INITED exec/s: 0")), (Some(741), None));
         let said = "INFO: seed\nthread '<unnamed>' panicked at src/x.rs:1:2:\nno room\n==1== ERROR: libFuzzer: deadly signal\n\
                     Test unit written to crash-1\n";
         assert_eq!(runs(said), None);

@@ -61,27 +61,20 @@ mod tests {
         }
     }
 
-    /// The map in the README is the one that `cargo xtask layout` prints.
+    /// The blocks on the pages are what the job prints; the README leaves out blanks at the end of a line.
     #[test]
-    fn the_readme_shows_the_map_as_it_is() {
-        let readme = files::ours("README.md").unwrap();
-        let (_, behind) =
-            readme.split_once("<!-- memory map: `cargo xtask layout` prints it -->\n\n```text\n").unwrap();
-        let (copy, _) = behind.split_once("```").unwrap();
-        let map = LAYOUT.to_string();
-        // The README leaves out blanks at the end of a line.
-        let lines = |text: &str| text.lines().map(|line| line.trim_end().to_owned()).collect::<Vec<_>>();
-        assert_eq!(lines(copy), lines(&map), "copy the output of `cargo xtask layout` into README.md");
-    }
-
-    /// The block in the guide for applications can be linked unchanged: it is the printed one.
-    #[test]
-    fn the_guide_shows_the_linker_block_as_it_is() {
-        let guide = files::ours("docs/application.md").unwrap();
+    fn the_pages_show_what_the_job_prints() {
+        let block = LAYOUT.linker_script(image_by_name(&LAYOUT, "program-1").unwrap()).to_string();
         let command = "cargo xtask layout --ld program-1 --board stm32f407g-disc1";
-        let (_, behind) = guide.split_once(&format!("<!-- printed by: {command} -->\n```text\n")).unwrap();
-        let (copy, _) = behind.split_once("```").unwrap();
-        let printed = LAYOUT.linker_script(image_by_name(&LAYOUT, "program-1").unwrap()).to_string();
-        assert_eq!(copy, printed, "copy the output of `{command}` into docs/application.md");
+        for (page, marker, printed) in [
+            ("README.md", "memory map: `cargo xtask layout` prints it -->\n", LAYOUT.to_string()),
+            ("docs/application.md", &format!("printed by: {command} -->"), block),
+        ] {
+            let text = files::ours(page).unwrap();
+            let (_, behind) = text.split_once(&format!("<!-- {marker}\n```text\n")).expect(page);
+            let (copy, _) = behind.split_once("```").unwrap();
+            let printed: String = printed.lines().map(|line| format!("{}\n", line.trim_end())).collect();
+            assert_eq!(copy, printed, "copy what `cargo xtask layout` prints into {page}");
+        }
     }
 }

@@ -20,7 +20,7 @@ pub const HOST_CRATES: &[&str] = &["--all-targets", "--keep-going"];
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     args.none_left()?;
-    setup::prepare(&[Part::Lint, Part::Firmware, Part::Emulator])?;
+    setup::prepare(&[Part::Firmware, Part::Emulator])?;
 
     // All checks run, so that one run shows all problems.
     let mut problems = formatting()?;

@@ -30,7 +30,6 @@ mod examples;
 mod files;
 #[cfg(test)]
 mod fleet;
-mod footprint;
 mod foreign;
 mod fuzz;
 mod hil;
@@ -45,7 +44,6 @@ mod ordered;
 mod outcome;
 mod package;
 mod pairs;
-mod parts;
 #[cfg(test)]
 mod paths;
 mod portable;

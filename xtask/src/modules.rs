@@ -104,37 +104,26 @@ pub fn paths(code: &str) -> Vec<Vec<String>> {
     found
 }
 
-/// Reads one path from a token on; returns its end.
+/// Reads one path from a name on; returns its end.
 fn tree(tokens: &[String], from: usize, before: &mut Vec<String>, found: &mut Vec<Vec<String>>) -> usize {
-    let mut at = from;
-    let depth = before.len();
-    loop {
-        match tokens.get(at).map(String::as_str) {
-            Some("{") => {
-                at += 1;
-                while tokens.get(at).is_some_and(|token| token != "}") {
-                    // A comma, the star of a glob, or `as` with its name.
-                    let other = !tokens.get(at).is_some_and(|token| is_name(token) && token != "as");
-                    at = if other { at + 1 } else { tree(tokens, at, before, found) };
-                }
-                at += 1;
-                break;
-            }
-            Some(name) if is_name(name) => {
-                before.push(name.to_owned());
-                at += 1;
-                if tokens.get(at).is_some_and(|token| token == "::") {
-                    at += 1;
-                    continue;
-                }
-                found.push(before.clone());
-                break;
-            }
-            _ => {
-                found.push(before.clone());
-                break;
-            }
+    let is = |at: usize, word: &str| tokens.get(at).is_some_and(|token| token == word);
+    let (mut at, depth) = (from, before.len());
+    let mut goes_on = true;
+    while goes_on && tokens.get(at).is_some_and(|token| is_name(token)) {
+        before.push(tokens[at].clone());
+        goes_on = is(at + 1, "::");
+        at += if goes_on { 2 } else { 1 };
+    }
+    if goes_on && is(at, "{") {
+        at += 1;
+        while at < tokens.len() && !is(at, "}") {
+            // A comma, the star of a glob, or `as` with its name.
+            let is_other = !is_name(&tokens[at]) || is(at, "as");
+            at = if is_other { at + 1 } else { tree(tokens, at, before, found) };
         }
+        at += 1;
+    } else {
+        found.push(before.clone());
     }
     before.truncate(depth);
     at
@@ -172,36 +161,24 @@ fn resolve(
     krate: &str,
     known: &BTreeSet<Module>,
 ) -> Option<Module> {
-    let mut at = own.to_vec();
-    let mut rest = path;
-    match rest.first().map(String::as_str)? {
-        "self" => rest = &rest[1..],
+    let (mut at, rest) = match path.first().map(String::as_str)? {
+        "self" => (own.to_vec(), &path[1..]),
         "super" => {
-            while rest.first().is_some_and(|name| name == "super") {
-                at.pop();
-                rest = &rest[1..];
-            }
+            let up = path.iter().take_while(|name| *name == "super").count();
+            (own[..own.len().saturating_sub(up)].to_vec(), &path[up..])
         }
         "crate" => {
-            rest = &rest[1..];
+            let rest = &path[1..];
             let first = &rest[..rest.len().min(1)];
             // A program takes files of the folder above it by `#[path]`.
             let is_above = known.contains(first) && !known.contains(&[root, first].concat());
-            at = if is_above { Module::new() } else { root.to_vec() };
+            (if is_above { Module::new() } else { root.to_vec() }, rest)
         }
-        name if name == krate => {
-            at.clear();
-            rest = &rest[1..];
-        }
+        name if name == krate => (Module::new(), &path[1..]),
         // The name of a child; any other name is of another crate, or was imported by a `use`.
-        name => {
-            at.push(name.to_owned());
-            if !known.contains(&at) {
-                return None;
-            }
-            rest = &rest[1..];
-        }
-    }
+        _ if known.contains(&[own, &path[..1]].concat()) => (own.to_vec(), path),
+        _ => return None,
+    };
     for name in rest {
         at.push(name.clone());
         if !known.contains(&at) {

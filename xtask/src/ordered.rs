@@ -2,7 +2,7 @@
 //! crates and functions that must not be lost when the rest is moved.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
@@ -20,15 +20,17 @@ const RX_INTERRUPTS: [&str; 4] = ["CAN1_RX0", "CAN1_RX1", "CAN2_RX0", "CAN2_RX1"
 /// The crates of others that the image of the bootloader contains.
 const IN_THE_IMAGE: [&str; 7] =
     ["rtic", "stm32f4xx-hal", "bxcan", "cortex-m", "heapless", "crc", "panic-probe"];
-/// What `shared-abi` has: the words for it, a file, and a piece of code in that file.
-const SHARED: [(&str, &str, &str); 3] = [
-    ("warm-start cell", "shared-abi/src/warm_start.rs", "pub struct Cell"),
-    ("vector relocation", "shared-abi/src/vectors.rs", "0xE000_ED08"),
-    ("callgate", "shared-abi/src/callgate.rs", "pub struct Table"),
+/// Code that is there: the words for it, a file, and pieces of that file.
+const CODE: [(&str, &str, &[&str]); 4] = [
+    ("warm-start cell", "shared-abi/src/warm_start.rs", &["pub struct Cell"]),
+    ("vector relocation", "shared-abi/src/vectors.rs", &["0xE000_ED08"]),
+    ("callgate", "shared-abi/src/callgate.rs", &["pub struct Table"]),
+    (
+        "callback of 1F51h = 80h that is called",
+        "app-template/src/objects.rs",
+        &["fn start_bootloader(", "self.start_bootloader("],
+    ),
 ];
-/// The file of the callback of 1F51h = 80h, and what it has.
-const CALLBACK: (&str, [&str; 2]) =
-    ("app-template/src/objects.rs", ["fn start_bootloader(", "self.start_bootloader("]);
 /// The test program of the ABI.
 const ABI_TESTS: &str = "abi";
 
@@ -37,95 +39,69 @@ const ABI_TESTS: &str = "abi";
 struct House {
     /// The files at and below the top-level paths, by their paths: the text of Rust sources, without
     /// comments, and nothing of the others.
-    files: BTreeMap<String, String>,
+    files: BTreeMap<PathBuf, String>,
     /// The crates that the image of the bootloader contains.
     image: BTreeSet<String>,
     /// The names of the test programs, with their sources.
-    tests: Vec<(String, String)>,
+    tests: Vec<(String, PathBuf)>,
 }
 
 /// The orders that are not kept, as messages.
 pub fn broken(metadata: &Value) -> Outcome<Vec<String>> {
     let root = workspace::root();
+    let from_the_root = |file: &Path| file.strip_prefix(root).unwrap_or(file).to_owned();
     let mut house = House::default();
     for path in TOP_LEVEL.map(|path| root.join(path)) {
         let files = if path.is_dir() { files::below(&path, &[])? } else { vec![path] };
         for file in files.iter().filter(|file| file.exists()) {
             let is_source = files::is(file, "rs");
             let text = if is_source { without_comments(&files::text(file)?) } else { String::new() };
-            let file = file.strip_prefix(root).unwrap_or(file);
-            house.files.insert(file.to_string_lossy().replace('\\', "/"), text);
+            house.files.insert(from_the_root(file), text);
         }
     }
     let tree = process::tree(&["--package", "bootloader", "--target", TARGET, "--edges", "normal"])?;
     house.image = tree.iter().filter_map(|krate| Some(krate.split(' ').next()?.to_owned())).collect();
-    house.tests = test_programs(metadata, root);
-    Ok(house.broken())
-}
-
-/// The test programs in the output of `cargo metadata`.
-fn test_programs(metadata: &Value, root: &Path) -> Vec<(String, String)> {
     let targets = list(metadata, "packages").flat_map(|package| list(package, "targets"));
-    let tests = targets.filter(|target| list(target, "kind").any(|kind| kind == "test"));
-    tests
-        .filter_map(|target| {
-            let source = Path::new(target["src_path"].as_str()?);
-            let source = source.strip_prefix(root).unwrap_or(source);
-            Some((target["name"].as_str()?.to_owned(), source.to_string_lossy().replace('\\', "/")))
-        })
-        .collect()
+    for target in targets.filter(|target| list(target, "kind").any(|kind| kind == "test")) {
+        if let (Some(name), Some(source)) = (target["name"].as_str(), target["src_path"].as_str()) {
+            house.tests.push((name.to_owned(), from_the_root(Path::new(source))));
+        }
+    }
+    Ok(house.broken())
 }
 
 impl House {
     fn broken(&self) -> Vec<String> {
         let mut broken = Vec::new();
+        let mut order = |is_kept: bool, message: String| broken.extend((!is_kept).then_some(message));
         for path in TOP_LEVEL {
-            let below = format!("{path}/");
-            if !self.files.keys().any(|file| file == path || file.starts_with(&below)) {
-                broken.push(format!("the top level has no {path}"));
-            }
+            order(self.has(path, |_| true), format!("the top level has no {path}"));
         }
         for program in PROGRAMS {
-            let below = format!("{program}/src/");
-            let sources: Vec<&str> = self
-                .files
-                .iter()
-                .filter(|(path, _)| path.starts_with(&below))
-                .map(|(_, text)| &**text)
-                .collect();
-            if !sources.iter().any(|source| has_receiving_task(source)) {
-                broken.push(format!(
-                    "{program}: no RTIC task is bound to the interrupt of received CAN frames"
-                ));
-            }
-            if !sources.iter().any(|source| source.contains("_monotonic!(")) {
-                broken.push(format!("{program}: there is no timer monotonic"));
-            }
+            let sources = format!("{program}/src");
+            let receives = self.has(&sources, has_receiving_task);
+            order(
+                receives,
+                format!("{program}: no RTIC task is bound to the interrupt of received CAN frames"),
+            );
+            let has_timer = self.has(&sources, |text| text.contains("_monotonic!("));
+            order(has_timer, format!("{program}: there is no timer monotonic"));
         }
         for krate in IN_THE_IMAGE {
-            if !self.image.contains(krate) {
-                broken.push(format!("bootloader: its image does not contain {krate}"));
-            }
+            order(self.image.contains(krate), format!("bootloader: its image does not contain {krate}"));
         }
-        for (what, file, piece) in SHARED {
-            if !self.has(file, piece) {
-                broken.push(format!("{file}: shared-abi has no {what} (`{piece}`)"));
-            }
+        for (what, file, pieces) in CODE {
+            let is_there = self.has(file, |text| pieces.iter().all(|piece| text.contains(piece)));
+            order(is_there, format!("{file}: there is no {what} (`{}`)", pieces.join("`, `")));
         }
-        let (file, pieces) = CALLBACK;
-        if !pieces.iter().all(|piece| self.has(file, piece)) {
-            broken.push(format!(
-                "{file}: there is no callback of 1F51h = 80h, `start_bootloader`, that is called"
-            ));
-        }
-        if !self.tests.iter().any(|(name, source)| name == ABI_TESTS && source.starts_with("tests/")) {
-            broken.push(format!("tests: there is no test program `{ABI_TESTS}`"));
-        }
+        let is_abi = |(name, source): &(String, PathBuf)| name == ABI_TESTS && source.starts_with("tests");
+        order(self.tests.iter().any(is_abi), format!("tests: there is no test program `{ABI_TESTS}`"));
         broken
     }
 
-    fn has(&self, file: &str, piece: &str) -> bool {
-        self.files.get(file).is_some_and(|text| text.contains(piece))
+    /// Whether a file at this path or below it has something.
+    fn has(&self, path: &str, something: impl Fn(&str) -> bool) -> bool {
+        self.files.iter().any(|(file, text)| file.starts_with(path) && something(text))
     }
 }
 
@@ -149,23 +125,18 @@ mod tests {
 
     fn house() -> House {
         let mut house = House::default();
-        let mut put = |path: &str, text: &str| {
-            house.files.entry(path.to_owned()).or_default().push_str(&format!("{text}\n"));
-        };
-        put("Cargo.toml", "");
-        put("linker/application.x", "");
-        put("tests/Cargo.toml", "");
+        let mut put = |path: &str, text: String| house.files.insert(path.into(), text);
+        for file in ["Cargo.toml", "linker/application.x", "tests/Cargo.toml"] {
+            put(file, String::new());
+        }
         for program in PROGRAMS {
-            put(&format!("{program}/src/main.rs"), APP);
+            put(&format!("{program}/src/main.rs"), APP.to_owned());
         }
-        for (_, file, piece) in SHARED {
-            put(file, piece);
-        }
-        for piece in CALLBACK.1 {
-            put(CALLBACK.0, piece);
+        for (_, file, pieces) in CODE {
+            put(file, pieces.join("\n"));
         }
         house.image = IN_THE_IMAGE.map(str::to_owned).into();
-        house.tests = vec![("abi".to_owned(), "tests/abi/main.rs".to_owned())];
+        house.tests = vec![("abi".to_owned(), "tests/abi/main.rs".into())];
         house
     }
 
@@ -176,11 +147,6 @@ mod tests {
 
     #[test]
     fn each_thing_that_is_missing_is_named() {
-        let without_file = |file: &str| {
-            let mut house = house();
-            house.files.remove(file);
-            house
-        };
         for (file, says) in [
             ("Cargo.toml", "no Cargo.toml"),
             ("linker/application.x", "no linker"),
@@ -190,7 +156,9 @@ mod tests {
             ("shared-abi/src/callgate.rs", "no callgate"),
             ("app-template/src/objects.rs", "no callback of 1F51h"),
         ] {
-            let broken = without_file(file).broken();
+            let mut house = house();
+            house.files.remove(Path::new(file));
+            let broken = house.broken();
             assert!(broken.len() == 1 && broken[0].contains(says), "{file}: {broken:?}");
         }
         for krate in IN_THE_IMAGE {
@@ -198,7 +166,7 @@ mod tests {
             house.image.remove(krate);
             assert_eq!(house.broken(), [format!("bootloader: its image does not contain {krate}")]);
         }
-        for tests in [vec![], vec![("abi".to_owned(), "shared-abi/tests/abi.rs".to_owned())]] {
+        for tests in [vec![], vec![("abi".to_owned(), "shared-abi/tests/abi.rs".into())]] {
             let broken = House { tests, ..house() }.broken();
             assert!(broken.len() == 1 && broken[0].contains("test program `abi`"), "{broken:?}");
         }
@@ -208,7 +176,7 @@ mod tests {
     fn a_program_without_its_task_or_its_timer_is_named() {
         let with = |program: &str, from: &str, to: &str| {
             let mut house = house();
-            let file = house.files.get_mut(&format!("{program}/src/main.rs")).unwrap();
+            let file = house.files.get_mut(&Path::new(program).join("src/main.rs")).unwrap();
             assert!(file.contains(from), "{from}");
             *file = without_comments(&file.replace(from, to));
             house.broken()
@@ -229,7 +197,8 @@ mod tests {
         }
         // A callback that nobody calls is none.
         let mut house = house();
-        house.files.insert(CALLBACK.0.to_owned(), CALLBACK.1[0].to_owned());
+        let (_, file, pieces) = CODE[3];
+        house.files.insert(file.into(), pieces[0].to_owned());
         assert!(house.broken()[0].contains("that is called"));
     }
 }

@@ -4,8 +4,6 @@
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
-use crate::elf::Elf;
-use crate::footprint::Flash;
 use crate::product::Product;
 use crate::setup::{self, Part};
 use crate::size::{budgets, within};
@@ -140,12 +138,11 @@ fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let told = |problem: String| format!("{}, {}: {problem}", board.board, words(row));
     let is_sealed = FIELDS.iter().zip(row).any(|((name, _), value)| *name == SEALED && *value > 0);
     let features = if is_sealed && board.home.is_some() { SEALED } else { "" };
-    let elf = build::to_look_at(board, features, product).map_err(told)?;
-    let flash = Flash::of(&Elf::parse(&elf)?, &build::bootloader_flash(board)).map_err(told)?;
-    for ((_, bytes), budget) in flash.used.iter().zip(budgets(board)) {
+    let used = build::bootloader_size(board, features, product).map_err(told)?;
+    for (bytes, budget) in used.iter().zip(budgets(board)) {
         within(*bytes, budget).map_err(told)?;
     }
-    Ok(flash.used.iter().map(|(_, bytes)| bytes).sum())
+    Ok(used.iter().sum())
 }
 
 /// The fields that differ from their default.

@@ -35,9 +35,7 @@ pub fn run(mut args: Args) -> Outcome {
         check.args(["--target", target, "--no-default-features", "--features", FEATURES]);
         // A folder of its own: nobody who builds for this machine has to wait.
         check.arg("--target-dir").arg(workspace::target_dir().join("portable"));
-        for package in PACKAGES {
-            check.args(["--package", package]);
-        }
+        check.args(PACKAGES.iter().flat_map(|package| ["--package", package]));
         match process::run(&mut check) {
             Ok(()) => println!("{target}: {} compile.", PACKAGES.join(" and ")),
             Err(problem) => {

@@ -5,6 +5,7 @@ use std::env;
 use std::ffi::OsStr;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
+use std::time::Duration;
 
 use serde_json::Value;
 
@@ -57,6 +58,17 @@ pub fn git(words: &[&str]) -> Outcome<String> {
 /// The C compiler for the chip: clang, or the program in the variable `CLANG`.
 pub fn clang() -> Command {
     Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()))
+}
+
+/// The exit code of a program that [`within`] has ended.
+pub const TOO_LATE: i32 = 124;
+
+/// A program that is ended after this time, with the exit code [`TOO_LATE`].
+pub fn within(limit: Duration, program: impl AsRef<OsStr>) -> Command {
+    let mut command = Command::new("timeout");
+    // In the foreground it passes signals on to the program alone.
+    command.arg("--foreground").arg(limit.as_secs_f64().to_string()).arg(program);
+    command
 }
 
 /// Runs a program to its end; its output is shown.

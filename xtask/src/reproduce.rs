@@ -6,9 +6,8 @@ use std::process::Command;
 use serde_json::json;
 
 use crate::args::Args;
-use crate::elf::{Elf, Segment};
 use crate::setup::{self, Part};
-use crate::{evidence, files, outcome::Outcome, process, toolchain, workspace};
+use crate::{elf, evidence, files, outcome::Outcome, process, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask reproduce [--board BOARD]
@@ -69,10 +68,7 @@ pub fn run(mut args: Args) -> Outcome {
 /// The pieces of an image that go into the flash, by address.
 fn loaded(path: &Path) -> Outcome<Vec<(u32, Vec<u8>)>> {
     let file = files::bytes(path)?;
-    let elf = Elf::parse(&file).map_err(|problem| format!("{}: {problem}", workspace::shown(path)))?;
-    let piece = |segment: &Segment| {
-        let bytes = &file[segment.offset as usize..][..segment.file_size as usize];
-        (segment.load_address, bytes.to_vec())
-    };
-    Ok(elf.segments.iter().filter(|segment| segment.file_size > 0).map(piece).collect())
+    let segments =
+        elf::segments(&file).map_err(|problem| format!("{}: {problem}", workspace::shown(path)))?;
+    Ok(segments.iter().map(|segment| (segment.address, segment.bytes.to_vec())).collect())
 }

@@ -32,6 +32,8 @@ pub enum Part {
     Firmware,
     /// The application in C: a compiler for the chip.
     C,
+    /// The fuzzer: a compiler for C++.
+    Cpp,
     /// The examples in C and C++: two compilers for the chip, and CMake.
     Examples,
     /// The emulator: cmake builds Unicorn from C, libclang makes its bindings, and clang assembles the
@@ -45,10 +47,6 @@ pub enum Part {
     Browser,
     /// Another emulated CPU to compare ours with.
     Qemu,
-    /// Formatter and linter.
-    Lint,
-    /// What counts the lines that tests reach.
-    Coverage,
     /// The package for Debian.
     Deb,
     /// The program for Windows: a linker for it.
@@ -73,7 +71,6 @@ pub fn run(args: Args) -> Outcome {
         Part::Python,
         Part::Gdb,
         Part::Browser,
-        Part::Lint,
     ])?;
     println!("Everything is there.");
     Ok(())
@@ -88,14 +85,6 @@ pub fn prepare(parts: &[Part]) -> Outcome {
     }
     if parts.contains(&Part::Firmware) {
         rust_target(TARGET)?;
-    }
-    if parts.contains(&Part::Lint) {
-        component("rustfmt", process::succeeds("rustfmt", &["--version"]))?;
-        component("clippy", process::succeeds("clippy-driver", &["--version"]))?;
-    }
-    if parts.contains(&Part::Coverage) {
-        let installed = process::output(Command::new("rustup").args(["component", "list", "--installed"]));
-        component("llvm-tools", installed.is_ok_and(|list| list.contains("llvm-tools")))?;
     }
     if parts.contains(&Part::Python) {
         python_environment()?;
@@ -189,6 +178,7 @@ impl Part {
             // header.
             Self::Emulator => &["build-essential", "make", "cmake", "pkg-config", "libclang-dev", "clang"],
             Self::C => &["clang"],
+            Self::Cpp => &["g++"],
             Self::Examples => &["gcc-arm-none-eabi", "clang", "make", "cmake"],
             Self::Gdb => &["gdb-multiarch"],
             Self::Browser => &["chromium"],
@@ -196,7 +186,7 @@ impl Part {
             Self::Windows => &["gcc-mingw-w64-x86-64"],
             Self::Qemu => &["qemu-system-arm"],
             Self::Python if !python_environment_is_there() => &["python3", "python3-venv"],
-            Self::Python | Self::Firmware | Self::Lint | Self::Coverage => &[],
+            Self::Python | Self::Firmware => &[],
         }
     }
 }
@@ -289,20 +279,6 @@ pub fn tool(name: &str, version: &str, options: &[&str]) -> Outcome<PathBuf> {
     Ok(program)
 }
 
-/// Installs a component of the Rust toolchain if it is missing.
-fn component(name: &str, is_there: bool) -> Outcome {
-    if is_there {
-        return Ok(());
-    }
-    println!("Adding {name} to the Rust toolchain ...");
-    process::run(Command::new("rustup").args(["component", "add", name])).map_err(|_| {
-        format!(
-            "{name} could not be added. With rustup and a connection, this line does it:\n\n    \
-             rustup component add {name}"
-        )
-    })
-}
-
 /// The interpreter of the Python environment.
 pub fn python() -> PathBuf {
     workspace::target_dir().join("python/bin/python")
@@ -356,7 +332,7 @@ mod tests {
     #[test]
     fn only_what_a_part_needs_and_is_missing_is_installed_and_once() {
         let nothing = |_: &str| false;
-        assert_eq!(missing_packages(&[Part::Firmware, Part::Lint], nothing), Vec::<&str>::new());
+        assert_eq!(missing_packages(&[Part::Firmware], nothing), Vec::<&str>::new());
         assert_eq!(
             missing_packages(&[Part::Emulator, Part::Emulator], nothing),
             ["build-essential", "clang", "cmake", "libclang-dev", "make", "pkg-config"]
@@ -378,7 +354,7 @@ mod tests {
     /// The line is CMake's.
     #[test]
     fn what_cmake_noted_in_another_folder_is_removed_and_nothing_else() {
-        let target = workspace::target_dir().join(format!("tmp/cmake-{}", std::process::id()));
+        let target = kit::folder::Folder::below(std::env::temp_dir(), "coboot-cmake");
         let notes = |package: &str| target.join("debug/build").join(package).join("out/build");
         for (package, of) in [("here", notes("here")), ("moved", "/another/clone/out/build".into())] {
             fs::create_dir_all(notes(package)).unwrap();
@@ -389,17 +365,6 @@ mod tests {
         renew_cmake(&target);
         assert!(notes("here").exists() && !notes("moved").exists());
         assert!(notes("moved").with_file_name("library").exists());
-        fs::remove_dir_all(&target).unwrap();
-    }
-
-    #[test]
-    fn a_pattern_finds_what_is_there() {
-        let root = env!("CARGO_MANIFEST_DIR");
-        for (pattern, there) in
-            [("src/setup.rs", true), ("{x,*}/set*.rs", true), ("{src,*}/setup.{py,c*}", false)]
-        {
-            assert_eq!(exists(&format!("{root}/{pattern}*")), there, "{pattern}");
-        }
     }
 
     /// Only exact versions, so that every machine runs the same client.

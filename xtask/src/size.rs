@@ -1,26 +1,20 @@
 //! `cargo xtask size`: compares the bootloader's flash with its budget.
 
-use std::collections::BTreeMap;
-use std::fmt::Write as _;
-use std::{cmp, fs};
-
-use serde_json::{json, Value};
+use serde_json::json;
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
-use crate::elf::Elf;
-use crate::footprint::{kib, read, Flash};
 use crate::setup::{self, Part};
-use crate::{build, evidence, outcome::Outcome, parts, ram_image, toolchain, workspace};
+use crate::{build, elf, evidence, outcome::Outcome, toolchain, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask size [--board BOARD] [--image IMAGE]
+usage: cargo xtask size [--board BOARD]
 
-Builds the bootloader, prints its flash by section, by part, by variant and by board, and fails when
-it is over the budget on any board.
+Builds the bootloaders of a board and prints the flash of each, and that of the plain and of the sealed
+one on every board. Fails when one of these is over the budget. What is in it by function:
+arm-none-eabi-nm --demangle --size-sort target/firmware/BOARD/bootloader.elf
 
-  --board BOARD   the board of the tables (default: stm32f407g-disc1)
-  --image IMAGE   this bootloader alone, bootloader-sealed for one, by section and by part
+  --board BOARD   the board of all bootloaders (default: stm32f407g-disc1)
 ";
 
 /// The largest permitted sizes in bytes: of resident part, header and RAM image together in the
@@ -31,14 +25,14 @@ const RAM_IMAGE: u32 = 56 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
-    let one = args.value("--image")?;
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
-    let parts = tables(board, one.as_deref().unwrap_or("bootloader"))?;
-    if one.is_some() {
-        return Ok(());
+    println!("bootloader                      bytes");
+    for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
+        let used = build::bootloader_size(board, variant.features, &variant.product()?)?;
+        let used: Vec<String> = used.iter().map(u32::to_string).collect();
+        println!("{:<31} {}", variant.name, used.join(" + "));
     }
-    print!("\n{}", by_variant(board)?);
 
     println!("\nboard                    image                      at         bytes     of");
     let mut problems = Vec::new();
@@ -49,9 +43,11 @@ pub fn run(mut args: Args) -> Outcome {
                 continue;
             }
             count += 1;
-            let path = build::images(board, &[name])?.join(name).with_extension("elf");
-            let flash = Flash::of(&read(&path)?, &build::bootloader_flash(board))?;
-            for ((region, bytes), budget) in flash.used.iter().zip(budgets(board)) {
+            let variant = build::Variant::by_name(board, name)?;
+            let used = build::bootloader_size(board, variant.features, &variant.product()?)
+                .map_err(|problem| format!("{}, {name}: {problem}", board.board))?;
+            let regions = build::bootloader_flash(board);
+            for ((bytes, region), budget) in used.iter().zip(regions).zip(budgets(board)) {
                 println!("{:<23}  {name:<25}  {:#010x}  {bytes:>5}  {budget:>5}", board.board, region.base);
                 images.push(json!({"image": name, "board": board.board, "bytes": bytes, "budget": budget}));
                 problems.extend(
@@ -60,14 +56,7 @@ pub fn run(mut args: Args) -> Outcome {
             }
         }
     }
-    let parts: Vec<Value> = parts.iter().map(Share::json).collect();
-    let facts = json!({
-        "bootloaders": count,
-        "failed": problems.len(),
-        "images": images,
-        "parts_of": board.board,
-        "parts": parts,
-    });
+    let facts = json!({"bootloaders": count, "failed": problems.len(), "images": images});
     evidence::record("size", facts)?;
     toolchain::notice();
     problems.into_iter().next().map_or(Ok(()), Err)
@@ -89,88 +78,19 @@ pub fn within(used: u32, budget: &u32) -> Outcome {
     match used.checked_sub(*budget) {
         None | Some(0) => Ok(()),
         Some(over) => Err(format!(
-            "the bootloader is {over} bytes over its budget of {}; `cargo xtask size` shows where they are.",
-            kib(*budget)
+            "the bootloader is {over} bytes over its budget of {}; docs/porting.md has what to leave out.",
+            elf::kib(*budget)
         )),
     }
-}
-
-/// Builds an image and prints its flash by section and by part.
-fn tables(board: &Layout, name: &str) -> Outcome<Vec<Share>> {
-    let path = build::images(board, &[name])?.join(name).with_extension("elf");
-    let elf = read(&path)?;
-    print!("\n{}", Flash::of(&elf, &build::bootloader_flash(board))?.table());
-    let image = elf.sections.iter().find(|section| section.name == ram_image::IMAGE);
-    let image = image.ok_or_else(|| format!("{name} is no bootloader: it has no RAM image."))?;
-    let file = fs::read(&path).map_err(|error| format!("{}: {error}.", workspace::shown(&path)))?;
-    let contents = &file[image.offset as usize..][..image.size as usize];
-    let parts = by_part(&elf, parts::of(&path, &file, image.address, contents)?);
-    println!("\npart                             bytes");
-    for Share { part, bytes } in &parts {
-        println!("{part:<31} {bytes:>6}");
-    }
-    Ok(parts)
-}
-
-/// The sizes of the bootloaders of other products, and of those with features that no product has.
-fn by_variant(board: &Layout) -> Outcome<String> {
-    let mut text = String::from("bootloader                      bytes\n");
-    for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
-        let elf = build::to_look_at(board, variant.features, &variant.product()?)?;
-        let flash = Flash::of(&Elf::parse(&elf)?, &build::bootloader_flash(board))?;
-        let used: Vec<String> = flash.used.iter().map(|(_, bytes)| bytes.to_string()).collect();
-        let _ = writeln!(text, "{:<31} {}", variant.name, used.join(" + "));
-    }
-    Ok(text)
-}
-
-/// What a part of the bootloader takes, in bytes.
-struct Share {
-    part: String,
-    bytes: u32,
-}
-
-impl Share {
-    fn json(&self) -> Value {
-        json!({"part": self.part, "bytes": self.bytes})
-    }
-}
-
-/// Flash by part, the largest first. `image` has the parts of the RAM image; what else is in flash is
-/// listed by its section.
-fn by_part(elf: &Elf, image: BTreeMap<String, u32>) -> Vec<Share> {
-    let others = elf.sections.iter().filter(|section| section.loaded && section.name != ram_image::IMAGE);
-    let others =
-        others.map(|section| Share { part: format!("{} (in flash)", section.name), bytes: section.size });
-    let mut rows: Vec<_> =
-        image.into_iter().map(|(part, bytes)| Share { part, bytes }).chain(others).collect();
-    let bytes = rows.iter().map(|row| row.bytes).sum();
-    rows.push(Share { part: "(all)".to_owned(), bytes });
-    rows.sort_by_key(|row| cmp::Reverse(row.bytes));
-    rows
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::elf::tests::by_hand;
 
     #[test]
     fn the_budget_itself_is_allowed_and_one_more_is_not() {
         assert_eq!(within(RESIDENT, &RESIDENT), Ok(()));
         assert!(within(RESIDENT + 1, &RESIDENT).unwrap_err().contains("1 bytes over its budget of 12 KiB"));
-    }
-
-    #[test]
-    fn the_parts_add_up() {
-        let image = [("a/b".to_owned(), 6), ("core".to_owned(), 2)].into();
-        let rows: Vec<_> = by_part(&Elf::parse(&by_hand()).unwrap(), image).iter().map(Share::json).collect();
-        let expected = [
-            json!({"part": "(all)", "bytes": 40}),
-            json!({"part": ".vectors (in flash)", "bytes": 32}),
-            json!({"part": "a/b", "bytes": 6}),
-            json!({"part": "core", "bytes": 2}),
-        ];
-        assert_eq!(rows, expected);
     }
 }

@@ -82,21 +82,19 @@ pub fn on_host() -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use kit::folder::Folder;
     use shared_abi::layout::nucleo_f446re::LAYOUT;
 
     use super::*;
 
     #[test]
     fn a_board_is_a_name_or_the_file_of_its_map() {
-        let file = target_dir().join(format!("tmp/board-{}.toml", std::process::id()));
-        let word = file.to_str().unwrap();
-        std::fs::create_dir_all(file.parent().unwrap()).unwrap();
-        std::fs::write(&file, Toml(&LAYOUT).to_string()).unwrap();
-        assert_eq!(board_named(word).unwrap().board, "nucleo-f446re");
-        std::fs::write(&file, Toml(&LAYOUT).to_string().replace("nucleo", "own")).unwrap();
-        assert!(board_named(word).unwrap_err().contains("--bootloader FILE"));
-        std::fs::remove_file(&file).unwrap();
-        assert!(board_named(word).unwrap_err().contains("cannot be read"));
+        let folder = Folder::below(std::env::temp_dir(), "coboot-board");
+        let map = Toml(&LAYOUT).to_string();
+        assert_eq!(board_named(&folder.file("map.toml", map.as_bytes())).unwrap().board, "nucleo-f446re");
+        let own = folder.file("own.toml", map.replace("nucleo", "own").as_bytes());
+        assert!(board_named(&own).unwrap_err().contains("--bootloader FILE"));
+        assert!(board_named(&folder.path("none.toml")).unwrap_err().contains("cannot be read"));
         assert!(board_named("arduino").unwrap_err().contains("there is: nucleo-f446re"));
     }
 }

@@ -6,7 +6,6 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::command::within;
 use crate::{files, outcome::Outcome, process};
 
 /// The time for any call. The longest one is a download in segments at 10 kbit/s.
@@ -91,7 +90,7 @@ impl Coflash {
     /// Calls coflash, which prints one document.
     pub fn call(&self, words: &[&str]) -> Outcome<Answer> {
         let bus = self.bus.replace("{rate}", &self.rate.to_string());
-        let mut command = within(LIMIT, &self.program);
+        let mut command = process::within(LIMIT, &self.program);
         command.args(words).args(["--bus", &bus, "--json"]);
         if words[0] != "monitor" {
             command.args(["--node", &self.node.to_string()]);

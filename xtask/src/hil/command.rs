@@ -1,6 +1,5 @@
 //! Command lines of the user: for the debug probe, and for the relay of the supply.
 
-use std::process::Command;
 use std::time::Duration;
 
 use crate::{outcome::Outcome, process};
@@ -40,16 +39,8 @@ impl CommandLine {
     /// Runs the command to its end, for this time at most.
     pub fn run(&self, values: &[(&str, &str)], limit: Duration) -> Outcome {
         let words = self.with(values);
-        process::output(within(limit, &words[0]).args(&words[1..])).map(drop)
+        process::output(process::within(limit, &words[0]).args(&words[1..])).map(drop)
     }
-}
-
-/// A command that is ended after this time, with the exit code 124.
-pub fn within(limit: Duration, program: impl AsRef<std::ffi::OsStr>) -> Command {
-    let mut command = Command::new("timeout");
-    // In the foreground it passes signals on to the program alone.
-    command.arg("--foreground").arg(limit.as_secs_f64().to_string()).arg(program);
-    command
 }
 
 #[cfg(test)]

@@ -1,14 +1,8 @@
 //! Checks each package as a user gets it: installed into an empty root, and run.
 
-use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
-
-use object::elf::PT_INTERP;
-use object::read::elf::{ElfFile64, ProgramHeader as _};
-use object::read::pe::PeFile64;
-use object::{Architecture, LittleEndian, Object as _};
 
 use super::build;
 use super::release::{package_crates, Release, LINUX, SUMS, VERSION};
@@ -21,7 +15,7 @@ pub fn sums(dist: &Path) -> Outcome {
 
 /// The sources build without a connection, and give the same program as the repository.
 pub fn source(release: &Release, root: &Path) -> Outcome {
-    unpack(&release.source(), root)?;
+    files::unpack(&release.source(), root)?;
     let sources = root.join(format!("coboot-{VERSION}"));
     let theirs = build::program(&sources, &root.join("target"), LINUX)?;
     let ours = build::program(workspace::root(), &release.build, LINUX)?;
@@ -42,7 +36,7 @@ pub fn source(release: &Release, root: &Path) -> Outcome {
 }
 
 pub fn linux(release: &Release, root: &Path) -> Outcome {
-    unpack(&release.linux(), root)?;
+    files::unpack(&release.linux(), root)?;
     let folder = root.join(format!("coflash-{VERSION}"));
     for file in ["LICENSE-MIT", "LICENSE-APACHE", "README.md", "THIRD-PARTY.txt", "udev/70-coflash.rules"] {
         there(&folder.join(file))?;
@@ -144,7 +138,7 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
 /// system allows that, and without an environment.
 fn works(root: &Path, program: &str) -> Outcome {
     let file = root.join(program);
-    if !is_static(&files::bytes(&file)?) {
+    if needs_a_linker(&file)? {
         return Err(format!("{} needs a dynamic linker, and so the libraries of a system.", file.display()));
     }
     let inside =
@@ -175,42 +169,33 @@ fn sample() -> Vec<u8> {
     image
 }
 
-/// Whether a 64-bit ELF file names no dynamic linker.
-fn is_static(file: &[u8]) -> bool {
-    let Ok(elf) = ElfFile64::<LittleEndian>::parse(file) else { return false };
-    elf.elf_program_headers().iter().all(|segment| segment.p_type(LittleEndian) != PT_INTERP)
+/// Whether an ELF file names a dynamic linker.
+fn needs_a_linker(program: &Path) -> Outcome<bool> {
+    let mut readelf = Command::new("readelf");
+    Ok(process::output(readelf.args(["--wide", "--program-headers"]).arg(program))?.contains(" INTERP "))
 }
 
 pub fn windows(release: &Release, _: &Path) -> Outcome {
-    runs_on_windows(&files::bytes(&release.windows())?)
+    // It comes with the linker.
+    let mut objdump = Command::new("x86_64-w64-mingw32-objdump");
+    runs_on_windows(&process::output(objdump.arg("--private-headers").arg(release.windows()))?)
 }
 
-/// Checks a program for Windows: it is one of x86-64, and uses the libraries of Windows alone.
-fn runs_on_windows(file: &[u8]) -> Outcome {
-    let none = |error| format!("the program for Windows is none: {error}.");
-    let program = PeFile64::parse(file).map_err(none)?;
-    if program.architecture() != Architecture::X86_64 {
+/// Checks a program for Windows, of which objdump says this: it is one of x86-64, and uses the libraries
+/// of Windows alone. Those of the compiler begin with `lib`.
+fn runs_on_windows(said: &str) -> Outcome {
+    if !said.contains("file format pei-x86-64") {
         return Err("the program for Windows is none of x86-64.".into());
     }
-    let imports = program.imports().map_err(none)?;
-    let libraries: BTreeSet<_> =
-        imports.iter().map(|import| String::from_utf8_lossy(import.library()).to_lowercase()).collect();
-    foreign_libraries(&libraries)
-}
-
-/// Checks the libraries of a program for Windows: those of the compiler begin with `lib`.
-fn foreign_libraries(libraries: &BTreeSet<String>) -> Outcome {
-    if !libraries.contains("kernel32.dll") {
+    let libraries: Vec<String> =
+        said.lines().filter_map(|line| Some(line.split_once("DLL Name: ")?.1.to_lowercase())).collect();
+    if !libraries.iter().any(|name| name == "kernel32.dll") {
         return Err(format!("the program for Windows does not import KERNEL32.dll; it has: {libraries:?}."));
     }
     match libraries.iter().find(|name| name.starts_with("lib")) {
         Some(foreign) => Err(format!("the program for Windows needs {foreign}, which no Windows has.")),
         None => Ok(()),
     }
-}
-
-fn unpack(archive: &Path, into: &Path) -> Outcome {
-    process::run(Command::new("tar").arg("--extract").arg("--file").arg(archive).arg("--directory").arg(into))
 }
 
 fn there(file: &Path) -> Outcome {
@@ -226,38 +211,36 @@ fn said_in(said: &str, expected: &str, who: &str) -> Outcome {
 
 #[cfg(test)]
 mod tests {
-    use object::elf::ProgramHeader64;
-    use object::read::elf::FileHeader as _;
+    use kit::folder::Folder;
 
     use super::*;
+    use crate::elf::tests::by_hand;
 
     #[test]
     fn a_program_with_a_dynamic_linker_is_not_static() {
+        let folder = Folder::below(std::env::temp_dir(), "coboot-static");
+        let file = |bytes: &[u8]| {
+            fs::write(folder.join("program"), bytes).unwrap();
+            needs_a_linker(&folder.join("program"))
+        };
         // This test program itself is linked against the system's libraries.
-        let mut program = fs::read(std::env::current_exe().unwrap()).unwrap();
-        assert!(!is_static(&program) && !is_static(b"#!/bin/sh") && !is_static(&program[..80]));
-        let elf = ElfFile64::<LittleEndian>::parse(&*program).unwrap();
-        let is_of_linker = |segment: &ProgramHeader64<_>| segment.p_type(LittleEndian) == PT_INTERP;
-        let number = elf.elf_program_headers().iter().position(is_of_linker).unwrap();
-        let at = elf.elf_header().e_phoff(LittleEndian) as usize + number * 56;
-        program[at] = 0;
-        assert!(is_static(&program));
+        assert_eq!(needs_a_linker(&std::env::current_exe().unwrap()), Ok(true));
+        assert_eq!(file(&by_hand()), Ok(false));
+        assert!(file(b"#!/bin/sh").is_err());
     }
 
+    /// Lines as objdump prints them.
     #[test]
-    fn what_is_no_program_for_windows_is_told() {
-        let program = fs::read(std::env::current_exe().unwrap()).unwrap();
-        for file in [&b""[..], b"MZ", &[b'M', b'Z', 0, 0, 0xFF], &[0xFF; 64], &program] {
-            assert!(runs_on_windows(file).is_err());
-        }
-    }
-
-    #[test]
-    fn a_library_of_the_compiler_is_foreign() {
-        let check = |names: &[&str]| foreign_libraries(&names.iter().map(ToString::to_string).collect());
-        assert_eq!(check(&["kernel32.dll", "api-ms-win-core-synch-l1-2-0.dll"]), Ok(()));
-        let gcc = check(&["kernel32.dll", "libgcc_s_seh-1.dll"]).unwrap_err();
+    fn a_program_for_windows_needs_the_libraries_of_windows_alone() {
+        let check = |format: &str, names: &[&str]| {
+            let names: String = names.iter().map(|name| format!("\tDLL Name: {name}\n")).collect();
+            runs_on_windows(&format!("\ncoflash.exe:     file format {format}\n\n{names}"))
+        };
+        let windows = ["KERNEL32.dll", "api-ms-win-core-synch-l1-2-0.dll"];
+        assert_eq!(check("pei-x86-64", &windows), Ok(()));
+        assert!(check("pei-i386", &windows).unwrap_err().contains("none of x86-64"));
+        let gcc = check("pei-x86-64", &[windows[0], "libgcc_s_seh-1.dll"]).unwrap_err();
         assert!(gcc.contains("libgcc_s_seh-1.dll"), "{gcc}");
-        assert!(check(&[]).is_err());
+        assert!(check("pei-x86-64", &windows[1..]).unwrap_err().contains("KERNEL32"));
     }
 }

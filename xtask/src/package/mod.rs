@@ -9,11 +9,8 @@ mod release;
 #[cfg(test)]
 mod workflow;
 
-use std::fmt::Write as _;
 use std::path::Path;
 use std::process::Command;
-
-use sha2::{Digest, Sha256};
 
 use self::release::{package_crates, Release, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
@@ -49,24 +46,16 @@ struct Part {
     check: fn(&Release, &Path) -> Outcome,
 }
 
-const fn part(
-    name: &'static str,
-    make: fn(&Release) -> Outcome,
-    check: fn(&Release, &Path) -> Outcome,
-) -> Part {
-    Part { name, make, check }
-}
-
 /// The parts, in the order in which they are made.
 const PARTS: [Part; 7] = [
-    part("source", source, check::source),
-    part("linux", linux, check::linux),
-    part("deb", deb::make, check::debian),
-    part("windows", windows, check::windows),
-    part("python", python, check::wheel),
+    Part { name: "source", make: source, check: check::source },
+    Part { name: "linux", make: linux, check: check::linux },
+    Part { name: "deb", make: deb::make, check: check::debian },
+    Part { name: "windows", make: windows, check: check::windows },
+    Part { name: "python", make: python, check: check::wheel },
     // The job that makes it checks it.
-    part("sbom", bills, |_, _| Ok(())),
-    part("crates", crates, check::crates),
+    Part { name: "sbom", make: bills, check: |_, _| Ok(()) },
+    Part { name: "crates", make: crates, check: check::crates },
 ];
 
 pub fn run(mut args: Args) -> Outcome {
@@ -169,12 +158,7 @@ fn linux(release: &Release) -> Outcome {
         let from = workspace::root().join(file);
         files::copy(&from, &folder.join(from.file_name().unwrap_or_default()))?;
     }
-    let mut tar = Command::new("tar");
-    tar.args(["--sort=name", "--owner=0", "--group=0", "--numeric-owner", "--mode=u+rw,go+r-w"]);
-    tar.arg(format!("--mtime=@{}", release.epoch)).args(["--use-compress-program", "gzip -9n"]);
-    process::run(
-        tar.arg("--directory").arg(&stage).arg("--create").arg("--file").arg(release.linux()).arg(name),
-    )?;
+    files::pack(&stage, &name, &release.epoch, &release.linux())?;
     files::remove(&stage)
 }
 
@@ -199,15 +183,12 @@ fn crates(release: &Release) -> Outcome {
 
 /// Writes SHA256SUMS in the form for `sha256sum --check`.
 fn sums(dist: &Path) -> Outcome {
-    let mut text = String::new();
+    let mut sha256sum = Command::new("sha256sum");
     for file in files::within(dist)?.iter().filter(|file| !file.ends_with(SUMS)) {
-        let bytes = files::bytes(file)?;
-        let sum: String = Sha256::digest(&bytes).iter().map(|byte| format!("{byte:02x}")).collect();
-        let name = file.file_name().unwrap_or_default().to_string_lossy();
-        let _ = writeln!(text, "{sum}  {name}");
-        println!("{:>9} KiB  {}", bytes.len().div_ceil(1024), workspace::shown(file));
+        println!("{:>9} KiB  {}", files::bytes(file)?.len().div_ceil(1024), workspace::shown(file));
+        sha256sum.args(file.file_name());
     }
-    files::write(&dist.join(SUMS), text)
+    files::write(&dist.join(SUMS), process::output(sha256sum.current_dir(dist))?)
 }
 
 fn git(words: &[&str]) -> Outcome<String> {

@@ -119,7 +119,7 @@ pub fn run(mut args: Args) -> Outcome {
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
         let own = if chosen_board {
-            build::boards(&[(board, &[])])?;
+            build::boards(&[(board, "")])?;
             build::tests_args(board)
         } else {
             build_images(Tier::Product)?;
@@ -317,7 +317,7 @@ fn other_chips() -> impl Iterator<Item = &'static Layout> {
 /// programs are compiled for it.
 fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcome {
     if tier == Tier::All {
-        build::boards(&[(board, &[])])?;
+        build::boards(&[(board, "")])?;
     }
     let programs = board_programs(board, tier)?;
     let mut jobs = Vec::new();
@@ -337,17 +337,17 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
 /// Jobs of the night that end by themselves.
 fn jobs(summary: &mut Summary) -> Outcome {
     type Run = fn(Args) -> Outcome;
-    let all: [(&str, Run, &[&str]); 6] = [
-        ("fuzz --replay", fuzz::run, &["--replay"]),
-        ("powercut", powercut::run, &[]),
-        ("attack", attack::run, &[]),
-        ("opinion", opinion::run, &[]),
-        ("reproduce", reproduce::run, &[]),
-        ("chips", chips::run, &[]),
+    let all: [(&str, Run); 6] = [
+        ("fuzz --replay", fuzz::run),
+        ("powercut", powercut::run),
+        ("attack", attack::run),
+        ("opinion", opinion::run),
+        ("reproduce", reproduce::run),
+        ("chips", chips::run),
     ];
-    for (name, run, words) in all {
+    for (name, run) in all {
         println!("== cargo xtask {name}");
-        let words = words.iter().map(|word| (*word).to_owned());
+        let words = name.split(' ').skip(1).map(str::to_owned);
         runner::count(&format!("cargo xtask {name}"), run(Args::new(words)), summary);
     }
     Ok(())

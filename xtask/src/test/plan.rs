@@ -114,37 +114,24 @@ pub struct Images {
     /// Their board.
     pub board: &'static Layout,
     /// Their names; empty for all of the board, and the applications in C.
-    pub names: &'static [&'static str],
+    pub names: &'static str,
 }
 
 /// The images for a board of another chip.
-const OF_A_CHIP: &[&str] =
-    &["bootloader", "bootloader-least", "bootloader-paulus", "bootloader-watchdog", "app-v1", "app-v2"];
+const OF_A_CHIP: &str = "bootloader bootloader-least bootloader-paulus bootloader-watchdog app-v1 app-v2";
 
 /// The images for the board with two programs.
-const OF_TWO_PROGRAMS: &[&str] = &[
-    "bootloader",
-    "bootloader-lift",
-    "app-v1",
-    "app-v2",
-    "app-program-2",
-    "app-lift",
-    "app-lift-v2",
-    "app-c",
-];
+const OF_TWO_PROGRAMS: &str =
+    "bootloader bootloader-lift app-v1 app-v2 app-program-2 app-lift app-lift-v2 app-c";
 
 /// The images by tier.
 pub const IMAGES: &[Images] = &[
-    Images { tier: Tier::Product, board: &stm32f407g_disc1::LAYOUT, names: &[] },
-    Images {
-        tier: Tier::Product,
-        board: &stm32f407g_disc1_can2::LAYOUT,
-        names: &["bootloader", "app-v1", "app-v2"],
-    },
+    Images { tier: Tier::Product, board: &stm32f407g_disc1::LAYOUT, names: "" },
+    Images { tier: Tier::Product, board: &stm32f407g_disc1_can2::LAYOUT, names: "bootloader app-v1 app-v2" },
     Images { tier: Tier::Ci, board: &stm32f407g_disc1_two::LAYOUT, names: OF_TWO_PROGRAMS },
     Images { tier: Tier::Ci, board: &nucleo_f446re::LAYOUT, names: OF_A_CHIP },
     Images { tier: Tier::Ci, board: &stm32f429i_disc1::LAYOUT, names: OF_A_CHIP },
-    Images { tier: Tier::All, board: &stm32f407g_disc1_two::LAYOUT, names: &[] },
+    Images { tier: Tier::All, board: &stm32f407g_disc1_two::LAYOUT, names: "" },
 ];
 
 /// Tests that run for a board of each chip in [`Tier::Ci`]: they show the mistakes that a port can

@@ -2,10 +2,14 @@
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::Duration;
 
 use serde_json::Value;
 
 use crate::{outcome::Outcome, process, workspace};
+
+/// After this time the tests of a module count as hanging, on the wall clock.
+pub const PATIENCE: Duration = Duration::from_secs(900);
 
 /// A test program: a crate's own tests, or its tests from outside.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -54,9 +58,9 @@ fn of_message(line: &str) -> Option<Program> {
 }
 
 impl Program {
-    /// The command that runs the program as cargo does.
+    /// The command that runs the program as cargo does, for [`PATIENCE`] at most.
     pub fn command(&self) -> Command {
-        let mut command = Command::new(&self.file);
+        let mut command = process::within(PATIENCE, &self.file);
         command.current_dir(&self.folder).env("CARGO_MANIFEST_DIR", &self.folder);
         command
     }

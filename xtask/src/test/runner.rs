@@ -2,21 +2,18 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ffi::{OsStr, OsString};
-use std::io::{Read, Write};
-use std::process::{Command, Stdio};
-use std::sync::mpsc::{self, RecvTimeoutError};
+use std::fs::File;
+use std::io::Write;
+use std::process::Stdio;
 use std::sync::{Mutex, PoisonError};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use serde_json::{json, Value};
 
 use super::plan::{SLOW, WAITING};
-use super::programs::Program;
-use crate::{outcome::Outcome, process};
-
-/// After this time the tests of a module count as hanging, on the wall clock.
-const PATIENCE: Duration = Duration::from_secs(900);
+use super::programs::{Program, PATIENCE};
+use crate::{files, outcome::Outcome, process, workspace};
 
 /// Variables for test programs.
 pub type Variables = Vec<(&'static str, OsString)>;
@@ -175,13 +172,8 @@ impl Job {
 
     /// Runs some tests in one process; returns those that were not finished in time.
     fn attempt(&self, tests: &[String], ran: &mut Ran) -> Option<Vec<String>> {
-        let mut command = self.program.command();
-        command.envs(self.variables.iter().map(|(name, value)| (name, OsStr::new(value))));
-        // The results are lines of their own, whatever the tests print.
-        command.args(["--exact", "--color=never"]).args(tests);
-        let (printed, end) =
-            output(&mut command).unwrap_or_else(|problem| (problem.into_bytes(), End::Failed));
-        if end == End::Passed {
+        let (printed, code) = self.output(tests).unwrap_or_else(|problem| (problem.into_bytes(), None));
+        if code == Some(0) {
             ran.passed.extend(tests.iter().cloned());
             return None;
         }
@@ -190,7 +182,24 @@ impl Job {
         ran.passed.extend(results.iter().filter(|(_, ok)| **ok).map(|(test, _)| (*test).to_owned()));
         let unfinished = tests.iter().filter(|test| !results.contains_key(test.as_str())).cloned().collect();
         ran.printed.extend_from_slice(&printed);
-        (end == End::Never).then_some(unfinished)
+        (code == Some(process::TOO_LATE)).then_some(unfinished)
+    }
+
+    /// Runs some tests in one process; returns what it printed, and its exit code.
+    fn output(&self, tests: &[String]) -> Outcome<(Vec<u8>, Option<i32>)> {
+        // In a file no program that a test has left holds the output up.
+        let log = workspace::target_dir().join("tests").join(self.name.replace(['/', ':'], "-"));
+        files::write(&log, "")?;
+        let unusable = |error: std::io::Error| format!("{}: {error}.", log.display());
+        // Both streams are in one file, so that they stay in order.
+        let file = File::options().append(true).open(&log).map_err(unusable)?;
+        let mut command = self.program.command();
+        command.envs(self.variables.iter().map(|(name, value)| (name, OsStr::new(value))));
+        // The results are lines of their own, whatever the tests print.
+        command.args(["--exact", "--color=never"]).args(tests);
+        command.stdin(Stdio::null()).stdout(file.try_clone().map_err(unusable)?).stderr(file);
+        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
+        Ok((files::bytes(&log)?, status.code()))
     }
 
     /// Prints a line, and what a failed test printed.
@@ -206,54 +215,6 @@ impl Job {
         let failed = if failed > 0 { format!(", {failed} FAILED") } else { String::new() };
         let _ =
             writeln!(out, "{:<44} {:>4} passed{failed} {:>7.1} s", self.name, ran.passed.len(), ran.seconds);
-    }
-}
-
-/// How a test program ended.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum End {
-    /// All of its tests passed.
-    Passed,
-    /// A test failed, or the program broke off.
-    Failed,
-    /// It was ended, since its time was over.
-    Never,
-}
-
-/// Runs a test program; returns what it printed, and how it ended.
-fn output(command: &mut Command) -> Outcome<(Vec<u8>, End)> {
-    let unreadable = |error: std::io::Error| format!("its output cannot be read: {error}.");
-    // Both streams in one pipe, so that they stay in order.
-    let (mut reader, writer) = std::io::pipe().map_err(unreadable)?;
-    command.stdin(Stdio::null()).stdout(writer.try_clone().map_err(unreadable)?).stderr(writer);
-    let mut child = command.spawn().map_err(|error| process::not_started(command, &error))?;
-    // The pipe ends with the last program that can write into it.
-    command.stdout(Stdio::null()).stderr(Stdio::null());
-    let (sender, receiver) = mpsc::channel();
-    thread::spawn(move || {
-        let mut part = [0; 1 << 14];
-        while let Ok(len @ 1..) = reader.read(&mut part) {
-            if sender.send(part[..len].to_vec()).is_err() {
-                break;
-            }
-        }
-    });
-    let end = Instant::now() + PATIENCE;
-    let mut printed = Vec::new();
-    loop {
-        match receiver.recv_timeout(end.saturating_duration_since(Instant::now())) {
-            Ok(part) => printed.extend(part),
-            Err(RecvTimeoutError::Disconnected) => {
-                let passed = child.wait().map_err(unreadable)?.success();
-                return Ok((printed, if passed { End::Passed } else { End::Failed }));
-            }
-            Err(RecvTimeoutError::Timeout) => {
-                // An error means that it has just ended.
-                let _ = child.kill();
-                let _ = child.wait();
-                return Ok((printed, End::Never));
-            }
-        }
     }
 }
 
