@@ -228,4 +228,17 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let said: Value = serde_json::from_str(&done.out).unwrap();
     let answer = said["error"]["answers"][0].as_str().unwrap();
     assert!(answer.starts_with("SDO abort ") && answer.contains("08000022h"), "{said}");
+    // A program that does not start: 2007h/2 says that the program is not released (docs/protocol.md).
+    let mut device = bootloader();
+    device.starts = Some(BOOTLOADER);
+    device.state = Some([5, 0, 0]);
+    let (url, _device) = serve(device);
+    let done = recorded(&folder, &["start", "-N", "5", "--bus", &url, "--json"], &[]);
+    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let answers = said["error"]["answers"].to_string();
+    assert!(
+        answers.contains("1F57h reads ")
+            && answers.contains("2007h: it stays in the bootloader: its program is not released"),
+        "{said}"
+    );
 }
