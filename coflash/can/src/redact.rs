@@ -1,7 +1,9 @@
-//! Removes passwords from frames, for records that users pass on.
+//! Removes passwords, and programs, from frames, for records that users pass on.
 
 use std::collections::BTreeMap;
 
+use canopen::debugger::DEBUGGER;
+use canopen::program::PROGRAM_DATA;
 use canopen::{Address, Frame, NodeId};
 use embedded_can::{Frame as _, Id};
 
@@ -9,16 +11,22 @@ use embedded_can::{Frame as _, Id};
 /// ESAcademy's bootloader.
 const PASSWORDS: [u16; 2] = [0x6005, 0x7F50];
 
+/// The objects through which programs and memory are transferred, in both directions.
+const CONTENTS: [u16; 2] = [PROGRAM_DATA, DEBUGGER];
+
 /// Whether data written to this object are a password.
 #[must_use]
 pub fn is_password(at: Address) -> bool {
     PASSWORDS.contains(&at.index)
 }
 
-/// Replaces the bytes of passwords by 0 in SDO downloads of every form.
+/// Replaces the bytes of passwords by 0 in SDO downloads of every form; a redactor
+/// [of contents](Redactor::of_contents) also those of programs.
 #[derive(Debug, Default)]
 pub struct Redactor {
-    /// The nodes to which a client is sending a password.
+    /// Whether programs and memory are removed, too.
+    contents: bool,
+    /// The nodes with a transfer of something that is removed.
     under_way: BTreeMap<NodeId, Form>,
 }
 
@@ -26,9 +34,18 @@ pub struct Redactor {
 enum Form {
     Segments,
     Blocks,
+    /// The node sends the data, in any form.
+    Upload,
 }
 
 impl Redactor {
+    /// A redactor that also removes programs and memory, which are data of 1F50h and of the debugger
+    /// interface, in downloads and uploads.
+    #[must_use]
+    pub fn of_contents() -> Self {
+        Self { contents: true, ..Self::default() }
+    }
+
     /// Returns the frame in a form that may be shown. Frames must be passed in the order of the
     /// bus.
     pub fn frame(&mut self, frame: &Frame) -> Frame {
@@ -37,6 +54,11 @@ impl Redactor {
         let data = frame.data();
         let Some(first) = data.first() else { return *frame };
         match id.as_raw() & 0x780 {
+            0x580 if *first != 0x80 && self.under_way.get(&node) == Some(&Form::Upload) => {
+                // The first answer repeats the object, and may already have up to four bytes.
+                let begins = first >> 5 == 2 && self.has_contents(data);
+                without(frame, if begins { 4 } else { 1 })
+            }
             0x580 => {
                 // An abort, or the answer to the end of a block download.
                 if *first == 0x80 || first & 0xE3 == 0xA1 {
@@ -51,8 +73,12 @@ impl Redactor {
 
     fn request(&mut self, frame: &Frame, node: NodeId, first: u8) -> Frame {
         let data = frame.data();
-        let secret = data.len() >= 3 && PASSWORDS.contains(&u16::from_le_bytes([data[1], data[2]]));
+        let contents = self.has_contents(data);
+        let secret = contents || has(data, &PASSWORDS);
+        let begins = matches!((first >> 5, first & 3), (1 | 2, _) | (5, 0) | (6, 0 | 2));
         match (self.under_way.get(&node), first >> 5) {
+            // Requests for more of an upload have no data.
+            (Some(Form::Upload), _) if first != 0x80 && !begins => *frame,
             (_, 0b100) if first == 0x80 => {
                 self.under_way.remove(&node);
                 *frame
@@ -76,12 +102,25 @@ impl Redactor {
                 self.under_way.insert(node, Form::Blocks);
                 *frame
             }
+            (_, 2 | 5) if contents => {
+                self.under_way.insert(node, Form::Upload);
+                *frame
+            }
             _ => {
                 self.under_way.remove(&node);
                 *frame
             }
         }
     }
+
+    fn has_contents(&self, data: &[u8]) -> bool {
+        self.contents && has(data, &CONTENTS)
+    }
+}
+
+/// Whether an SDO frame names one of these objects.
+fn has(data: &[u8], objects: &[u16]) -> bool {
+    data.len() >= 3 && objects.contains(&u16::from_le_bytes([data[1], data[2]]))
 }
 
 /// The frame with zeros from byte `from` on.
@@ -98,8 +137,11 @@ mod tests {
     use super::*;
 
     fn shown(frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
+        shown_by(Redactor::default(), frames)
+    }
+
+    fn shown_by(mut redactor: Redactor, frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
         let node = NodeId::new(5).unwrap();
-        let mut redactor = Redactor::default();
         let id = |to_node| if to_node { CobId::sdo_request(node) } else { CobId::sdo_response(node) };
         let shown = frames.iter().map(|(to_node, data)| redactor.frame(&Frame::full(id(*to_node), *data)));
         shown.map(|frame| frame.data().try_into().unwrap()).collect()
@@ -139,6 +181,58 @@ mod tests {
             assert!(!all.iter().any(|data| data[4..] == *b"INIT"), "{all:?}");
             assert_eq!(all.last(), Some(&after.1));
             assert_eq!(all[0][..4], case[0].1[..4]);
+        }
+    }
+
+    /// CiA 301: downloads to 1F50h in segments and blocks, uploads from it expedited, in segments and
+    /// blocks. The number of a block's segment may be equal to a command.
+    #[test]
+    fn a_program_is_not_in_what_a_redactor_of_contents_shows() {
+        const P: u8 = 0xEE;
+        let cases: [&[(bool, [u8; 8])]; 5] = [
+            &[
+                (true, [0x21, 0x50, 0x1F, 1, 7, 0, 0, 0]),
+                (false, [0x60, 0x50, 0x1F, 1, 0, 0, 0, 0]),
+                (true, [0x01, P, P, P, P, P, P, P]),
+            ],
+            &[
+                (true, [0xC6, 0x50, 0x1F, 1, 14, 0, 0, 0]),
+                (false, [0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]),
+                (true, [0x21, P, P, P, P, P, P, P]),
+                (true, [0xA2, P, P, P, P, P, P, P]),
+                (false, [0xA2, 2, 127, 0, 0, 0, 0, 0]),
+                (true, [0xC1, 0, 0, 0, 0, 0, 0, 0]),
+                (false, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+            ],
+            &[(true, [0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]), (false, [0x43, 0x50, 0x1F, 1, P, P, P, P])],
+            &[
+                (true, [0x40, 0x25, 0x10, 2, 0, 0, 0, 0]),
+                (false, [0x41, 0x25, 0x10, 2, 14, 0, 0, 0]),
+                (true, [0x60, 0, 0, 0, 0, 0, 0, 0]),
+                (false, [0x00, P, P, P, P, P, P, P]),
+                (true, [0x70, 0, 0, 0, 0, 0, 0, 0]),
+                (false, [0x11, P, P, P, P, P, P, P]),
+            ],
+            &[
+                (true, [0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]),
+                (false, [0xC6, 0x50, 0x1F, 1, 14, 0, 0, 0]),
+                (true, [0xA3, 0, 0, 0, 0, 0, 0, 0]),
+                (false, [0x43, P, P, P, P, P, P, P]),
+                (false, [0xA1, P, P, P, P, P, P, P]),
+                (true, [0xA2, 2, 127, 0, 0, 0, 0, 0]),
+                (false, [0xC1, 0, 0, 0, 0, 0, 0, 0]),
+                (true, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+            ],
+        ];
+        let after = [(true, [0x40, 0, 0x10, 0, 0, 0, 0, 0]), (false, [0x43, 0, 0x10, 0, P, 1, 0, 0])];
+        for case in cases {
+            let all = shown_by(Redactor::of_contents(), &[case, &after].concat());
+            let (of_case, of_after) = all.split_at(case.len());
+            assert!(!of_case.as_flattened().contains(&P), "{of_case:?}");
+            assert_eq!(of_after, after.map(|(_, data)| data));
+            assert_eq!(of_case[0], case[0].1);
+            // Where only passwords are removed, the program stays.
+            assert_eq!(shown(case), case.iter().map(|(_, data)| *data).collect::<Vec<_>>());
         }
     }
 

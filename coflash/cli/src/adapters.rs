@@ -70,7 +70,8 @@ fn row(found: &Found) -> [String; 4] {
     [found.url.clone(), about, rate, found.state.clone().unwrap_or_else(none)]
 }
 
-fn value(list: &List) -> Value {
+/// The JSON value.
+pub(super) fn value(list: &List) -> Value {
     let found = |found: &Found| {
         json!({
             "bus": found.url,

@@ -61,7 +61,7 @@ impl Context {
     }
 
     /// The given bus, or the bus of the only adapter.
-    fn url(&self, bus: Option<&str>) -> Result<String, Failure> {
+    pub(super) fn url(&self, bus: Option<&str>) -> Result<String, Failure> {
         match bus {
             Some(bus) => Ok(bus.to_string()),
             None => only(self.out, &self.kinds()),

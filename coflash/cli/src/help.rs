@@ -108,7 +108,7 @@ const RARE: [&str; 39] = [
 const LEGACY: [&str; 4] = ["serial", "revision", "product", "vendor"];
 
 /// Typical calls of each command; the empty name is the program itself.
-const EXAMPLES: [(&str, &str); 37] = [
+const EXAMPLES: [(&str, &str); 38] = [
     (
         "",
         "\
@@ -130,6 +130,13 @@ Examples:
   coflash flash app.hex --board my-board.toml
   coflash flash --job line.toml --report result.json
   coflash flash machine.cpk --trust root.pub",
+    ),
+    (
+        "report",
+        "\
+Examples:
+  coflash report bundle reports --node 5
+  coflash report bundle reports/20261128T091500-flash -o fault.zip",
     ),
     (
         "package",

@@ -51,6 +51,7 @@ mod provision;
 mod read;
 mod record;
 mod renew;
+mod report;
 mod reset;
 mod scan;
 mod seal;
@@ -153,6 +154,7 @@ enum Command {
     Lss(lss::Lss),
     Debug(debug::Debug),
     Monitor(monitor::Monitor),
+    Report(report::Report),
     Shell(shell::Shell),
     #[cfg(feature = "conform")]
     Conform(conform::Conform),
@@ -179,6 +181,8 @@ impl Command {
                 | Self::Nameplate(_)
                 | Self::Package(_)
                 | Self::Adapters(_)
+                // A bad bus is one of the faults that it is for.
+                | Self::Report(_)
                 | Self::Completions(_)
                 | Self::Man(_)
         )
@@ -219,6 +223,7 @@ impl Command {
             Self::Lss(lss) => lss.run(context),
             Self::Debug(debug) => debug.run(context),
             Self::Monitor(monitor) => monitor.run(context),
+            Self::Report(report) => report.run(context),
             Self::Shell(shell) => shell.run(context, shell_line),
             #[cfg(feature = "conform")]
             Self::Conform(conform) => conform.run(context),

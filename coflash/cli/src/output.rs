@@ -280,6 +280,8 @@ pub(super) struct Failure {
     /// The state of the device after the failure, if it is known.
     left: Option<DeviceAfterUpdate>,
     advice: Option<String>,
+    /// The device's own answers, in words.
+    answers: Vec<String>,
     /// Whether the document on standard output already contains the failure.
     told: bool,
 }
@@ -355,7 +357,7 @@ impl Failure {
 
     fn new(exit: Exit, number: Option<u32>, what: String, advice: Option<String>) -> Self {
         let legacy = number.unwrap_or(exit.legacy());
-        Self { exit, number, legacy, what, left: None, advice, told: false }
+        Self { exit, number, legacy, what, left: None, advice, answers: Vec::new(), told: false }
     }
 
     /// An error of the command line's parser.
@@ -496,6 +498,7 @@ impl Failure {
                     DeviceAnswer::Silent | DeviceAnswer::NotAsked => None,
                 }),
                 "advice": self.advice,
+                "answers": self.answers,
             }
         })
     }
@@ -594,7 +597,9 @@ impl From<Error> for Failure {
             | Error::OtherIdentity { .. } => Exit::NoStart,
         };
         let legacy = legacy::exit_code(&error);
-        Self { legacy, ..Self::new(exit, Some(error.number()), error.to_string(), Some(error.advice())) }
+        let answers = error.answers();
+        let number = Some(error.number());
+        Self { legacy, answers, ..Self::new(exit, number, error.to_string(), Some(error.advice())) }
     }
 }
 

@@ -3,6 +3,7 @@
 //!
 //! One record serves the whole program, so that code with a message need not have access to it.
 
+use std::collections::{BTreeMap, VecDeque};
 use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
@@ -10,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use canopen::{Frame, NodeId};
+use canopen::{CobId, Frame, NodeId};
 use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
@@ -20,6 +21,9 @@ use coflash_core::update::Event;
 use serde_json::{json, Value};
 
 use super::secrets;
+
+/// The files of a run's folder: the report, the events, the messages, the frames.
+pub(super) const FILES: [&str; 4] = ["report.json", "events.jsonl", "log.txt", "trace.log"];
 
 static RECORD: OnceLock<Record> = OnceLock::new();
 
@@ -36,6 +40,30 @@ struct Report {
     trace: Sink,
     /// `report.json`, written at the beginning and again at the end.
     document: Mutex<Value>,
+    /// What each device has shown since its last update.
+    histories: Mutex<BTreeMap<NodeId, History>>,
+}
+
+/// What `report.json` says about a failed update.
+#[derive(Default)]
+struct History {
+    /// The steps and repetitions of the update.
+    tried: VecDeque<String>,
+    /// The last frames from and to the node.
+    frames: VecDeque<String>,
+}
+
+/// The most steps, and the most frames, of a device: a failed request with all of its attempts, and the
+/// questions after it.
+const MOST_TRIED: usize = 256;
+const MOST_FRAMES: usize = 32;
+
+/// Adds a line, and forgets the oldest one if there are more than `most`.
+fn push(lines: &mut VecDeque<String>, line: String, most: usize) {
+    lines.push_back(line);
+    if lines.len() > most {
+        lines.pop_front();
+    }
 }
 
 /// A file that may become full. The first error is shown, and the command continues.
@@ -56,7 +84,7 @@ impl Sink {
     fn line(&self, line: &str) {
         let mut file = self.file.lock().unwrap_or_else(PoisonError::into_inner);
         let Some(open) = file.as_mut() else { return };
-        if let Err(error) = open.write_all(format!("{line}\n").as_bytes()) {
+        if let Err(error) = open.write_all(format!("{}\n", secrets::without_urls(line)).as_bytes()) {
             *file = None;
             let _ = writeln!(io::stderr(), "warning: {}: writing failed: {error}", self.name);
         }
@@ -80,19 +108,22 @@ pub(super) fn begin(
     let report = match reports {
         Some(folder) => {
             let folder = own_folder(folder, command)?;
-            logs.push(Sink::new(&folder.join("log.txt"))?);
+            let [_, events, messages, frames] = FILES.map(|file| folder.join(file));
+            logs.push(Sink::new(&messages)?);
             let document = json!({
-                "coflash": env!("CARGO_PKG_VERSION"),
+                "coflash": env!("COFLASH_VERSION"),
                 "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
+                "command": command,
                 "command_line": secrets::without(words),
                 "bus": bus,
                 "began": stamp(wall()),
                 "ended": null,
             });
             let report = Report {
-                events: Sink::new(&folder.join("events.jsonl"))?,
-                trace: Sink::new(&folder.join("trace.log"))?,
+                events: Sink::new(&events)?,
+                trace: Sink::new(&frames)?,
                 document: Mutex::new(document),
+                histories: Mutex::default(),
                 folder,
             };
             report.write(&[])?;
@@ -165,6 +196,7 @@ pub(super) fn event(node: NodeId, event: &Event) {
         let mut line = serde_json::to_value(event.line(node)).unwrap_or_default();
         line["time"] = stamp(wall()).into();
         report.events.line(&line.to_string());
+        report.remember(node, event);
     }
 }
 
@@ -182,17 +214,19 @@ pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send
         return adapter;
     }
     let origin = wall().saturating_sub(adapter.now());
-    let (mut redactor, mut decoder) = (Redactor::default(), Decoder::new());
+    let (mut passwords, mut contents) = (Redactor::default(), Redactor::of_contents());
+    let mut decoder = Decoder::new();
     let ear = move |now: Duration, frame: &Frame| {
         let Some(record) = RECORD.get() else { return };
-        let frame = redactor.frame(frame);
+        let bare = contents.frame(frame);
+        let frame = passwords.frame(frame);
         let line = Line { time: origin + now, interface: "can0".to_string(), frame };
-        let words = decoder.decode(&frame);
+        let words = decoder.decode(&bare);
         let text = line.to_string();
-        let shown = text.rsplit(' ').next().unwrap_or_default();
-        record.note("frame", &format!("{shown}  {words}"));
+        record.note("frame", &format!("{frame}  {words}"));
         if let Some(report) = &record.report {
             report.trace.line(&text);
+            report.saw(&bare, &words);
         }
     };
     Box::new(Tap::new(adapter, Box::new(ear)))
@@ -210,14 +244,53 @@ impl Record {
 }
 
 impl Report {
+    /// Remembers a step of an update. If the update has failed, `report.json` gets what was tried, and the
+    /// frames that decided.
+    fn remember(&self, node: NodeId, event: &Event) {
+        let mut histories = self.histories.lock().unwrap_or_else(PoisonError::into_inner);
+        match event {
+            Event::Progress { .. } => {}
+            Event::Done(done) => {
+                let History { tried, frames } = histories.remove(&node).unwrap_or_default();
+                if done.error.is_some() {
+                    let update = json!({ "node": node.get(), "tried": tried, "frames": frames });
+                    let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
+                    match document["failed_updates"].as_array_mut() {
+                        Some(updates) => updates.push(update),
+                        None => document["failed_updates"] = json!([update]),
+                    }
+                }
+            }
+            event => {
+                let line = format!("{}  {event}", stamp(wall()));
+                push(&mut histories.entry(node).or_default().tried, line, MOST_TRIED);
+            }
+        }
+    }
+
+    /// Remembers a frame, which must be without passwords and programs, for the node that sends it or for
+    /// which it is.
+    fn saw(&self, frame: &Frame, words: &str) {
+        let node = match frame.cob_id() {
+            Some(CobId::NMT) => frame.exactly().map(|[_, node]: &[u8; 2]| *node),
+            Some(id) => Some((id.get() & 0x7F) as u8),
+            None => None,
+        };
+        let Some(node) = node.and_then(NodeId::new) else { return };
+        let line = format!("{}  {frame}  {words}", stamp(wall()));
+        let mut histories = self.histories.lock().unwrap_or_else(PoisonError::into_inner);
+        push(&mut histories.entry(node).or_default().frames, line, MOST_FRAMES);
+    }
+
     /// Writes `report.json` with these additional entries.
     fn write(&self, entries: &[(&str, Value)]) -> Result<(), String> {
         let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
         for (name, value) in entries {
             document[*name] = value.clone();
         }
-        let path = self.folder.join("report.json");
-        fs::write(&path, format!("{:#}\n", *document)).map_err(|error| cannot(&path, &error))
+        let path = self.folder.join(FILES[0]);
+        let text = secrets::without_urls(&format!("{:#}\n", *document));
+        fs::write(&path, text).map_err(|error| cannot(&path, &error))
     }
 }
 

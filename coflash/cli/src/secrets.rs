@@ -1,4 +1,4 @@
-//! Removes passwords from a command line, for records that users pass on.
+//! Removes passwords from a command line, and tokens from URLs, for records that users pass on.
 
 use std::ffi::OsString;
 
@@ -32,6 +32,59 @@ pub(super) fn without(words: &[OsString]) -> Vec<String> {
     words.iter().map(shown).collect()
 }
 
+/// The text with the secrets of its URLs hidden: user names and passwords, queries and fragments,
+/// and the paths of web servers, since that of `coflash ui` is a token. Messages name an adapter
+/// without the scheme of its URL, so a word need not have one.
+pub(super) fn without_urls(text: &str) -> String {
+    // A password may have any other character. JSON ends a text with a quotation mark.
+    let ends = |c: char| c.is_whitespace() || c == '"';
+    let mut shown = String::new();
+    for part in text.split_inclusive(ends) {
+        let word = part.trim_end_matches(|c: char| ends(c) || "\\,.;:)'`>".contains(c));
+        match word.split_once("://") {
+            Some((scheme, rest)) => {
+                let is_web = ["http", "https"].iter().any(|web| scheme.to_lowercase().ends_with(web));
+                let (rest, fragment) = hidden_from(rest, '#');
+                let rest = without_secrets(rest, is_web);
+                shown.push_str(&format!("{scheme}://{rest}{fragment}"));
+            }
+            None => shown.push_str(&without_secrets(word, false)),
+        }
+        shown.push_str(&part[word.len()..]);
+    }
+    shown
+}
+
+/// What is before a mark, and the mark with what follows it hidden, if anything does.
+fn hidden_from(text: &str, mark: char) -> (&str, String) {
+    match text.split_once(mark) {
+        Some((before, after)) if !after.is_empty() => (before, format!("{mark}{HIDDEN}")),
+        _ => (text, String::new()),
+    }
+}
+
+/// A URL without its scheme, with its secrets hidden.
+fn without_secrets(text: &str, is_web: bool) -> String {
+    let (place, query) = hidden_from(text, '?');
+    // A bit rate is behind the last @ of an adapter's URL.
+    let is_rate = |text: &str| {
+        let digits = text.trim_end_matches(['k', 'K', 'M']);
+        !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit())
+    };
+    let (place, rate) = match place.rsplit_once('@') {
+        Some((place, rate)) if is_rate(rate) => (place, format!("@{rate}")),
+        _ => (place, String::new()),
+    };
+    let place = match place.rsplit_once('@') {
+        Some((user, host)) if !user.is_empty() && !host.is_empty() => format!("{HIDDEN}@{host}"),
+        _ => place.to_owned(),
+    };
+    match place.split_once('/') {
+        Some((host, path)) if is_web && !path.is_empty() => format!("{host}/{HIDDEN}{query}"),
+        _ => format!("{place}{rate}{query}"),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -50,6 +103,26 @@ mod tests {
         ] {
             let words: Vec<OsString> = words.split(' ').map(OsString::from).collect();
             assert_eq!(without(&words).join(" "), shown);
+        }
+    }
+
+    #[test]
+    fn the_secrets_of_urls_are_hidden() {
+        for (text, shown) in [
+            ("bus slcan:tcp://10.0.0.7:2000@500k, and", "bus slcan:tcp://10.0.0.7:2000@500k, and"),
+            ("socketcand://me:sesame@host:29536/can0", "socketcand://***@host:29536/can0"),
+            ("slcan:tcp://me:sesame@host:2000@500k", "slcan:tcp://***@host:2000@500k"),
+            ("cia309://host:1/1?key=sesame", "cia309://host:1/1?***"),
+            ("{\"url\":\"http://127.0.0.1:80/sesame/\"}", "{\"url\":\"http://127.0.0.1:80/***\"}"),
+            ("see https://me:ses@me@host/a/sesame#sesame.", "see https://***@host/***#***."),
+            (
+                "(socketcand me:ses,ame@10.0.0.7:1, bus can0?token=sesame cannot be opened)",
+                "(socketcand ***@10.0.0.7:1, bus can0?*** cannot be opened)",
+            ),
+            ("slcan:tcp://host:2000@500k. Why? \"a\\\"\"", "slcan:tcp://host:2000@500k. Why? \"a\\\"\""),
+            ("slcan:/dev/ttyACM0@500k 605#2B17", "slcan:/dev/ttyACM0@500k 605#2B17"),
+        ] {
+            assert_eq!(without_urls(text), shown);
         }
     }
 }

@@ -9,6 +9,7 @@ mod legacy;
 mod mistakes;
 mod package;
 mod renew;
+mod report;
 mod sealing;
 mod several;
 mod tool;

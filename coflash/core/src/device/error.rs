@@ -383,6 +383,32 @@ impl Error {
         )
     }
 
+    /// What the device has answered, one sentence for each: the abort code, the status in 1F57h, the state
+    /// in 2007h. Empty if it has given no reason.
+    #[must_use]
+    pub fn answers(&self) -> Vec<String> {
+        let (code, failed, state) = match self {
+            Self::Refused { code, .. } => (Some(*code), None, None),
+            Self::NoBootloader { code, .. } | Self::TrialFailed { how: TrialFailure::Stays(code), .. } => {
+                (*code, None, None)
+            }
+            Self::Failed { error, detail, code, .. } => (*code, Some((*error, *detail)), None),
+            Self::StartFailed { status, state, .. }
+            | Self::TrialFailed { how: TrialFailure::NotStarted(status, state), .. } => {
+                let failed = status.and_then(|status| Some((status.error?, status.detail)));
+                (None, failed, *state)
+            }
+            _ => (None, None, None),
+        };
+        let code = code.map(|code| format!("SDO abort {code}"));
+        let failed = failed.map(|(error, detail)| {
+            let words = failure_words(error, detail);
+            format!("1F57h reads {:02X}h, detail {detail:04X}h: {words}", error.code())
+        });
+        let state = state.map(|state| format!("2007h: it {state}"));
+        [code, failed, state].into_iter().flatten().collect()
+    }
+
     /// The stable error number: the manual's number (L-1112e_5, table 5, which contains all numbers
     /// of the newer manual) if there is one, otherwise 60000100h plus the code of 1F57h, 60000200h
     /// plus the error code of LSS, or 6000030xh for adapters.

@@ -1,0 +1,244 @@
+//! `coflash report bundle`, and what `report.json` says about a failed update.
+
+use std::collections::HashSet;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::tool::{command, data, folder, run, Done};
+use coflash_core::machine::zip;
+use kit::fake::{serve, Blocks, Fake, Outcome, BOOTLOADER};
+use kit::folder::Folder;
+use serde_json::Value;
+
+/// A device without delays that takes block transfers.
+fn bootloader() -> Fake {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.knows_blocks = Blocks::Known(127);
+    fake.erase_time = Duration::from_millis(30);
+    fake.restart_time = Duration::from_millis(20);
+    fake
+}
+
+/// A run in the folder, recorded in `reports`.
+fn recorded(folder: &Folder, words: &[&str], variables: &[(&str, &str)]) -> Done {
+    let variables = variables.iter().copied();
+    run(command().current_dir(folder.path("")).envs(variables).args(words).args(["--report-dir", "reports"]))
+}
+
+/// The members of an archive.
+fn members(path: &str) -> Vec<(String, Vec<u8>)> {
+    let bytes = fs::read(path).unwrap();
+    let members = zip::read(&bytes).unwrap();
+    members.iter().map(|member| (member.name.to_owned(), member.bytes.to_vec())).collect()
+}
+
+fn text(members: &[(String, Vec<u8>)], end: &str) -> String {
+    let (_, bytes) = members.iter().find(|(name, _)| name.ends_with(end)).unwrap();
+    String::from_utf8(bytes.clone()).unwrap()
+}
+
+fn json(members: &[(String, Vec<u8>)], end: &str) -> Value {
+    serde_json::from_str(&text(members, end)).unwrap()
+}
+
+fn runs(folder: &Folder) -> Vec<PathBuf> {
+    let mut all: Vec<PathBuf> =
+        fs::read_dir(folder.path("reports")).unwrap().map(|entry| entry.unwrap().path()).collect();
+    all.sort();
+    all
+}
+
+/// Finds seven bytes of a firmware, the data of one SDO segment, as bytes and as hexadecimal digits.
+struct Firmware(HashSet<Vec<u8>>);
+
+impl Firmware {
+    fn new(firmware: &[u8]) -> Self {
+        // Its texts may be words of a message, too.
+        let is_text = |part: &[u8]| part.iter().all(|byte| matches!(byte, b' '..=b'~'));
+        let is_distinct = |part: &&[u8]| part.iter().collect::<HashSet<_>>().len() > 3 && !is_text(part);
+        let parts = firmware.windows(7).filter(is_distinct);
+        let digits = |part: &[u8]| part.iter().flat_map(|byte| format!("{byte:02X}").into_bytes()).collect();
+        Self(parts.flat_map(|part| [part.to_vec(), digits(part)]).collect())
+    }
+
+    fn is_in(&self, bytes: &[u8]) -> bool {
+        [7, 14].into_iter().any(|size| bytes.windows(size).any(|part| self.0.contains(part)))
+    }
+}
+
+/// A secret is planted in each place that one could come from: the command line, the environment, the
+/// configuration, a URL, a frame, and key files, beside the recorded files and in their place.
+#[test]
+fn a_bundle_has_no_secret_and_no_firmware() {
+    const PLANT: &str = "PLANTED";
+    let folder = folder("bundle");
+    let image = data("plain-400.blk");
+    let flash = ["flash", &image, "-N", "5", "--dialect", "block"];
+    let (url, _device) = serve(bootloader());
+    let line = recorded(&folder, &[&flash[..], &["--bus", &url, "--unlock", "PLANTED-line"]].concat(), &[]);
+    assert_eq!(line.exit, 0, "{}", line.err);
+    let (url, _device) = serve(bootloader());
+    let environment = [("COFLASH_UNLOCK", "PLANTED-env"), ("COFLASH_BUS", url.as_str())];
+    assert_eq!(recorded(&folder, &flash, &environment).exit, 0);
+    folder.write("coflash.toml", b"unlock = \"PLANTED-config\"\n");
+    let (url, _device) = serve(bootloader());
+    assert_eq!(recorded(&folder, &[&flash[..], &["--bus", &url, "--segmented"]].concat(), &[]).exit, 0);
+    // Its frames: a password in segments.
+    let (url, _device) = serve(bootloader());
+    let write = ["write", "6005/1", "PLANTED-frame", "--type", "string", "-N", "5", "--bus", &url];
+    recorded(&folder, &write, &[]);
+    let bad = "socketcand://me:PLANTED-user@127.0.0.1:1/can0?token=PLANTED-query";
+    assert_ne!(recorded(&folder, &[&flash[..], &["--bus", bad]].concat(), &[]).exit, 0);
+    let key = b"-----BEGIN PRIVATE KEY-----\nPLANTED-key\n-----END PRIVATE KEY-----\n";
+    folder.write("release.pem", key);
+    let last = runs(&folder).pop().unwrap();
+    fs::write(last.join("release.pem"), key).unwrap();
+    let false_run = Path::new(&folder.path("reports")).join("20000101T000000-flash");
+    fs::create_dir(&false_run).unwrap();
+    fs::write(false_run.join("report.json"), "{\"bus\": \"http://host/a/PLANTED/?PLANTED\"}").unwrap();
+    for name in ["events.jsonl", "log.txt", "trace.log"] {
+        fs::write(false_run.join(name), key).unwrap();
+    }
+    // The firmware is in what was recorded, so that its absence means something.
+    let firmware = Firmware::new(&fs::read(&image).unwrap());
+    let first = runs(&folder).into_iter().nth(1).unwrap();
+    for name in ["trace.log", "log.txt"] {
+        assert!(firmware.is_in(&fs::read(first.join(name)).unwrap()), "{name}");
+    }
+    let words = ["report", "bundle", "-o", "fault.zip", "-N", "5"];
+    let (url, _device) = serve(bootloader());
+    let query = format!("{url}?PLANTED-now");
+    for bus in [&query, &url] {
+        let variables = [("COFLASH_BUS", bus.as_str()), ("COFLASH_UNLOCK", "PLANTED-env")];
+        let done = recorded(&folder, &words, &variables);
+        assert_eq!(done.exit, 0, "{}", done.err);
+        let members = members(&folder.path("fault.zip"));
+        for (name, bytes) in &members {
+            let text = String::from_utf8(bytes.clone()).unwrap();
+            assert!(!text.contains(PLANT), "{name}: {text}");
+            // The same in a frame.
+            assert!(!text.contains("504C414E544544"), "{name}: {text}");
+            assert!(!firmware.is_in(bytes), "{name}");
+        }
+    }
+    // Everything else is there.
+    let members = members(&folder.path("fault.zip"));
+    let readme = text(&members, "README.txt");
+    assert_eq!(members[0].0, "README.txt");
+    for (name, _) in &members[1..] {
+        assert!(readme.contains(&format!("\n{name}: ")), "{name} is not in {readme}");
+    }
+    let first = first.file_name().unwrap().to_string_lossy().into_owned();
+    assert_eq!(json(&members, &format!("{first}-report.json"))["result"]["size"], 4001);
+    assert!(text(&members, &format!("{first}-events.jsonl")).contains("\"event\":\"done\""));
+    assert!(text(&members, &format!("{first}-log.txt")).contains("  said     "));
+    assert!(text(&members, &format!("{first}-trace.log")).contains(" 605#C6501F01"));
+    assert_eq!(text(&members, "20000101T000000-flash-log.txt"), "");
+}
+
+/// What the device says now, and the versions; a run of `read` keeps its frames alone, without what was
+/// read from 1F50h.
+#[test]
+fn a_bundle_has_what_the_device_says_and_no_values_of_read() {
+    let folder = folder("bundle-device");
+    let mut device = bootloader();
+    device.readable = Some(b"FIRMWARE of the device".to_vec());
+    let (url, _device) = serve(device);
+    let read = recorded(&folder, &["read", "1F50/1", "-N", "5", "--bus", &url], &[]);
+    assert!(read.exit == 0 && read.out.contains("FIRMWARE"), "{}{}", read.out, read.err);
+    let of_run = runs(&folder).pop().unwrap().display().to_string();
+    let (url, _device) = serve(bootloader());
+    let words = ["report", "bundle", &of_run, "-N", "5", "--bus", &url, "--json"];
+    let done = run(command().current_dir(folder.path("")).args(words));
+    let said: Value = serde_json::from_str(&done.out).unwrap();
+    assert_eq!((&said["runs"], &said["answer"]), (&1.into(), &"the device has answered".into()));
+    let members = members(&folder.path("coflash-report.zip"));
+    assert_eq!(json(&members, "device.json")["device_type"], BOOTLOADER);
+    assert_eq!(json(&members, "adapters.json")["in_use"], url.as_str());
+    let version = run(command().arg("--version")).out;
+    assert_eq!(
+        format!("coflash {}\n", json(&members, "versions.json")["coflash"].as_str().unwrap()),
+        version
+    );
+    assert!(json(&members, "-report.json")["result"].is_null());
+    assert!(text(&members, "-trace.log").contains(" 585#"), "{}", text(&members, "-trace.log"));
+    for (name, bytes) in &members {
+        let text = String::from_utf8(bytes.clone()).unwrap();
+        assert!(!text.contains("FIRMWARE") && !text.contains("4649524D"), "{name}: {text}");
+    }
+}
+
+#[test]
+fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
+    let folder = folder("bundle-silent");
+    let (url, _device) = serve(bootloader());
+    let quick = ["--sdo-timeout", "50", "--boot-timeout", "50"];
+    let silent = [&["report", "bundle", "-N", "9", "--bus", &url][..], &quick].concat();
+    for (words, why) in [
+        (silent, "node 9 does not answer"),
+        (vec!["report", "bundle"], "no CAN bus is given"),
+        (vec!["report", "bundle", "--bus", "nonsense:1"], "nonsense"),
+    ] {
+        let done = run(command().current_dir(folder.path("")).args(&words));
+        assert!(done.exit == 0 && done.out.contains(why), "{words:?}: {}{}", done.out, done.err);
+        let members = members(&folder.path("coflash-report.zip"));
+        assert!(json(&members, "device.json")["error"]["what"].as_str().unwrap().contains(why));
+        assert!(text(&members, "README.txt").contains(why));
+    }
+    let done = run(command().current_dir(folder.path("")).args(["report", "bundle", "none"]));
+    assert!(done.exit == 3 && done.err.contains("none: cannot be read"), "{}", done.err);
+    fs::create_dir(folder.path("empty")).unwrap();
+    let done = run(command().current_dir(folder.path("")).args(["report", "bundle", "empty"]));
+    assert!(done.exit == 2 && done.err.contains("has no recorded run"), "{}", done.err);
+}
+
+/// A block with a wrong CRC is sent again, and again: the report has each attempt, what the device
+/// answered, and the frames with that answer, without the program.
+#[test]
+fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
+    let folder = folder("failed-update");
+    let mut device = bootloader();
+    device.on_block = Box::new(|_| Outcome::Status(0x06));
+    let (url, _device) = serve(device);
+    let image = data("plain-400.blk");
+    let done = recorded(&folder, &["flash", &image, "-N", "5", "--bus", &url, "--block-repeats", "2"], &[]);
+    assert_eq!(done.exit, 6, "{}", done.err);
+    let path = runs(&folder).pop().unwrap().join("report.json");
+    let bytes = fs::read(&path).unwrap();
+    let report: Value = serde_json::from_slice(&bytes).unwrap();
+    let [update] = report["failed_updates"].as_array().unwrap().as_slice() else { panic!("{report:#}") };
+    assert_eq!(update["node"], 5);
+    let tried = update["tried"].to_string();
+    for attempt in ["sending block 0 again, 1 of 2: the CRC", "sending block 0 again, 2 of 2: the CRC"] {
+        assert!(tried.contains(attempt), "{tried}");
+    }
+    // CiA 302-3: the answer to the read of 1F57h/1 with the error 3 in bits 1 to 7.
+    let frames = update["frames"].as_array().unwrap();
+    let decided = |frame: &Value| frame.as_str().unwrap().contains("  585#43571F0106000000  ");
+    assert!(frames.iter().any(decided) && frames.len() <= 32, "{update:#}");
+    let answers = report["error"]["answers"].as_array().unwrap();
+    assert!(answers[0].as_str().unwrap().starts_with("1F57h reads 06h"), "{answers:?}");
+    assert!(!Firmware::new(&fs::read(&image).unwrap()).is_in(&bytes));
+    // A refusal by abort.
+    let mut device = bootloader();
+    device.on_command = Box::new(|_| Outcome::Abort(0x0800_0022));
+    let (url, _device) = serve(device);
+    let done = recorded(&folder, &["erase", "-N", "5", "--bus", &url, "--json"], &[]);
+    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let answer = said["error"]["answers"][0].as_str().unwrap();
+    assert!(answer.starts_with("SDO abort ") && answer.contains("08000022h"), "{said}");
+    // A program that does not start: 2007h/2 says that the program is not released (docs/protocol.md).
+    let mut device = bootloader();
+    device.starts = Some(BOOTLOADER);
+    device.state = Some([5, 0, 0]);
+    let (url, _device) = serve(device);
+    let done = recorded(&folder, &["start", "-N", "5", "--bus", &url, "--json"], &[]);
+    let said: Value = serde_json::from_str(&done.out).unwrap();
+    let answers = said["error"]["answers"].to_string();
+    assert!(
+        answers.contains("1F57h reads ")
+            && answers.contains("2007h: it stays in the bootloader: its program is not released"),
+        "{said}"
+    );
+}
