@@ -518,7 +518,7 @@ fn to_open_a_journal_takes_a_look_at_each_byte_and_no_more() {
     }
 }
 
-/// A region that was damaged: behind its header and a record there is nothing but slots that are no records. A
+/// A region that was damaged: after its header and a record there is nothing but slots that are no records. A
 /// store copies the record, and looks at each slot a few times, not at all of them for each.
 #[test]
 fn a_store_in_a_region_full_of_what_is_no_record_looks_at_each_slot_a_few_times() {
