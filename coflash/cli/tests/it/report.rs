@@ -199,7 +199,7 @@ fn a_silent_device_or_no_bus_is_in_the_bundle_and_no_failure() {
 fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let folder = folder("failed-update");
     let mut device = bootloader();
-    device.on_block = Box::new(|_| Outcome::Status(0x06));
+    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
     let (url, _device) = serve(device);
     let image = data("plain-400.blk");
     let done = recorded(&folder, &["flash", &image, "-N", "5", "--bus", &url, "--block-repeats", "2"], &[]);
@@ -210,7 +210,7 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let [update] = report["failed_updates"].as_array().unwrap().as_slice() else { panic!("{report:#}") };
     assert_eq!(update["node"], 5);
     let tried = update["tried"].to_string();
-    for attempt in ["sending block 0 again, 1 of 2: the CRC", "sending block 0 again, 2 of 2: the CRC"] {
+    for attempt in ["sending block 1 again, 1 of 2: the CRC", "sending block 1 again, 2 of 2: the CRC"] {
         assert!(tried.contains(attempt), "{tried}");
     }
     // CiA 302-3: the answer to the read of 1F57h/1 with the error 3 in bits 1 to 7.
