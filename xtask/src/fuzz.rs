@@ -120,16 +120,16 @@ pub fn run(mut args: Args) -> Outcome {
     // If there is none, rustup says how to get it.
     process::output(Command::new("rustup").args(["run", "nightly", "rustc", "--version"]))?;
     setup::prepare(&[setup::Part::Cpp])?;
-    let tools = Tools { cargo_fuzz: setup::tool("cargo-fuzz", CARGO_FUZZ, &[])? };
+    let cargo_fuzz = setup::tool("cargo-fuzz", CARGO_FUZZ, &[])?;
     println!("Building the fuzz targets ...");
     for target in &targets {
-        process::run(&mut tools.command("build", target))?;
+        process::run(&mut command(&cargo_fuzz, "build", target))?;
     }
     let next = AtomicUsize::new(0);
     let one = |target: &String| -> Outcome<Value> {
-        let row = tools.fuzz(target, &end)?;
+        let row = fuzz(&cargo_fuzz, target, &end)?;
         if keep && !is_failed(&row) {
-            process::output(tools.command("cmin", target).arg(found(target)))?;
+            process::output(command(&cargo_fuzz, "cmin", target).arg(found(target)))?;
             corpus::keep(&found(target), &kept_file(target))?;
         }
         Ok(row)
@@ -180,56 +180,51 @@ fn counted(rows: &[Value]) -> Value {
     })
 }
 
-struct Tools {
-    cargo_fuzz: PathBuf,
+/// The command of cargo-fuzz, with this word of its, for a target.
+fn command(cargo_fuzz: &Path, word: &str, target: &str) -> Command {
+    let mut command = Command::new("rustup");
+    command.args(["run", "nightly"]).arg(cargo_fuzz).args(["fuzz", word]);
+    // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
+    command.arg("--sanitizer=none").arg("--fuzz-dir").arg(folder());
+    // Each of the two is built with options of its own.
+    let mut programs = target_dir();
+    if longest_commands(target).is_some() {
+        command.arg("--no-trace-compares");
+        programs.push("without-compares");
+    }
+    command.arg(target).current_dir(workspace::root());
+    command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
+    // The lines of a panic; and a wrapped number is a find, too.
+    command.env("CARGO_PROFILE_RELEASE_DEBUG", "1").env("CARGO_PROFILE_RELEASE_OVERFLOW_CHECKS", "true");
+    command
 }
 
-impl Tools {
-    fn command(&self, word: &str, target: &str) -> Command {
-        let mut command = Command::new("rustup");
-        command.args(["run", "nightly"]).arg(&self.cargo_fuzz).args(["fuzz", word]);
-        // It looks for mistakes with pointers, which safe Rust cannot make, and takes half the time.
-        command.arg("--sanitizer=none").arg("--fuzz-dir").arg(folder());
-        // Each of the two is built with options of its own.
-        let mut programs = target_dir();
-        if longest_commands(target).is_some() {
-            command.arg("--no-trace-compares");
-            programs.push("without-compares");
-        }
-        command.arg(target).current_dir(workspace::root());
-        command.env("CARGO_TARGET_DIR", programs).env_remove("CARGO");
-        // The lines of a panic; and a wrapped number is a find, too.
-        command.env("CARGO_PROFILE_RELEASE_DEBUG", "1").env("CARGO_PROFILE_RELEASE_OVERFLOW_CHECKS", "true");
-        command
+/// Runs a target until this end: an option of the fuzzer. Prints and returns what it has counted;
+/// why it failed, if it did.
+fn fuzz(cargo_fuzz: &Path, target: &str, end: &str) -> Outcome<Value> {
+    // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
+    let corpus = corpus::unpack(&kept_file(target), found(target))?;
+    let log = target_dir().join(target).with_extension("log");
+    let file = fs::File::create(&log).map_err(|error| format!("{}: {error}.", log.display()))?;
+    let mut command = command(cargo_fuzz, "run", target);
+    command.arg(&corpus);
+    let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
+    command.args(["--", "-print_final_stats=1", end]);
+    command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
+    let started = Instant::now();
+    command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
+    let status = command.status().map_err(|error| process::not_started(&command, &error))?;
+    let said = fs::read(&log).unwrap_or_default();
+    let said = String::from_utf8_lossy(&said);
+    let runs = runs(&said).filter(|runs| status.success() && *runs > 0);
+    if let Some(runs) = runs {
+        let seconds = started.elapsed().as_secs();
+        println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
+        return Ok(json!({"target": target, "inputs": runs, "seconds": seconds}));
     }
-
-    /// Runs a target until this end: an option of the fuzzer. Prints and returns what it has counted;
-    /// why it failed, if it did.
-    fn fuzz(&self, target: &str, end: &str) -> Outcome<Value> {
-        // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
-        let corpus = corpus::unpack(&kept_file(target), found(target))?;
-        let log = target_dir().join(target).with_extension("log");
-        let file = fs::File::create(&log).map_err(|error| format!("{}: {error}.", log.display()))?;
-        let mut command = self.command("run", target);
-        command.arg(&corpus);
-        let longest = longest_commands(target).unwrap_or(LONGEST_INPUT);
-        command.args(["--", "-print_final_stats=1", end]);
-        command.args([format!("-max_len={longest}"), format!("-timeout={TOO_LONG}")]);
-        let started = Instant::now();
-        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(file);
-        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
-        let said = fs::read(&log).unwrap_or_default();
-        let said = String::from_utf8_lossy(&said);
-        let runs = runs(&said).filter(|runs| status.success() && *runs > 0);
-        if let Some(runs) = runs {
-            let seconds = started.elapsed().as_secs();
-            println!("  {target:<16} {runs:>10} inputs in {seconds} s, no fault");
-            return Ok(json!({"target": target, "inputs": runs, "seconds": seconds}));
-        }
-        let words = if status.success() { "ran no input" } else { "FAILED" };
-        println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
-        Ok(json!({"target": target}))
-    }
+    let words = if status.success() { "ran no input" } else { "FAILED" };
+    println!("  {target:<16} {words}; all of it is in {}\n{}", workspace::shown(&log), excerpt(&said));
+    Ok(json!({"target": target}))
 }
 
 /// The targets, from the names of their files.
