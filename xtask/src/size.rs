@@ -10,11 +10,11 @@ use crate::{build, elf, evidence, outcome::Outcome, toolchain, workspace};
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD]
 
-Builds the bootloaders of a board and prints the flash of each, and that of the plain and of the sealed
-one on every board. Fails when one of these is over the budget. What is in it by function:
+Builds the plain and the sealed bootloader for every board, and prints the flash of each. Fails when one
+is over the budget. What is in it by function:
 arm-none-eabi-nm --demangle --size-sort target/firmware/BOARD/bootloader.elf
 
-  --board BOARD   the board of all bootloaders (default: stm32f407g-disc1)
+  --board BOARD   before that, every bootloader of this board
 ";
 
 /// The largest permitted sizes in bytes: of resident part, header and RAM image together in the
@@ -24,17 +24,20 @@ const RESIDENT: u32 = 12 * 1024;
 const RAM_IMAGE: u32 = 56 * 1024;
 
 pub fn run(mut args: Args) -> Outcome {
-    let board = workspace::board(&mut args)?;
+    let chosen = args.has("--board").then(|| workspace::board(&mut args)).transpose()?;
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
-    println!("bootloader                      bytes");
-    for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
-        let used = build::bootloader_size(board, variant.features, &variant.product()?)?;
-        let used: Vec<String> = used.iter().map(u32::to_string).collect();
-        println!("{:<31} {}", variant.name, used.join(" + "));
+    if let Some(board) = chosen {
+        println!("bootloader                      bytes");
+        for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
+            let used = build::bootloader_size(board, variant.features, &variant.product()?)?;
+            let used: Vec<String> = used.iter().map(u32::to_string).collect();
+            println!("{:<31} {}", variant.name, used.join(" + "));
+        }
+        println!();
     }
 
-    println!("\nboard                    image                      at         bytes     of");
+    println!("board                    image                      at         bytes     of");
     let mut problems = Vec::new();
     let (mut images, mut count) = (Vec::new(), 0);
     for board in BOARDS {

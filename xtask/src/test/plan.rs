@@ -140,7 +140,6 @@ pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("device", "device::"),
     ("device", "watchdog::"),
     ("device", "supply::"),
-    ("device", "boot_time::"),
     ("device", "abi::"),
     ("device", "handover::"),
     ("update", "main_job::"),
