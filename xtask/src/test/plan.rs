@@ -159,6 +159,14 @@ pub const SPLIT_ALONE: &[(&str, &str)] = &[
     ("sealed", ""),
 ];
 
+/// Tests of boards whose bootloader can be renewed: those with a region for staging.
+pub const RENEWED_ALONE: &[(&str, &str)] = &[
+    ("device", "renewal::"),
+    ("update", "renewal"),
+    ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
+    ("sealed", "renewal::"),
+];
+
 /// The table [`LATER`], as a page has it.
 pub fn table() -> String {
     let mut table = String::from("| tests | first run by | why not earlier |\n|---|---|---|\n");
