@@ -164,6 +164,8 @@ pub const RENEWED_ALONE: &[(&str, &str)] = &[
     ("device", "renewal::"),
     ("update", "renewal"),
     ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
+    ("update", "fleet::a_later_device_that_refuses_a_bootloader"),
+    ("update", "fleet::if_the_first_device_refuses_a_bootloader"),
     ("sealed", "renewal::"),
 ];
 
