@@ -66,7 +66,7 @@ const fn stage(
 /// All stages, in the order in which they run.
 const STAGES: &[Stage] = &[
     stage("product", "the default board, device and tool", 12, Tier::Product, product),
-    stage("ci", "Chromium, tools of others, other chips, pages", 8, Tier::Ci, ci),
+    stage("ci", "Chromium, tools of others, other chips, pages", 13, Tier::Ci, ci),
     stage("slow", "tests that take minutes", 25, Tier::All, slow),
     stage("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
     stage("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
