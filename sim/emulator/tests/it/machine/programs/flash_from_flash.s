@@ -14,12 +14,7 @@ vector 15, tick
     movs r2, #7
     str r2, [r1]
     ldr r1, =FLASH
-    ldr r0, =KEY1
-    str r0, [r1, #4]
-    ldr r0, =KEY2
-    str r0, [r1, #4]
-    ldr r0, =0x0001020A         // FLASH_CR: STRT, x32, sector 1, SER
-    str r0, [r1, #16]
+    erases_sector_1
 1:
     adds r7, #1
     ldr r0, [r1, #12]

@@ -10,12 +10,7 @@
     blx r4
     str r0, [r6, #4]
     ldr r1, =FLASH
-    ldr r0, =KEY1
-    str r0, [r1, #4]
-    ldr r0, =KEY2
-    str r0, [r1, #4]
-    ldr r0, =0x0001020A         // FLASH_CR: STRT, x32, sector 1, SER
-    str r0, [r1, #16]
+    erases_sector_1
     ldr r0, =ARGUMENT
     ldr r0, [r0]
     cmp r0, #0

@@ -12,12 +12,7 @@
     ldr r4, =0x08004001
     blx r4
     stmia r6!, {r0}
-    ldr r0, =KEY1
-    str r0, [r1, #4]
-    ldr r0, =KEY2
-    str r0, [r1, #4]
-    ldr r0, =0x0001020A         // FLASH_CR: STRT, x32, sector 1, SER
-    str r0, [r1, #16]
+    erases_sector_1
 1:
     ldr r0, [r1, #12]
     lsls r0, r0, #15
