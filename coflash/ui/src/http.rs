@@ -108,9 +108,10 @@ impl From<Refusal> for Refused {
 }
 
 /// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
-const FILES: [(&str, &str, &str); 14] = [
+const FILES: [(&str, &str, &str); 15] = [
     ("", HTML, include_str!("page/index.html")),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
+    ("colours.css", CSS, include_str!("page/colours.css")),
     ("style.css", CSS, include_str!("page/style.css")),
     ("app.js", SCRIPT, include_str!("page/app.js")),
     ("api.js", SCRIPT, include_str!("page/api.js")),

@@ -28,8 +28,9 @@ use crate::state::Notice;
 #[cfg(test)]
 pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
 
-const FILES: [(&str, &str, &str); 8] = [
+const FILES: [(&str, &str, &str); 9] = [
     ("", HTML, include_str!("page/service.html")),
+    ("colours.css", CSS, include_str!("../page/colours.css")),
     ("service.css", CSS, include_str!("page/service.css")),
     ("service.js", SCRIPT, include_str!("page/service.js")),
     ("words.json", "application/json", TABLE),

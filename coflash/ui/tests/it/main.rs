@@ -258,7 +258,7 @@ fn other_names_and_other_origins_are_turned_away() {
 #[test]
 fn the_page_keeps_to_itself() {
     let ui = Ui::new(None);
-    for what in ["", "app.js", "style.css", "uPlot.js", "adapters", "trace", "nowhere"] {
+    for what in ["", "app.js", "style.css", "colours.css", "uPlot.js", "adapters", "trace", "nowhere"] {
         let answer = ui.get(what);
         for line in [
             "content-security-policy: default-src 'none'; script-src 'self';",

@@ -138,7 +138,8 @@ fn a_station_has_nothing_but_its_package() {
     assert_eq!(ui.request("POST", &format!("{}update", ui.path), &lines, b"{}").status, 415);
     let long = json!({ "operator": "x".repeat(70_000) });
     assert_eq!(ui.post("update", &long).status, 413);
-    for what in ["", "service.js", "service.css", "words.json", "station", "dom.js", "kept.js"] {
+    for what in ["", "service.js", "service.css", "colours.css", "words.json", "station", "dom.js", "kept.js"]
+    {
         let answer = ui.get(what);
         assert_eq!(answer.status, 200, "{what}");
         assert!(answer.head.contains("default-src 'none'"), "{what}: {}", answer.head);
