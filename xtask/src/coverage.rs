@@ -33,7 +33,7 @@ const CRATES: [(&str, &str); 5] = [
     ("coboot-seal", "core/seal"),
 ];
 /// The tests of sealed images that need no built firmware, in the test program `sealed`.
-pub const SEALED_TESTS: [&str; 4] = ["access::", "dictionary::", "model::", "pieces::"];
+pub const SEALED_TESTS: [&str; 5] = ["access::", "dictionary::", "model::", "pieces::", "strangers::"];
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;

@@ -91,7 +91,9 @@ pub fn run(mut args: Args) -> Outcome {
         let left = mutants(name, name, &[&options[..], &[format!("--exclude-re={SEALED}")]].concat())?;
         let again: Vec<_> = left.iter().map(|line| format!("--re=^{}$", exactly(line))).collect();
         if !again.is_empty() {
-            missed.extend(mutants(name, "again", &[&sealed[..], &again].concat())?);
+            // cargo-mutants tries each deletion of a field or an arm in these files, whatever the pattern.
+            let missed_again = mutants(name, "again", &[&sealed[..], &again].concat())?;
+            missed.extend(missed_again.into_iter().filter(|line| left.contains(line)));
         }
         let within = [&options[..], &sealed, &[format!("--re={SEALED}")]].concat();
         missed.extend(mutants(name, "sealed", &within)?);

@@ -44,7 +44,8 @@ impl ProgramWords {
         self.written
     }
 
-    const fn at(&self) -> u32 {
+    /// The address of the word whose turn it is.
+    pub(crate) const fn at(&self) -> u32 {
         self.address + 4 * self.written as u32
     }
 }
@@ -59,6 +60,11 @@ pub(crate) struct EraseSectors {
 impl EraseSectors {
     pub(crate) const fn new(region: Region) -> Self {
         Self { next: region.base, end: region.end() }
+    }
+
+    /// An address in the sector whose erase began last.
+    pub(crate) const fn at(&self) -> u32 {
+        self.next.wrapping_sub(1)
     }
 
     /// The next operation, `None` after all sectors.

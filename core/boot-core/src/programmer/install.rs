@@ -106,6 +106,15 @@ impl Phase {
         Self::Erase(EraseSectors::new(places.home))
     }
 
+    /// An address in the sector of the operation that began last, 0 for none.
+    pub(super) const fn at(&self) -> u32 {
+        match self {
+            Self::Erase(sectors) => sectors.at(),
+            Self::Copy(words) => words.at(),
+            Self::Counter | Self::Permit | Self::Check(_) | Self::Done => 0,
+        }
+    }
+
     /// The next operation of the installation of the image with this record, until [`Phase::Done`].
     pub(super) fn next<F: Flash>(
         &mut self,

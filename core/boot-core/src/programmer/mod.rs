@@ -26,7 +26,7 @@ use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next, Operation};
 use crate::program::{Expected, FlashCrc};
 use crate::queue::Piece;
-use crate::renewal::{header, Places};
+use crate::renewal::{check, Places};
 use crate::resume::Partial;
 use crate::source::{Demand, Source};
 use crate::store::{Key, NodeParameters, Parameters, ProgramRecord, RenewalRecord, Value};
@@ -465,9 +465,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             Ok(Some(operation)) => Next::Start(operation),
             Ok(None) => Next::Done(Ok(())),
             Err(FlashFault::Protected) => {
-                let at = match &self.job {
-                    Some(Job::Erase { until, .. }) => until - 1,
-                    Some(Job::Write(write)) => write.address(),
+                let at = match (&self.job, &self.install) {
+                    (Some(Job::Erase { until, .. }), _) => until - 1,
+                    (Some(Job::Write(write)), _) => write.at(),
+                    (Some(Job::Install), Some(install)) if P::RENEWS => install.at(),
                     _ => 0,
                 };
                 self.detail = flash.sector_at(at).map_or(0, |sector| sector.number);
@@ -664,7 +665,11 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         let Some(install) = &self.install else { return Ok(None) };
         let (change, state) = match install {
             Phase::Counter => {
-                let counter = header(flash, self.places().staging).counter;
+                // It was good when it was loaded. Home is not given up for one that has decayed since.
+                let Some(Header { counter, .. }) = self.staged(flash, &record) else {
+                    self.void(BOOTLOADER);
+                    return Err(FlashError::NoValidProgram);
+                };
                 let raised = self.raised_counter(parameters, flash, counter);
                 self.install = Some(Phase::Permit);
                 return Ok(raised.map(|counter| store_counter(parameters, BOOTLOADER, counter)));
@@ -680,6 +685,13 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             self.check_writable(flash, self.places().home)?;
         }
         Ok(Some(store(parameters, change, BOOTLOADER, value)))
+    }
+
+    /// The header of the image in staging, if the whole image is still that of the record.
+    fn staged<F: Flash>(&self, flash: &F, record: &RenewalRecord) -> Option<Header> {
+        let renewing = self.renewing.as_ref()?;
+        let image = check(flash, renewing.places().staging, renewing.layout, renewing.host());
+        image.ok().filter(|image| image.crc == record.crc)
     }
 
     /// The stored counter of the bootloader with this lowest value; `None` on a device that takes no sealed

@@ -28,9 +28,9 @@ impl WritePiece {
         Some(Self { piece, edges, words: ProgramWords::new(first) })
     }
 
-    /// The address of its first byte.
-    pub(super) fn address(&self) -> u32 {
-        self.piece.address
+    /// The address of the word whose turn it is.
+    pub(super) const fn at(&self) -> u32 {
+        self.words.at()
     }
 
     /// The next operation, `None` when the whole piece is in flash and was read back.

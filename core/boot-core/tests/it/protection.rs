@@ -122,6 +122,34 @@ fn blocks_are_refused_before_the_record_is_removed() {
     }
 }
 
+/// Somebody protects a sector in the middle of a download: the erase of a sector that is still to come names
+/// it, and so does a word in one that was erased before.
+#[test]
+fn a_sector_that_is_protected_in_mid_download_is_named() {
+    let new = raw(&STANDARD_1, 5000, 2);
+    let base = STANDARD_1.region(1).base;
+    let control = block(0, 0, &[5000_u32.to_le_bytes(), [0; 4], PRODUCT_CODE.to_le_bytes()].concat());
+    // Block 1 ends in sector 5, which is erased for it. Block 2 ends there as well, block 3 in sector 6.
+    for (sector, sent) in [(5, 1), (6, 2)] {
+        let mut rig = Rig::new(&STANDARD_1, 8192);
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        rig.send(1, &control).unwrap();
+        let mut blocks = (1..).zip([(0, 1200), (1200, 2000), (2000, 4000)]);
+        let mut send = |rig: &mut Rig| {
+            let (number, (from, to)) = blocks.next().unwrap();
+            let _ = rig.send(1, &block(number, base + from, &new[from as usize..to]));
+            rig.settle();
+            rig.status(1)
+        };
+        for _ in 0..sent {
+            assert_eq!(send(&mut rig), 0);
+        }
+        rig.chip.model().protected = vec![sector];
+        assert_eq!(send(&mut rig), secured(sector));
+    }
+}
+
 /// A CLEAR that erases, at once or as the second one, needs all of the region.
 #[test]
 fn a_clear_that_erases_loses_nothing_either() {

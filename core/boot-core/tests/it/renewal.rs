@@ -92,6 +92,7 @@ const BUSY: u32 = 0x86;
 const NOT_CLEARED: u32 = 0x08;
 const FORMAT: u32 = 0x04;
 const NO_VALID_PROGRAM: u32 = 0x02;
+const WRITE: u32 = 0x0A;
 const SECURED: u32 = 0x0E;
 
 const SOUND: Header = Header {
@@ -794,6 +795,85 @@ fn a_spare_is_kept_until_home_is_repaired() {
     }
 }
 
+/// Clears the lowest bit of a cell that has one.
+fn decay(flash: &mut ModelFlash, at: u32) {
+    let cell = flash.cells(Region::new(at, 1))[0];
+    assert_ne!(cell, 0);
+    flash.poke(at, &[cell & (cell - 1)]);
+}
+
+/// Home is the only other good bootloader: it is erased for an image that is whole, and for no other.
+#[test]
+fn an_image_that_has_decayed_since_its_start_does_not_cost_home() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    for at in [0, 4, 0x20, 0x41, 0x2FF] {
+        let mut board = Board::on_trial(&old, &new);
+        let mut node = board.start();
+        decay(node.0.flash(), STAGING.base + at);
+        assert_eq!(node.command(N, CONFIRM), NO_VALID_PROGRAM, "byte {at}");
+        assert_eq!(node.progress().state, State::None, "byte {at}");
+        assert_eq!(board.flash.cells(HOME)[..old.len()], old, "byte {at}");
+        board.off();
+        board.renew(&new);
+        board.off();
+        board.check([&new, &new]);
+    }
+    // Nor does a whole one that nobody has tried, from a probe.
+    let mut board = Board::on_trial(&old, &new);
+    let mut node = board.start();
+    node.0.flash().poke(STAGING.base, &image(0x300, 3));
+    assert_eq!(node.command(N, CONFIRM), NO_VALID_PROGRAM);
+    assert_eq!(board.flash.cells(HOME)[..old.len()], old);
+}
+
+/// Somebody protects home while it is erased or written: 1F57h names its sector.
+#[test]
+fn a_home_that_is_protected_in_the_middle_is_named() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    // Before it is erased, and when half of it is written.
+    for until in [&[][..], &new[..0x100]] {
+        let mut board = Board::on_trial(&old, &new);
+        let mut node = board.start();
+        node.try_command(N, CONFIRM).unwrap();
+        // The record that permits the erase is stored.
+        while node.progress().state != State::Confirmed || !node.0.flash().cells(HOME).starts_with(until) {
+            assert_ne!(node.0.step(), Step::Idle);
+        }
+        node.0.flash().protected = vec![4];
+        node.settle();
+        assert_eq!((node.word(0x1F57), node.progress().state), (SECURED | 4 << 16, State::Confirmed));
+        node.0.flash().protected.clear();
+        assert_eq!((node.command(N, CONFIRM), node.progress().state), (0, State::Installed));
+    }
+}
+
+/// And it is installed when the whole copy is what was staged: both decay while home is being written.
+#[test]
+fn a_copy_is_compared_before_it_counts_as_installed() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    for place in [STAGING, HOME] {
+        let mut board = Board::on_trial(&old, &new);
+        let mut node = board.start();
+        node.try_command(N, CONFIRM).unwrap();
+        // The first words are there, the last ones are not.
+        while node.0.flash().cells(HOME)[..0x100] != new[..0x100] {
+            assert_ne!(node.0.step(), Step::Idle);
+        }
+        let at = if place == HOME { 0x80 } else { 0x2FF };
+        decay(node.0.flash(), place.base + at);
+        node.settle();
+        assert_eq!(node.word(0x1F57), WRITE, "{place:?}");
+        assert_eq!(node.progress().state, State::Confirmed, "{place:?}");
+        // 83h tries again: from what is still good, and from nothing else.
+        let status = node.command(N, CONFIRM);
+        let state = node.progress().state;
+        match place {
+            HOME => assert_eq!((status, state), (0, State::Installed)),
+            _ => assert_eq!((status, state), (NO_VALID_PROGRAM, State::None)),
+        }
+    }
+}
+
 /// A debug probe writes another bootloader while a record of the old one is stored.
 #[test]
 fn an_image_from_a_probe_makes_the_record_void() {
@@ -817,6 +897,24 @@ fn an_image_from_a_probe_makes_the_record_void() {
         assert_eq!(node.progress().state, State::None, "confirmed: {confirmed}");
         assert_eq!(board.flash.cells(HOME)[..probed.len()], probed);
     }
+}
+
+/// The bootloader from before an installation, written by a probe, is foreign as well.
+#[test]
+fn an_older_image_from_a_probe_makes_the_record_of_an_installed_one_void() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    let mut board = Board::new(&old);
+    board.renew(&new);
+    board.off();
+    board.flash.poke(HOME.base, &[0xFF; HOME.size as usize]);
+    board.flash.poke(HOME.base, &old);
+    let mut node = board.start();
+    assert_eq!(node.progress(), Progress::default());
+    // A damage of it is none that the newer one repairs behind the owner's back.
+    board.off();
+    assert_eq!(PLACES.order(&board.flash, None, false)[1], None);
+    let journal = Journal::open(&board.flash, LAYOUT.parameters);
+    assert_eq!(RenewalRecord::load(&journal, &board.flash), None);
 }
 
 /// The heart: a power cut at any operation, and another one in what follows.
