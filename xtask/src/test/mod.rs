@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
-use self::plan::{Tier, IMAGES, OF_EACH_CHIP, RENEWED_ALONE, SPLIT_ALONE};
+use self::plan::{Tier, IMAGES, NEEDS, OF_EACH_CHIP};
 use self::programs::Program;
 use self::runner::{Job, Summary, Variables};
 use crate::args::Args;
@@ -325,8 +325,7 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
         rows.iter().any(|(of, tests)| *of == program && test.starts_with(tests))
     };
     let chosen = |program: &str, test: &str| {
-        let has = (board.home.is_some() || !is_among(SPLIT_ALONE, program, test))
-            && (board.staging.is_some() || !is_among(RENEWED_ALONE, program, test));
+        let has = NEEDS.iter().all(|needs| (needs.has)(board) || !is_among(needs.tests, program, test));
         let of_tier = is_among(OF_EACH_CHIP, program, test) && Tier::of(program, test) != Tier::All;
         has && (tier == Tier::All || of_tier)
     };

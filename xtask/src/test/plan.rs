@@ -146,27 +146,47 @@ pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("update", "conform::"),
 ];
 
-/// Tests of images that only a board with the split map has: sealed, with a log, with the debugger,
-/// with CAN over UART.
-pub const SPLIT_ALONE: &[(&str, &str)] = &[
-    ("device", "debugger::"),
-    ("device", "image::a_ram_image_runs_on_the_resident_part_of_another_bootloader"),
-    ("device", "log::"),
-    ("device", "virtual_can::"),
-    ("update", "attacker::"),
-    ("port", "matrix::"),
-    ("foreign", "gdb_door::"),
-    ("sealed", ""),
-];
+/// Tests that need what not every board has.
+pub struct Needs {
+    /// Whether a board has it.
+    pub has: fn(&Layout) -> bool,
+    /// The tests: a program, and the beginning of their paths in it.
+    pub tests: &'static [(&'static str, &'static str)],
+}
 
-/// Tests of boards whose bootloader can be renewed: those with a region for staging.
-pub const RENEWED_ALONE: &[(&str, &str)] = &[
-    ("device", "renewal::"),
-    ("update", "renewal"),
-    ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
-    ("update", "fleet::a_later_device_that_refuses_a_bootloader"),
-    ("update", "fleet::if_the_first_device_refuses_a_bootloader"),
-    ("sealed", "renewal::"),
+/// The tests that some boards leave out.
+pub const NEEDS: &[Needs] = &[
+    // Images that only the split map has room for: sealed, with a log, with the debugger, with CAN over UART.
+    Needs {
+        has: |board| board.home.is_some(),
+        tests: &[
+            ("device", "debugger::"),
+            ("device", "image::a_ram_image_runs_on_the_resident_part_of_another_bootloader"),
+            ("device", "log::"),
+            ("device", "virtual_can::"),
+            ("update", "attacker::"),
+            ("port", "matrix::"),
+            ("foreign", "gdb_door::"),
+            ("sealed", ""),
+        ],
+    },
+    // A bootloader that can be renewed.
+    Needs {
+        has: |board| board.staging.is_some(),
+        tests: &[
+            ("device", "renewal::"),
+            ("update", "renewal"),
+            ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
+            ("update", "fleet::a_later_device_that_refuses_a_bootloader"),
+            ("update", "fleet::if_the_first_device_refuses_a_bootloader"),
+            ("sealed", "renewal::"),
+        ],
+    },
+    // A twin of the same product with two programs.
+    Needs {
+        has: |board| board.board == stm32f407g_disc1::LAYOUT.board,
+        tests: &[("update", "fleet::a_device_without_room_refuses_alone")],
+    },
 ];
 
 /// The table [`LATER`], as a page has it.
