@@ -251,17 +251,23 @@ fn add(
     Ok(())
 }
 
+/// Builds the images of a tier, and test programs beside them: the link of an image uses one core, and so
+/// does much of what cargo builds.
+fn beside_images<T>(tier: Tier, programs: impl FnOnce() -> Outcome<T>) -> Outcome<T> {
+    std::thread::scope(|scope| {
+        let images = scope.spawn(|| build_images(tier));
+        let programs = programs();
+        images.join().map_err(|_| "a build broke off.".to_owned())??;
+        programs
+    })
+}
+
 /// The tests of the product on its default board.
 fn product(summary: &mut Summary) -> Outcome {
     let mut jobs = Vec::new();
-    std::thread::scope(|scope| {
-        // The link of an image uses one core, and so does much of what cargo builds beside it.
-        let images = scope.spawn(|| build_images(Tier::Product));
-        let programs = test_programs()?;
-        images.join().map_err(|_| "a build broke off.".to_owned())??;
-        let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
-        add(&mut jobs, summary, &programs, None, variables(DEFAULT), chosen)
-    })?;
+    let programs = beside_images(Tier::Product, test_programs)?;
+    let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
+    add(&mut jobs, summary, &programs, None, variables(DEFAULT), chosen)?;
     runner::run(jobs, summary);
     Ok(())
 }
@@ -286,8 +292,8 @@ fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
 
 /// What `.ci/run` adds.
 fn ci(summary: &mut Summary) -> Outcome {
-    build_images(Tier::Ci)?;
-    runner::run(later(Tier::Ci, summary)?, summary);
+    let jobs = beside_images(Tier::Ci, || later(Tier::Ci, summary))?;
+    runner::run(jobs, summary);
     let mut doc = process::cargo("test");
     let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
     doc.current_dir(workspace::root()).args(["--doc", "--workspace", "--quiet"]).args(without);
@@ -297,9 +303,9 @@ fn ci(summary: &mut Summary) -> Outcome {
 
 /// The tests that take minutes.
 fn slow(summary: &mut Summary) -> Outcome {
-    build_images(Tier::All)?;
+    let jobs = beside_images(Tier::All, || later(Tier::All, summary))?;
     examples::all()?;
-    runner::run(later(Tier::All, summary)?, summary);
+    runner::run(jobs, summary);
     Ok(())
 }
 
