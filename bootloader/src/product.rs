@@ -272,6 +272,10 @@ impl Product {
         }
         assert!(!SEALED || matches!(self.crc, CrcKind::Crc32), "product: a sealed image carries a CRC-32");
         assert!(
+            self.block_download || !self.second_server,
+            "product: second_server needs block_download, by which a group gets its data"
+        );
+        assert!(
             LAYOUT.home.is_some()
                 || !(self.block_upload
                     || self.second_server
@@ -288,10 +292,6 @@ impl Product {
         assert!(
             !(SEALED && self.rom_loader),
             "product: rom_loader would write any program into a device that takes sealed images"
-        );
-        assert!(
-            self.block_download || !self.second_server,
-            "product: second_server needs block_download, by which a group gets its data"
         );
         assert!(
             self.segments_per_sub_block >= 1 && self.segments_per_sub_block <= 127,

@@ -8,6 +8,7 @@ use coboot_tests::firmware;
 use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
+use shared_abi::geometry::Line;
 
 /// 2007h/2: two resets (docs/protocol.md).
 const TWO_RESETS: u8 = 13;
@@ -228,7 +229,9 @@ fn the_rom_loader_finds_the_chip_as_after_a_reset() {
     let found = REGISTERS.map(|register| bench.machine().register(register).unwrap());
     // HSI runs and is ready; the calibration is the chip's.
     assert_eq!(found[2] & 0xFFFF_00FF, 0x0000_0083);
-    let expected = [0x1FFF_0000, 0, found[2], 0x2400_3010, 0, 0x0010_0000, 0, 0, 0x0000_4000, 0, 0, 1];
+    // PWR_CR: VOS is 01 in the F405 and F407, 11 in those with three scales (RM0090 section 5.4, RM0390).
+    let power = if firmware::board().chip.line == Line::F407 { 0x0000_4000 } else { 0x0000_C000 };
+    let expected = [0x1FFF_0000, 0, found[2], 0x2400_3010, 0, 0x0010_0000, 0, 0, power, 0, 0, 1];
     assert_eq!(found, expected, "{found:08X?}");
     // The vectors at address 0 are those of the ROM, too.
     let mut vector = [0; 4];

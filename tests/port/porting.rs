@@ -616,8 +616,13 @@ const MISTAKES: &[Mistake] = &[
         "product: autostart names a program that the layout has not",
     ),
     product(
-        "Product { block_download: false, ..Product::DEFAULT }",
+        "Product { second_server: true, block_download: false, ..Product::DEFAULT }",
         "product: second_server needs block_download, by which a group gets its data",
+    ),
+    product(
+        "Product { second_server: true, ..Product::DEFAULT }",
+        "product: block_upload, second_server, resume, read_back and program_date need the split map: the \
+         compact one has no room for them",
     ),
     product(
         "Product { segments_per_sub_block: 128, ..Product::DEFAULT }",
@@ -687,6 +692,7 @@ const MISTAKES: &[Mistake] = &[
                 download: Policy { data: Some(1), ..Policy::DEFAULT },
                 ..Profile::STANDARD
             },
+            autostart: Autostart::List(&[1]),
             ..Product::DEFAULT
         }",
         "product: autostart names the profile's data, which are no program",

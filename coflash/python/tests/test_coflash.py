@@ -19,7 +19,7 @@ import pytest
 
 import coflash
 
-BASE = 0x0801_0000
+BASE = 0x0802_0000
 BOARD = "stm32f407g-disc1"
 
 

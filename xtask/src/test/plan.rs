@@ -161,15 +161,21 @@ pub struct Needs {
 
 /// The tests that some boards leave out.
 pub const NEEDS: &[Needs] = &[
-    // Images that only the split map has room for: sealed, with a log, with the debugger, with CAN over UART.
+    // What only the split map has room for: images that are sealed, with a log, with the debugger, with CAN over
+    // UART; a second server, resumption, the program's date; a RAM image to damage.
     Needs {
         has: |board| board.home.is_some(),
         tests: &[
             ("device", "debugger::"),
             ("device", "image::a_ram_image_runs_on_the_resident_part_of_another_bootloader"),
             ("device", "log::"),
+            ("device", "software_date::"),
             ("device", "virtual_can::"),
+            ("device", "ways_in::two_resets_without_a_bootloader_start_the_program"),
             ("update", "attacker::"),
+            ("update", "fleet::"),
+            ("update", "resume::"),
+            ("update", "throughput::a_compressed_program_is_faster_than_the_wire_of_the_raw_one"),
             ("port", "matrix::"),
             ("foreign", "gdb_door::"),
             ("sealed", ""),
@@ -179,6 +185,7 @@ pub const NEEDS: &[Needs] = &[
     Needs {
         has: |board| board.staging.is_some(),
         tests: &[
+            ("device", "program_control::the_bootloader_is_a_program_of_the_application_too"),
             ("device", "renewal::"),
             ("update", "renewal"),
             ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
