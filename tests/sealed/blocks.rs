@@ -128,7 +128,7 @@ fn what_is_not_authentic_costs_nothing() {
         block
     }
     let mut bench = board_with_a_program();
-    let program = (firmware::board().programs[0].base - firmware::board().chip.flash.base) as usize;
+    let program = firmware::program_offset();
     let genuine = blocks(&seal(&sealer(COUNTER), firmware::APP_V2), 128);
     let cases: [(&str, Spoil, u32); 6] = [
         (

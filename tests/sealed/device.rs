@@ -196,7 +196,7 @@ fn what_is_not_genuine_is_refused_and_the_old_program_starts() {
             let before = bench.machine().flash().to_vec();
             let (abort, word) = write(&mut bench, &file, transfers);
             assert_eq!(word, expected, "{what}, {transfers:?}: {abort:X?}");
-            let program = (firmware::board().programs[0].base - firmware::board().chip.flash.base) as usize;
+            let program = firmware::program_offset();
             assert!(bench.machine().flash()[program..] == before[program..], "{what}: the flash is another");
             // A power cycle, too, because bad signatures slow the device down.
             assert_old_program_starts(&mut bench, what);

@@ -91,6 +91,12 @@ pub fn board() -> &'static Layout {
     }
 }
 
+/// Where the first program begins in the flash of the board, in bytes from the start of the flash.
+#[must_use]
+pub fn program_offset() -> usize {
+    (board().programs[0].base - board().chip.flash.base) as usize
+}
+
 /// The folder of the images: `COBOOT_FIRMWARE_DIR`, or the default folder of `cargo xtask build`.
 #[must_use]
 pub fn dir() -> PathBuf {

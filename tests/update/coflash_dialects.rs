@@ -74,8 +74,8 @@ fn images_and_intel_hex_update_the_standard_firmware() {
             assert!(events.contains(&Phase::Verified { crc: blocks.crc() }.into()), "{events:?}");
             assert!(!events.contains(&Phase::Released.into()), "{events:?}");
             assert_eq!(version(&mut bench, NODE), expected);
-            let program = firmware::board().programs[0].base - firmware::board().chip.flash.base;
-            let stored = &bench.machine().flash()[program as usize..][..report.program_size as usize];
+            let program = &bench.machine().flash()[firmware::program_offset()..];
+            let stored = &program[..report.program_size as usize];
             assert_eq!(stored, &*blocks.flash_image());
         }
         power_cycle(&mut bench, NODE);

@@ -127,9 +127,8 @@ fn operations(bench: &mut Bench) -> u64 {
 
 /// The first bytes of the program that are in flash.
 fn in_flash(bench: &mut Bench, file: &Program) -> usize {
-    let board = firmware::board();
-    let start = (board.programs[0].base - board.chip.flash.base) as usize;
-    let both = bench.machine().flash()[start..].iter().zip(file.flash_image().into_owned());
+    let program = &bench.machine().flash()[firmware::program_offset()..];
+    let both = program.iter().zip(file.flash_image().into_owned());
     both.take_while(|(cell, byte)| **cell == *byte).count()
 }
 

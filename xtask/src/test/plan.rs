@@ -162,7 +162,7 @@ pub struct Needs {
 /// The tests that some boards leave out.
 pub const NEEDS: &[Needs] = &[
     // What only the split map has room for: images that are sealed, with a log, with the debugger, with CAN over
-    // UART; a second server, resumption, the program's date; a RAM image to damage.
+    // UART; a second server, resumption, block upload, the program's date; a RAM image to damage.
     Needs {
         has: |board| board.home.is_some(),
         tests: &[
@@ -177,7 +177,12 @@ pub const NEEDS: &[Needs] = &[
             ("update", "resume::"),
             ("update", "throughput::a_compressed_program_is_faster_than_the_wire_of_the_raw_one"),
             ("port", "matrix::"),
+            ("foreign", "block_upload::"),
+            ("foreign", "eds::a_file_has_no_object_that_the_product_leaves_out"),
+            ("foreign", "eds::each_product_has_the_objects_of_its_file_and_no_others"),
+            ("foreign", "eds::python_canopen_finds_other_products_as_their_files_say"),
             ("foreign", "gdb_door::"),
+            ("foreign", "peers::"),
             ("sealed", ""),
         ],
     },
@@ -188,16 +193,28 @@ pub const NEEDS: &[Needs] = &[
             ("device", "program_control::the_bootloader_is_a_program_of_the_application_too"),
             ("device", "renewal::"),
             ("update", "renewal"),
+            ("update", "masters::systecs_order_renews_a_bootloader_with_a_second_83h"),
+            ("update", "masters::zephyrs_runner_renews_a_bootloader_with_one_request_more"),
             ("update", "powercut_board::a_cut_shows_a_home_that_is_erased_too_early"),
             ("update", "fleet::a_later_device_that_refuses_a_bootloader"),
             ("update", "fleet::if_the_first_device_refuses_a_bootloader"),
+            ("sealed", "conform::"),
+            ("sealed", "flash_lock::a_sealed_program_that_writes_flash_is_not_locked_out"),
+            ("sealed", "provisioning::a_bootloader_that_can_be_renewed_leaves_its_home_writable"),
             ("sealed", "renewal::"),
         ],
     },
-    // A twin of the same product with two programs.
+    // The board of the pages and of the projects that they describe; and its twin with two programs.
     Needs {
         has: |board| board.board == stm32f407g_disc1::LAYOUT.board,
-        tests: &[("update", "fleet::a_device_without_room_refuses_alone")],
+        tests: &[
+            ("update", "fleet::a_device_without_room_refuses_alone"),
+            ("update", "recording::"),
+            ("foreign", "examples::"),
+            ("foreign", "pages::"),
+            ("foreign", "python_package::"),
+            ("port", "porting::"),
+        ],
     },
 ];
 

@@ -20,8 +20,7 @@ pub const BOOT_MS: u64 = RESCUE_WINDOW_MS + 250;
 /// The flash from the start of the first program on.
 #[must_use]
 pub fn program_flash(flash: &[u8]) -> &[u8] {
-    let board = firmware::board();
-    &flash[(board.programs[0].base - board.chip.flash.base) as usize..]
+    &flash[firmware::program_offset()..]
 }
 
 /// The highest bit rate. It is stored in the device and differs from the default, so a device that
