@@ -826,6 +826,30 @@ fn an_image_that_has_decayed_since_its_start_does_not_cost_home() {
     assert_eq!(board.flash.cells(HOME)[..old.len()], old);
 }
 
+/// 1F57h/n is busy until the image is installed: that is what a tool waits for. A program that is being
+/// downloaded meanwhile makes no difference.
+#[test]
+fn an_installation_is_busy_to_its_end() {
+    let (old, new) = (image(0x200, 1), image(0x300, 2));
+    for downloads in [false, true] {
+        let mut board = Board::on_trial(&old, &new);
+        let mut node = board.start();
+        if downloads {
+            assert_eq!(node.command(1, CLEAR), 0);
+            for block in &block_file_at(&program_of(0x1000), PROGRAM.base, 200)[..3] {
+                node.send(1, block).unwrap();
+            }
+        }
+        node.try_command(N, CONFIRM).unwrap();
+        while node.progress().state != State::Installed {
+            assert_eq!(node.word(0x1F57) & 1, 1, "{downloads}: {:?}", node.progress());
+            assert_ne!(node.0.step(), Step::Idle);
+        }
+        node.settle();
+        assert_eq!(node.word(0x1F57), 0);
+    }
+}
+
 /// Somebody protects home while it is erased or written: 1F57h names its sector.
 #[test]
 fn a_home_that_is_protected_in_the_middle_is_named() {
