@@ -49,8 +49,8 @@ impl Agent {
         let seed = getrandom::u64().unwrap_or_default();
         let options = Options::default().once(self.once).seed(seed).cancelled(cancelled.clone());
         let tell = |said: &Said| show(context, said);
-        let count = config.devices.len();
-        let noun = if count == 1 { "device" } else { "devices" };
+        let count = config.targets.len();
+        let noun = if count == 1 { "target" } else { "targets" };
         context.out.say(format_args!("{count} {noun}  (Ctrl-C ends it)"));
         let open = |bus: &str| {
             context.link_at(Some(bus), None).map_err(|failure| failure.to_string().trim_end().to_string())
