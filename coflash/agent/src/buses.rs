@@ -17,7 +17,7 @@ use super::controller::{Flashed, News};
 use super::firmware::Content;
 use super::machine;
 use super::run::{Devices, Order};
-use super::told::{failure, news_of, waits};
+use super::told::{failure, waits, Shown};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::state::{reason, source, supply};
@@ -75,8 +75,9 @@ impl<'o> Buses<'o> {
 
     /// Carries out all orders that wait for the bus.
     fn work(&self, url: &str, waiting: Vec<Waiting>) {
+        let shown = Shown::default();
         let mut link = match (self.open)(url) {
-            Ok(link) => link,
+            Ok(link) => shown.on(link),
             Err(why) => {
                 for order in waiting {
                     let _ = order.done.send(Flashed::NotNow(why.clone()));
@@ -104,8 +105,9 @@ impl<'o> Buses<'o> {
         let jobs: Vec<Job> = orders.iter().map(|order| order.job.clone()).collect();
         let options = ManyOptions::default().cancelled(self.cancelled.clone());
         let tell = |number: usize, event: Event| {
-            for news in news_of(&event) {
-                let _ = orders[number].news.send(news);
+            let order = &orders[number];
+            for news in shown.news(order.job.node, &event) {
+                let _ = order.news.send(news);
             }
         };
         let results = match &mut link {
@@ -195,7 +197,7 @@ impl Buses<'_> {
             return Flashed::Interrupted;
         }
         match (self.open)(&target.bus) {
-            Ok(mut link) => machine::update(&mut link, &target.bus, package, &self.cancelled, news),
+            Ok(link) => machine::update(link, &target.bus, package, &self.cancelled, news),
             Err(why) => Flashed::NotNow(why),
         }
     }
@@ -214,7 +216,7 @@ fn flashed(job: &Job, result: Result<Report, Failed>) -> Flashed {
         Err(Failed { error: Error::Cancelled, .. }) => Flashed::Interrupted,
         Err(failed) => match waits(&failed) {
             Some(why) => Flashed::NotNow(why),
-            None => Flashed::Failed(failure(&failed).to_vec()),
+            None => Flashed::Failed(failure(&failed)),
         },
     }
 }

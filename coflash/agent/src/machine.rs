@@ -15,12 +15,12 @@ use coflash_core::update::{Event, ManyOptions};
 use coflash_core::Error;
 
 use super::controller::{Flashed, News};
-use super::told::{failure, news_of, not_now, waits};
+use super::told::{failure, not_now, waits, Shown};
 
 /// Updates the devices of a bus that the package is for. An interrupted update goes on with another call:
 /// its plan leaves out what the devices have.
 pub(super) fn update(
-    link: &mut Link,
+    link: Link,
     url: &str,
     package: &Package,
     cancelled: &Arc<AtomicBool>,
@@ -30,13 +30,14 @@ pub(super) fn update(
 }
 
 fn carry_out(
-    link: &mut Link,
+    link: Link,
     url: &str,
     package: &Package,
     cancelled: &Arc<AtomicBool>,
     news: &Sender<News>,
 ) -> Result<Flashed, Flashed> {
-    let Link::Bus(adapter) = link else {
+    let shown = Shown::default();
+    let Link::Bus(mut adapter) = shown.on(link) else {
         let what = "a gateway cannot search the bus for the devices of a package";
         let advice = "what to do: set bus in the agent's configuration to an adapter on the machine's bus";
         return Err(Flashed::Failed(vec![what.to_string(), advice.to_string()]));
@@ -46,7 +47,7 @@ fn carry_out(
     let named = package.programs().flat_map(|(entry, _)| &entry.nodes);
     lock(url, named.filter_map(|node| NodeId::new(*node)), &mut locks)?;
     let plan =
-        plan(&mut **adapter, package, &ScanOptions::default().alone(true), cancelled).map_err(unplanned)?;
+        plan(&mut *adapter, package, &ScanOptions::default().alone(true), cancelled).map_err(unplanned)?;
     lock(url, plan.nodes(), &mut locks)?;
     for line in plan.to_string().lines() {
         let _ = news.send(News::Phase(line.to_string()));
@@ -54,10 +55,11 @@ fn carry_out(
     let all = plan.updates().max(1);
     let percents = Mutex::new(BTreeMap::new());
     let tell = |node: NodeId, entry: usize, event: Event| {
-        for its in news_of(&event) {
+        for its in shown.news(node, &event) {
             let of_all = match its {
                 // A part of the machine keeps its program, and not the machine: the next plan finds out.
                 News::Kept => continue,
+                News::Failed(_) => its,
                 News::Phase(words) => News::Phase(format!("node {node}: {words}")),
                 News::Percent(percent) => {
                     let mut percents = percents.lock().unwrap_or_else(PoisonError::into_inner);
@@ -70,7 +72,7 @@ fn carry_out(
         }
     };
     let options = RunOptions::default().many(ManyOptions::default().cancelled(cancelled.clone()));
-    Ok(flashed(package, &run(&mut **adapter, package, &plan, &options, &tell)))
+    Ok(flashed(package, &run(&mut *adapter, package, &plan, &options, &tell)))
 }
 
 /// Locks these nodes too among the programs of this computer.

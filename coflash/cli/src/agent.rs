@@ -74,10 +74,13 @@ impl Agent {
 /// Shows a message: a line for people, or an event.
 fn show(context: &Context, said: &Said) {
     let Said { controller, kind, text, .. } = said;
+    if let Some(update) = &said.update {
+        record::failed(update, &[("controller", controller)]);
+    }
     if context.out.shows_events() {
         record::note("said", &format!("{controller}: {text}"));
         context.out.event(&json!(said));
-    } else if *kind == Kind::Progress {
+    } else if matches!(kind, Kind::Progress | Kind::Report) {
         context.out.detail(format_args!("{controller}: {text}"));
     } else {
         context.out.say(format_args!("{controller}: {text}"));

@@ -61,7 +61,7 @@ fn a_sealed_image_is_the_same_in_a_file_and_in_blocks() {
 #[test]
 fn a_raw_binary_is_where_the_board_or_the_dialect_says() {
     let (bytes, on) = (program(GOOD), |dialect| Reading::new(1).dialect(dialect));
-    assert_eq!(start(read(Reading::new(1).board(Some(&DEFAULT)), "a.bin", &bytes)), START);
+    assert_eq!(start(read(Reading::new(1).board(Some(DEFAULT)), "a.bin", &bytes)), START);
     // Their images have no addresses.
     for dialect in [Dialect::Raw, Dialect::Lift] {
         assert_eq!(start(read(on(Some(dialect)).judging(Judging::Nothing), "a.bin", &bytes)), 0);
@@ -70,13 +70,13 @@ fn a_raw_binary_is_where_the_board_or_the_dialect_says() {
         assert!(read(on(dialect), "a.bin", &bytes).unwrap_err().is_without_address());
     }
     assert!(!read(Reading::new(1), "a.dat", &bytes).unwrap_err().is_without_address());
-    let fault = read(Reading::new(9).board(Some(&DEFAULT)), "a.bin", &bytes).unwrap_err();
+    let fault = read(Reading::new(9).board(Some(DEFAULT)), "a.bin", &bytes).unwrap_err();
     assert_eq!(fault.to_string(), "stm32f407g-disc1 has no program 9");
 }
 
 #[test]
 fn a_file_is_judged_as_much_as_its_reader_wants() {
-    let on_board = Reading::new(1).board(Some(&DEFAULT));
+    let on_board = Reading::new(1).board(Some(DEFAULT));
     let zeros = vec![0; 1024];
     let over = program(OVER_THE_HANDOFF);
     let handoff = |fault: &judge::Fault| matches!(fault, judge::Fault::StackOverHandoff { .. });
