@@ -1,17 +1,27 @@
 //! The bootloader of a sealed device is renewed: by a genuine image that is newer, and by no other.
 
-use canopen::program::{FlashError, ProgramControl};
+use std::sync::Arc;
+
+use canopen::program::{FlashError, ProgramControl, DEVICE_STATE, STATE_RENEWAL};
+use canopen::{Address, BitRate, NodeId};
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
 use coboot_tests::renewal::{
     cells, confirm, crc_of, identification, image_of, number, progress, running, start, status as refusal,
-    with_crc,
+    version, with_crc,
 };
-use coboot_tests::sealed_board::{board, key, release, root, sealer, status, write_to, COUNTER};
+use coboot_tests::sealed_board::{board, key, provision, release, root, sealer, status, write_to, COUNTER};
+use coflash_core::device::info::info;
+use coflash_core::device::scan::ScanOptions;
 use coflash_core::device::Transfers;
+use coflash_core::file::block_file;
 use coflash_core::file::sealed::{Certificate, Role, Sealer, SigningKey};
+use coflash_core::machine::{self, make, plan, Entry, Good, Package, Part, RunOptions};
+use coflash_core::update::steps::call_back;
+use emulator::machine::Operation;
 use shared_abi::geometry::Region;
-use shared_abi::renewal::{Origin, State};
+use shared_abi::ram_image::Version;
+use shared_abi::renewal::{Origin, Progress, State};
 
 /// The program number of a bootloader in a manifest.
 const BOOTLOADER: u8 = 255;
@@ -207,4 +217,81 @@ fn an_image_that_knows_no_sealed_programs_is_refused() {
     let file = bootloader_sealer(1).seal(&open, &signer()).unwrap();
     assert_eq!(send(&mut bench, &file), status::WRONG_PRODUCT);
     assert_eq!(progress(&mut bench).state, State::None);
+}
+
+/// One package for a machine of a sealed device and an open one: each gets a new bootloader of its kind, and then
+/// its program. Once more, nothing is written.
+#[test]
+fn a_package_renews_a_sealed_device_and_an_open_one_and_updates_both() {
+    let mut bench = Bench::of_boards(2);
+    let boards = bench.boards();
+    bench.commission(boards[1], 2, BitRate::K125);
+    let sealed_device = bench.world.machine_mut(boards[0]);
+    sealed_device.load(&firmware::elf(firmware::BOOTLOADER_SEALED)).unwrap();
+    provision(&mut bench);
+    bench.power_on();
+    bench.run_ms(200);
+
+    let part = |name: &str, node, program, bytes| Part {
+        entry: Entry {
+            name: name.to_owned(),
+            file: String::new(),
+            size: 0,
+            sha256: String::new(),
+            nodes: vec![node],
+            identity: None,
+            count: None,
+            program,
+            dialect: None,
+            trial_run: true,
+            verify: false,
+        },
+        bytes,
+    };
+    let (of_sealed, of_open) = (0x0002_0000, 0x0009_0001);
+    let parts = [
+        part("sealed bootloader", 1, BOOTLOADER, sealed(2, of_sealed)),
+        part("bootloader", 2, BOOTLOADER, version(firmware::BOOTLOADER, of_open)),
+        part(
+            "sealed program",
+            1,
+            1,
+            sealer(COUNTER).seal(&firmware::raw(firmware::APP_V1), &release()).unwrap(),
+        ),
+        part("program", 2, 1, block_file::emit(&firmware::blocks(firmware::APP_V1))),
+    ];
+    let package = Package::parse(&make(None, None, &parts, &[(&root(), None)]).unwrap()).unwrap();
+    package.trust(&[root().public()]).unwrap();
+    let scan = ScanOptions::default().nodes((1..=3).filter_map(NodeId::new).collect());
+    let ended = |bench: &mut Bench| {
+        let plan = plan(bench, &package, &scan, &Arc::default()).unwrap();
+        let outcomes = machine::run(bench, &package, &plan, &RunOptions::default(), &|_, _, _| {});
+        let good = outcomes.into_iter().map(|outcome| match outcome.result {
+            Ok(Good::Had) => "had",
+            Ok(Good::Updated(report)) if report.renewal.is_some_and(|renewal| renewal.unchanged) => {
+                "unchanged"
+            }
+            Ok(Good::Updated(_)) => "updated",
+            Err(bad) => panic!("{:?} {:?}: {bad:?}", outcome.node, outcome.entry),
+        });
+        good.collect::<Vec<_>>()
+    };
+    assert_eq!(ended(&mut bench), ["updated"; 4]);
+    for (node, version) in [(1, of_sealed), (2, of_open)] {
+        assert!(!bench.is_bootloader(node), "node {node} runs its program");
+        call_back(&mut bench.session_with(node)).unwrap();
+        let info = info(&mut bench.session_with(node)).unwrap();
+        assert_eq!(info.bootloader.unwrap().version, Version(version), "node {node}");
+        let state = bench.session_with(node).read_number(Address::new(DEVICE_STATE, STATE_RENEWAL)).unwrap();
+        assert_eq!(Progress::from_bytes(state.to_le_bytes()).unwrap().state, State::Installed, "node {node}");
+        bench.session_with(node).command(1, ProgramControl::Start).unwrap();
+        bench.run_ms(500);
+    }
+    boards.iter().for_each(|board| bench.world.machine_mut(*board).keep_flash_log());
+    assert!(ended(&mut bench).iter().all(|how| *how != "updated"));
+    for board in boards {
+        let log = bench.world.machine_mut(board).take_flash_log();
+        let erased = log.iter().filter(|operation| matches!(operation, Operation::Erase { .. })).count();
+        assert_eq!(erased, 0, "nothing is written twice");
+    }
 }

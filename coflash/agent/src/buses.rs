@@ -1,5 +1,4 @@
-//! The devices: flashes them and asks them for their attributes. The only file of the agent that
-//! calls `coflash-core` for that.
+//! The devices: flashes them and asks them for their attributes.
 //!
 //! Devices of one bus whose orders come while the bus is in use are updated together, once it is
 //! free.
@@ -13,16 +12,19 @@ use std::sync::{Arc, Mutex, PoisonError};
 use canopen::program::{ProgramState, PROGRAM_CONTROL, PROGRAM_ID};
 use canopen::Address;
 
-use super::config::Device;
+use super::config::{Device, Target, What};
 use super::controller::{Flashed, News};
+use super::firmware::Content;
+use super::machine;
 use super::run::{Devices, Order};
+use super::told::{failure, waits, Shown};
 use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::state::{reason, source, supply};
 use coflash_core::device::{info, DeviceInfo, Error, Session, Timing};
-use coflash_core::update::event::Phase;
+use coflash_core::machine::Package;
 use coflash_core::update::many::{flash_in_turn, flash_many, Failed, Job, ManyOptions};
-use coflash_core::update::{DeviceState, Event, FlashOptions, Payload, Report};
+use coflash_core::update::{Event, FlashOptions, Payload, Report};
 
 /// Opens a bus by its URL; an error is in words.
 pub type Open<'o> = &'o (dyn Fn(&str) -> Result<Link, String> + Sync);
@@ -73,8 +75,9 @@ impl<'o> Buses<'o> {
 
     /// Carries out all orders that wait for the bus.
     fn work(&self, url: &str, waiting: Vec<Waiting>) {
+        let shown = Shown::default();
         let mut link = match (self.open)(url) {
-            Ok(link) => link,
+            Ok(link) => shown.on(link),
             Err(why) => {
                 for order in waiting {
                     let _ = order.done.send(Flashed::NotNow(why.clone()));
@@ -102,8 +105,9 @@ impl<'o> Buses<'o> {
         let jobs: Vec<Job> = orders.iter().map(|order| order.job.clone()).collect();
         let options = ManyOptions::default().cancelled(self.cancelled.clone());
         let tell = |number: usize, event: Event| {
-            for news in news_of(&event) {
-                let _ = orders[number].news.send(news);
+            let order = &orders[number];
+            for news in shown.news(order.job.node, &event) {
+                let _ = order.news.send(news);
             }
         };
         let results = match &mut link {
@@ -129,25 +133,46 @@ impl Buses<'_> {
 }
 
 impl Devices for Buses<'_> {
-    fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String> {
-        let bus = self.bus(&device.bus);
+    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
+        let What::Device(device) = &target.what else {
+            // A scan would end the transfers of other tools, only to tell this.
+            return Ok(of_agent(target));
+        };
+        let bus = self.bus(&target.bus);
         let _turn = lock(&bus.turn);
-        let mut link = (self.open)(&device.bus)?;
+        let mut link = (self.open)(&target.bus)?;
         let mut session = Session::on(&mut link, device.node, Timing::default());
         session.cancel_by(self.cancelled.clone());
         let info = info(&mut session).map_err(|error| format!("{error}: {}", error.advice()))?;
-        Ok(attributes(device, &info))
+        Ok(attributes(target, device, &info))
     }
 
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
-        let Order { device, program, kept } = order;
+        let Order { target, content, kept } = order;
+        match content {
+            Content::Program(device, program) => self.device(target, device, program, kept, news),
+            Content::Package(package) => self.machine(target, &package, &news),
+        }
+    }
+}
+
+impl Buses<'_> {
+    /// Updates a device, together with those that wait for the same bus.
+    fn device(
+        &self,
+        target: &Target,
+        device: &Device,
+        program: Payload,
+        kept: bool,
+        news: Sender<News>,
+    ) -> Flashed {
         let options = FlashOptions::default()
             .program(device.program)
             .check_target(program.target().filter(|_| device.check_target))
             .trial_run(device.trial_run)
             .verify(device.verify);
         let (done, result) = channel();
-        let bus = self.bus(&device.bus);
+        let bus = self.bus(&target.bus);
         let job = Job::new(device.node, program, options);
         lock(&bus.waiting).push(Waiting { job, kept, news, done });
         let _turn = lock(&bus.turn);
@@ -159,9 +184,22 @@ impl Devices for Buses<'_> {
             return Flashed::Interrupted;
         }
         let waiting = std::mem::take(&mut *lock(&bus.waiting));
-        self.work(&device.bus, waiting);
+        self.work(&target.bus, waiting);
         // Every order gets its result. If it did not, the update would be begun anew.
         result.try_recv().unwrap_or(Flashed::Interrupted)
+    }
+
+    /// Updates a machine, when the bus is free.
+    fn machine(&self, target: &Target, package: &Package, news: &Sender<News>) -> Flashed {
+        let bus = self.bus(&target.bus);
+        let _turn = lock(&bus.turn);
+        if self.cancelled.load(Ordering::Relaxed) {
+            return Flashed::Interrupted;
+        }
+        match (self.open)(&target.bus) {
+            Ok(link) => machine::update(link, &target.bus, package, &self.cancelled, news),
+            Err(why) => Flashed::NotNow(why),
+        }
     }
 }
 
@@ -171,48 +209,31 @@ fn of(program: &Payload) -> String {
     format!("{kind} of {} bytes, CRC {:08X}h", program.size(), program.crc())
 }
 
-/// The news in an event of an update.
-fn news_of(event: &Event) -> Vec<News> {
-    let phase = News::Phase(event.to_string());
-    match event {
-        Event::Progress { done, total } => {
-            let percent = (done * 100).checked_div(*total).unwrap_or(100);
-            vec![News::Percent(u8::try_from(percent).unwrap_or(100))]
-        }
-        Event::Phase(Phase::Released | Phase::Started(_) | Phase::Installed { .. }) => {
-            vec![News::Kept, phase]
-        }
-        Event::Done(_) => Vec::new(),
-        _ => vec![phase],
-    }
-}
-
 /// The result of an update for the server.
 fn flashed(job: &Job, result: Result<Report, Failed>) -> Flashed {
     match result {
         Ok(report) => Flashed::Done(vec![report.to_string(), of(&job.file)]),
         Err(Failed { error: Error::Cancelled, .. }) => Flashed::Interrupted,
-        Err(Failed { error: error @ (Error::Adapter(_) | Error::NotAlone { .. }), left })
-            if left.state == DeviceState::Untouched =>
-        {
-            Flashed::NotNow(format!("{error}: {}", error.advice()))
-        }
-        Err(Failed { error, left }) => Flashed::Failed(vec![
-            format!("{error} [{:#010X}]", error.number()),
-            format!("the device: {left}"),
-            format!("what to do: {}", error.advice()),
-        ]),
+        Err(failed) => match waits(&failed) {
+            Some(why) => Flashed::NotNow(why),
+            None => Flashed::Failed(failure(&failed)),
+        },
     }
 }
 
-/// What the server gets to know of a device: what `coflash info` shows.
-fn attributes(device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
-    let mut all = vec![
-        ("bus".to_string(), device.bus.clone()),
-        ("node".to_string(), device.node.to_string()),
-        ("runs".to_string(), info.device_type.to_string()),
+/// What the server gets to know of any target.
+fn of_agent(target: &Target) -> Vec<(String, String)> {
+    vec![
+        ("bus".to_string(), target.bus.clone()),
         ("coflash".to_string(), env!("CARGO_PKG_VERSION").to_string()),
-    ];
+    ]
+}
+
+/// What the server gets to know of a device: what `coflash info` shows.
+fn attributes(target: &Target, device: &Device, info: &DeviceInfo) -> Vec<(String, String)> {
+    let mut all = of_agent(target);
+    all.push(("node".to_string(), device.node.to_string()));
+    all.push(("runs".to_string(), info.device_type.to_string()));
     let texts =
         [("name", &info.name), ("hardware", &info.hardware_version), ("software", &info.software_version)];
     for (key, text) in texts {

@@ -10,6 +10,7 @@ use shared_abi::layout::Layout;
 
 use super::url::Server;
 use coflash_core::file::board;
+use coflash_core::file::sealed::PublicKey;
 
 /// The server, and the devices that get updates from it.
 #[derive(Clone, Debug)]
@@ -23,18 +24,48 @@ pub struct Config {
     pub(super) state: PathBuf,
     /// The shortest and longest pause between two polls of a device.
     pub(super) poll: (Duration, Duration),
-    /// The devices, in the order of the file.
-    pub devices: Vec<Device>,
+    /// The targets, in the order of the file: first the devices, then the machines.
+    pub targets: Vec<Target>,
+}
+
+/// What the server gives updates to.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Target {
+    /// Its name on the server: the controllerId.
+    pub controller: String,
+    /// The URL of its bus.
+    pub bus: String,
+    /// What is there.
+    pub what: What,
+    pub(super) part: Option<String>,
+    pub(super) artifact: Option<String>,
+    pub(super) attempt: Attempt,
+    pub(super) confirm: bool,
+    pub(super) token: Token,
+}
+
+/// What a target is.
+#[derive(Clone, Debug)]
+pub enum What {
+    /// One device, which gets programs.
+    Device(Device),
+    /// The devices of a bus, which get packages.
+    Machine(Machine),
+}
+
+/// A machine: the devices of a bus that a package names.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub struct Machine {
+    /// The roots that may sign its packages; at least one.
+    pub trust: Vec<PublicKey>,
 }
 
 /// A device.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub struct Device {
-    /// Its name on the server: the controllerId.
-    pub controller: String,
-    /// The URL of its bus.
-    pub bus: String,
     /// Its node-ID.
     pub node: NodeId,
     /// The number of the program: sub-index of 1F50h.
@@ -46,11 +77,6 @@ pub struct Device {
     /// Whether the CRC of the running program is compared at the end.
     pub verify: bool,
     pub(super) board: Option<&'static Layout>,
-    pub(super) part: Option<String>,
-    pub(super) artifact: Option<String>,
-    pub(super) attempt: Attempt,
-    pub(super) confirm: bool,
-    pub(super) token: Token,
 }
 
 /// What is done with a deployment that the server does not force.
@@ -105,18 +131,17 @@ struct File {
     bus: Option<String>,
     board: Option<String>,
     #[serde(default)]
-    device: Vec<Entry>,
+    device: Vec<Entry<OneDevice>>,
+    #[serde(default)]
+    machine: Vec<Entry<OneMachine>>,
 }
 
+/// A target. The fields of its kind are in `T`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
-struct Entry {
+struct Entry<T> {
     controller_id: String,
-    node: u8,
     bus: Option<String>,
-    board: Option<String>,
-    #[serde(default = "default_program")]
-    program: u8,
     token_file: Option<PathBuf>,
     token_env: Option<String>,
     part: Option<String>,
@@ -125,6 +150,24 @@ struct Entry {
     attempt: Attempt,
     #[serde(default)]
     confirm: bool,
+    #[serde(flatten)]
+    own: T,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+struct OneMachine {
+    #[serde(default)]
+    trust: Vec<PathBuf>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+struct OneDevice {
+    node: u8,
+    board: Option<String>,
+    #[serde(default = "default_program")]
+    program: u8,
     #[serde(default = "yes")]
     check_target: bool,
     #[serde(default = "yes")]
@@ -215,28 +258,27 @@ impl Config {
             scheme: "GatewayToken",
         })
         .map_err(|why| format!("the gateway token: {why}"))?;
-        if file.device.is_empty() {
+        if file.device.is_empty() && file.machine.is_empty() {
             return Err("it names no device: add [[device]] with controller-id, bus and node".to_string());
         }
-        let mut devices: Vec<Device> = Vec::new();
-        for entry in &file.device {
-            let id = entry.controller_id.as_str();
-            let of = |why: String| format!("device '{id}': {why}");
-            name("controller-id", id).map_err(of)?;
-            let own = read(Source {
-                file: entry.token_file.as_deref(),
-                env: entry.token_env.as_deref(),
-                scheme: "TargetToken",
-            })
-            .map_err(|why| of(format!("its token: {why}")))?;
-            let device = entry.device(&file, folder, own.or_else(|| gateway.clone())).map_err(of)?;
-            if let Some(other) = devices.iter().find(|other| {
-                other.controller == device.controller
-                    || (&other.bus, other.node) == (&device.bus, device.node)
-            }) {
-                return Err(of(format!("it is the same device as '{}', or has its name", other.controller)));
+        let common = Common { bus: file.bus.as_deref(), gateway: gateway.as_ref(), token: &read };
+        let mut targets: Vec<Target> = Vec::new();
+        let mut add = |kind: &str, id: &str, target: Result<Target, String>| {
+            let of = |why: String| format!("{kind} '{id}': {why}");
+            let target = target.map_err(of)?;
+            if let Some(other) = targets.iter().find(|other| other.is_the_same(&target)) {
+                return Err(of(format!("it is the same {kind} as '{}', or has its name", other.controller)));
             }
-            devices.push(device);
+            targets.push(target);
+            Ok(())
+        };
+        for entry in &file.device {
+            let what = || entry.own.device(file.board.as_deref(), folder).map(What::Device);
+            add("device", &entry.controller_id, entry.target(&common, &what))?;
+        }
+        for entry in &file.machine {
+            let what = || entry.own.machine(folder).map(What::Machine);
+            add("machine", &entry.controller_id, entry.target(&common, &what))?;
         }
         Ok(Self {
             server,
@@ -244,17 +286,76 @@ impl Config {
             ca_file: file.ca_file.map(|path| folder.join(path)),
             state: folder.join(file.state),
             poll: (Duration::from_secs(file.poll_least), Duration::from_secs(file.poll_most)),
-            devices,
+            targets,
         })
     }
 }
 
-impl Entry {
-    fn device(&self, file: &File, folder: &Path, token: Option<Token>) -> Result<Device, String> {
-        let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
-        let bus = self.bus.as_ref().or(file.bus.as_ref()).ok_or("it has no bus")?;
+/// What the file has for all targets.
+struct Common<'f> {
+    bus: Option<&'f str>,
+    gateway: Option<&'f Token>,
+    token: &'f dyn Fn(Source<'_>) -> Result<Option<Token>, String>,
+}
+
+impl Target {
+    /// Whether both have one name, or are one device, or the machine of one bus.
+    fn is_the_same(&self, other: &Self) -> bool {
+        let is_one = match (&self.what, &other.what) {
+            (What::Device(one), What::Device(other)) => one.node == other.node,
+            (What::Machine(_), What::Machine(_)) => true,
+            _ => false,
+        };
+        self.controller == other.controller || is_one && self.bus == other.bus
+    }
+}
+
+impl<T> Entry<T> {
+    fn target(&self, common: &Common<'_>, what: &dyn Fn() -> Result<What, String>) -> Result<Target, String> {
+        name("controller-id", &self.controller_id)?;
+        let own = (common.token)(Source {
+            file: self.token_file.as_deref(),
+            env: self.token_env.as_deref(),
+            scheme: "TargetToken",
+        })
+        .map_err(|why| format!("its token: {why}"))?;
+        let bus = self.bus.as_deref().or(common.bus).ok_or("it has no bus")?;
         coboot_can::check(bus).map_err(|error| error.to_string())?;
-        let board = self.board.as_ref().or(file.board.as_ref()).map(|word| board::in_folder(word, folder));
+        let what = what()?;
+        let advice = "it has no token: set token-file or token-env, or the gateway's one for all devices";
+        Ok(Target {
+            controller: self.controller_id.clone(),
+            bus: bus.to_string(),
+            what,
+            part: self.part.clone(),
+            artifact: self.artifact.clone(),
+            attempt: self.attempt,
+            confirm: self.confirm,
+            token: own.or_else(|| common.gateway.cloned()).ok_or(advice)?,
+        })
+    }
+}
+
+impl OneMachine {
+    fn machine(&self, folder: &Path) -> Result<Machine, String> {
+        if self.trust.is_empty() {
+            return Err("it trusts nobody: set trust to the public keys of the roots that sign its packages"
+                .to_string());
+        }
+        let key = |path: &PathBuf| {
+            let path = folder.join(path);
+            let text = coflash_core::file::limit::read_text(&path);
+            let of = |why: &dyn fmt::Display| format!("{}: {why}", path.display());
+            PublicKey::from_pem(&text.map_err(|error| of(&error))?).map_err(|fault| of(&fault))
+        };
+        Ok(Machine { trust: self.trust.iter().map(key).collect::<Result<_, _>>()? })
+    }
+}
+
+impl OneDevice {
+    fn device(&self, board: Option<&str>, folder: &Path) -> Result<Device, String> {
+        let node = NodeId::new(self.node).ok_or("node-IDs are 1 to 127")?;
+        let board = self.board.as_deref().or(board).map(|word| board::in_folder(word, folder));
         let board = board.map(|word| board::named(&word)).transpose().map_err(|error| error.to_string())?;
         if !(1..=254).contains(&self.program) {
             return Err("programs are 1 to 254".to_string());
@@ -262,21 +363,13 @@ impl Entry {
         if let Some(board) = board.filter(|board| board.program(self.program).is_none()) {
             return Err(format!("{} has no program {}", board.board, self.program));
         }
-        let advice = "it has no token: set token-file or token-env, or the gateway's one for all devices";
         Ok(Device {
-            controller: self.controller_id.clone(),
-            bus: bus.clone(),
             node,
             program: self.program,
             check_target: self.check_target,
             trial_run: self.trial_run,
             verify: self.verify,
             board,
-            part: self.part.clone(),
-            artifact: self.artifact.clone(),
-            attempt: self.attempt,
-            confirm: self.confirm,
-            token: token.ok_or(advice)?,
         })
     }
 }
@@ -315,10 +408,16 @@ fn token(
 
 #[cfg(test)]
 mod tests {
+    use coflash_core::file::sealed::SigningKey;
+
     use super::*;
 
     const DOOR: &str =
         "[[device]]\ncontroller-id = 'door'\nbus = 'socketcan:can0'\nnode = 5\ntoken-env = 'DOOR'\n";
+
+    fn root() -> PublicKey {
+        SigningKey::from_seed([1; 32]).unwrap().public()
+    }
 
     fn read(text: &str) -> Result<Config, String> {
         let variable = |name: &str| match name {
@@ -337,9 +436,9 @@ mod tests {
              bus = 'socketcan:can0'\nnode = 6\nattempt = 'hold'\nboard = 'stm32f407g-disc1'\n"
         );
         let config = read(&text).unwrap();
-        let headers: Vec<&str> = config.devices.iter().map(|device| device.token.header()).collect();
+        let headers: Vec<&str> = config.targets.iter().map(|target| target.token.header()).collect();
         assert_eq!(headers, ["TargetToken secret-of-the-door", "GatewayToken secret-of-all"]);
-        assert_eq!(config.devices[1].attempt, Attempt::Hold);
+        assert_eq!(config.targets[1].attempt, Attempt::Hold);
         assert_eq!(config.state, Path::new("/etc/coflash/agent-state"));
         assert!(!format!("{config:?}").contains("secret"), "{config:?}");
     }
@@ -351,13 +450,54 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("coflash-agent-example-{}", std::process::id()));
         std::fs::create_dir_all(&folder).unwrap();
         std::fs::write(folder.join("gateway.token"), "t").unwrap();
+        std::fs::write(folder.join("root.pub"), root().to_pem()).unwrap();
         let config = Config::read(example, &folder, (None, None), &|_| Some("t".to_string()));
         std::fs::remove_dir_all(&folder).unwrap();
         match config {
-            Ok(config) => assert!(config.devices.len() > 1),
+            Ok(config) => assert!(config.targets.len() > 1),
             // The example's server is at https://.
             Err(why) => assert!(!cfg!(feature = "tls") && why.contains("feature tls"), "{why}"),
         }
+    }
+
+    /// A machine trusts somebody, and a bus is that of one machine; devices may be on it, too.
+    #[test]
+    fn a_machine_names_the_roots_that_it_trusts() {
+        let folder = std::env::temp_dir().join(format!("coflash-agent-machine-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("root.pub"), root().to_pem()).unwrap();
+        std::fs::write(folder.join("none.pub"), "none").unwrap();
+        let machine = |id: &str, more: &str| {
+            format!(
+                "[[machine]]\ncontroller-id = '{id}'\nbus = 'socketcan:can0'\ntoken-env = 'ALL'\n{more}\n"
+            )
+        };
+        let read = |more: &str| {
+            let text = format!("url = 'http://localhost'\n{more}");
+            Config::read(&text, &folder, (None, None), &|_| Some("t".to_string()))
+        };
+        let good = machine("press", "trust = ['root.pub']");
+        let config = read(&format!("{DOOR}{good}")).unwrap();
+        let [Target { what: What::Device(_), .. }, Target { what: What::Machine(machine_of), .. }] =
+            config.targets.as_slice()
+        else {
+            panic!("{config:?}")
+        };
+        assert_eq!(machine_of.trust, [root()]);
+        for (text, words) in [
+            (machine("press", ""), "machine 'press': it trusts nobody"),
+            (machine("press", "trust = []"), "it trusts nobody"),
+            (machine("press", "trust = ['no.pub']"), "no.pub: "),
+            (machine("press", "trust = ['none.pub']"), "none.pub: "),
+            (machine("press", "trust = ['root.pub']\nnode = 5"), "unknown field `node`"),
+            (good.clone() + &machine("other", "trust = ['root.pub']"), "the same machine as 'press'"),
+            (DOOR.to_string() + &machine("door", "trust = ['root.pub']"), "has its name"),
+            (format!("{DOOR}trust = ['root.pub']\n"), "unknown field `trust`"),
+        ] {
+            let why = read(&text).unwrap_err();
+            assert!(why.contains(words), "{text}: {why}");
+        }
+        std::fs::remove_dir_all(&folder).unwrap();
     }
 
     #[test]

@@ -7,6 +7,8 @@ use std::time::Duration;
 use serde::Serialize;
 use serde_json::Value;
 
+use coflash_core::update::FailedUpdate;
+
 use super::backoff::Jitter;
 use super::config::Attempt;
 use super::ddi::{self, Artifact, Base, Cancel, Deployment, Execution, Finished, Handling};
@@ -106,6 +108,8 @@ pub enum News {
     Percent(u8),
     /// The device keeps the program from now on, whatever happens.
     Kept,
+    /// The update of a device has failed: what it has shown.
+    Failed(FailedUpdate),
 }
 
 /// A message for the people who run the agent.
@@ -119,6 +123,9 @@ pub struct Said {
     pub kind: Kind,
     /// The words.
     pub text: String,
+    /// What a device has shown whose update has failed; with [`Kind::Report`] alone.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub update: Option<FailedUpdate>,
 }
 
 /// What a message is about.
@@ -136,6 +143,8 @@ pub enum Kind {
     Failed,
     /// The server has cancelled a deployment.
     Cancelled,
+    /// What a device has shown whose update has failed, for a report.
+    Report,
     /// Something went wrong that is tried again.
     Trouble,
     /// Something else.
@@ -785,6 +794,11 @@ impl Controller {
                 let words = format!("action {}: {words}", task.action);
                 self.say(Kind::Progress, words);
             }
+            News::Failed(update) => {
+                let text = format!("action {}: the update of node {} has failed", task.action, update.node);
+                let (controller, kind) = (self.name.clone(), Kind::Report);
+                self.said.push(Said { controller, kind, text, update: Some(update) });
+            }
             News::Percent(percent) => {
                 let percent = percent.min(100);
                 progress.percent = percent;
@@ -873,7 +887,7 @@ impl Controller {
     }
 
     fn say(&mut self, kind: Kind, text: String) {
-        self.said.push(Said { controller: self.name.clone(), kind, text });
+        self.said.push(Said { controller: self.name.clone(), kind, text, update: None });
     }
 }
 

@@ -17,6 +17,8 @@ const ID_MOST: usize = 64;
 const NAME_MOST: usize = 255;
 /// The longest part of a wrong value that is shown, in characters.
 const SHOWN_MOST: usize = 40;
+/// The most lines of feedback: hawkBit keeps 50.
+const LINES_MOST: usize = 50;
 /// The longest line of feedback, in characters: hawkBit keeps 512.
 const LINE_MOST: usize = 500;
 /// The longest key and value of an attribute: hawkBit keeps 32 and 128.
@@ -252,10 +254,15 @@ pub(super) fn feedback(
     percent: Option<u8>,
     details: &[String],
 ) -> serde_json::Value {
-    let details: Vec<String> = details.iter().map(|line| line.chars().take(LINE_MOST).collect()).collect();
+    let mut shown: Vec<String> =
+        details.iter().take(LINES_MOST).map(|line| line.chars().take(LINE_MOST).collect()).collect();
+    if let Some(over) = details.len().checked_sub(LINES_MOST).filter(|over| *over > 0) {
+        shown.pop();
+        shown.push(format!("and {} more lines, which the agent's own output has", over + 1));
+    }
     let mut body = serde_json::json!({
         "id": action,
-        "status": { "execution": execution, "result": { "finished": finished }, "details": details },
+        "status": { "execution": execution, "result": { "finished": finished }, "details": shown },
     });
     if let Some(percent) = percent {
         body["status"]["result"]["progress"] = serde_json::json!({ "cnt": percent, "of": 100 });
@@ -340,6 +347,13 @@ mod tests {
         assert_eq!(body["status"]["execution"], "closed");
         assert_eq!(body["status"]["result"], serde_json::json!({ "finished": "failure" }));
         assert_eq!(body["status"]["details"][0].as_str().unwrap().len(), 500);
+        let many: Vec<String> = (0..60).map(|number| number.to_string()).collect();
+        let body = feedback("8", Execution::Closed, Finished::Failure, None, &many);
+        let shown = body["status"]["details"].as_array().unwrap();
+        assert_eq!((shown.len(), shown[48].as_str().unwrap()), (50, "48"));
+        assert!(shown[49].as_str().unwrap().starts_with("and 11 more lines"));
+        let body = feedback("8", Execution::Closed, Finished::Failure, None, &many[..50]);
+        assert_eq!(body["status"]["details"][49], "49");
         let body = feedback("8", Execution::Proceeding, Finished::None, Some(40), &[]);
         assert_eq!(body["status"]["result"]["progress"], serde_json::json!({ "cnt": 40, "of": 100 }));
         let data = config_data(&[("k".repeat(50), "v".repeat(500))]);

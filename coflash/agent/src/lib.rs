@@ -12,9 +12,11 @@
 //! | `controller` | what one device does next: a state machine without I/O |
 //! | `http` | requests to the server, with limits |
 //! | `download` | artifacts: fetched piece by piece, checked |
-//! | `firmware` | the artifact as a program |
-//! | `buses` | the devices: the only file that calls `coflash-core` |
-//! | `run` | a thread for each device, which joins these parts |
+//! | `firmware` | the artifact as a program of a device, or as a package for a machine |
+//! | `buses` | the devices, and those of machines |
+//! | `told` | what the server hears of an update |
+//! | `machine` | an update with a package, in words for the server |
+//! | `run` | a thread for each target, which joins these parts |
 //!
 //! Nothing is flashed whose size and SHA-256 were not compared with the deployment.
 #![forbid(unsafe_code)]
@@ -27,14 +29,17 @@ mod ddi;
 mod download;
 mod firmware;
 mod http;
+mod machine;
 mod pause;
 mod record;
 mod run;
+mod told;
 mod url;
 
 pub use self::buses::{Buses, Open};
-pub use self::config::{Config, Device, Fault};
+pub use self::config::{Config, Device, Fault, Machine, Target, What};
 pub use self::controller::{Flashed, Kind, News, Said};
+pub use self::firmware::Content;
 pub use self::run::{run, CannotStart, Devices, Ended, Options, Order, Times};
 
 /// The example on the crate's page compiles and runs.

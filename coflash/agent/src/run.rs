@@ -11,35 +11,34 @@ use std::time::{Duration, Instant};
 use crc::{Crc, CRC_64_XZ};
 
 use super::backoff::Jitter;
-use super::config::{Config, Device};
+use super::config::{Config, Target};
 use super::controller::{Controller, Flash, Flashed, Kind, News, Rules, Said, Step, Wanted};
 use super::download::{self, Pause};
-use super::firmware;
+use super::firmware::{self, Content};
 use super::http::{Client, Limits};
 use super::record::{Record, Store};
 use coflash_core::file::limit::MAX_FILE_SIZE;
-use coflash_core::update::Payload;
 
 /// What an agent does with its devices.
 pub trait Devices: Sync {
-    /// The attributes of a device for the server; an error is in words.
+    /// The attributes of a target for the server; an error is in words.
     ///
     /// # Errors
     /// In words, if the device does not answer.
-    fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String>;
+    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String>;
 
-    /// Flashes a device, and says what happens.
+    /// Flashes a device or those of a machine, and says what happens.
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed;
 }
 
-/// An order to flash a device.
+/// An order to flash a target.
 #[derive(Debug)]
 #[non_exhaustive]
 pub struct Order<'o> {
-    /// The device.
-    pub device: &'o Device,
-    /// The program: fetched, checked and judged.
-    pub program: Payload,
+    /// The target.
+    pub target: &'o Target,
+    /// What it gets.
+    pub content: Content<'o>,
     /// Whether an earlier agent has seen that the device keeps this program. If it runs, the order
     /// is carried out already.
     pub kept: bool,
@@ -175,7 +174,7 @@ pub fn run(
     let shared = &shared;
     let results: Vec<Ended> = thread::scope(|scope| {
         let threads: Vec<_> =
-            config.devices.iter().map(|device| scope.spawn(move || serve(shared, device))).collect();
+            config.targets.iter().map(|target| scope.spawn(move || serve(shared, target))).collect();
         // A thread that panicked has served nobody.
         let lost = Ended { unserved: 1, ..Ended::default() };
         threads.into_iter().map(|thread| thread.join().unwrap_or(lost)).collect()
@@ -201,15 +200,20 @@ fn lock(path: PathBuf) -> Result<File, String> {
 
 /// The record of a device. A damaged one is said, and read again after a pause: it may be put right.
 /// `None` if the run ends before that.
-fn record(shared: &Shared<'_>, device: &Device, root: &str, seed: u64) -> Option<Record> {
+fn record(shared: &Shared<'_>, target: &Target, root: &str, seed: u64) -> Option<Record> {
     let Options { once, times, cancelled, .. } = shared.options;
     let mut jitter = Jitter::new(seed);
     for failures in 1.. {
-        let why = match shared.store.load(&device.controller, root) {
+        let why = match shared.store.load(&target.controller, root) {
             Ok(record) => return Some(record),
             Err(why) => why,
         };
-        (shared.tell)(&Said { controller: device.controller.clone(), kind: Kind::Trouble, text: why });
+        (shared.tell)(&Said {
+            controller: target.controller.clone(),
+            kind: Kind::Trouble,
+            text: why,
+            update: None,
+        });
         let until = shared.began.elapsed() + jitter.after(failures, times.backoff_first, times.backoff_most);
         while !once && shared.began.elapsed() < until && !cancelled.load(Ordering::Relaxed) {
             thread::sleep(TICK.min(until.saturating_sub(shared.began.elapsed())));
@@ -221,27 +225,27 @@ fn record(shared: &Shared<'_>, device: &Device, root: &str, seed: u64) -> Option
     None
 }
 
-/// Serves one device.
-fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
+/// Serves one target.
+fn serve(shared: &Shared<'_>, target: &Target) -> Ended {
     let Shared { config, options, .. } = *shared;
-    let root = config.server.controller(&config.tenant, &device.controller);
-    let seed = options.seed ^ Crc::<u64>::new(&CRC_64_XZ).checksum(device.controller.as_bytes());
-    let Some(record) = record(shared, device, &root, seed) else {
+    let root = config.server.controller(&config.tenant, &target.controller);
+    let seed = options.seed ^ Crc::<u64>::new(&CRC_64_XZ).checksum(target.controller.as_bytes());
+    let Some(record) = record(shared, target, &root, seed) else {
         return Ended { unserved: 1, ..Ended::default() };
     };
     let Times { backoff_first, backoff_most, tell, .. } = options.times;
     let rules = Rules {
-        part: device.part.clone(),
-        artifact: device.artifact.clone(),
-        attempt: device.attempt,
-        confirm: device.confirm,
+        part: target.part.clone(),
+        artifact: target.artifact.clone(),
+        attempt: target.attempt,
+        confirm: target.confirm,
         size_most: MAX_FILE_SIZE,
         poll: config.poll,
         backoff: (backoff_first, backoff_most),
         tell,
     };
-    let mut controller = Controller::new(&device.controller, rules, record, seed);
-    let path = shared.store.path(&device.controller, "part");
+    let mut controller = Controller::new(&target.controller, rules, record, seed);
+    let path = shared.store.path(&target.controller, "part");
     let (sender, heard) = channel();
     let mut ended = Ended::default();
     thread::scope(|scope| {
@@ -264,7 +268,7 @@ fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
             }
             match controller.next(now) {
                 Step::Save(record) => {
-                    let result = shared.store.save(&device.controller, &record);
+                    let result = shared.store.save(&target.controller, &record);
                     if result.is_ok() && !controller.needs_file() {
                         // Without the file the next download begins anew, which is no harm.
                         let _ = fs::remove_file(&path);
@@ -276,25 +280,25 @@ fn serve(shared: &Shared<'_>, device: &Device) -> Ended {
                 Step::Wait(until) => wait(shared, &mut controller, &heard, until),
                 _ if over => wait(shared, &mut controller, &heard, now + TICK),
                 Step::Ask(request) => {
-                    let reply = shared.client.send(&root, &device.token, &request, shared.limits);
+                    let reply = shared.client.send(&root, &target.token, &request, shared.limits);
                     controller.answered(shared.began.elapsed(), reply);
                 }
                 Step::Fetch(wanted) => {
                     let ends = || options.cancelled.load(Ordering::Relaxed);
                     let pause = Pause { after: options.times.piece, now: &ends };
-                    let piece = download::fetch(&shared.client, &device.token, &wanted, &path, &pause);
+                    let piece = download::fetch(&shared.client, &target.token, &wanted, &path, &pause);
                     controller.fetched(shared.began.elapsed(), piece);
                 }
                 Step::AskDevice => {
                     let sender = sender.clone();
                     scope.spawn(move || {
-                        let _ = sender.send(Heard::Looked(shared.devices.look(device)));
+                        let _ = sender.send(Heard::Looked(shared.devices.look(target)));
                     });
                 }
                 Step::Flash(Flash { wanted, kept }) => {
                     let sender = sender.clone();
                     let path = &path;
-                    scope.spawn(move || flash(shared, device, path.clone(), &wanted, kept, &sender));
+                    scope.spawn(move || flash(shared, target, path.clone(), &wanted, kept, &sender));
                 }
             }
         }
@@ -322,7 +326,7 @@ fn wait(shared: &Shared<'_>, controller: &mut Controller, heard: &Receiver<Heard
 /// Carries out an order, on a thread of its own.
 fn flash(
     shared: &Shared<'_>,
-    device: &Device,
+    target: &Target,
     path: PathBuf,
     wanted: &Wanted,
     kept: bool,
@@ -335,10 +339,10 @@ fn flash(
                 let _ = sender.send(Heard::News(news));
             }
         });
-        let program = download::bytes(&path, wanted).map_err(|why| vec![why]);
-        let program = program.and_then(|bytes| firmware::program(&bytes, &wanted.name, device));
-        match program {
-            Ok(program) => shared.devices.flash(Order { device, program, kept }, news),
+        let bytes = download::bytes(&path, wanted).map_err(|why| vec![why]);
+        let content = bytes.and_then(|bytes| firmware::content(&bytes, &wanted.name, target));
+        match content {
+            Ok(content) => shared.devices.flash(Order { target, content, kept }, news),
             Err(lines) => {
                 drop(news);
                 Flashed::Failed(lines)

@@ -49,8 +49,8 @@ impl Agent {
         let seed = getrandom::u64().unwrap_or_default();
         let options = Options::default().once(self.once).seed(seed).cancelled(cancelled.clone());
         let tell = |said: &Said| show(context, said);
-        let count = config.devices.len();
-        let noun = if count == 1 { "device" } else { "devices" };
+        let count = config.targets.len();
+        let noun = if count == 1 { "target" } else { "targets" };
         context.out.say(format_args!("{count} {noun}  (Ctrl-C ends it)"));
         let open = |bus: &str| {
             context.link_at(Some(bus), None).map_err(|failure| failure.to_string().trim_end().to_string())
@@ -74,10 +74,13 @@ impl Agent {
 /// Shows a message: a line for people, or an event.
 fn show(context: &Context, said: &Said) {
     let Said { controller, kind, text, .. } = said;
+    if let Some(update) = &said.update {
+        record::failed(update, &[("controller", controller)]);
+    }
     if context.out.shows_events() {
         record::note("said", &format!("{controller}: {text}"));
         context.out.event(&json!(said));
-    } else if *kind == Kind::Progress {
+    } else if matches!(kind, Kind::Progress | Kind::Report) {
         context.out.detail(format_args!("{controller}: {text}"));
     } else {
         context.out.say(format_args!("{controller}: {text}"));

@@ -130,7 +130,7 @@ impl Conform {
     fn image(&self, context: &Context) -> Result<Option<Payload>, Failure> {
         let Some(path) = &self.image else { return Ok(None) };
         let done = self.source.program(path, 1, Label::OfImage { date: 0 })?;
-        warn(context, path, &done);
+        warn(context, path, &done.notes, done.left_out);
         Ok(Some(Arc::new(done.program).into()))
     }
 

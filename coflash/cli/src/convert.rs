@@ -176,7 +176,7 @@ impl Convert {
             }
         }
         let done = self.source.convert(firmware, input, self.program, self.labels.label(input)?)?;
-        warn(context, input, &done);
+        warn(context, input, &done.notes, done.left_out);
         let program = &done.program;
         let (image, start) = (program.image(), program.start());
         match (self.source.layout()?, StackAtEnd::of(image, start)) {

@@ -10,8 +10,8 @@ use coflash_core::file::convert::{
 };
 use coflash_core::file::program::LastBlock;
 use coflash_core::file::read::{self, Firmware, Format};
-use coflash_core::file::{self, limit, AddressRange};
-use coflash_core::update::JOINED_BLOCKS;
+use coflash_core::file::{self, limit, AddressRange, Note};
+use coflash_core::update::{Reading, JOINED_BLOCKS};
 use shared_abi::layout;
 
 use super::context::Context;
@@ -60,11 +60,6 @@ pub(super) struct Place {
     /// The number that is added to every address of the file (0xF8000000 subtracts 0x08000000).
     #[arg(long, alias = "adjust_start", value_name = "OFFSET", value_parser = number, default_value = "0")]
     adjust_start: u32,
-
-    /// The start address of a raw binary if no option gives one: for devices that take an image
-    /// without addresses.
-    #[arg(skip)]
-    image_at: Option<u32>,
 
     /// The file's format, if the first bytes do not show it.
     #[arg(short = 'I', long = "input-format", value_name = "FORMAT", ignore_case = true)]
@@ -153,28 +148,37 @@ impl Source {
         program: u8,
         label: Label,
     ) -> Result<Converted, Failure> {
-        let options = self
-            .place
-            .options(program)?
+        let options = self.options(self.place.options(program)?, label);
+        program_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+    }
+
+    /// How to read a file for program `number` of a device. Whether its board has such a program is of no
+    /// matter for a file that says where it belongs.
+    pub(super) fn reading(&self, program: u8, label: Label) -> Result<Reading, Failure> {
+        let board = self.layout()?;
+        let place = match board {
+            Some(_) => Options::default().adjust_start(self.place.adjust_start),
+            None => self.place.options(program)?,
+        };
+        let convert = self.options(place, label);
+        Ok(Reading::new(program).format(self.format()).board(board).convert(convert))
+    }
+
+    /// The options of a conversion, for this place.
+    fn options(&self, place: Options, label: Label) -> Options {
+        place
             .block_size(self.block_size())
             .gap_fill(GapFill::new(self.gap_fill))
             .label(label)
             .checksum(if self.crc16 { Checksum::Crc16 } else { Checksum::Crc32 })
             .max_gap(self.block_max_gap)
-            .last_block(if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 });
-        program_of(firmware, &options).map_err(|error| Failure::convert(error, file))
+            .last_block(if self.last_block_2008 { LastBlock::Of2008 } else { LastBlock::Of2015 })
     }
 
     /// The same options for another board.
     pub(super) fn for_board(&self, name: &str) -> Self {
         let map = MemoryMap { board: Some(name.to_owned()), ..MemoryMap::default() };
         let place = Place { map, ..self.place.clone() };
-        Self { place, ..self.clone() }
-    }
-
-    /// The same options for a device that takes images without addresses.
-    pub(super) fn for_images(&self) -> Self {
-        let place = Place { image_at: Some(0), ..self.place.clone() };
         Self { place, ..self.clone() }
     }
 
@@ -218,13 +222,7 @@ impl Place {
 
     /// Reads `file` for program `number`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
-        // A raw file begins at the start of the region; the conversion adjusts this address like
-        // any other one.
-        let raw_address = match self.region(program)? {
-            Region::Unknown | Region::CutBehind(_) => self.image_at,
-            Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
-            Region::Cut(range) => Some(range.first),
-        };
+        let raw_address = self.options(program)?.raw_address();
         Ok(read::load_telling(file, self.format.map(Format::from), raw_address)?)
     }
 
@@ -246,11 +244,7 @@ impl Place {
         match (self.map.layout()?, self.start_address, self.end_address) {
             (Some(layout), ..) => match layout.program(program) {
                 Some(region) => Ok(Region::Strict(region.into())),
-                None => {
-                    let what = format!("{} has no program {program}", layout.board);
-                    let advice = format!("its programs are 1 to {}", layout.programs.len());
-                    Err(Failure::usage(what, advice))
-                }
+                None => Err(Failure::no_such_program(layout.board, program, layout.programs.len())),
             },
             (None, None, None) => Ok(Region::Unknown),
             (None, None, Some(last)) => Ok(Region::CutBehind(last)),
@@ -297,15 +291,14 @@ pub(super) fn bytes(path: &Path) -> Result<Vec<u8>, Failure> {
 }
 
 /// Warns of what is odd about the file, and if data were left out.
-pub(super) fn warn(context: &Context, file: &Path, converted: &Converted) {
-    for note in &converted.notes {
+pub(super) fn warn(context: &Context, file: &Path, notes: &[Note], left_out: u64) {
+    for note in notes {
         context.out.warn(format_args!("{}: {note}", file.display()));
     }
-    if converted.left_out > 0 {
+    if left_out > 0 {
         context.out.warn(format_args!(
-            "{}: {} bytes outside the address range were left out [0x60002001]",
-            file.display(),
-            converted.left_out
+            "{}: {left_out} bytes outside the address range were left out [0x60002001]",
+            file.display()
         ));
     }
 }

@@ -1,7 +1,6 @@
 //! `coflash flash`: downloads a program into a device.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Duration;
 
 use canopen::NodeId;
@@ -11,15 +10,12 @@ use coflash_core::device::lock::Lock;
 use coflash_core::device::lss::{ensure_node_id, LssAddress};
 use coflash_core::device::Dialect;
 use coflash_core::file::convert::{blocks_of_sealed, Label};
-use coflash_core::file::judge::judge;
 use coflash_core::file::limit::read_text;
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
-use coflash_core::file::Program;
-use coflash_core::update::dialect::is_data;
 use coflash_core::update::job::{self, Entry, Settings};
 use coflash_core::update::many::{flash_in_turn, flash_many, Job, ManyOptions};
-use coflash_core::update::{flash_program, Event, FlashOptions, Payload};
+use coflash_core::update::{flash_program, Event, FlashOptions, Judging, Payload};
 use serde_json::json;
 use shared_abi::block_file::ProgramVersion;
 
@@ -27,15 +23,13 @@ use super::context::Context;
 use super::convert::Labels;
 use super::device::{cancelled, Patience};
 use super::dialect::Access;
-use super::file::{warn, Source};
+use super::file::{bytes, warn, Source};
 use super::legacy::Legacy;
 use super::many::{diagnose_silence, document, summary, write_report, Board, Outcome};
 use super::output::Failure;
 use super::package::{is_package, Given, Machine, Typed};
 use super::progress::Progress;
-use super::renew::bootloader_in;
 use super::values::{nodes, number, program_number, watch_time};
-use super::verify::{self, is_sealed};
 
 /// When devices get the same program together.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -286,19 +280,11 @@ impl Flash {
         self.legacy.program().unwrap_or(self.program)
     }
 
-    /// The options for reading a file for the named dialect.
-    fn source(&self) -> Source {
-        match self.access.dialect() {
-            Some(Dialect::Raw | Dialect::Lift) => self.source.for_images(),
-            _ => self.source.clone(),
-        }
-    }
-
     /// The devices of the command line, which all get the same program.
     fn devices(&self, context: &Context) -> Result<Vec<Assignment>, Failure> {
         let unnamed = || Failure::usage("no firmware file is named", "name the firmware: coflash flash FILE");
         let image = self.image().ok_or_else(unnamed)?;
-        let file = self.payload(context, image, self.number(), &self.source(), self.labels.label(image)?)?;
+        let file = self.payload(context, image, self.number(), &self.source, self.labels.label(image)?)?;
         let options = self.options(&file, &Settings::default())?;
         match &file {
             Payload::Program(program) => {
@@ -353,8 +339,8 @@ impl Flash {
                 Some((.., file)) => file.clone(),
                 None => {
                     let source = match &settings.board {
-                        Some(board) => self.source().for_board(board),
-                        None => self.source(),
+                        Some(board) => self.source.for_board(board),
+                        None => self.source.clone(),
                     };
                     let file = self.payload(context, &image, program, &source, Label::default())?;
                     known.push((image.clone(), settings.board.clone(), program, file.clone()));
@@ -376,39 +362,16 @@ impl Flash {
         source: &Source,
         label: Label,
     ) -> Result<Payload, Failure> {
-        if let Some(new) = bootloader_in(path, source.format())? {
-            return Ok(new.into());
+        let judging = if self.force { Judging::Nothing } else { Judging::Whole };
+        let reading = source.reading(program, label)?.dialect(self.access.dialect()).judging(judging);
+        let loaded = reading.read(path, &bytes(path)?).map_err(|fault| Failure::content(path, fault))?;
+        warn(context, path, &loaded.notes, loaded.left_out);
+        if let (Payload::Sealed(file), true) = (&loaded.payload, self.in_blocks) {
+            // The device reports the program's start address later; this checks now whether such blocks
+            // are possible.
+            blocks_of_sealed(file, 0, source.block_size()).map_err(|error| Failure::convert(error, path))?;
         }
-        if is_sealed(path) {
-            let bytes = verify::read(path)?.image;
-            let file = match self.force {
-                true => SealedFile::parse(bytes),
-                false => SealedFile::for_program(bytes, program),
-            };
-            let file = file.map_err(|refusal| Failure::sealed(path, &refusal))?;
-            if self.in_blocks {
-                // The device reports the program's start address later; this checks now whether
-                // such blocks are possible.
-                blocks_of_sealed(&file, 0, source.block_size())
-                    .map_err(|error| Failure::convert(error, path))?;
-            }
-            return Ok(Arc::new(file).into());
-        }
-        let done = source.program(path, program, label)?;
-        warn(context, path, &done);
-        self.judge(path, &done.program, program, source)?;
-        Ok(Arc::new(done.program).into())
-    }
-
-    /// Refuses a file that cannot be a program, before any request to a device. For a possible lift
-    /// device, the meaning of a program number above 1 is not known without the device.
-    fn judge(&self, path: &Path, program: &Program, number: u8, source: &Source) -> Result<(), Failure> {
-        let dialect = self.access.dialect();
-        if self.force || is_data(dialect.unwrap_or(Dialect::Lift), number) {
-            return Ok(());
-        }
-        let board = source.layout()?;
-        judge(program.image(), program.start(), board).map_err(|fault| Failure::no_program(path, fault))
+        Ok(loaded.payload)
     }
 
     /// The options of the command line, unless the device's own settings replace them.

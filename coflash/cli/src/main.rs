@@ -50,7 +50,6 @@ mod progress;
 mod provision;
 mod read;
 mod record;
-mod renew;
 mod report;
 mod reset;
 mod scan;

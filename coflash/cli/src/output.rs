@@ -17,7 +17,7 @@ use coflash_core::file::sealed::Refusal;
 use coflash_core::file::{judge, Cause, FileError};
 use coflash_core::machine;
 use coflash_core::update::job::Fault;
-use coflash_core::update::{refusal_number, DeviceAfterUpdate, DeviceAnswer};
+use coflash_core::update::{refusal_number, ContentFault, DeviceAfterUpdate, DeviceAnswer};
 use coflash_core::Error;
 use serde_json::{json, Value};
 
@@ -466,6 +466,25 @@ impl Failure {
         // The manual's tools do not know such files.
         let legacy = Exit::File.legacy();
         Self { legacy, ..Self::new(Exit::File, number, what, Some(advice)) }
+    }
+
+    /// A program number that a board does not have.
+    pub(super) fn no_such_program(board: &str, program: u8, programs: usize) -> Self {
+        Self::usage(format!("{board} has no program {program}"), format!("its programs are 1 to {programs}"))
+    }
+
+    /// A file that is nothing for a device.
+    pub(super) fn content(path: &Path, fault: ContentFault) -> Self {
+        match fault {
+            ContentFault::Bootloader(fault) => Self::file(path, &format!("it {fault}")),
+            ContentFault::Sealed(refusal) => Self::sealed(path, &refusal),
+            ContentFault::NoProgram { board, program, programs } => {
+                Self::no_such_program(board, program, programs)
+            }
+            ContentFault::File(error) => error.of(path.display()).into(),
+            ContentFault::Convert(error) => Self::convert(error, path),
+            ContentFault::Judged(fault) => Self::no_program(path, fault),
+        }
     }
 
     /// A failed conversion of `file`.

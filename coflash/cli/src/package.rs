@@ -100,16 +100,13 @@ fn is_same(one: &Path, other: &Path) -> bool {
     real(one).is_some_and(|one| real(other) == Some(one))
 }
 
-/// Whether a file is one for a machine: by its ending, or because it begins as a package. A file with this
-/// ending that is no package is refused, so that its name does not get it past the roots of the configuration.
+/// Whether a file is one for a machine.
 pub(super) fn is_package(path: &Path) -> bool {
-    if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("cpk")) {
-        return true;
-    }
     let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
     let mut front = Vec::new();
     let mut read = |file: std::fs::File| file.take(machine::FRONT as u64).read_to_end(&mut front);
-    is_file && std::fs::File::open(path).and_then(&mut read).is_ok() && machine::looks_like(&front)
+    let is_read = is_file && std::fs::File::open(path).and_then(&mut read).is_ok();
+    machine::is_package(path, if is_read { &front } else { &[] })
 }
 
 /// A package, and which of its signers belong to the roots that the user has named, if any was named.

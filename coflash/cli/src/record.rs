@@ -3,7 +3,6 @@
 //!
 //! One record serves the whole program, so that code with a message need not have access to it.
 
-use std::collections::{BTreeMap, VecDeque};
 use std::ffi::OsString;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
@@ -11,13 +10,12 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use canopen::{CobId, Frame, NodeId};
+use canopen::{Frame, NodeId};
 use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
 use coboot_can::{Adapter, Tap};
-use coflash_core::file::inspect::Date;
-use coflash_core::update::Event;
+use coflash_core::update::{stamp, Event, FailedUpdate, Histories};
 use serde_json::{json, Value};
 
 use super::secrets;
@@ -40,31 +38,12 @@ struct Report {
     trace: Sink,
     /// `report.json`, written at the beginning and again at the end.
     document: Mutex<Value>,
-    /// What each device has shown since its last update.
-    histories: Mutex<BTreeMap<NodeId, History>>,
+    /// What the devices of the bus have shown, if the command has one.
+    histories: Mutex<Histories>,
 }
 
-/// What `report.json` says about a failed update.
-#[derive(Default)]
-struct History {
-    /// The steps and repetitions of the update.
-    tried: VecDeque<String>,
-    /// The last frames from and to the node.
-    frames: VecDeque<String>,
-}
-
-/// The most steps, and the most frames, of a device: a failed request with all of its attempts, and the
-/// questions after it.
-const MOST_TRIED: usize = 256;
-const MOST_FRAMES: usize = 32;
-
-/// Adds a line, and forgets the oldest one if there are more than `most`.
-fn push(lines: &mut VecDeque<String>, line: String, most: usize) {
-    lines.push_back(line);
-    if lines.len() > most {
-        lines.pop_front();
-    }
-}
+/// The most failed updates of a run: the latest ones count.
+const MOST_FAILED: usize = 127;
 
 /// A file that may become full. The first error is shown, and the command continues.
 struct Sink {
@@ -196,8 +175,21 @@ pub(super) fn event(node: NodeId, event: &Event) {
         let mut line = serde_json::to_value(event.line(node)).unwrap_or_default();
         line["time"] = stamp(wall()).into();
         report.events.line(&line.to_string());
-        report.remember(node, event);
+        let mut histories = report.histories.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(update) = histories.told(wall(), node, event) {
+            report.failed(json!(update));
+        }
     }
+}
+
+/// Records a failed update that a page or an agent has made, at once: they end last of all.
+pub(super) fn failed(update: &FailedUpdate, more: &[(&str, &str)]) {
+    let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) else { return };
+    let mut value = json!(update);
+    more.iter().for_each(|(name, word)| value[*name] = (*word).into());
+    report.failed(value);
+    // An error of writing is reported at the end of the run.
+    let _ = report.write(&[]);
 }
 
 /// Records the result of a command, as JSON.
@@ -218,15 +210,13 @@ pub(super) fn tapped(adapter: Box<dyn Adapter + Send>) -> Box<dyn Adapter + Send
     let mut decoder = Decoder::new();
     let ear = move |now: Duration, frame: &Frame| {
         let Some(record) = RECORD.get() else { return };
-        let bare = contents.frame(frame);
-        let frame = passwords.frame(frame);
-        let line = Line { time: origin + now, interface: "can0".to_string(), frame };
-        let words = decoder.decode(&bare);
-        let text = line.to_string();
-        record.note("frame", &format!("{frame}  {words}"));
+        let words = decoder.decode(&contents.frame(frame));
+        let (time, shown) = (origin + now, passwords.frame(frame));
+        let text = Line { time, interface: "can0".to_string(), frame: shown }.to_string();
+        record.note("frame", &format!("{shown}  {words}"));
         if let Some(report) = &record.report {
             report.trace.line(&text);
-            report.saw(&bare, &words);
+            report.histories.lock().unwrap_or_else(PoisonError::into_inner).saw(time, frame);
         }
     };
     Box::new(Tap::new(adapter, Box::new(ear)))
@@ -244,42 +234,18 @@ impl Record {
 }
 
 impl Report {
-    /// Remembers a step of an update. If the update has failed, `report.json` gets what was tried, and the
-    /// frames that decided.
-    fn remember(&self, node: NodeId, event: &Event) {
-        let mut histories = self.histories.lock().unwrap_or_else(PoisonError::into_inner);
-        match event {
-            Event::Progress { .. } => {}
-            Event::Done(done) => {
-                let History { tried, frames } = histories.remove(&node).unwrap_or_default();
-                if done.error.is_some() {
-                    let update = json!({ "node": node.get(), "tried": tried, "frames": frames });
-                    let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
-                    match document["failed_updates"].as_array_mut() {
-                        Some(updates) => updates.push(update),
-                        None => document["failed_updates"] = json!([update]),
-                    }
-                }
+    /// Adds a failed update to `report.json`.
+    fn failed(&self, update: Value) {
+        let mut document = self.document.lock().unwrap_or_else(PoisonError::into_inner);
+        match document["failed_updates"].as_array_mut() {
+            Some(updates) => {
+                // A server, a page or an agent may run for years.
+                let over = (updates.len() + 1).saturating_sub(MOST_FAILED);
+                updates.drain(..over);
+                updates.push(update);
             }
-            event => {
-                let line = format!("{}  {event}", stamp(wall()));
-                push(&mut histories.entry(node).or_default().tried, line, MOST_TRIED);
-            }
+            None => document["failed_updates"] = json!([update]),
         }
-    }
-
-    /// Remembers a frame, which must be without passwords and programs, for the node that sends it or for
-    /// which it is.
-    fn saw(&self, frame: &Frame, words: &str) {
-        let node = match frame.cob_id() {
-            Some(CobId::NMT) => frame.exactly().map(|[_, node]: &[u8; 2]| *node),
-            Some(id) => Some((id.get() & 0x7F) as u8),
-            None => None,
-        };
-        let Some(node) = node.and_then(NodeId::new) else { return };
-        let line = format!("{}  {frame}  {words}", stamp(wall()));
-        let mut histories = self.histories.lock().unwrap_or_else(PoisonError::into_inner);
-        push(&mut histories.entry(node).or_default().frames, line, MOST_FRAMES);
     }
 
     /// Writes `report.json` with these additional entries.
@@ -296,20 +262,4 @@ impl Report {
 
 fn wall() -> Duration {
     SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default()
-}
-
-/// `2026-11-22T06:22:31.123Z`.
-fn stamp(time: Duration) -> String {
-    let date = Date(time.as_secs()).to_string();
-    format!("{}.{:03}Z", date.trim_end_matches(" UTC").replace(' ', "T"), time.subsec_millis())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_time_is_that_of_iso_8601() {
-        assert_eq!(stamp(Duration::from_millis(1_420_070_400_042)), "2015-01-01T00:00:00.042Z");
-    }
 }

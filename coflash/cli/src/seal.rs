@@ -275,7 +275,7 @@ impl Seal {
         let (firmware, _) = self.place.load(path, self.program)?;
         let done = program_of(firmware, &self.place.options(self.program)?);
         let done = done.map_err(|error| Failure::convert(error, path))?;
-        super::file::warn(context, path, &done);
+        super::file::warn(context, path, &done.notes, done.left_out);
         let to_seal = ToSeal {
             path,
             program: &done.program,

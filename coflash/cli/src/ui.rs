@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_ui::{Options, Server, Service};
+use coflash_ui::{Failed, Options, Server, Service};
 use serde_json::json;
 
 use super::context::Context;
@@ -11,6 +11,7 @@ use super::device::cancelled;
 use super::memory;
 use super::output::Failure;
 use super::package::{self, Trusted, Typed};
+use super::record;
 
 /// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
 ///
@@ -54,6 +55,7 @@ impl Ui {
         options.bus = context.bus.clone();
         options.port = self.port;
         options.kinds = context.kinds();
+        options.failed = Failed::new(|update| record::failed(update, &[]));
         options.sdo_ids = match (context.sdo_request, context.sdo_response) {
             (None, None) => None,
             (request, response) => Some((request.unwrap_or(0x600), response.unwrap_or(0x580))),

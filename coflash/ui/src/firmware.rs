@@ -1,18 +1,17 @@
 //! The firmware file that the user dropped on the page.
 
+use std::fmt::Display;
 use std::path::Path;
 use std::sync::Arc;
 
 use shared_abi::block_file::ProgramVersion;
 
 use super::state::{Firmware, Notice, Seal, Settings};
-use coflash_core::file::convert::{program_of, ConvertError, Options, Region};
 use coflash_core::file::inspect::Inspection;
-use coflash_core::file::judge::{judge, Fault};
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
-use coflash_core::file::{self, ram_image, AddressRange, Format, Program, Target};
-use coflash_core::update::{NewBootloader, Payload};
+use coflash_core::file::{ram_image, Program, Target};
+use coflash_core::update::{self, ContentFault, Judging, NewBootloader, Payload, Reading};
 
 /// The most bytes of a file: an ELF file of the largest program with all debug information.
 pub(super) const FILE_MAX: usize = 32 * 1024 * 1024;
@@ -31,67 +30,68 @@ pub(super) struct Loaded {
 /// Reads a file and makes a program of it; a sealed image stays unchanged.
 pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Result<Loaded, Notice> {
     let name = printable(name);
-    let bad = |error: &dyn std::fmt::Display| {
-        let advice =
-            "choose the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image; \
-                      a raw binary (.bin) needs a board that says where it belongs";
-        Notice::failed(error.to_string(), advice)
-    };
     if bytes.len() > FILE_MAX {
         let words = format!("{name}: {} bytes are more than any program has", bytes.len());
         return Err(Notice::failed(words, "choose the firmware file itself"));
     }
-    let region = region(settings)?;
-    let format = Format::of(Path::new(&name), &bytes);
-    if let Some(new) = NewBootloader::in_file(&bytes, format)
-        .map_err(|fault| Notice::failed(format!("{name}: {fault}"), ram_image::Fault::ADVICE))?
-    {
-        return Ok(bootloader(bytes, name, new));
-    }
-    if format == Some(Format::Sealed) {
-        return sealed(bytes, name, settings);
-    }
-    let start = region.map(|region| region.first);
-    if format == Some(Format::Raw) && start.is_none() {
-        let words = format!("{name}: a raw binary does not contain its address");
-        return Err(Notice::failed(words, "choose the board"));
-    }
-    let firmware = file::read(&bytes, format, start).map_err(|error| bad(&error.of(&name)))?;
-    let board = settings.board;
-    let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
-    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
-    let converted = program_of(firmware, &options).map_err(|error| match error {
-        ConvertError::File(error) => bad(&error.of(&name)),
-        error => bad(&format!("{name}: {error}")),
-    })?;
-    let program = converted.program;
     // The update itself judges the rest, but does not know the board.
-    if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(program.image(), program.start(), board) {
-        return Err(Notice::failed(format!("{name}: {fault}"), fault.advice()));
+    let reading =
+        Reading::new(settings.program).board(settings.board).judging(Judging::Handoff).inspect(true);
+    let read = reading.read(Path::new(&name), &bytes).map_err(|fault| notice(&name, fault))?;
+    let size = bytes.len();
+    let shown = match &read.payload {
+        Payload::Program(program) => of_program(program, &read, size, name),
+        Payload::Sealed(file) => of_sealed(file, size, name),
+        Payload::Bootloader(new) => of_bootloader(new, size, name),
+    };
+    Ok(Loaded { bytes, program: read.payload, shown })
+}
+
+/// Why a file cannot be taken.
+fn notice(name: &str, fault: ContentFault) -> Notice {
+    let anew = "choose the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image; \
+                a raw binary (.bin) needs a board that says where it belongs";
+    let of = |what: &dyn Display| format!("{name}: {what}");
+    match fault {
+        ContentFault::Bootloader(fault) => Notice::failed(of(&fault), ram_image::Fault::ADVICE),
+        ContentFault::Sealed(refusal) => Notice::failed(of(&refusal), refusal.advice()),
+        ContentFault::Judged(fault) => Notice::failed(of(&fault), fault.advice()),
+        ContentFault::NoProgram { programs, .. } => {
+            Notice::failed(fault.to_string(), format!("its programs are 1 to {programs}"))
+        }
+        fault if fault.is_without_address() => {
+            Notice::failed(of(&"a raw binary does not contain its address"), "choose the board")
+        }
+        ContentFault::File(error) => Notice::failed(error.of(name).to_string(), anew),
+        fault => Notice::failed(of(&fault), anew),
     }
-    let label = label_of(&program);
-    let shown = Firmware {
-        size: bytes.len(),
-        inspection: inspection.as_ref().map(Inspection::to_string).unwrap_or_default(),
+}
+
+/// A program.
+fn of_program(program: &Program, read: &update::Loaded, size: usize, name: String) -> Firmware {
+    let label = label_of(program);
+    let inspection = read.inspection.as_ref();
+    Firmware {
+        size,
+        inspection: inspection.map(Inspection::to_string).unwrap_or_default(),
         program_size: program.size(),
         crc: program.crc(),
         vendor_id: label.as_ref().map(|label| label.0),
         product_code: label.as_ref().map(|label| label.1),
         version: inspection
-            .and_then(|inspection| inspection.software_version)
+            .and_then(|inspection| inspection.software_version.clone())
             .or(label.and_then(|label| label.2)),
-        left_out: converted.left_out,
+        left_out: read.left_out,
         seal: None,
         name,
-    };
-    Ok(Loaded { bytes, program: Arc::new(program).into(), shown })
+    }
 }
 
 /// A bootloader, which takes the place of that of the device.
-fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
+fn of_bootloader(new: &NewBootloader, size: usize, name: String) -> Firmware {
     let target = new.target();
-    let shown = Firmware {
-        size: bytes.len(),
+    Firmware {
+        size,
         inspection: format!(
             "a bootloader: it renews that of the device, and the program stays ({})",
             new.version()
@@ -104,17 +104,14 @@ fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
         left_out: 0,
         seal: None,
         name,
-    };
-    Loaded { bytes, program: new.into(), shown }
+    }
 }
 
-/// Reads a sealed image. Only the device's keys decrypt it.
-fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
-    let file = SealedFile::for_program(bytes.to_vec(), settings.program);
-    let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
+/// A sealed image. Only the device's keys decrypt it.
+fn of_sealed(file: &SealedFile, size: usize, name: String) -> Firmware {
     let (head, sealed, target) = (file.head(), file.parts(), file.target());
-    let shown = Firmware {
-        size: bytes.len(),
+    Firmware {
+        size,
         inspection: sealed.to_string(),
         program_size: head.size(),
         crc: head.crc(),
@@ -130,8 +127,7 @@ fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Load
             flags: flags(head.flags()).collect(),
         }),
         name,
-    };
-    Ok(Loaded { bytes, program: Arc::new(file).into(), shown })
+    }
 }
 
 /// The target of the program: vendor-ID, product code and version, from the file or from the label
@@ -142,18 +138,6 @@ fn label_of(program: &Program) -> Option<(u32, u32, Option<String>)> {
     }
     let label = program.label()?;
     Some((label.vendor_id, label.product_code, Some(ProgramVersion(label.version).to_string())))
-}
-
-/// The region of the program on the selected board, if there is one.
-fn region(settings: &Settings) -> Result<Option<AddressRange>, Notice> {
-    let Some(layout) = settings.board else { return Ok(None) };
-    match layout.program(settings.program) {
-        Some(region) => Ok(Some(region.into())),
-        None => {
-            let words = format!("{} has no program {}", layout.board, settings.program);
-            Err(Notice::failed(words, format!("its programs are 1 to {}", layout.programs.len())))
-        }
-    }
 }
 
 /// A name from outside as safe text: one line of limited length, without control or direction

@@ -4,7 +4,8 @@ use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use canopen::Frame;
+use canopen::{Frame, NodeId};
+use coflash_core::update::{Event, FailedUpdate, Histories};
 use serde::Serialize;
 use tokio::sync::watch;
 
@@ -52,12 +53,14 @@ pub(super) struct Frames {
     forgotten: u64,
     seconds: VecDeque<Second>,
     decoder: Decoder,
+    histories: Histories,
     count: u64,
 }
 
 impl Frames {
     fn note(&mut self, time: Duration, frame: &Frame, own: bool) {
         self.count += 1;
+        self.histories.saw(time, frame);
         let words = self.decoder.decode(frame);
         let (number, shown) = (self.count, frame.to_string());
         push(&mut self.rows, ROWS, Row { number, time: time.as_secs_f64(), own, frame: shown, words });
@@ -70,6 +73,11 @@ impl Frames {
             last.frames += 1;
             last.bits += load::bits(frame);
         }
+    }
+
+    /// Remembers an event of an update; gives what the device has shown if its update has failed.
+    pub(super) fn told(&mut self, node: NodeId, event: &Event) -> Option<FailedUpdate> {
+        self.histories.told(wall(), node, event)
     }
 
     /// The frames after this one, oldest first.

@@ -45,6 +45,7 @@ mod worker;
 
 pub use self::server::{Options, Server};
 pub use self::service::Service;
+pub use self::shared::Failed;
 
 /// The example on the crate's page compiles and runs.
 #[cfg(doctest)]

@@ -23,7 +23,7 @@ use super::guard::Guard;
 use super::guests::{Guest, Guests};
 use super::http::{engineers, router, Page, Site};
 use super::service::Service;
-use super::shared::{Order, Shared};
+use super::shared::{Failed, Order, Shared};
 use super::upload::Room;
 use super::worker;
 use coboot_can::Kind;
@@ -52,6 +52,8 @@ pub struct Options {
     pub kinds: Vec<Kind>,
     /// A page for people who update machines, in place of the one for engineers.
     pub service: Option<Service>,
+    /// What is done with what a device has shown whose update has failed.
+    pub failed: Failed,
     /// How long a reader may accept no data before it is dropped.
     pub write_timeout: Duration,
     /// How long the header of a request may take to arrive.
@@ -68,6 +70,7 @@ impl Default for Options {
             sdo_ids: None,
             kinds: Kind::ALL.to_vec(),
             service: None,
+            failed: Failed::default(),
             write_timeout: Duration::from_secs(10),
             head_timeout: Duration::from_secs(10),
             body_timeout: Duration::from_secs(10),
@@ -112,7 +115,7 @@ impl Server {
         let port = listener.local_addr()?.port();
         let guard = Guard { token: Guard::token().map_err(io::Error::other)?, port };
         let (tell, orders) = sync_channel(4);
-        let shared = Arc::new(Shared::new(tell));
+        let shared = Arc::new(Shared::new(tell, options.failed.clone()));
         Ok(Self {
             runtime,
             listener,

@@ -1,16 +1,43 @@
 //! The state that the server and the thread of the bus share.
 
+use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use canopen::NodeId;
 use tokio::sync::watch;
 
 use coboot_can::Link;
+use coflash_core::update::{Event, FailedUpdate};
 
 use super::firmware::Loaded;
 use super::frames::Frames;
 use super::state::{Connection, Notice, State};
+
+/// What is done with what a device has shown whose update has failed.
+#[derive(Clone)]
+pub struct Failed(Arc<dyn Fn(&FailedUpdate) + Send + Sync>);
+
+impl Failed {
+    /// Calls this function for each.
+    #[must_use]
+    pub fn new(act: impl Fn(&FailedUpdate) + Send + Sync + 'static) -> Self {
+        Self(Arc::new(act))
+    }
+}
+
+impl Default for Failed {
+    fn default() -> Self {
+        Self::new(|_| {})
+    }
+}
+
+impl fmt::Debug for Failed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Failed").finish_non_exhaustive()
+    }
+}
 
 /// An order for the thread of the bus.
 pub(super) enum Order {
@@ -54,6 +81,7 @@ pub(super) struct Shared {
     pub(super) cancelled: Arc<AtomicBool>,
     pub(super) firmware: Mutex<Option<Arc<Loaded>>>,
     pub(super) readback: Mutex<Option<Arc<Vec<u8>>>>,
+    failed: Failed,
     orders: SyncSender<Order>,
 }
 
@@ -64,7 +92,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 impl Shared {
-    pub(super) fn new(orders: SyncSender<Order>) -> Self {
+    pub(super) fn new(orders: SyncSender<Order>, failed: Failed) -> Self {
         Self {
             state: Mutex::default(),
             changed: watch::Sender::new(1),
@@ -73,6 +101,7 @@ impl Shared {
             cancelled: Arc::default(),
             firmware: Mutex::default(),
             readback: Mutex::default(),
+            failed,
             orders,
         }
     }
@@ -82,6 +111,14 @@ impl Shared {
         let result = change(&mut lock(&self.state));
         self.changed.send_modify(|version| *version += 1);
         result
+    }
+
+    /// Remembers an event of an update, and reports the update if it has failed.
+    pub(super) fn told(&self, node: NodeId, event: &Event) {
+        let failed = lock(&self.frames).told(node, event);
+        if let Some(update) = failed {
+            (self.failed.0)(&update);
+        }
     }
 
     /// Reads the state.

@@ -148,6 +148,9 @@ fn update_all(
         .collect();
     let many = ManyOptions::default().at_once(AT_ONCE).cancelled(shared.cancelled.clone());
     let tell = |number: usize, event: Event| {
+        if let Some(job) = jobs.get(number) {
+            shared.told(job.node, &event);
+        }
         shared.change(|state| {
             if let Some(update) = state.updates.get_mut(number) {
                 update.event(&event);

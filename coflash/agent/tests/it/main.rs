@@ -8,6 +8,7 @@ macro_rules! data {
     };
 }
 
+mod package;
 mod tls;
 
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,7 +17,9 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use coflash_agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
+use coflash_agent::{
+    run, Config, Content, Devices, Ended, Flashed, News, Options, Order, Said, Target, Times, What,
+};
 use coflash_core::file::block_file;
 use coflash_core::update::Payload;
 use kit::folder::Folder;
@@ -43,7 +46,8 @@ impl Fake {
 }
 
 impl Devices for Fake {
-    fn look(&self, device: &Device) -> Result<Vec<(String, String)>, String> {
+    fn look(&self, target: &Target) -> Result<Vec<(String, String)>, String> {
+        let What::Device(device) = &target.what else { return Ok(Vec::new()) };
         match self.silent {
             true => Err("it does not answer".to_string()),
             false => Ok(vec![("node".to_string(), device.node.to_string())]),
@@ -51,8 +55,12 @@ impl Devices for Fake {
     }
 
     fn flash(&self, order: Order<'_>, news: Sender<News>) -> Flashed {
-        let Payload::Program(file) = &order.program else { panic!("a block file") };
-        self.given.lock().unwrap().push((order.device.controller.clone(), file.crc()));
+        let crc = match &order.content {
+            Content::Program(_, Payload::Program(file)) => file.crc(),
+            Content::Program(..) => panic!("a block file"),
+            Content::Package(package) => package.programs().map(|(_, program)| program.crc()).sum(),
+        };
+        self.given.lock().unwrap().push((order.target.controller.clone(), crc));
         let _ = news.send(News::Percent(40));
         while self.busy.as_ref().is_some_and(|busy| busy.load(Ordering::Relaxed)) {
             thread::sleep(Duration::from_millis(5));

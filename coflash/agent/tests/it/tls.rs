@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use coflash_agent::{run, Config, Device, Devices, Ended, Flashed, News, Options, Order, Said, Times};
+use coflash_agent::{run, Config, Devices, Ended, Flashed, News, Options, Order, Said, Target, Times};
 use kit::hawkbit::{Action, Fault, File, Server};
 use rustls::pki_types::pem::PemObject as _;
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
@@ -17,7 +17,7 @@ use rustls::{ServerConfig, ServerConnection, StreamOwned};
 struct Good;
 
 impl Devices for Good {
-    fn look(&self, _: &Device) -> Result<Vec<(String, String)>, String> {
+    fn look(&self, _: &Target) -> Result<Vec<(String, String)>, String> {
         Ok(Vec::new())
     }
 

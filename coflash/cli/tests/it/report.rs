@@ -9,6 +9,7 @@ use crate::tool::{command, data, folder, run, Done};
 use coflash_core::machine::zip;
 use kit::fake::{serve, Blocks, Fake, Outcome, BOOTLOADER};
 use kit::folder::Folder;
+use kit::hawkbit::{Action, File, Server};
 use serde_json::Value;
 
 /// A device without delays that takes block transfers.
@@ -217,6 +218,7 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
     let frames = update["frames"].as_array().unwrap();
     let decided = |frame: &Value| frame.as_str().unwrap().contains("  585#43571F0106000000  ");
     assert!(frames.iter().any(decided) && frames.len() <= 32, "{update:#}");
+    assert_eq!(update["answers"], report["error"]["answers"]);
     let answers = report["error"]["answers"].as_array().unwrap();
     assert!(answers[0].as_str().unwrap().starts_with("1F57h reads 06h"), "{answers:?}");
     assert!(!Firmware::new(&fs::read(&image).unwrap()).is_in(&bytes));
@@ -241,4 +243,33 @@ fn a_report_of_a_failed_update_has_attempts_frames_and_answers() {
             && answers.contains("2007h: it stays in the bootloader: its program is not released"),
         "{said}"
     );
+}
+
+/// The agent's failed update is in its report as that of `flash` is, and the server gets the device's answer. The
+/// report is there while the agent goes on.
+#[test]
+fn a_failed_update_of_the_agent_is_in_its_report_too() {
+    let folder = folder("failed-agent");
+    let mut device = bootloader();
+    device.on_block = Box::new(|block| if block == 1 { Outcome::Status(0x06) } else { Outcome::Accept });
+    let (url, _device) = serve(device);
+    let server = Server::start(&["door"]);
+    let image = fs::read(data("plain-400.blk")).unwrap();
+    server.assign("door", Action::new(1, &File::new("app.blk", &image)));
+    server.state().targets.get_mut("door").unwrap().wants_attributes = false;
+    folder.write("agent.toml", b"[[device]]\ncontroller-id = 'door'\nnode = 5\ntoken-env = 'TOKEN'\n");
+    let words = ["agent", "--once", "--bus", &url, "--hawkbit", &server.url];
+    let done = recorded(&folder, &words, &[("TOKEN", "t-door")]);
+    assert_eq!(done.exit, 8, "{}{}", done.out, done.err);
+    let bytes = fs::read(runs(&folder).pop().unwrap().join("report.json")).unwrap();
+    let report: Value = serde_json::from_slice(&bytes).unwrap();
+    let [update] = report["failed_updates"].as_array().unwrap().as_slice() else { panic!("{report:#}") };
+    assert_eq!((&update["controller"], &update["node"]), (&"door".into(), &5.into()));
+    assert!(update["tried"].to_string().contains("sending block 1 again, 3 of 3: the CRC"), "{update:#}");
+    // CiA 302-3: the answer to the read of 1F57h/1 with the error 3 in bits 1 to 7.
+    assert!(update["frames"].to_string().contains("  585#43571F0106000000  "), "{update:#}");
+    assert!(update["answers"][0].as_str().unwrap().starts_with("1F57h reads 06h"), "{update:#}");
+    assert!(!Firmware::new(&image).is_in(&bytes));
+    let told = server.action("door").details("closed");
+    assert!(told.contains("it answered: 1F57h reads 06h"), "{told}");
 }

@@ -153,6 +153,17 @@ impl Options {
         max_gap: Option<u32>,
         last_block: LastBlock,
     }
+
+    /// The address of a raw binary, if the region gives it: the file begins at the start of the region. The
+    /// conversion adjusts it like any other address.
+    #[must_use]
+    pub fn raw_address(&self) -> Option<u32> {
+        match self.region {
+            Region::Unknown | Region::CutBehind(_) => None,
+            Region::Strict(range) => Some(range.first.wrapping_sub(self.adjust_start)),
+            Region::Cut(range) => Some(range.first),
+        }
+    }
 }
 
 impl Default for Options {

@@ -1,5 +1,6 @@
 //! A package: its members, read, checked and parsed, before anything of it is used.
 
+use std::path::Path;
 use std::sync::Arc;
 
 use sha2::{Digest as _, Sha256};
@@ -34,6 +35,14 @@ pub struct Package {
 #[must_use]
 pub fn looks_like(front: &[u8]) -> bool {
     zip::looks_like(front) && front.get(30..).is_some_and(|name| name.starts_with(manifest::NAME.as_bytes()))
+}
+
+/// Whether a file with this name is one for a machine: by its ending, or because it begins as a package. A file
+/// with this ending that is no package is refused as one, so that its name does not get it past the roots that
+/// its user trusts.
+#[must_use]
+pub fn is_package(name: &Path, front: &[u8]) -> bool {
+    name.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("cpk")) || looks_like(front)
 }
 
 /// The bytes that [`looks_like`] needs.

@@ -1,7 +1,7 @@
 //! The recipe of a package, `machine.toml`: which files become which programs of which devices.
 
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use seal::wire::BOOTLOADER;
 use serde::Deserialize;
@@ -10,12 +10,8 @@ use super::manifest::{Entry, Identity};
 use super::package::{target, Part};
 use crate::device::Dialect;
 use crate::file::board::{self, in_folder};
-use crate::file::convert::{program_of, Options, Region};
-use crate::file::judge::judge;
-use crate::file::sealed::{carried, SealedFile};
-use crate::file::{block_file, limit, ram_image, read, AddressRange, Format, Place};
-use crate::update::dialect::is_data;
-use crate::update::{line_of, NewBootloader, Payload};
+use crate::file::{block_file, limit, ram_image, Place, ReadError};
+use crate::update::{line_of, ContentFault, Payload, Reading};
 
 /// A recipe.
 #[derive(Debug, Deserialize)]
@@ -148,41 +144,25 @@ fn content(
     number: u8,
     dialect: Option<Dialect>,
 ) -> Result<(Payload, Vec<u8>), String> {
-    let said = |what: &dyn std::fmt::Display| format!("{}: {what}", path.display());
-    let bytes = limit::read(path).map_err(|cause| Place::File.fault(cause).of(path.display()).to_string())?;
-    let bytes = carried(bytes).map_err(|error| error.of(path.display()).to_string())?.image;
-    let format = Format::of(path, &bytes);
-    let new = NewBootloader::in_file(&bytes, format);
-    if let Some(new) = new.map_err(|fault| said(&format!("it {fault}: {}", ram_image::Fault::ADVICE)))? {
-        let bytes = match &new {
-            NewBootloader::Plain(image) => image.bytes().to_vec(),
-            NewBootloader::Sealed(file) => file.bytes().to_vec(),
-        };
-        return Ok((new.into(), bytes));
-    }
-    if format == Some(Format::Sealed) {
-        let file = SealedFile::for_program(bytes.clone(), number);
-        let file = file.map_err(|refusal| said(&format!("{refusal}: {}", refusal.advice())))?;
-        return Ok((Arc::new(file).into(), bytes));
-    }
-    let layout = board.map(board::named).transpose().map_err(|error| error.to_string())?;
-    let region: Option<AddressRange> = match layout {
-        None => None,
-        Some(layout) => {
-            let region = layout.program(number).ok_or(format!("{} has no program {number}", layout.board))?;
-            Some(region.into())
-        }
+    let of = |error: ReadError| error.of(path.display()).to_string();
+    let said = |what: &dyn Display| format!("{}: {what}", path.display());
+    let bytes = limit::read(path).map_err(|cause| of(Place::File.fault(cause)))?;
+    let board = board.map(board::named).transpose().map_err(|error| error.to_string())?;
+    let loaded = Reading::new(number).board(board).dialect(dialect).read(path, &bytes);
+    let payload = loaded
+        .map_err(|fault| match fault {
+            ContentFault::Bootloader(fault) => said(&format!("it {fault}: {}", ram_image::Fault::ADVICE)),
+            ContentFault::Sealed(refusal) => said(&format!("{refusal}: {}", refusal.advice())),
+            ContentFault::File(error) => of(error),
+            ContentFault::Judged(fault) => said(&format!("the image {fault}: {}", fault.advice())),
+            fault @ ContentFault::NoProgram { .. } => fault.to_string(),
+            fault @ ContentFault::Convert(_) => said(&fault),
+        })?
+        .payload;
+    let bytes = match &payload {
+        Payload::Program(program) => block_file::emit(program),
+        Payload::Sealed(file) => file.bytes().to_vec(),
+        Payload::Bootloader(new) => new.bytes().to_vec(),
     };
-    let is_image = matches!(dialect, Some(Dialect::Raw | Dialect::Lift));
-    let raw_address = region.map(|region| region.first).or(is_image.then_some(0));
-    let firmware =
-        read::read(&bytes, format, raw_address).map_err(|error| error.of(path.display()).to_string())?;
-    let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
-    let program = program_of(firmware, &options).map_err(|error| said(&error))?.program;
-    if !is_data(dialect.unwrap_or(Dialect::Lift), number) {
-        judge(program.image(), program.start(), layout)
-            .map_err(|fault| said(&format!("the image {fault}: {}", fault.advice())))?;
-    }
-    let bytes = block_file::emit(&program);
-    Ok((Arc::new(program).into(), bytes))
+    Ok((payload, bytes))
 }

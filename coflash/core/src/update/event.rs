@@ -76,13 +76,21 @@ pub struct Problem {
     pub what: String,
     /// What to do next.
     pub advice: String,
+    /// What the device has answered, for reports: [`Error::answers`].
+    #[serde(skip)]
+    pub answers: Vec<String>,
 }
 
 impl Problem {
     /// The data of this error.
     #[must_use]
     pub fn of(error: &Error) -> Self {
-        Self { number: error.number(), what: error.to_string(), advice: error.advice() }
+        Self {
+            number: error.number(),
+            what: error.to_string(),
+            advice: error.advice(),
+            answers: error.answers(),
+        }
     }
 }
 

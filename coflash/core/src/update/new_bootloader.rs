@@ -79,7 +79,8 @@ impl NewBootloader {
     }
 
     /// The bytes for 1F50h.
-    pub(super) fn bytes(&self) -> &[u8] {
+    #[must_use]
+    pub fn bytes(&self) -> &[u8] {
         match self {
             Self::Plain(image) => image.bytes(),
             Self::Sealed(file) => file.bytes(),

@@ -151,6 +151,7 @@ impl Work for Update {
         };
         let date = wall().as_secs();
         let tell = |node: NodeId, _: usize, event: Event| {
+            shared.told(node, &event);
             shared.change(|state| {
                 if let Some(update) = state.updates.iter_mut().find(|update| update.node == node.get()) {
                     update.event(&event);

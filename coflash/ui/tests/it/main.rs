@@ -11,7 +11,8 @@ use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
-use coflash_ui::{Options, Server};
+use coflash_core::update::FailedUpdate;
+use coflash_ui::{Failed, Options, Server};
 use serde_json::{json, Value};
 
 use kit::fake::vault::Vault;
@@ -570,7 +571,12 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
         let vault = Vault { kept: kept.clone(), start: 0x0801_0000, room: 0x10000, status };
         fake.maker = Some(Box::new(vault));
         let (bus, _server) = kit::fake::serve(fake);
-        let ui = Ui::new(Some(bus));
+        let reported: Arc<Mutex<Vec<FailedUpdate>>> = Arc::default();
+        let report = reported.clone();
+        let ui = Ui::with(|options| {
+            options.bus = Some(bus);
+            options.failed = Failed::new(move |update| report.lock().unwrap().push(update.clone()));
+        });
         ui.until("the adapter", |state| state["adapter"]["state"] == "open");
         assert_eq!(ui.file("app.cbs", &file).status, 200);
         ui.post("update", &json!({ "nodes": [kit::fake::NODE], "trial": true, "start": true }));
@@ -583,6 +589,17 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
             None => assert!(update["advice"].is_null(), "{update}"),
         }
         assert!(*kept.lock().unwrap() == file, "{status:02X}h");
+        // What only a log could say: the frame and the words with the answer of 1F57h (CiA 302-3).
+        let reported = reported.lock().unwrap();
+        assert_eq!(reported.len(), usize::from(status != 0), "{reported:?}");
+        for failed in reported.iter() {
+            assert_eq!(failed.node.get(), kit::fake::NODE);
+            assert!(failed.tried.iter().any(|line| line.contains("erase the old program")), "{failed:?}");
+            let answer = format!("#43571F01{status:02X}000000  ");
+            assert!(failed.frames.iter().any(|line| line.contains(&answer)), "{answer}: {failed:?}");
+            let reads = format!("1F57h reads {status:02X}h");
+            assert!(failed.answers.iter().any(|line| line.starts_with(&reads)), "{failed:?}");
+        }
     }
 }
 

@@ -8,9 +8,10 @@ use std::time::Duration;
 use canopen::{Frame, NodeId};
 use coflash_core::device::lock::Lock;
 use coflash_core::machine::{make, Package, Recipe};
-use coflash_ui::Service;
+use coflash_core::update::FailedUpdate;
+use coflash_ui::{Failed, Service};
 use embedded_can::{Frame as _, StandardId};
-use kit::fake::{Bus, Deed, Fake, Maker, APPLICATION};
+use kit::fake::{Bus, Deed, Fake, Maker, Outcome, APPLICATION};
 use kit::folder::Folder;
 use serde_json::{json, Value};
 
@@ -352,4 +353,30 @@ fn the_end_of_the_server_saves_the_outcome() {
     assert!(words.starts_with("an update was running: node 5: cancelled"), "{words}");
     let reports = saved(&folder, "csv");
     assert!(reports.len() == 1 && reports[0].1.contains(",failed,5,"), "{reports:?}");
+}
+
+/// What only a log could say of a device that fails, for the report of the run.
+#[test]
+fn what_a_failed_device_has_shown_is_reported() {
+    let folder = kit::folder!("service-shown");
+    let mut five = device(5, 1234).0;
+    five.on_block = Box::new(|_| Outcome::Status(0x06));
+    let (bus, _server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
+    let service =
+        Service::new(package(&folder, DRIVES), "press.cpk".as_ref(), false, &folder.join("reports")).unwrap();
+    let reported: Arc<Mutex<Vec<FailedUpdate>>> = Arc::default();
+    let report = reported.clone();
+    let ui = Ui::with(|options| {
+        (options.bus, options.service) = (Some(bus), Some(service));
+        options.failed = Failed::new(move |update| report.lock().unwrap().push(update.clone()));
+    });
+    let plan = planned(&ui);
+    assert_eq!(confirm(&ui, &plan, &[5, 6]).status, 200);
+    assert_eq!(rows(&ended(&ui)), [(5, "state-failed"), (6, "state-updated")]);
+    let reported = reported.lock().unwrap();
+    assert!(!reported.is_empty() && reported.iter().all(|failed| failed.node.get() == 5), "{reported:?}");
+    // CiA 302-3: the error 3 in bits 1 to 7 of 1F57h.
+    let failed = &reported[0];
+    assert!(failed.answers.iter().any(|line| line.starts_with("1F57h reads 06h")), "{failed:?}");
+    assert!(!failed.tried.is_empty() && !failed.frames.is_empty(), "{failed:?}");
 }

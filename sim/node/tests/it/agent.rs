@@ -8,6 +8,7 @@ use std::thread;
 use std::time::Duration;
 
 use crate::bus::{Coflash, Folder, Nodes, VECTORS};
+use crate::machine;
 use coboot_can::Link;
 use coflash_agent::{run, Buses, Config, Ended, Options, Said, Times};
 use kit::hawkbit::{Action, File, Server};
@@ -257,4 +258,113 @@ fn a_bus_that_is_not_there_is_waited_for() {
         drop(node);
     });
     assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
+}
+
+/// A folder with the signed package of the machine, and the configuration of an agent for it.
+fn of_machine(
+    test: &str,
+    server: &Server,
+    panel: &dyn Fn(&Folder) -> Nodes,
+) -> (Folder, Nodes, Config, File) {
+    let folder = machine::folder(test);
+    let nodes = panel(&folder);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&["key", "new", "--role", "root", "-o", "root.pem"]);
+    coflash.done(&["package", "machine.toml", "--key", "root.pem"]);
+    folder.write("token", b"g\n");
+    let text = format!(
+        "gateway-token-file = 'token'\npoll-least = 1\n[[machine]]\ncontroller-id = '{}'\nbus = '{}'\ntrust = ['root.pub']\n",
+        IDS[0],
+        nodes.url()
+    );
+    let path = folder.path("agent.toml");
+    let config = Config::parse(&text, path.parent().unwrap(), Some(&server.url), None).unwrap();
+    let file = File::new("machine.cpk", &folder.read("machine.cpk"));
+    (folder, nodes, config, file)
+}
+
+/// Eight nodes of three types, and a stranger: each gets its program, then none a second time. A valve that is
+/// absent is a failure with its name, and the others are as before.
+#[test]
+fn a_machine_is_updated_by_one_package_and_each_outcome_is_told() {
+    let server = Server::start(&IDS);
+    let start = |folder: &Folder| Nodes::start(folder, machine::PANEL);
+    let (folder, panel, config, file) = of_machine("agent-machine", &server, &start);
+    let drives = Nodes::join(&folder, panel.url(), &machine::drives("11"));
+    let valves = Nodes::join(&folder, panel.url(), &machine::valves("21", "3"));
+    let foreign = ["--node", "77", "--serial", "77", "--vendor-id", "9", "--product-code", "9"];
+    let _stranger = Nodes::join(&folder, panel.url(), &foreign);
+    drives.await_line("serial 14, node 14: bootloader");
+    valves.await_line("serial 23, node 23: bootloader");
+    for (number, what) in [(1, "updated"), (2, "had it before")] {
+        server.assign(IDS[0], Action::new(number, &file));
+        let (ended, said) = serve(&config, &options());
+        assert_eq!((ended.updated, ended.failed), (1, 0), "{said}");
+        let action = server.action(IDS[0]);
+        assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
+        let details = action.details("closed");
+        assert!(details.contains("8 of 8 programs are in their devices"), "{details}");
+        for its in ["panel: {}: node 1", "drive: {}: node 11, 12, 13, 14", "valve: {}: node 21, 22, 23"] {
+            let line = its.replace("{}", what);
+            assert!(details.lines().any(|its| its == line), "{line}: {details}");
+        }
+        let plan = action.details("proceeding");
+        assert!(number == 2 || plan.contains("node 77: not in the package, and left alone"), "{plan}");
+    }
+    // What is in the flash is the file of each, byte for byte.
+    for (serial, program) in [("1", "panel.bin"), ("13", "drive.bin"), ("22", "valve.bin")] {
+        let flash = folder.read(&format!("{serial}.flash"));
+        assert!(flash[0x2_0000..0x2_0000 + 40 * 1024] == folder.read(program), "{serial}");
+    }
+    assert!(folder.read("77.flash").iter().all(|byte| *byte == 0xFF), "the stranger was changed");
+    drop(valves);
+    let two = Nodes::join(&folder, panel.url(), &machine::valves("21", "2"));
+    two.await_line("serial 22, node 22: would start program 1");
+    server.assign(IDS[0], Action::new(3, &file));
+    let (ended, said) = serve(&config, &options());
+    assert_eq!((ended.updated, ended.failed), (0, 1), "{said}");
+    let action = server.action(IDS[0]);
+    assert_eq!(action.result.as_deref(), Some("failure"));
+    let details = action.details("closed");
+    for words in [
+        "7 of 8 programs are in their devices",
+        "node 23: valve: node 23 is not on the bus [0x60000013]; what to do: ",
+        "valve: had it before: node 21, 22",
+    ] {
+        assert!(details.contains(words), "{words}: {details}");
+    }
+}
+
+/// The agent is ended in the middle of the drives. Another one goes on: the panel is not written again.
+#[test]
+fn the_update_of_a_machine_goes_on_after_a_restart() {
+    let server = Server::start(&IDS);
+    let start = |folder: &Folder| Nodes::start(folder, machine::PANEL);
+    let (folder, panel, config, file) = of_machine("agent-machine-restart", &server, &start);
+    let slow: Vec<&str> =
+        machine::drives("11").into_iter().filter(|word| !["--flash", "instant"].contains(word)).collect();
+    let drives = Nodes::join(&folder, panel.url(), &slow);
+    let valves = Nodes::join(&folder, panel.url(), &machine::valves("21", "3"));
+    drives.await_line("serial 14, node 14: bootloader");
+    valves.await_line("serial 23, node 23: bootloader");
+    server.assign(IDS[0], Action::new(1, &file));
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let endless = options().once(false).cancelled(cancelled.clone());
+    thread::scope(|scope| {
+        let agent = scope.spawn(|| serve(&config, &endless));
+        // The first bytes after the vectors, so that each drive has half a program.
+        folder.await_bytes("11.flash", 0x2_0000);
+        cancelled.store(true, Ordering::Relaxed);
+        agent.join().unwrap();
+    });
+    assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
+    let (ended, said) = serve(&config, &options());
+    assert_eq!(ended.updated, 1, "{said}");
+    let action = server.action(IDS[0]);
+    assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
+    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
+    let details = action.details("closed");
+    for line in ["panel: had it before: node 1", "drive: updated: node 11, 12, 13, 14"] {
+        assert!(details.lines().any(|its| its == line), "{line}: {details}");
+    }
 }

@@ -36,7 +36,7 @@ fn program(fill: u8) -> Vec<u8> {
     bytes
 }
 
-fn folder(test: &str) -> Folder {
+pub fn folder(test: &str) -> Folder {
     let folder = Folder::new(test);
     for (name, fill) in [("panel.bin", 1), ("drive.bin", 2), ("valve.bin", 3), ("older.bin", 4)] {
         folder.write(name, &program(fill));
@@ -45,16 +45,16 @@ fn folder(test: &str) -> Folder {
     folder
 }
 
-const PANEL: &[&str] =
+pub const PANEL: &[&str] =
     &["--node", "1", "--vendor-id", "0x3F", "--product-code", "3", "--flash", "instant", "--stand-in"];
 
 /// Four drives, from this node-ID on.
-fn drives(node: &'static str) -> Vec<&'static str> {
+pub fn drives(node: &'static str) -> Vec<&'static str> {
     let identity = ["--vendor-id", "0x3F", "--product-code", "1", "--flash", "instant", "--stand-in"];
     [&["--node", node, "--serial", node, "--count", "4"][..], &identity].concat()
 }
 
-fn valves(node: &'static str, count: &'static str) -> Vec<&'static str> {
+pub fn valves(node: &'static str, count: &'static str) -> Vec<&'static str> {
     vec!["--node", node, "--serial", node, "--count", count, "--flash", "instant", "--stand-in"]
 }
 

@@ -8,6 +8,7 @@ mod many;
 mod master;
 mod mastership;
 mod procedure;
+mod reading;
 mod renew;
 mod search;
 mod watch;
