@@ -25,7 +25,8 @@ pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Paylo
     }
     if format == Some(Format::Sealed) {
         let file = SealedFile::for_program(bytes.to_vec(), device.program);
-        let file = file.map_err(|refusal| lines(format!("{name}: {refusal}"), refusal.advice()))?;
+        let file =
+            file.map_err(|refusal| lines(format!("{name}: {refusal}"), &refusal.advice().to_string()))?;
         return Ok(Arc::new(file).into());
     }
     let region: Option<AddressRange> =
@@ -41,6 +42,6 @@ pub(super) fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Paylo
     let converted = program_of(firmware, &options);
     let program = converted.map_err(|error| lines(format!("{name}: {error}"), anew))?.program;
     judge(program.image(), program.start(), device.board)
-        .map_err(|fault| lines(format!("{name}: {fault}"), fault.advice()))?;
+        .map_err(|fault| lines(format!("{name}: {fault}"), &fault.advice().to_string()))?;
     Ok(Arc::new(program).into())
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use shared_abi::block_file::ProgramVersion;
 
+use super::advice;
 use super::state::{Firmware, Notice, Seal, Settings};
 use coflash_core::file::convert::{program_of, ConvertError, Options, Region};
 use coflash_core::file::inspect::Inspection;
@@ -56,23 +57,24 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
         let words = format!("{name}: a raw binary does not contain its address");
         return Err(Notice::failed(words, "choose the board"));
     }
-    let firmware = file::read(&bytes, format, start).map_err(|error| bad(&error.of(&name)))?;
+    let firmware =
+        file::read(&bytes, format, start).map_err(|error| bad(&advice::of_file(&error.of(&name))))?;
     let board = settings.board;
     let inspection = format.map(|format| Inspection::of(&firmware, format, start, board));
     let options = Options::default().region(region.map_or(Region::Unknown, Region::Strict));
     let converted = program_of(firmware, &options).map_err(|error| match error {
-        ConvertError::File(error) => bad(&error.of(&name)),
+        ConvertError::File(error) => bad(&advice::of_file(&error.of(&name))),
         error => bad(&format!("{name}: {error}")),
     })?;
     let program = converted.program;
     // The update itself judges the rest, but does not know the board.
     if let Err(fault @ Fault::StackOverHandoff { .. }) = judge(program.image(), program.start(), board) {
-        return Err(Notice::failed(format!("{name}: {fault}"), fault.advice()));
+        return Err(Notice::failed(format!("{name}: {fault}"), advice::on_page(&fault.advice())));
     }
     let label = label_of(&program);
     let shown = Firmware {
         size: bytes.len(),
-        inspection: inspection.as_ref().map(Inspection::to_string).unwrap_or_default(),
+        inspection: inspection.as_ref().map(|it| advice::with_advice(it, it.advice())).unwrap_or_default(),
         program_size: program.size(),
         crc: program.crc(),
         vendor_id: label.as_ref().map(|label| label.0),
@@ -111,7 +113,9 @@ fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
 /// Reads a sealed image. Only the device's keys decrypt it.
 fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Loaded, Notice> {
     let file = SealedFile::for_program(bytes.to_vec(), settings.program);
-    let file = file.map_err(|refusal| Notice::failed(format!("{name}: {refusal}"), refusal.advice()))?;
+    let file = file.map_err(|refusal| {
+        Notice::failed(format!("{name}: {refusal}"), advice::on_page(&refusal.advice()))
+    })?;
     let (head, sealed, target) = (file.head(), file.parts(), file.target());
     let shown = Firmware {
         size: bytes.len(),

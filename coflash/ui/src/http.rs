@@ -321,7 +321,7 @@ async fn own_board(site: &Site, name: &str, bytes: &[u8]) -> Answer {
     let layout = board::parse(&String::from_utf8_lossy(bytes)).map_err(|error| {
         bad(
             format!("{name}: {error}"),
-            "choose the file that `cargo xtask layout --toml` wrote for the board",
+            "choose the memory map that the build of the board has written (my-board.toml)",
         )
     })?;
     lock(&site.own_boards).push(layout);

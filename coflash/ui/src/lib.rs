@@ -24,9 +24,11 @@
 //! | `frames` | what goes over the bus, in words, counted, and as a log |
 //! | `load` | how long a frame keeps the bus busy |
 //! | `adapters` | what this machine has |
+//! | `advice` | what to do next, in the words of the page |
 #![forbid(unsafe_code)]
 
 mod adapters;
+mod advice;
 mod events;
 mod firmware;
 mod frames;

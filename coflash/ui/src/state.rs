@@ -7,6 +7,7 @@ use canopen::NodeId;
 use serde::{Serialize, Serializer};
 use shared_abi::layout::Layout;
 
+use super::advice;
 use coboot_can::decode::state_words;
 use coflash_core::device::info::{DeviceInfo, ProgramInfo};
 use coflash_core::device::lss::LssAddress;
@@ -434,7 +435,7 @@ impl Update {
         if let Event::Done(_) = event {
             return;
         }
-        self.words = event.to_string();
+        self.words = advice::with_advice(event, event.advice());
         if self.lines.len() < LINES {
             self.lines.push(self.words.clone());
         }
@@ -443,7 +444,7 @@ impl Update {
     pub(super) fn failed(&mut self, error: &Error, left: &str) {
         self.phase = Phase::Failed;
         self.words = format!("{error}. The device: {left}.");
-        self.advice = Some(error.advice());
+        self.advice = Some(advice::on_page(&error.advice()));
     }
 }
 
@@ -457,7 +458,7 @@ impl Notice {
     }
 
     pub(super) fn error(error: &Error) -> Self {
-        Self::failed(error.to_string(), error.advice())
+        Self::failed(error.to_string(), advice::on_page(&error.advice()))
     }
 }
 

@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::{program, Address, NodeId};
 
+use super::advice;
 use super::firmware::Loaded;
 use super::frames::wall;
 use super::job::{Job, Step};
@@ -90,7 +91,8 @@ fn step_of(link: &mut Link, shared: &Shared, node: NodeId, number: u8, step: Ste
 fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) -> Result<Notice, Error> {
     let node = session.node();
     let mut tell = |event: Event| {
-        shared.change(|state| state.task.as_mut().map(|task| task.words = format!("node {node}: {event}")));
+        let words = advice::with_advice(&event, event.advice());
+        shared.change(|state| state.task.as_mut().map(|task| task.words = format!("node {node}: {words}")));
     };
     let words = match step {
         Step::CallBack => {
@@ -170,7 +172,9 @@ fn update_all(
                         None => format!("done in {:.1} s", report.took.as_secs_f64()),
                     };
                 }
-                Err(Failed { error, left }) => update.failed(error, &left.to_string()),
+                Err(Failed { error, left }) => {
+                    update.failed(error, &advice::with_advice(left, left.advice()))
+                }
             }
         }
     });
@@ -183,7 +187,7 @@ fn update_all(
     let words = format!("{good} of {} devices updated with {}", results.len(), file.shown.name);
     match results.into_iter().find_map(Result::err) {
         None => Notice::done(words),
-        Some(Failed { error, .. }) => Notice::failed(words, error.advice()),
+        Some(Failed { error, .. }) => Notice::failed(words, advice::on_page(&error.advice())),
     }
 }
 
@@ -219,7 +223,9 @@ fn report(
                 }
                 Ok(report) if report.running.is_some() => "updated, and the program runs".to_string(),
                 Ok(_) => "updated".to_string(),
-                Err(Failed { error, left }) => format!("failed: {error}; the device: {left}"),
+                Err(Failed { error, left }) => {
+                    format!("failed: {error}; the device: {}", advice::with_advice(left, left.advice()))
+                }
             };
             let report = Report {
                 number: state.reports.last().map_or(1, |last| last.number + 1),

@@ -315,7 +315,7 @@ fn a_memory_map_is_taken_and_chosen_and_a_bad_one_is_refused_with_its_line() {
     ] {
         let refused = ui.file("a.TOML", bytes);
         assert!(refused.status == 400 && refused.body.contains(says), "{}: {}", refused.status, refused.body);
-        assert!(refused.json()["advice"].as_str().unwrap().contains("cargo xtask layout --toml"));
+        assert!(refused.json()["advice"].as_str().unwrap().contains("my-board.toml"));
     }
     ui.until("the board stays", |state| state["settings"]["board"] == "my-board");
     // Each map stays in memory.
@@ -560,7 +560,7 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
     let file = sealed(Sealer::default());
     for (status, phase, words, advice) in [
         (0, "done", "done in", None),
-        (0x8A, "failed", "the program's signature is wrong", Some("coflash verify")),
+        (0x8A, "failed", "the program's signature is wrong", Some("root's public key")),
         (0x8C, "failed", "its counter or the epoch of its key is too low", Some("coflash info")),
         (0x8E, "failed", "the device has no key for this program", Some("coflash show")),
     ] {
