@@ -83,6 +83,7 @@ pub(super) fn load(bytes: Arc<Vec<u8>>, name: &str, settings: &Settings) -> Resu
             .and_then(|inspection| inspection.software_version)
             .or(label.and_then(|label| label.2)),
         left_out: converted.left_out,
+        is_bootloader: false,
         seal: None,
         name,
     };
@@ -104,6 +105,7 @@ fn bootloader(bytes: Arc<Vec<u8>>, name: String, new: NewBootloader) -> Loaded {
         product_code: Some(target.product_code),
         version: Some(new.version().to_string()),
         left_out: 0,
+        is_bootloader: true,
         seal: None,
         name,
     };
@@ -126,6 +128,7 @@ fn sealed(bytes: Arc<Vec<u8>>, name: String, settings: &Settings) -> Result<Load
         product_code: Some(target.product_code),
         version: Some(ProgramVersion(head.version()).to_string()),
         left_out: 0,
+        is_bootloader: false,
         seal: Some(Seal {
             program: head.program(),
             counter: head.counter(),

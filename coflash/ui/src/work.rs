@@ -30,8 +30,9 @@ impl Work for Job {
     fn run(self: Box<Self>, link: &mut Link, shared: &Shared) -> Notice {
         let done = match *self {
             Self::Scan => search(link, shared),
-            Self::Update { nodes, file, program, trial, start } => {
-                let options = FlashOptions::default().program(program).trial_run(trial).start(start);
+            Self::Update { nodes, file, program, trial, start, unlock } => {
+                let options =
+                    FlashOptions::default().program(program).trial_run(trial).start(start).unlock(unlock);
                 return update_all(link, shared, &nodes, &file, options);
             }
             Self::Step { node, program, step } => step_of(link, shared, node, program, step),
@@ -184,7 +185,9 @@ fn update_all(
     }
     report(shared, nodes, file, options.program, &results, wall().saturating_sub(began));
     let good = results.len() - failed;
-    let words = format!("{good} of {} devices updated with {}", results.len(), file.shown.name);
+    let done =
+        if file.shown.is_bootloader { "devices have the bootloader of" } else { "devices updated with" };
+    let words = format!("{good} of {} {done} {}", results.len(), file.shown.name);
     match results.into_iter().find_map(Result::err) {
         None => Notice::done(words),
         Some(Failed { error, .. }) => Notice::failed(words, advice::on_page(&error.advice())),
@@ -218,8 +221,7 @@ fn report(
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get())).cloned();
             let words = match result {
                 Ok(report) if report.renewal.is_some() => {
-                    let version = file.shown.version.as_deref().unwrap_or_default();
-                    format!("renewed: bootloader {version}")
+                    report.renewal.map(|renewal| renewal.to_string()).unwrap_or_default()
                 }
                 Ok(report) if report.running.is_some() => "updated, and the program runs".to_string(),
                 Ok(_) => "updated".to_string(),

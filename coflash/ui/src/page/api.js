@@ -8,9 +8,9 @@ export async function ask(what, value) {
   return send(what, { headers: { "content-type": "application/json" }, body: JSON.stringify(value ?? {}) });
 }
 
-/** Sends a file. */
-export async function sendFile(file) {
-  return send("firmware?name=" + encodeURIComponent(file.name), {
+/** Sends a file: a "firmware", or the memory map of a "board". */
+export async function sendFile(what, file) {
+  return send(`${what}?name=` + encodeURIComponent(file.name), {
     headers: { "content-type": "application/octet-stream" },
     body: file,
   });
