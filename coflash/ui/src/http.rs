@@ -403,6 +403,15 @@ pub(super) fn node_id(number: u8) -> Result<NodeId, Refused> {
     NodeId::new(number).ok_or_else(|| bad(format!("{number} is not a node-ID"), "node-IDs are 1 to 127"))
 }
 
+/// The password in a request; none for an empty field. A refusal does not repeat it.
+pub(super) fn password_of(text: &str) -> Result<Option<Password>, Refused> {
+    let too_long = || bad("the password has more than 64 bytes", "enter the password of the device");
+    match text {
+        "" => Ok(None),
+        text => Password::new(text).map(Some).ok_or_else(too_long),
+    }
+}
+
 async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
     let Update { nodes, trial, start, renew, password } = body(&headers, &bytes)?;
     let Some(file) = lock(&site.shared.firmware).clone() else {
@@ -415,13 +424,7 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
         );
         return Err(Refused(StatusCode::CONFLICT, notice));
     }
-    let unlock =
-        match password.as_str() {
-            "" => None,
-            text => Some(Password::new(text).ok_or_else(|| {
-                bad("the password has more than 64 bytes", "enter the password of the device")
-            })?),
-        };
+    let unlock = password_of(&password)?;
     let mut wanted: Vec<NodeId> = Vec::new();
     for node in nodes {
         let node = node_id(node)?;

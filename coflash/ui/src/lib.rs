@@ -46,7 +46,7 @@ mod work;
 mod worker;
 
 pub use self::server::{Options, Server};
-pub use self::service::Service;
+pub use self::service::{Origin, Service};
 
 /// The example on the crate's page compiles and runs.
 #[cfg(doctest)]
