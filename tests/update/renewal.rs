@@ -159,7 +159,7 @@ fn a_program_that_reaches_into_staging_is_named() {
         panic!("{result:?}")
     };
     assert!(error.to_string().contains("program 1 reaches into the flash where a new bootloader waits"));
-    assert!(error.advice().contains("coflash erase --program 1"));
+    assert!(error.advice().to_string().contains("coflash erase --program 1"));
 }
 
 /// A sealed device takes a sealed one alone.
@@ -200,7 +200,7 @@ fn assert_wants_a_password(bootloader: &str, node: u8, right: Option<&str>, othe
         let error = renewed(&mut bench, *other).unwrap_err();
         let is_unlock = matches!(error, Error::Refused { doing: Doing::Unlock, .. });
         assert!(is_unlock || matches!(error, Error::NoPassword { .. }), "{other:?}: {error}");
-        assert!(error.advice().contains("password"), "{}", error.advice());
+        assert!(error.advice().to_string().contains("password"), "{}", error.advice());
         // The next attempt must wait.
         bench.run_ms(600);
     }

@@ -49,9 +49,10 @@ const COFLASH: &[Rule] = &[
     ("setters", ""),
     ("unicode", ""),
     ("json", "canopen"),
-    ("file", "setters shared_abi unicode"),
-    ("device", "canopen coboot_can json setters shared_abi unicode"),
-    ("update", "canopen coboot_can device file json setters shared_abi"),
+    ("advice", "canopen"),
+    ("file", "advice setters shared_abi unicode"),
+    ("device", "advice canopen coboot_can json setters shared_abi unicode"),
+    ("update", "advice canopen coboot_can device file json setters shared_abi"),
     ("machine", "canopen coboot_can device file json setters shared_abi update"),
 ];
 

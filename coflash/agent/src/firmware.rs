@@ -62,8 +62,10 @@ fn program(bytes: &[u8], name: &str, device: &Device) -> Result<Payload, Vec<Str
         let anew = "deploy the firmware file itself: Intel HEX, S-record, ELF, block file or sealed image";
         match fault {
             ContentFault::Bootloader(fault) => lines(format!("{name}: {fault}"), ram_image::Fault::ADVICE),
-            ContentFault::Sealed(refusal) => lines(format!("{name}: {refusal}"), refusal.advice()),
-            ContentFault::Judged(fault) => lines(format!("{name}: {fault}"), fault.advice()),
+            ContentFault::Sealed(refusal) => {
+                lines(format!("{name}: {refusal}"), &refusal.advice().to_string())
+            }
+            ContentFault::Judged(fault) => lines(format!("{name}: {fault}"), &fault.advice().to_string()),
             fault if fault.is_without_address() => lines(
                 format!("{name}: a raw binary does not contain its address"),
                 "set board in the agent's configuration",

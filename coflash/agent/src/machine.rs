@@ -95,7 +95,7 @@ fn unplanned(error: PlanError) -> Flashed {
         PlanError::Bus(Error::Cancelled) => return Flashed::Interrupted,
         PlanError::Bus(bus) => match not_now(bus) {
             Some(why) => return Flashed::NotNow(why),
-            None => (bus.to_string(), bus.number(), bus.advice()),
+            None => (bus.to_string(), bus.number(), bus.advice().to_string()),
         },
         PlanError::Package(fault) => (error.to_string(), fault.number(), fault.advice().to_string()),
     };

@@ -130,6 +130,10 @@ pub(super) const NO_SCHEME: &str = "it has no ':' after the adapter's name";
 /// The message for a URL with an unknown scheme.
 pub(super) const NO_ADAPTER: &str = "there is no such adapter";
 
+/// The advice for a vendor's adapter that is not there.
+#[cfg(any(feature = "peak", feature = "kvaser"))]
+pub(super) const ABSENT: &str = "plug it in, and check its number";
+
 /// The errors of an adapter.
 #[derive(Debug, thiserror::Error)]
 pub enum AdapterError {
@@ -160,6 +164,8 @@ pub enum AdapterError {
         advice: String,
         /// Whether another program uses the adapter.
         in_use: bool,
+        /// Whether the URL names what is not there: a list of the adapters helps.
+        absent: bool,
     },
     /// The adapter accepts no more frames, because its queued frames do not reach the bus.
     #[error("{adapter} accepts no more frames: its queued frames do not reach the bus")]
@@ -210,23 +216,23 @@ impl AdapterError {
         }
     }
 
-    /// What to do next.
+    /// Whether the URL names no adapter of this computer: a list of those that are there helps.
+    #[must_use]
+    pub const fn is_absent(&self) -> bool {
+        matches!(self, Self::Url { .. } | Self::Unusable { absent: true, .. })
+    }
+
+    /// What to do next, wherever the user has entered the URL.
     #[must_use]
     pub fn advice(&self) -> String {
         match self {
-            Self::Url { why, .. } if why.contains("did you mean") => {
-                "give this bus with --bus or in COFLASH_BUS"
-            }
-            Self::Url { why, .. }
-                if !why.starts_with(NO_SCHEME)
-                    && !why.starts_with(NO_ADAPTER) =>
-            {
-                "correct the URL in --bus or COFLASH_BUS; coflash adapters lists the adapters of this computer"
+            Self::Url { why, .. } if why.contains("did you mean") => "give this bus",
+            Self::Url { why, .. } if !why.starts_with(NO_SCHEME) && !why.starts_with(NO_ADAPTER) => {
+                "correct the URL of the bus"
             }
             Self::Url { .. } => {
                 return format!(
-                    "give the bus as --bus URL or in COFLASH_BUS, for example socketcan:can0 or slcan:/dev/ttyACM0@500k \
-                     (coflash adapters lists those that are there); known are {URLS}"
+                    "give the bus by its URL, for example socketcan:can0 or slcan:/dev/ttyACM0@500k; known are {URLS}"
                 )
             }
             Self::Open { source, .. } => match source.kind() {
@@ -253,8 +259,8 @@ impl AdapterError {
                 "check that the address is the adapter's, and that the adapter has this bus"
             }
             Self::Gateway { .. } => {
-                "check the network's number behind the gateway's address, and that the gateway is on the bus; then run \
-                 the command again"
+                "check the network's number behind the gateway's address, and that the gateway is on the bus; then try \
+                 again"
             }
             Self::Lost { .. } => {
                 "check the cable, the adapter and the program that serves it; then flash the device again"
@@ -279,6 +285,17 @@ impl AdapterError {
         what: impl Into<String>,
         advice: impl Into<String>,
     ) -> Self {
-        Self::Unusable { adapter: adapter.into(), what: what.into(), advice: advice.into(), in_use: false }
+        let (adapter, what, advice) = (adapter.into(), what.into(), advice.into());
+        Self::Unusable { adapter, what, advice, in_use: false, absent: false }
+    }
+
+    /// An adapter that is not there.
+    pub(crate) fn missing(
+        adapter: impl Into<String>,
+        what: impl Into<String>,
+        advice: impl Into<String>,
+    ) -> Self {
+        let (adapter, what, advice) = (adapter.into(), what.into(), advice.into());
+        Self::Unusable { adapter, what, advice, in_use: false, absent: true }
     }
 }

@@ -154,11 +154,11 @@ impl Health {
             ),
             Trouble::Strange => {
                 "the adapter sends what is not of its protocol, and no frames: it was reset, or something else is at this \
-                 port or address; unplug it and plug it in again, or check --bus"
+                 port or address; unplug it and plug it in again, or check the URL of the bus"
                     .to_string()
             }
             Trouble::Echo => {
-                "the server returns our own frames, and no other node has sent any; check --node, that the bus in --bus is \
+                "the server returns our own frames, and no other node has sent any; check the node-ID, that the bus in the URL is \
                  that of the device, and that the device has power"
                     .to_string()
             }

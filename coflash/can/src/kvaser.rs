@@ -9,7 +9,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::canlib::{Canlib, Message};
 
-use super::adapter::AdapterError;
+use super::adapter::{AdapterError, ABSENT};
 use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
@@ -89,6 +89,7 @@ pub(super) fn open(channel: &str, rate: u32) -> Result<Driven, AdapterError> {
         what,
         advice: advice.to_string(),
         in_use,
+        absent: advice == ABSENT,
     };
     let Some((given, segments)) = parameters(rate) else {
         return Err(unusable(
@@ -241,12 +242,10 @@ fn words(status: i32) -> String {
 /// The advice for a `canStatus`.
 fn advice(status: i32) -> &'static str {
     match status {
-        -3 | -26 => "plug it in, and check its number: coflash adapters lists the adapters of this computer",
-        NO_CHANNELS | NO_ACCESS => {
-            "close the other program (CanKing, for example), and run the command again"
-        }
+        -3 | -26 => ABSENT,
+        NO_CHANNELS | NO_ACCESS => "close the other program (CanKing, for example), and try again",
         -23 | -24 => FROM,
-        _ => "unplug the adapter, plug it in and run the command again",
+        _ => "unplug the adapter, plug it in and try again",
     }
 }
 

@@ -10,7 +10,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::pcan::{Message, Pcan};
 
-use super::adapter::AdapterError;
+use super::adapter::{AdapterError, ABSENT};
 use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
@@ -121,6 +121,7 @@ pub(super) fn open(channel_name: &str, rate: u32) -> Result<Driven, AdapterError
         what,
         advice: advice.to_string(),
         in_use,
+        absent: advice == ABSENT,
     };
     let (Some(channel), Some(registers)) = (channel(channel_name), registers(rate)) else {
         return Err(unusable(format!("it does not support {rate} bit/s"), "choose one from 5k to 1M", false));
@@ -290,12 +291,10 @@ fn words(status: u32) -> String {
 /// The advice for the error in a status.
 fn advice(status: u32) -> &'static str {
     match status & !status::HARMLESS {
-        0x100 | 0x1400 => {
-            "plug it in, and check its number: coflash adapters lists the adapters of this computer"
-        }
+        0x100 | 0x1400 => ABSENT,
         0x200 => FROM,
-        0x400 | 0x800 => "close the other program (PCAN-View, for example), and run the command again",
-        _ => "unplug the adapter, plug it in and run the command again",
+        0x400 | 0x800 => "close the other program (PCAN-View, for example), and try again",
+        _ => "unplug the adapter, plug it in and try again",
     }
 }
 

@@ -72,20 +72,22 @@ pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) ->
                 ),
             )
         }
-        (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => (
-            "no serial port has this name".to_string(),
-            format!("{}; plug the adapter in, or name the right one: --bus slcan:PORT@500k", those_there()),
-        ),
-        _ if there => (
-            format!("it is not a serial port ({})", shown(error.to_string().as_bytes())),
-            format!("{}; name the right one: --bus slcan:PORT@500k", those_there()),
-        ),
+        (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => {
+            let advice =
+                format!("{}; plug the adapter in, or name the right one: slcan:PORT@500k", those_there());
+            return AdapterError::missing(adapter, "no serial port has this name", advice);
+        }
+        _ if there => {
+            let what = format!("it is not a serial port ({})", shown(error.to_string().as_bytes()));
+            let advice = format!("{}; name the right one: slcan:PORT@500k", those_there());
+            return AdapterError::missing(adapter, what, advice);
+        }
         _ => (
             shown(error.to_string().as_bytes()),
             format!("{}; unplug the adapter and plug it in again", those_there()),
         ),
     };
-    AdapterError::Unusable { adapter, what, advice, in_use }
+    AdapterError::Unusable { adapter, what, advice, in_use, absent: false }
 }
 
 fn busy(port: &str) -> (String, String) {
@@ -94,10 +96,7 @@ fn busy(port: &str) -> (String, String) {
     } else {
         "a terminal program, for example".to_string()
     };
-    (
-        "another program uses the port".to_string(),
-        format!("close the other program ({who}), and run the command again"),
-    )
+    ("another program uses the port".to_string(), format!("close the other program ({who}), and try again"))
 }
 
 /// The group that may use a port; `dialout` if this is unknown.

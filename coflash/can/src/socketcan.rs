@@ -96,7 +96,7 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
         (
             format!("this kernel has no CAN support at present ({error})"),
             "load it: sudo modprobe can_raw; if that fails, the kernel was built without CAN: use slcan:, peak:, \
-             kvaser: or gs_usb: instead (coflash adapters)"
+             kvaser: or gs_usb: instead"
                 .to_string(),
         )
     } else if NONE.contains(&code) {

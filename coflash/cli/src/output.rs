@@ -618,7 +618,11 @@ impl From<Error> for Failure {
         let legacy = legacy::exit_code(&error);
         let answers = error.answers();
         let number = Some(error.number());
-        Self { legacy, answers, ..Self::new(exit, number, error.to_string(), Some(error.advice())) }
+        Self {
+            legacy,
+            answers,
+            ..Self::new(exit, number, error.to_string(), Some(error.advice().to_string()))
+        }
     }
 }
 

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use coflash_ui::{Failed, Options, Server, Service};
+use coflash_ui::{Failed, Options, Origin, Server, Service};
 use serde_json::json;
 
 use super::context::Context;
@@ -15,7 +15,7 @@ use super::record;
 
 /// Serves a page for the browser to this computer only: scan, update, LSS and the bus in words.
 ///
-/// With --service the page is for people who update machines: it takes this one package, has nothing
+/// With --service the page is for people who update machines: it takes this one package or job file, has nothing
 /// else to choose, and saves a report about each device in the folder of --report-dir; without it, in
 /// coflash-reports in the home folder.
 ///
@@ -36,8 +36,8 @@ pub(super) struct Ui {
     #[arg(long)]
     no_open: bool,
 
-    /// Be a service station for the machines of this package.
-    #[arg(long, value_name = "PACKAGE")]
+    /// Be a service station for the machines of this package, or of this job file (.toml).
+    #[arg(long, value_name = "FILE")]
     service: Option<PathBuf>,
 
     #[command(flatten)]
@@ -84,19 +84,25 @@ impl Ui {
         Ok(())
     }
 
-    /// The service station for a package, which is checked as by `flash`.
+    /// The service station for a package or a job file, which is checked as by `flash`.
     fn station(&self, context: &Context, path: &Path) -> Result<Service, Failure> {
-        let checked = package::read(path, &self.trusted)?;
-        checked.signers().iter().for_each(|line| context.out.say(line));
+        let (package, origin) = if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("toml"))
+        {
+            (package::of_job(path, &self.trusted)?, Origin::Job)
+        } else {
+            let checked = package::read(path, &self.trusted)?;
+            checked.signers().iter().for_each(|line| context.out.say(line));
+            let origin = if checked.known.is_some() { Origin::Trusted } else { Origin::Package };
+            (checked.package, origin)
+        };
         let folder = context
             .report_dir
             .clone()
             .unwrap_or_else(|| std::env::home_dir().unwrap_or_default().join("coflash-reports"));
-        let service =
-            Service::new(checked.package, path, checked.known.is_some(), &folder).map_err(|error| {
-                let what = format!("reports cannot be saved in {}: {error}", folder.display());
-                Failure::usage(what, "name another folder with --report-dir")
-            })?;
+        let service = Service::new(package, path, origin, &folder).map_err(|error| {
+            let what = format!("reports cannot be saved in {}: {error}", folder.display());
+            Failure::usage(what, "name another folder with --report-dir")
+        })?;
         context.out.say(format_args!("reports are saved in {}", service.report_dir().display()));
         Ok(service.memory(memory::file("service-bus")))
     }

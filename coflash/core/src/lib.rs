@@ -3,9 +3,10 @@
 //!
 //! | room | what is in it | uses |
 //! |---|---|---|
-//! | [`file`](mod@file) | firmware files: read, checked, converted | |
-//! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | |
-//! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `device`, `file` |
+//! | [`advice`] | what to do next, after an error or in mid-update | |
+//! | [`file`](mod@file) | firmware files: read, checked, converted | `advice` |
+//! | [`device`] | SDO with one node, what it says about itself, scan, LSS, errors with numbers and advice | `advice` |
+//! | [`update`] | the procedure, a file for each dialect, many devices at once, job files | `advice`, `device`, `file` |
 //! | [`machine`] | a package with the programs of a whole machine: its file, the plan for a bus, the update | `device`, `file`, `update` |
 //!
 //! The page in the browser, the update agent, the conformance checks and the command line are crates
@@ -39,11 +40,13 @@ mod json;
 mod setters;
 mod unicode;
 
+pub mod advice;
 pub mod device;
 pub mod file;
 pub mod machine;
 pub mod update;
 
+pub use advice::Advice;
 pub use device::{Error, Session};
 
 /// The example on the crate's page compiles and runs.

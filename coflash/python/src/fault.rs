@@ -37,7 +37,7 @@ impl Fault {
             Self::File(error) => ("FileError", error.error.cause.number(), error.to_string(), String::new()),
             Self::Sealed(file, refusal) => {
                 let what = format!("{file}: {refusal}");
-                ("FileError", refusal_number(&refusal), what, refusal.advice().to_owned())
+                ("FileError", refusal_number(&refusal), what, refusal.advice().to_string())
             }
             Self::Bootloader(file, fault) => {
                 let advice = ram_image::Fault::ADVICE.to_owned();
@@ -49,7 +49,7 @@ impl Fault {
                     Error::Cancelled => "Cancelled",
                     _ => "DeviceError",
                 };
-                (class, error.number(), error.to_string(), error.advice())
+                (class, error.number(), error.to_string(), error.advice().to_string())
             }
         };
         let exception = py

@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use shared_abi::block_file::ProgramVersion;
 
+use super::advice;
 use super::state::{Firmware, Notice, Seal, Settings};
-use coflash_core::file::inspect::Inspection;
 use coflash_core::file::sealed::show::flags;
 use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{ram_image, Program, Target};
@@ -54,15 +54,15 @@ fn notice(name: &str, fault: ContentFault) -> Notice {
     let of = |what: &dyn Display| format!("{name}: {what}");
     match fault {
         ContentFault::Bootloader(fault) => Notice::failed(of(&fault), ram_image::Fault::ADVICE),
-        ContentFault::Sealed(refusal) => Notice::failed(of(&refusal), refusal.advice()),
-        ContentFault::Judged(fault) => Notice::failed(of(&fault), fault.advice()),
+        ContentFault::Sealed(refusal) => Notice::failed(of(&refusal), advice::on_page(&refusal.advice())),
+        ContentFault::Judged(fault) => Notice::failed(of(&fault), advice::on_page(&fault.advice())),
         ContentFault::NoProgram { programs, .. } => {
             Notice::failed(fault.to_string(), format!("its programs are 1 to {programs}"))
         }
         fault if fault.is_without_address() => {
             Notice::failed(of(&"a raw binary does not contain its address"), "choose the board")
         }
-        ContentFault::File(error) => Notice::failed(error.of(name).to_string(), anew),
+        ContentFault::File(error) => Notice::failed(advice::of_file(&error.of(name)), anew),
         fault => Notice::failed(of(&fault), anew),
     }
 }
@@ -73,7 +73,7 @@ fn of_program(program: &Program, read: &update::Loaded, size: usize, name: Strin
     let inspection = read.inspection.as_ref();
     Firmware {
         size,
-        inspection: inspection.map(Inspection::to_string).unwrap_or_default(),
+        inspection: inspection.map(|it| advice::with_advice(it, it.advice())).unwrap_or_default(),
         program_size: program.size(),
         crc: program.crc(),
         vendor_id: label.as_ref().map(|label| label.0),
@@ -82,6 +82,7 @@ fn of_program(program: &Program, read: &update::Loaded, size: usize, name: Strin
             .and_then(|inspection| inspection.software_version.clone())
             .or(label.and_then(|label| label.2)),
         left_out: read.left_out,
+        is_bootloader: false,
         seal: None,
         name,
     }
@@ -102,6 +103,7 @@ fn of_bootloader(new: &NewBootloader, size: usize, name: String) -> Firmware {
         product_code: Some(target.product_code),
         version: Some(new.version().to_string()),
         left_out: 0,
+        is_bootloader: true,
         seal: None,
         name,
     }
@@ -119,6 +121,7 @@ fn of_sealed(file: &SealedFile, size: usize, name: String) -> Firmware {
         product_code: Some(target.product_code),
         version: Some(ProgramVersion(head.version()).to_string()),
         left_out: 0,
+        is_bootloader: false,
         seal: Some(Seal {
             program: head.program(),
             counter: head.counter(),

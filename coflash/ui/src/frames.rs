@@ -12,6 +12,7 @@ use tokio::sync::watch;
 use super::load;
 use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
+use coboot_can::redact::Redactor;
 use coboot_can::{Adapter, AdapterError, Health};
 
 /// The most frames in words that the page can request.
@@ -54,6 +55,8 @@ pub(super) struct Frames {
     seconds: VecDeque<Second>,
     decoder: Decoder,
     histories: Histories,
+    /// Passwords are on the bus, and not on the page or in its log.
+    redactor: Redactor,
     count: u64,
 }
 
@@ -61,10 +64,11 @@ impl Frames {
     fn note(&mut self, time: Duration, frame: &Frame, own: bool) {
         self.count += 1;
         self.histories.saw(time, frame);
-        let words = self.decoder.decode(frame);
-        let (number, shown) = (self.count, frame.to_string());
+        let seen = self.redactor.frame(frame);
+        let words = self.decoder.decode(&seen);
+        let (number, shown) = (self.count, seen.to_string());
         push(&mut self.rows, ROWS, Row { number, time: time.as_secs_f64(), own, frame: shown, words });
-        self.forgotten += u64::from(push(&mut self.trace, TRACE, (time, *frame)));
+        self.forgotten += u64::from(push(&mut self.trace, TRACE, (time, seen)));
         let second = time.as_secs();
         if self.seconds.back().is_none_or(|last| last.second < second) {
             push(&mut self.seconds, SECONDS, Second { second, ..Second::default() });
@@ -219,6 +223,25 @@ mod tests {
         };
         assert_eq!(seconds(0, 2), [(1, 1)]);
         assert_eq!(seconds(0, 3), [(1, 1), (2, 1)]);
+    }
+
+    /// 6005h/1 by segments: "Si8K" of a password, and a number into 7F50h/1.
+    #[test]
+    fn a_password_is_neither_on_the_page_nor_in_the_log() {
+        let mut frames = Frames::default();
+        for data in [
+            [0x21, 0x05, 0x60, 1, 4, 0, 0, 0],
+            [0x07, b'S', b'i', b'8', b'K', 0, 0, 0],
+            [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'],
+        ] {
+            let frame = Frame::new(StandardId::new(0x605).unwrap(), &data).unwrap();
+            frames.note(Duration::ZERO, &frame, true);
+        }
+        let rows = serde_json::to_string(&frames.rows_after(0)).unwrap();
+        let shown = rows + &candump(&frames.log().0, 0);
+        for secret in ["53 69 38 4B", "5369384B", "Si8K", "54 49 4E 49", "54494E49", "TINI", "494E4954"] {
+            assert!(!shown.contains(secret), "{secret}: {shown}");
+        }
     }
 
     #[test]

@@ -68,7 +68,7 @@ impl Guard {
         if !same(shown.as_bytes(), self.token.as_bytes()) {
             return Some((
                 StatusCode::FORBIDDEN,
-                "the token is missing or wrong: open the URL that coflash ui printed",
+                "the token is missing or wrong: open the URL that coflash has printed",
             ));
         }
         // A body with an announced length that is too large is refused before it is read.

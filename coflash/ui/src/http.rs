@@ -29,7 +29,7 @@ use super::upload::{self, Room, Upload};
 use coboot_can::Kind;
 use coflash_core::device::lss::{BitRate, LssAddress};
 use coflash_core::file::board;
-use coflash_core::update::FlashOptions;
+use coflash_core::update::{FlashOptions, Password};
 
 /// The most bytes of a request without a file.
 const BODY_MAX: usize = 64 * 1024;
@@ -135,6 +135,7 @@ pub(super) fn engineers() -> Page {
         .route("/adapters", get(list))
         .route("/trace", get(trace))
         .route("/firmware", post(take_file))
+        .route("/board", post(take_board))
         .route("/readback", get(readback))
         .route("/open", post(open))
         .route("/close", post(close))
@@ -274,9 +275,6 @@ async fn take_file(
 ) -> Answer {
     idle(&site)?;
     let Upload { bytes, room } = site.room.read(&headers, body).await?;
-    if named.name.to_ascii_lowercase().ends_with(".toml") {
-        return own_board(&site, &named.name, &bytes).await;
-    }
     let settings = site.shared.look(|state| state.settings.clone());
     let answer = load(&site, Arc::new(bytes), named.name, settings).await;
     drop(room);
@@ -312,21 +310,28 @@ fn boards(site: &Site) -> Vec<&'static Layout> {
 }
 
 /// Takes the file with the memory map of a board, and chooses that board.
-async fn own_board(site: &Site, name: &str, bytes: &[u8]) -> Answer {
-    let name = firmware::printable(name);
+async fn take_board(
+    State(site): State<Site>,
+    Query(named): Query<Named>,
+    headers: HeaderMap,
+    body: Body,
+) -> Answer {
+    idle(&site)?;
+    let Upload { bytes, .. } = site.room.read(&headers, body).await?;
+    let name = firmware::printable(&named.name);
     let is_full = lock(&site.own_boards).len() >= BOARDS_MAX;
     if is_full {
         return Err(bad("this coflash has taken too many memory maps", "start it again"));
     }
-    let layout = board::parse(&String::from_utf8_lossy(bytes)).map_err(|error| {
+    let layout = board::parse(&String::from_utf8_lossy(&bytes)).map_err(|error| {
         bad(
             format!("{name}: {error}"),
-            "choose the file that `cargo xtask layout --toml` wrote for the board",
+            "choose the memory map that the build of the board has written (my-board.toml)",
         )
     })?;
     lock(&site.own_boards).push(layout);
     let program = site.shared.look(|state| state.settings.program);
-    choose(site, Settings { board: Some(layout), program }).await
+    choose(&site, Settings { board: Some(layout), program }).await
 }
 
 /// Applies settings; the firmware file is converted again.
@@ -386,17 +391,40 @@ struct Update {
     nodes: Vec<u8>,
     trial: bool,
     start: bool,
+    /// Whether the user has confirmed that bootloaders are renewed.
+    #[serde(default)]
+    renew: bool,
+    /// The password of locked devices; empty for none.
+    #[serde(default)]
+    password: String,
 }
 
 pub(super) fn node_id(number: u8) -> Result<NodeId, Refused> {
     NodeId::new(number).ok_or_else(|| bad(format!("{number} is not a node-ID"), "node-IDs are 1 to 127"))
 }
 
+/// The password in a request; none for an empty field. A refusal does not repeat it.
+pub(super) fn password_of(text: &str) -> Result<Option<Password>, Refused> {
+    let too_long = || bad("the password has more than 64 bytes", "enter the password of the device");
+    match text {
+        "" => Ok(None),
+        text => Password::new(text).map(Some).ok_or_else(too_long),
+    }
+}
+
 async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> Answer {
-    let Update { nodes, trial, start } = body(&headers, &bytes)?;
+    let Update { nodes, trial, start, renew, password } = body(&headers, &bytes)?;
     let Some(file) = lock(&site.shared.firmware).clone() else {
         return Err(bad("there is no firmware file", "drop one on the page, or choose one"));
     };
+    if file.shown.is_bootloader && !renew {
+        let notice = Notice::failed(
+            "the file is a bootloader, and nobody has confirmed that it replaces that of the devices",
+            "press the button Update, and confirm the renewal; no device was changed",
+        );
+        return Err(Refused(StatusCode::CONFLICT, notice));
+    }
+    let unlock = password_of(&password)?;
     let mut wanted: Vec<NodeId> = Vec::new();
     for node in nodes {
         let node = node_id(node)?;
@@ -421,7 +449,7 @@ async fn update(State(site): State<Site>, headers: HeaderMap, bytes: Bytes) -> A
             Notice::failed(words, "choose the file that is made for this device; no device was changed");
         return Err(Refused(StatusCode::UNPROCESSABLE_ENTITY, notice));
     }
-    site.shared.begin(Job::Update { nodes: wanted, file, program, trial, start })?;
+    site.shared.begin(Job::Update { nodes: wanted, file, program, trial, start, unlock })?;
     done()
 }
 

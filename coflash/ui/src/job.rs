@@ -7,13 +7,22 @@ use canopen::NodeId;
 use super::firmware::Loaded;
 use super::state::{State, Update};
 use coflash_core::device::lss::{BitRate, LssAddress};
+use coflash_core::update::Password;
 
 /// A task.
 pub(super) enum Job {
     /// Search the nodes on the bus.
     Scan,
     /// Download the file into these devices.
-    Update { nodes: Vec<NodeId>, file: Arc<Loaded>, program: u8, trial: bool, start: bool },
+    Update {
+        nodes: Vec<NodeId>,
+        file: Arc<Loaded>,
+        program: u8,
+        trial: bool,
+        start: bool,
+        /// The password of locked devices.
+        unlock: Option<Password>,
+    },
     /// A single step with one device.
     Step { node: NodeId, program: u8, step: Step },
     /// Find one of the devices without a node-ID.
@@ -47,7 +56,9 @@ impl Job {
             Self::Update { nodes, file, .. } => {
                 state.updates = nodes.iter().map(|node| Update::waiting(*node)).collect();
                 let devices = if nodes.len() == 1 { "device" } else { "devices" };
-                ("update", format!("the update of {} {devices} with {}", nodes.len(), file.shown.name))
+                let what =
+                    if file.shown.is_bootloader { "the renewal of the bootloader" } else { "the update" };
+                ("update", format!("{what} of {} {devices} with {}", nodes.len(), file.shown.name))
             }
             Self::Step { node, program, step } => {
                 let words = match step {

@@ -24,9 +24,11 @@
 //! | `frames` | what goes over the bus, in words, counted, and as a log |
 //! | `load` | how long a frame keeps the bus busy |
 //! | `adapters` | what this machine has |
+//! | `advice` | what to do next, in the words of the page |
 #![forbid(unsafe_code)]
 
 mod adapters;
+mod advice;
 mod events;
 mod firmware;
 mod frames;
@@ -44,7 +46,7 @@ mod work;
 mod worker;
 
 pub use self::server::{Options, Server};
-pub use self::service::Service;
+pub use self::service::{Origin, Service};
 pub use self::shared::Failed;
 
 /// The example on the crate's page compiles and runs.

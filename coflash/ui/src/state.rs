@@ -7,10 +7,13 @@ use canopen::NodeId;
 use serde::{Serialize, Serializer};
 use shared_abi::layout::Layout;
 
+use super::advice;
 use coboot_can::decode::state_words;
+use coflash_core::device::access::Security;
 use coflash_core::device::info::{DeviceInfo, ProgramInfo};
 use coflash_core::device::lss::LssAddress;
 use coflash_core::device::scan::Found;
+use coflash_core::device::state::supply;
 use coflash_core::device::Error;
 use coflash_core::update::Event;
 
@@ -102,10 +105,17 @@ pub(super) struct Device {
     /// NMT state of the last heartbeat.
     pub(super) heartbeat: Option<&'static str>,
     pub(super) dialect: Option<&'static str>,
-    /// What it reports about sealed images, in words.
-    pub(super) sealed: Option<String>,
+    /// What it reports about sealed images: whether it is sealed, root keys, counters and epoch.
+    pub(super) security: Option<Security>,
     /// Why it stays in its bootloader, in words (2007h).
     pub(super) state: Option<String>,
+    /// Its supply, in words (2007h).
+    pub(super) supply: Option<&'static str>,
+    /// Its option bytes in words, and what is wrong with them.
+    pub(super) option_bytes: Option<String>,
+    pub(super) warnings: Vec<&'static str>,
+    /// Its bootloader, in words, if that can be renewed.
+    pub(super) renewable: Option<String>,
     pub(super) programs: Vec<Program>,
     /// The comparison of the firmware file's label with this device.
     pub(super) verdict: Option<Verdict>,
@@ -150,6 +160,8 @@ pub(super) struct Firmware {
     pub(super) version: Option<String>,
     /// Bytes that the conversion left out.
     pub(super) left_out: u64,
+    /// Whether it is a bootloader, which takes the place of that of the device.
+    pub(super) is_bootloader: bool,
     /// Further properties of a sealed image.
     pub(super) seal: Option<Seal>,
 }
@@ -322,6 +334,7 @@ impl State {
 
 impl Device {
     fn of(info: &DeviceInfo) -> Self {
+        let option_bytes = info.state.and_then(|state| state.option_bytes);
         Self {
             node: info.node.get(),
             answers: true,
@@ -333,8 +346,12 @@ impl Device {
             identity: info.identity,
             heartbeat: None,
             dialect: info.dialect.map(|dialect| dialect.name()),
-            sealed: info.security.as_ref().map(ToString::to_string),
+            security: info.security.clone(),
             state: info.state.map(|state| state.to_string()),
+            supply: info.state.and_then(|state| supply(state.supply)),
+            option_bytes: option_bytes.map(|bytes| bytes.to_string()),
+            warnings: option_bytes.map_or(Vec::new(), |bytes| bytes.warnings()),
+            renewable: info.bootloader.map(|its| advice::with_advice(its, its.advice())),
             programs: info.programs.iter().map(Program::of).collect(),
             verdict: None,
         }
@@ -399,7 +416,11 @@ impl Firmware {
             (Some((_, file)), Some((_, own))) if file != own => {
                 verdict(Fits::No, format!("made for product code {file:08X}h, this device has {own:08X}h"))
             }
-            _ if device.crc(number) == Some(self.crc) => {
+            (Some(_), Some(_)) if self.is_bootloader => match &device.renewable {
+                Some(_) => verdict(Fits::Yes, "a bootloader for this product".to_string()),
+                None => verdict(Fits::Unknown, "the device does not report its bootloader".to_string()),
+            },
+            _ if !self.is_bootloader && device.crc(number) == Some(self.crc) => {
                 verdict(Fits::Yes, "in the device already (same CRC)".to_string())
             }
             (Some(_), Some(_)) => verdict(Fits::Yes, "made for this product".to_string()),
@@ -434,7 +455,7 @@ impl Update {
         if let Event::Done(_) = event {
             return;
         }
-        self.words = event.to_string();
+        self.words = advice::with_advice(event, event.advice());
         if self.lines.len() < LINES {
             self.lines.push(self.words.clone());
         }
@@ -443,7 +464,7 @@ impl Update {
     pub(super) fn failed(&mut self, error: &Error, left: &str) {
         self.phase = Phase::Failed;
         self.words = format!("{error}. The device: {left}.");
-        self.advice = Some(error.advice());
+        self.advice = Some(advice::on_page(&error.advice()));
     }
 }
 
@@ -457,7 +478,7 @@ impl Notice {
     }
 
     pub(super) fn error(error: &Error) -> Self {
-        Self::failed(error.to_string(), error.advice())
+        Self::failed(error.to_string(), advice::on_page(&error.advice()))
     }
 }
 

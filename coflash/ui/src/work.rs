@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::nmt::NmtCommand;
 use canopen::{program, Address, NodeId};
 
+use super::advice;
 use super::firmware::Loaded;
 use super::frames::wall;
 use super::job::{Job, Step};
@@ -29,8 +30,9 @@ impl Work for Job {
     fn run(self: Box<Self>, link: &mut Link, shared: &Shared) -> Notice {
         let done = match *self {
             Self::Scan => search(link, shared),
-            Self::Update { nodes, file, program, trial, start } => {
-                let options = FlashOptions::default().program(program).trial_run(trial).start(start);
+            Self::Update { nodes, file, program, trial, start, unlock } => {
+                let options =
+                    FlashOptions::default().program(program).trial_run(trial).start(start).unlock(unlock);
                 return update_all(link, shared, &nodes, &file, options);
             }
             Self::Step { node, program, step } => step_of(link, shared, node, program, step),
@@ -90,7 +92,8 @@ fn step_of(link: &mut Link, shared: &Shared, node: NodeId, number: u8, step: Ste
 fn single(session: &mut Session<'_>, shared: &Shared, number: u8, step: Step) -> Result<Notice, Error> {
     let node = session.node();
     let mut tell = |event: Event| {
-        shared.change(|state| state.task.as_mut().map(|task| task.words = format!("node {node}: {event}")));
+        let words = advice::with_advice(&event, event.advice());
+        shared.change(|state| state.task.as_mut().map(|task| task.words = format!("node {node}: {words}")));
     };
     let words = match step {
         Step::CallBack => {
@@ -173,7 +176,9 @@ fn update_all(
                         None => format!("done in {:.1} s", report.took.as_secs_f64()),
                     };
                 }
-                Err(Failed { error, left }) => update.failed(error, &left.to_string()),
+                Err(Failed { error, left }) => {
+                    update.failed(error, &advice::with_advice(left, left.advice()))
+                }
             }
         }
     });
@@ -183,10 +188,12 @@ fn update_all(
     }
     report(shared, nodes, file, options.program, &results, wall().saturating_sub(began));
     let good = results.len() - failed;
-    let words = format!("{good} of {} devices updated with {}", results.len(), file.shown.name);
+    let done =
+        if file.shown.is_bootloader { "devices have the bootloader of" } else { "devices updated with" };
+    let words = format!("{good} of {} {done} {}", results.len(), file.shown.name);
     match results.into_iter().find_map(Result::err) {
         None => Notice::done(words),
-        Some(Failed { error, .. }) => Notice::failed(words, error.advice()),
+        Some(Failed { error, .. }) => Notice::failed(words, advice::on_page(&error.advice())),
     }
 }
 
@@ -217,12 +224,13 @@ fn report(
             let device = state.devices.as_ref().and_then(|devices| devices.get(&node.get())).cloned();
             let words = match result {
                 Ok(report) if report.renewal.is_some() => {
-                    let version = file.shown.version.as_deref().unwrap_or_default();
-                    format!("renewed: bootloader {version}")
+                    report.renewal.map(|renewal| renewal.to_string()).unwrap_or_default()
                 }
                 Ok(report) if report.running.is_some() => "updated, and the program runs".to_string(),
                 Ok(_) => "updated".to_string(),
-                Err(Failed { error, left }) => format!("failed: {error}; the device: {left}"),
+                Err(Failed { error, left }) => {
+                    format!("failed: {error}; the device: {}", advice::with_advice(left, left.advice()))
+                }
             };
             let report = Report {
                 number: state.reports.last().map_or(1, |last| last.number + 1),

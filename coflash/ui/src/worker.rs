@@ -6,6 +6,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::advice;
 use super::frames::Tap;
 use super::shared::{Order, Shared};
 use super::state::{Adapter, Connection, Notice};
@@ -56,7 +57,7 @@ pub(super) fn run(shared: &Arc<Shared>, orders: &Receiver<Order>, sdo_ids: Optio
                 let notice = done.unwrap_or_else(|_| {
                     Notice::failed(
                         "there was an internal error of coflash",
-                        "start coflash ui again and report it",
+                        "start coflash again and report it",
                     )
                 });
                 shared.change(|state| {
@@ -110,7 +111,7 @@ fn open(shared: &Shared, url: String, sdo_ids: Option<SdoBases>) -> Bus {
         Err(error) => {
             shared.change(|state| {
                 state.adapter.state = Connection::Closed;
-                state.notice(Notice::failed(error.to_string(), error.advice()));
+                state.notice(Notice::failed(error.to_string(), advice::of_adapter(&error)));
             });
             Bus::Closed
         }

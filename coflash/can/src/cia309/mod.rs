@@ -362,7 +362,7 @@ impl fmt::Display for Wait<'_> {
         let own = self.patience.saturating_sub(self.sdo);
         write!(
             f,
-            " ({:.1} s for the node, --sdo-timeout, and {:.1} s for the gateway)",
+            " ({:.1} s for SDO with the node, and {:.1} s for the gateway)",
             seconds(self.sdo),
             seconds(own)
         )

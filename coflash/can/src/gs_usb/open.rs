@@ -25,7 +25,7 @@ pub(crate) fn open(which: &str, rate: u32) -> Result<Driven, AdapterError> {
     Driven::open(name, move || {
         let usb = usb::open(&adapter, &which.device)?;
         GsUsb::start(usb, which.channel, rate).map_err(|what| {
-            let advice = "unplug the adapter, plug it in and run the command again; it must speak gs_usb (candleLight)";
+            let advice = "unplug the adapter, plug it in and try again; it must speak gs_usb (candleLight)";
             AdapterError::unusable(adapter, what, advice)
         })
     })

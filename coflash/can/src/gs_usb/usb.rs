@@ -73,7 +73,7 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
             0 => "no such adapter is connected to USB".to_string(),
             count => format!("it is not connected ({count} other(s) are)"),
         };
-        unusable(what, "plug it in; coflash adapters lists the adapters of this computer")
+        AdapterError::missing(name, what, "plug it in")
     })?;
     let refused = |error: nusb::Error| {
         let advice = match error.kind() {
@@ -83,19 +83,20 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
             }
             ErrorKind::Busy => {
                 "the kernel's driver or another program uses it: on Linux use the interface that the kernel made of it \
-                 (socketcan:can0; coflash adapters lists it)"
+                 (socketcan:can0)"
             }
             ErrorKind::Unsupported => {
                 "on Windows the device needs the driver WinUSB, which candleLight asks for by itself; Zadig installs it \
                  for others"
             }
-            _ => "unplug the adapter, plug it in and run the command again",
+            _ => "unplug the adapter, plug it in and try again",
         };
         AdapterError::Unusable {
             adapter: name.to_string(),
             what: error.to_string(),
             advice: advice.to_string(),
             in_use: error.kind() == ErrorKind::Busy,
+            absent: false,
         }
     };
     let opened = device.open().wait().map_err(refused)?;

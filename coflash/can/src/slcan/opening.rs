@@ -284,10 +284,9 @@ impl<L: Line> Slcan<L> {
         };
         let what = format!("it answered neither V (version) nor O (open the bus) as an adapter does{said}");
         let advice = format!(
-            "this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb \
-             (coflash adapters)",
+            "this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb",
             ports::those_there()
         );
-        AdapterError::unusable(self.name.clone(), what, advice)
+        AdapterError::missing(self.name.clone(), what, advice)
     }
 }

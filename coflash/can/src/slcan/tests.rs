@@ -562,7 +562,7 @@ fn an_adapter_that_becomes_something_else_is_told() {
         let health = bus.health().unwrap();
         assert!(health.strange >= 3, "{health:?}");
         let advice = health.advice().unwrap();
-        assert!(advice.contains("not of its protocol") && advice.contains("--bus"), "{advice}");
+        assert!(advice.contains("not of its protocol") && advice.contains("URL of the bus"), "{advice}");
     }
 }
 

@@ -471,8 +471,7 @@ fn a_gateway_that_answers_something_else_is_an_error_in_words() {
     }
     let (result, _) = asked(|_| None);
     let found = words(result);
-    let expected =
-        "it has not answered for 0.3 s (0.1 s for the node, --sdo-timeout, and 0.2 s for the gateway)";
+    let expected = "it has not answered for 0.3 s (0.1 s for SDO with the node, and 0.2 s for the gateway)";
     assert!(found.contains(expected), "{found}");
 }
 

@@ -138,12 +138,7 @@ const MISTAKES: &[Mistake] = &[
         4,
         &["another program uses the port", "fuser -v", "close the other program"],
     ),
-    Mistake(
-        "scan --bus slcan:/dev/null@500k",
-        Nothing,
-        4,
-        &["it is not a serial port", "--bus slcan:PORT@500k"],
-    ),
+    Mistake("scan --bus slcan:/dev/null@500k", Nothing, 4, &["it is not a serial port", "slcan:PORT@500k"]),
     Mistake("scan --bus slcan:{file}@500k", Nothing, 4, &["it is not a serial port"]),
     Mistake(
         "scan --bus slcan:tcp://{server}@500k",

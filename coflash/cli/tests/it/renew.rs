@@ -70,7 +70,7 @@ fn flash_refuses_what_is_no_bootloader_for_a_device() {
     damaged[100] ^= 1;
     let damaged = folder.file("damaged.bin", &damaged);
     for (file, words) in [
-        (bench, "it is a bootloader without a CRC: build it by `cargo xtask build`, which writes the CRC"),
+        (bench, "it is a bootloader without a CRC: build it by cargo xtask build, which writes the CRC"),
         (damaged, "it is a damaged bootloader: its header has the CRC"),
     ] {
         let done = coflash(&["--bus", "socketcand://127.0.0.1:1/can0", "flash", &file]);

@@ -13,6 +13,7 @@ use super::device_type::DeviceType;
 use super::dialect::Dialect;
 use super::doing::{Doing, LssDoing};
 use super::state::{reason, source, trial_end, BootloaderState};
+use crate::advice::Advice;
 use coboot_can::gateway::GatewayError;
 use coboot_can::AdapterError;
 
@@ -104,7 +105,7 @@ pub enum Error {
         /// What is wrong with it, as the rest of a sentence that begins with "the image".
         why: String,
         /// What to do next.
-        advice: &'static str,
+        advice: Advice,
     },
     /// The device has the program at another address than the image.
     OtherRegion {

@@ -12,6 +12,7 @@ use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 use super::error::{told, Error};
 use super::session::Session;
 use super::state::trial_end;
+use crate::advice::Advice;
 
 /// What a device reports about its bootloader.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,6 +77,16 @@ pub fn progress(session: &mut Session<'_>) -> Result<Option<Progress>, Error> {
     Ok(Progress::from_bytes(word.to_le_bytes()))
 }
 
+impl Bootloader {
+    /// The advice in its text, if there is any.
+    #[must_use]
+    pub fn advice(&self) -> Option<Advice> {
+        let progress = self.running?.progress;
+        let is_on_trial = progress.state == State::Staged && progress.origin == Origin::Trial;
+        is_on_trial.then_some(Advice::ConfirmIt)
+    }
+}
+
 impl fmt::Display for Bootloader {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { number, version, running } = self;
@@ -86,7 +97,7 @@ impl fmt::Display for Bootloader {
         match (state, origin) {
             (State::None, _) => {}
             (State::Staged, Origin::Trial) => {
-                f.write_str("; it is on trial: coflash flash with its file confirms it")?;
+                write!(f, "; it is on trial: {}", Advice::ConfirmIt)?;
             }
             (State::Staged, _) => f.write_str("; another one waits for its trial")?,
             (_, Origin::Spare) => f.write_str("; its place was damaged, and is being repaired")?,

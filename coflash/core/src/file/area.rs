@@ -4,6 +4,7 @@
 use std::fmt;
 
 use super::range::AddressRange;
+use crate::advice::Advice;
 
 /// An area outside the main flash.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -85,36 +86,18 @@ impl Area {
 
     /// What to do with data for this area.
     #[must_use]
-    pub const fn advice(self) -> &'static str {
+    pub const fn advice(self) -> Advice {
         match self {
-            Self::Alias => {
-                "link the program for the flash, which begins at 08000000h; S1 and S2 records have no room for such \
-                 an address: write S3 records (objcopy --srec-forceS3), or add what is missing (--adjust-start)"
-            }
-            Self::Eeprom => "an STM32F4 has no data EEPROM: leave this section out of the file",
-            Self::OptionBytes => {
-                "a bootloader does not write them: leave the section out of the file (objcopy \
-                 --remove-section), and set option bytes with a debug probe"
-            }
-            Self::SystemMemory => "it cannot be written: leave this section out of the file",
-            Self::Otp => {
-                "a bootloader does not write it: leave the section out of the file (objcopy \
-                 --remove-section), and write it with a debug probe"
-            }
-            Self::Ccm | Self::Ram => {
-                "it is empty after power-on: give the section a load address in the flash (AT > FLASH), \
-                 from where the start-up of the program copies it, or make it NOLOAD"
-            }
-            Self::BackupSram => "the program itself has to fill it: leave this section out of the file",
-            Self::Registers => "no file can fill them: leave this section out of the file",
-            Self::Reserved => {
-                "check that the file is for an STM32F4; if it is, leave the section out of it (objcopy \
-                 --remove-section)"
-            }
-            Self::External => {
-                "the bootloader writes the chip's own flash alone: leave the section out of the file \
-                 (objcopy --remove-section), and let the program or a debug probe write it"
-            }
+            Self::Alias => Advice::AreaAlias,
+            Self::Eeprom => Advice::AreaEeprom,
+            Self::OptionBytes => Advice::AreaOptionBytes,
+            Self::SystemMemory => Advice::AreaSystemMemory,
+            Self::Otp => Advice::AreaOtp,
+            Self::Ccm | Self::Ram => Advice::AreaRam,
+            Self::BackupSram => Advice::AreaBackupSram,
+            Self::Registers => Advice::AreaRegisters,
+            Self::Reserved => Advice::AreaReserved,
+            Self::External => Advice::AreaExternal,
         }
     }
 }

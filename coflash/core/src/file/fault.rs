@@ -6,6 +6,7 @@ use shared_abi::block_file::{FRAMING, MAX_BLOCK_SIZE};
 
 use super::area::{Area, FLASH};
 use super::range::AddressRange;
+use crate::advice::Advice;
 
 /// A place in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -124,7 +125,10 @@ pub enum Cause {
     #[error("is empty")]
     Empty,
     /// A file in none of the known formats.
-    #[error("is not a firmware file (neither Intel HEX, S-record, ELF nor block file; for a raw binary give -I binary and --start-address)")]
+    #[error(
+        "is not a firmware file (neither Intel HEX, S-record, ELF nor block file; {})",
+        Advice::RawNeedsAddress
+    )]
     NotFirmware,
     /// A file of another kind, which its first bytes name.
     #[error("is not a firmware file but {what}")]
@@ -146,10 +150,10 @@ pub enum Cause {
     #[error("{0}: an editor or a shell has stored it anew, and its format is plain ASCII: take the file as it was built, or store it as ASCII (PowerShell: Out-File -Encoding ascii)")]
     Encoding(Encoding),
     /// A sealed image in a place that needs the program itself.
-    #[error("is a sealed image and cannot be converted: `coflash flash` downloads it, `coflash show` and `coflash verify` describe it")]
+    #[error("is a sealed image and cannot be converted: {}", Advice::SealedStays)]
     Sealed,
     /// A raw file without an address.
-    #[error("a raw binary does not contain its address: give --start-address or --board")]
+    #[error("a raw binary does not contain its address: {}", Advice::GiveAddress)]
     NoAddress,
     /// A record or structure ends too early.
     #[error(
@@ -256,7 +260,10 @@ pub enum Cause {
     #[error("holds no data inside {0}")]
     NothingInside(AddressRange),
     /// The distance between the first and the last byte is too large for one program.
-    #[error("the data spans {first:#010x}..={last:#010x}, too much for one program: select the program with --start-address and --end-address")]
+    #[error(
+        "the data spans {first:#010x}..={last:#010x}, too much for one program: {}",
+        Advice::SelectRange
+    )]
     TooSparse {
         /// First address of the program.
         first: u32,
@@ -316,6 +323,19 @@ pub enum Cause {
 }
 
 impl Cause {
+    /// The advice at the end of its text that depends on where the user gives files.
+    #[must_use]
+    pub fn advice(&self) -> Option<Advice> {
+        Some(match self {
+            Self::NotFirmware => Advice::RawNeedsAddress,
+            Self::Sealed => Advice::SealedStays,
+            Self::NoAddress => Advice::GiveAddress,
+            Self::TooSparse { .. } => Advice::SelectRange,
+            Self::Elsewhere { area, .. } => area.advice(),
+            _ => return None,
+        })
+    }
+
     /// The fault of data that lie outside a program's region.
     pub(crate) fn outside(data: AddressRange, region: AddressRange) -> Self {
         let first_outside = if region.has(data.first) { region.last.saturating_add(1) } else { data.first };

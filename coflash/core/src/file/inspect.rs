@@ -19,6 +19,7 @@ use super::program::Program;
 use super::ram_image::{self, RamImage};
 use super::range::AddressRange;
 use super::read::{Firmware, Format};
+use crate::advice::Advice;
 
 /// The contents of a firmware file. `Display` describes them for people.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -191,6 +192,19 @@ impl fmt::Display for Date {
     }
 }
 
+impl Inspection {
+    /// The advice in its text.
+    #[must_use]
+    pub fn advice(&self) -> Vec<Advice> {
+        let update = match (&self.bootloader, &self.judgement) {
+            (Some((_, Ok(()))), _) => Some(Advice::RenewsDevice),
+            (Some((_, Err(_))), _) | (None, Err(_)) => Some(Advice::IsRefused),
+            (None, Ok(())) => None,
+        };
+        update.into_iter().chain(self.stack_at_end.map(|_| Advice::KnowBoard)).collect()
+    }
+}
+
 impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match &self.blocks {
@@ -235,15 +249,15 @@ impl fmt::Display for Inspection {
         }
         match (&self.bootloader, &self.judgement) {
             (Some((_, Ok(()))), _) => {
-                writeln!(f, "  judged       a bootloader: coflash flash renews that of a device")?;
+                writeln!(f, "  judged       a bootloader: {}", Advice::RenewsDevice)?;
             }
             (Some((_, Err(fault))), _) => {
-                writeln!(f, "  judged       {fault}: coflash flash refuses it")?;
+                writeln!(f, "  judged       {fault}: {}", Advice::IsRefused)?;
             }
             (None, Ok(())) => {
                 writeln!(f, "  judged       can be a program: stack pointer and reset vector are plausible")?;
             }
-            (None, Err(fault)) => writeln!(f, "  judged       {fault}: coflash flash refuses it")?,
+            (None, Err(fault)) => writeln!(f, "  judged       {fault}: {}", Advice::IsRefused)?,
         }
         if let (Ok(()), Some(stack)) = (&self.judgement, self.stack_at_end) {
             writeln!(f, "  caution      {stack}")?;

@@ -13,6 +13,7 @@ use shared_abi::vectors::{Memory, VectorFault};
 use super::area::{Area, FLASH};
 use super::image::Image;
 use super::range::AddressRange;
+use crate::advice::Advice;
 
 /// Its first sector, which has 16 KiB on every chip. No program can have it, because the CPU starts
 /// there after a reset.
@@ -93,34 +94,15 @@ impl Fault {
 
     /// What to do next.
     #[must_use]
-    pub fn advice(&self) -> &'static str {
+    pub const fn advice(&self) -> Advice {
         match self {
-            Self::Bootloader => {
-                "give the program, linked for an address after the bootloader; coflash flash renews a bootloader whose \
-                 RAM image has a header, and a debug probe writes any other"
-            }
+            Self::Bootloader => Advice::BootloaderFile,
             Self::Elsewhere { area, .. } => area.advice(),
-            Self::OtherPlace { .. } => {
-                "let FLASH begin at that address in the linker script (cargo xtask layout --ld program-1 prints \
-                 the board's), or check --board and --program; --force leaves that to the device"
-            }
-            Self::StackOverHandoff { .. } => {
-                "let RAM end before the handoff in the linker script: 64 bytes less than the chip has (LENGTH = \
-                 128K - 64), so that _estack or _stack_start is at most the handoff's address; --force leaves that \
-                 to the device"
-            }
-            Self::ResetVector { .. } => {
-                "check that it is the right file, and that it is linked for this address (--board, --program); \
-                 --force leaves that to the device"
-            }
-            Self::VectorInTable { .. } => {
-                "give the vector table its whole length, one vector for each interrupt of the chip, and let the \
-                 linker script place the code after it; --force leaves that to the device"
-            }
-            _ => {
-                "check that it is the right file, and that it begins with the vector table; \
-                 --force leaves that to the device"
-            }
+            Self::OtherPlace { .. } => Advice::OtherPlace,
+            Self::StackOverHandoff { .. } => Advice::StackOverHandoff,
+            Self::ResetVector { .. } => Advice::ResetVector,
+            Self::VectorInTable { .. } => Advice::VectorTable,
+            _ => Advice::NoVectorTable,
         }
     }
 }
@@ -201,8 +183,9 @@ impl fmt::Display for StackAtEnd {
         write!(
             f,
             "its stack begins at {stack:08X}h, over the handoff ({:08X}h) of a board whose SRAM ends at {end:08X}h: \
-             such a board does not start it; --board says whether yours is one",
-            end - SHARED
+             such a board does not start it; {}",
+            end - SHARED,
+            Advice::KnowBoard
         )
     }
 }

@@ -22,7 +22,7 @@ pub struct RamImage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Fault {
     /// It is for the bench: nobody has computed its CRC.
-    #[error("is a bootloader without a CRC: build it by `cargo xtask build`, which writes the CRC")]
+    #[error("is a bootloader without a CRC: build it by cargo xtask build, which writes the CRC")]
     Bench,
     /// Its CRC is wrong.
     #[error("is a damaged bootloader: its header has the CRC {said:08X}h, and its bytes have {found:08X}h")]

@@ -3,6 +3,7 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use canopen::NodeId;
 use seal::wire::BOOTLOADER;
 use serde::Deserialize;
 
@@ -11,6 +12,7 @@ use super::package::{target, Part};
 use crate::device::Dialect;
 use crate::file::board::{self, in_folder};
 use crate::file::{block_file, limit, ram_image, Place, ReadError};
+use crate::update::job;
 use crate::update::{line_of, ContentFault, Payload, Reading};
 
 /// A recipe.
@@ -40,6 +42,9 @@ struct Row {
     dialect: Option<String>,
     trial_run: Option<bool>,
     verify: Option<bool>,
+    /// Whether the devices must be those that the file names.
+    #[serde(skip)]
+    check_target: bool,
 }
 
 /// The parts of a package, with its texts.
@@ -87,7 +92,69 @@ impl Recipe {
     }
 }
 
+impl Recipe {
+    /// The recipe that does what a job file in this folder says. Devices with the same settings get one program
+    /// together.
+    ///
+    /// # Errors
+    /// The first error in the job file or in one of its images; also a device by its LSS address and a program that
+    /// is not to be started, which a machine does not have.
+    pub fn of_job(text: &str, folder: &Path) -> Result<Self, job::Fault> {
+        let mut rows: Vec<(usize, job::Settings, Row)> = Vec::new();
+        for (number, entry) in (1..).zip(job::parse(text, folder)?) {
+            let wrong = |what: &str| job::Fault::Device(number, what.to_owned());
+            let (Some(node), None) = (entry.node, entry.address) else {
+                return Err(wrong("a machine has node-IDs: give node alone, and set it by LSS before"));
+            };
+            if entry.settings.start == Some(false) {
+                return Err(wrong("each program of a machine is started: leave start = false out"));
+            }
+            match rows.iter_mut().find(|(_, settings, _)| *settings == entry.settings) {
+                Some((_, _, row)) => row.nodes.push(node.get()),
+                None => rows.push((number, entry.settings.clone(), Row::of_job(node, entry.settings))),
+            }
+        }
+        let mut recipe = Self { name: None, release: None, parts: Vec::new(), images: Vec::new() };
+        for (number, _, row) in rows {
+            recipe.images.push(row.image.clone());
+            // The paths of a job are in its folder already.
+            let part = row.part(None, Path::new("")).map_err(|what| job::Fault::Device(number, what))?;
+            recipe.parts.push(part);
+        }
+        // Two images, or one image with two settings, may have one name.
+        for at in 1..recipe.parts.len() {
+            let (before, rest) = recipe.parts.split_at_mut(at);
+            let Some(Part { entry, .. }) = rest.first_mut() else { continue };
+            if before.iter().any(|part| part.entry.name == entry.name) {
+                entry.name = format!("{} ({})", entry.name, at + 1);
+            }
+        }
+        Ok(recipe)
+    }
+}
+
 impl Row {
+    /// The program of a device of a job.
+    fn of_job(node: NodeId, settings: job::Settings) -> Self {
+        let job::Settings { image, board, program, check_target, trial_run, verify, .. } = settings;
+        Self {
+            name: None,
+            // A parsed job has an image for each device.
+            image: image.unwrap_or_default(),
+            board,
+            nodes: vec![node.get()],
+            vendor: None,
+            product: None,
+            revision: None,
+            count: None,
+            program,
+            dialect: None,
+            trial_run,
+            verify,
+            check_target: check_target.unwrap_or(false),
+        }
+    }
+
     fn part(self, board: Option<&str>, folder: &Path) -> Result<Part, String> {
         let path = folder.join(&self.image);
         let dialect = match self.dialect.as_deref() {
@@ -101,7 +168,7 @@ impl Row {
         let (program, bytes) = content(&path, board.as_deref(), self.program.unwrap_or(1), dialect)?;
         let identity = match (self.vendor, self.product) {
             (Some(vendor), Some(product)) => Some(Identity { vendor, product, revision: self.revision }),
-            (None, None) if self.nodes.is_empty() || self.revision.is_some() => {
+            (None, None) if self.nodes.is_empty() || self.revision.is_some() || self.check_target => {
                 let target = target(&program).ok_or(
                     "the file does not say for which device it is: give nodes, or vendor and product",
                 )?;

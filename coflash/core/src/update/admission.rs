@@ -10,6 +10,7 @@ use super::content::{refusal_number, Content};
 use super::dialect::is_data;
 use super::options::FlashOptions;
 use super::steps::compare_target;
+use crate::advice::Advice;
 use crate::device::access::{security_of, told_challenge, Challenge};
 use crate::device::error::{told, Error, Mismatch};
 use crate::device::region::program_region;
@@ -158,10 +159,7 @@ fn takes_sealed(session: &mut Session<'_>, file: &SealedFile) -> Result<bool, Er
     match told_challenge(session)? {
         Some(challenge) if !challenge.is_sealed() => {
             let why = "cannot be installed: the device is not sealed and has no keys to check the image";
-            let advice =
-                "write keys into the device with a debug probe (coflash provision makes the file), or flash the \
-                          program as it is, not sealed";
-            Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice })
+            Err(Error::NoProgram { number: Fault::NUMBER, why: why.to_string(), advice: Advice::Provision })
         }
         Some(challenge) => admit_age(session, file, &challenge).map(|()| true),
         None => Ok(false),

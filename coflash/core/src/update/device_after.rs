@@ -6,6 +6,7 @@ use canopen::program::ProgramState;
 use serde::ser::SerializeStruct as _;
 use serde::{Serialize, Serializer};
 
+use crate::advice::Advice;
 use crate::device::DeviceType;
 
 /// The contents of a device after a failed procedure.
@@ -99,6 +100,16 @@ pub struct Seen {
     pub crc: Option<u32>,
 }
 
+impl DeviceAfterUpdate {
+    /// The advice at the end of its text, if there is any.
+    #[must_use]
+    pub fn advice(&self) -> Option<Advice> {
+        let DeviceAnswer::Seen(seen) = self.answer else { return None };
+        let waits = self.state == DeviceState::Called && seen.running.is_bootloader() && !seen.empty();
+        waits.then_some(Advice::StartIt)
+    }
+}
+
 impl Seen {
     /// Whether the device reports that it has no program.
     pub(super) fn empty(&self) -> bool {
@@ -148,11 +159,10 @@ impl fmt::Display for DeviceAfterUpdate {
                     }
                     _ => {}
                 }
-                let waits = self.state == DeviceState::Called && seen.running.is_bootloader();
-                if waits && !seen.empty() {
-                    f.write_str(": coflash start starts it again")?;
+                match self.advice() {
+                    Some(advice) => write!(f, ": {advice}"),
+                    None => Ok(()),
                 }
-                Ok(())
             }
         }
     }

@@ -13,6 +13,7 @@ pub use super::device_after::{DeviceAfterUpdate, DeviceState};
 pub use super::phase::{Note, Phase, Warning};
 pub use super::report::Report;
 pub use super::retry::{RepeatReason, Retry};
+use crate::advice::Advice;
 use crate::device::{DeviceType, Error};
 use crate::json;
 
@@ -88,7 +89,7 @@ impl Problem {
         Self {
             number: error.number(),
             what: error.to_string(),
-            advice: error.advice(),
+            advice: error.advice().to_string(),
             answers: error.answers(),
         }
     }
@@ -114,6 +115,16 @@ impl Event {
     #[must_use]
     pub fn line(&self, node: NodeId) -> Line<'_> {
         Line { node, event: self, text: self }
+    }
+
+    /// The advice at the end of its text, if there is any.
+    #[must_use]
+    pub fn advice(&self) -> Option<Advice> {
+        match self {
+            Self::Phase(Phase::NotReleased) => Some(Advice::ReleaseIt),
+            Self::Done(done) if done.report.is_none() => done.left.advice(),
+            _ => None,
+        }
     }
 
     /// The state of the device, if this event is the end of a failed update.

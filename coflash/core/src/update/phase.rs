@@ -6,6 +6,7 @@ use std::time::Duration;
 use canopen::NodeId;
 use serde::Serialize;
 
+use crate::advice::Advice;
 use crate::device::info::Nameplate;
 use crate::device::{DeviceType, Dialect, Doing};
 use crate::file::checksum::Checksum;
@@ -206,10 +207,13 @@ impl fmt::Display for Phase {
                 write!(f, "the trial was successful: {running} started and returned to the bootloader")
             }
             Self::Released => f.write_str("released for autostart (83h)"),
-            Self::NotReleased => f.write_str(
-                "not released for autostart: the device stays in the bootloader; coflash start tries the \
-                 program, coflash release releases it",
-            ),
+            Self::NotReleased => {
+                write!(
+                    f,
+                    "not released for autostart: the device stays in the bootloader; {}",
+                    Advice::ReleaseIt
+                )
+            }
             Self::Starting => f.write_str("starting the program"),
             Self::StartingAgain => {
                 f.write_str("nothing was changed: starting the program again that was called back")

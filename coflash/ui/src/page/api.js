@@ -8,9 +8,9 @@ export async function ask(what, value) {
   return send(what, { headers: { "content-type": "application/json" }, body: JSON.stringify(value ?? {}) });
 }
 
-/** Sends a file. */
-export async function sendFile(file) {
-  return send("firmware?name=" + encodeURIComponent(file.name), {
+/** Sends a file: a "firmware", or the memory map of a "board". */
+export async function sendFile(what, file) {
+  return send(`${what}?name=` + encodeURIComponent(file.name), {
     headers: { "content-type": "application/octet-stream" },
     body: file,
   });
@@ -21,7 +21,7 @@ async function send(what, options) {
   try {
     response = await fetch(what, { method: "POST", ...options });
   } catch {
-    notice(false, "the request did not get through", "check that coflash ui still runs, and try again");
+    notice(false, "the request did not get through", "check that coflash still runs, and try again");
     return false;
   }
   if (response.ok) return true;
@@ -37,7 +37,7 @@ async function send(what, options) {
 
 const LOST = {
   lost: "The connection to coflash is lost; the page tries again. An update that was running goes on without the page.",
-  ended: "coflash ui has ended or was restarted: open the URL that it prints. The page tries again.",
+  ended: "coflash has ended or was restarted: open the URL that it prints. The page tries again.",
 };
 
 /** Has `take` called with each event, and `renew` when they begin anew. */

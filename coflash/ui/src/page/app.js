@@ -105,7 +105,9 @@ async function take(files) {
     notice(false, "not now: something is being done", "wait until it has finished, or cancel it");
     return;
   }
-  if (await sendFile(given)) notice(true, `the file ${given.name} was read and checked`);
+  if (given.name.toLowerCase().endsWith(".toml")) {
+    if (await sendFile("board", given)) notice(true, `the memory map ${given.name} was read, and its board is chosen`);
+  } else if (await sendFile("firmware", given)) notice(true, `the file ${given.name} was read and checked`);
 }
 
 function dropping() {
@@ -125,12 +127,14 @@ function dropping() {
     }
     take([...(event.dataTransfer?.files ?? [])]);
   });
-  $("file").addEventListener("change", async (event) => {
-    const files = [...event.target.files];
-    // The user may choose the same file again after a new build.
-    event.target.value = "";
-    if (files.length > 0) await take(files);
-  });
+  for (const id of ["file", "map"]) {
+    $(id).addEventListener("change", async (event) => {
+      const files = [...event.target.files];
+      // The user may choose the same file again after a new build.
+      event.target.value = "";
+      if (files.length > 0) await take(files);
+    });
+  }
 }
 
 async function adapters() {

@@ -55,7 +55,8 @@ function row(device) {
     cell("Choose", check),
     cell("Node", el("strong", {}, String(device.node))),
     cell("Name", device.name ?? "unknown"),
-    cell("Runs", device.runs, device.heartbeat ? el("span", { class: "faint" }, ` · ${device.heartbeat}`) : null),
+    cell("Runs", device.runs, ...[device.heartbeat, device.security?.sealed ? "sealed" : null]
+      .filter((words) => words).map((words) => el("span", { class: "faint" }, ` · ${words}`))),
     cell("Version", device.software ?? "unknown"),
     cell("CRC", el("code", {}, one?.crc ? hex(one.crc) : "–")),
     cell("Program", one?.words ?? "unknown"),
@@ -75,16 +76,36 @@ function buttons() {
   const busy = state.task !== null;
   const ready = state.adapter.state === "open" && !busy;
   for (const id of ["scan", "fastscan", "assign"]) $(id).disabled = !ready;
-  for (const id of ["connect", "disconnect", "board", "program", "file"]) $(id).disabled = busy;
+  for (const id of ["connect", "disconnect", "board", "program", "file", "map"]) $(id).disabled = busy;
   $("drop").classList.toggle("off", busy);
   $("all").checked = list.length > 0 && chosen.size === list.length;
   $("all").indeterminate = chosen.size > 0 && chosen.size < list.length;
   const count = chosen.size;
-  text($("update"), count === 0 ? "Update" : count === 1 ? `Update node ${[...chosen][0]}` : `Update ${count} devices`);
+  text($("update"), label(count));
+  for (const id of ["trial", "start"]) $(id).disabled = busy || Boolean(state.firmware?.is_bootloader);
   const why = busy ? "" : state.adapter.state !== "open" ? "Connect to an adapter first."
     : !state.firmware ? "Choose a firmware file first." : count === 0 ? "Choose a device in the table." : "";
   $("update").disabled = busy || why !== "";
   text($("update-hint"), why);
+}
+
+/** What a device says about sealed images. */
+function sealed(security) {
+  if (!security) return [["Sealed", "not reported"]];
+  if (!security.sealed) return [["Sealed", "no, it has no keys"]];
+  return [
+    ["Sealed", "yes: it takes sealed images alone"],
+    ["Root keys", security.roots.join(", ") || "not reported"],
+    ["Lowest counters", security.counters.map((one, index) => `program ${index + 1}: ${one}`).join(", ") || "not reported"],
+    ["Lowest epoch", security.epoch ?? "not reported"],
+  ];
+}
+
+/** What the button Update says for so many devices. */
+function label(count) {
+  const what = state.firmware?.is_bootloader ? "Renew the bootloader of" : "Update";
+  if (count === 0) return "Update";
+  return count === 1 ? `${what} node ${[...chosen][0]}` : `${what} ${count} devices`;
 }
 
 let opened = null;
@@ -100,8 +121,10 @@ function open(node) {
     ["Name", device.name ?? "unknown"],
     ["Hardware", device.hardware ?? "unknown"],
     ["Software", device.software ?? "unknown"],
-    ["Sealed", device.sealed ?? "not reported"],
-    ...(device.state ? [["State", device.state]] : []),
+    ...sealed(device.security),
+    ...[["State", device.state], ["Supply", device.supply], ["Option bytes", device.option_bytes],
+      ["Bootloader", device.renewable]].filter(([, words]) => words),
+    ...device.warnings.map((words) => ["Warning", words]),
     ["Vendor-ID", vendor], ["Product code", product], ["Revision", revision], ["Serial number", serial],
     ["Dialect", device.dialect ?? "unknown"],
     ...device.programs.map((one) => [`Program ${one.number}`, `${one.words}${one.crc ? `, CRC ${hex(one.crc)}` : ""}`]),
@@ -123,7 +146,16 @@ export function start() {
   });
   $("update-form").addEventListener("submit", (event) => {
     event.preventDefault();
-    ask("update", { nodes: [...chosen].sort((a, b) => a - b), trial: $("trial").checked, start: $("start").checked });
+    if (!state.firmware?.is_bootloader) return update(false);
+    const { name, version } = state.firmware;
+    text($("renew-words"), `${chosen.size === 1 ? `Node ${[...chosen][0]} gets` : `${chosen.size} devices get`} the bootloader ` +
+      `${version} of ${name} in place of their own. The programs stay. A new bootloader runs on trial first; until it has answered ` +
+      "and is installed, a reset brings the old one back.");
+    $("renew").showModal();
+  });
+  $("renew").addEventListener("close", () => {
+    if ($("renew").returnValue === "yes") update(true);
+    $("renew").returnValue = "";
   });
   for (const button of $("device").querySelectorAll("[data-step]")) {
     button.addEventListener("click", () => step(button.dataset.step));
@@ -138,6 +170,12 @@ export function start() {
     tabs.open("lss");
     $("lss-node").focus();
   });
+}
+
+/** Updates the chosen devices. The password is sent, and kept nowhere. */
+async function update(renew) {
+  const [nodes, password] = [[...chosen].sort((a, b) => a - b), $("password").value];
+  if (await ask("update", { nodes, trial: $("trial").checked, start: $("start").checked, renew, password })) $("password").value = "";
 }
 
 function step(name) {

@@ -1,5 +1,5 @@
 //! The service station (`coflash ui --service`): a page for people who update machines and need to know
-//! nothing about CANopen. Package, options and folder of the reports are fixed; there is no LSS, no erase
+//! nothing about CANopen. Package or job, options and folder of the reports are fixed; there is no LSS, no erase
 //! and no choice of a file.
 //!
 //! `coflash_core::machine` scans, matches, plans and writes; [`work`] calls it, and the page shows what is
@@ -23,7 +23,7 @@ use std::sync::Arc;
 use self::station::Station;
 use super::http::Page;
 
-pub use self::setup::Service;
+pub use self::setup::{Origin, Service};
 
 mod folder;
 mod message;

@@ -15,18 +15,20 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::report::Entered;
+use super::setup::Origin;
 use super::station::{change, Stage, Station};
 use super::words::TABLE;
 use super::work::{is_due, Search, Update};
 use crate::adapters;
-use crate::http::{bad, body, done, download, idle, json_response, node_id};
+use crate::http::{bad, body, done, download, idle, json_response, node_id, password_of};
 use crate::http::{Answer, Open, Page, Refused, Site, CSS, HTML, SCRIPT};
 use crate::shared::Order;
 use crate::state::Notice;
 
 /// The keys of this module, for the test of the table.
 #[cfg(test)]
-pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
+pub(super) const KEYS: &[&str] =
+    &["signature-good", "signature-unknown", "signature-none", "job-file", "package"];
 
 const FILES: [(&str, &str, &str); 9] = [
     ("", HTML, include_str!("page/service.html")),
@@ -62,11 +64,12 @@ async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Statio
     let found = tokio::task::spawn_blocking(move || adapters::list(&site.kinds)).await.unwrap_or_default();
     let service = &station.service;
     let manifest = service.package.manifest();
-    let signature = match (service.is_trusted, service.package.signers()) {
-        (true, _) => "signature-good",
-        (false, []) => "signature-none",
-        (false, _) => "signature-unknown",
+    let signature = match (service.origin, service.package.signers()) {
+        (Origin::Trusted, _) => "signature-good",
+        (Origin::Package | Origin::Job, []) => "signature-none",
+        (Origin::Package | Origin::Job, _) => "signature-unknown",
     };
+    let kind = if service.origin == Origin::Job { "job-file" } else { "package" };
     let programs = service.package.programs().map(|(entry, program)| {
         json!({ "name": entry.name, "version": version(program), "nodes": entry.nodes, "count": entry.count })
     });
@@ -74,6 +77,7 @@ async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Statio
         "adapters": found,
         "last": service.last_bus(),
         "package": {
+            "kind": kind,
             "file": service.file,
             "name": manifest.name,
             "release": manifest.release,
@@ -115,6 +119,9 @@ struct Confirmed {
     plan: u64,
     /// The devices that get their programs.
     nodes: Vec<u8>,
+    /// The password of locked devices; empty for none. It is not a part of what is entered for the report.
+    #[serde(default)]
+    password: String,
     #[serde(flatten)]
     entered: Entered,
 }
@@ -125,7 +132,7 @@ async fn update(
     headers: HeaderMap,
     bytes: Bytes,
 ) -> Answer {
-    let Confirmed { plan: number, nodes, entered } = body(&headers, &bytes)?;
+    let Confirmed { plan: number, nodes, password, entered } = body(&headers, &bytes)?;
     idle(&site)?;
     if !entered.is_text() {
         return Err(bad(
@@ -133,6 +140,7 @@ async fn update(
             "enter it again",
         ));
     }
+    let unlock = password_of(&password)?;
     let Some(plan) = station.plan(number) else {
         let notice =
             Notice::failed("there is a newer plan, or none", "look at the devices, and confirm again");
@@ -147,7 +155,7 @@ async fn update(
     if plan.devices.is_empty() || (nodes.is_empty() && !due.is_empty()) {
         return Err(bad("no device is chosen", "choose one of the plan"));
     }
-    site.shared.begin(Update { station, number, plan, nodes, entered })?;
+    site.shared.begin(Update { station, number, plan, nodes, unlock, entered })?;
     done()
 }
 

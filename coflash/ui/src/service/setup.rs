@@ -11,14 +11,24 @@ use super::folder::Folder;
 /// The most bytes of the file with the adapter.
 const URL_MAX: usize = 1000;
 
+/// Where the programs of a station come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// A package that a root which the user trusts has signed.
+    Trusted,
+    /// Any other package.
+    Package,
+    /// A job file.
+    Job,
+}
+
 /// What a service station works with.
 #[derive(Clone)]
 pub struct Service {
     pub(super) package: Arc<Package>,
-    /// The name of the package's file.
+    /// The name of the file.
     pub(super) file: String,
-    /// Whether a root that the user trusts has signed it.
-    pub(super) is_trusted: bool,
+    pub(super) origin: Origin,
     pub(super) folder: Folder,
     /// The file with the adapter that was used last.
     memory: Option<PathBuf>,
@@ -32,15 +42,14 @@ impl std::fmt::Debug for Service {
 }
 
 impl Service {
-    /// A station for this package, which was read from `file`. `is_trusted` says whether a root that the user has
-    /// named has signed it. The reports go into a folder, which is made if it is not there.
+    /// A station for this package, which was read from `file`, or made of the job in it. The reports go into a folder, which is made if it is not there.
     ///
     /// # Errors
     /// The folder cannot be made, or no file can be written into it.
-    pub fn new(package: Package, file: &Path, is_trusted: bool, report_dir: &Path) -> io::Result<Self> {
+    pub fn new(package: Package, file: &Path, origin: Origin, report_dir: &Path) -> io::Result<Self> {
         let file = file.file_name().unwrap_or(file.as_os_str()).to_string_lossy().into_owned();
         let folder = Folder::new(report_dir)?;
-        Ok(Self { package: Arc::new(package), file, is_trusted, folder, memory: None })
+        Ok(Self { package: Arc::new(package), file, origin, folder, memory: None })
     }
 
     /// Remembers the adapter that was used last, with its bit rate, in this file.

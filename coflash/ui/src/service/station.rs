@@ -2,7 +2,8 @@
 
 use std::sync::{Arc, Mutex};
 
-use coflash_core::machine::{Foreign, Plan};
+use coflash_core::device::Dialect;
+use coflash_core::machine::{Entry, Foreign, Plan};
 use serde_json::{json, Value};
 
 use super::message::Message;
@@ -68,6 +69,8 @@ pub(super) struct State {
     pub(super) message: Option<Message>,
     /// That of the machine that is being updated or was updated last.
     pub(super) device_number: String,
+    /// Whether a device of this machine needs a password: the page has a field for it, and nothing keeps it.
+    pub(super) asks_password: bool,
     /// The names of the saved reports of the last update.
     saved: Vec<String>,
     /// The number of reports that could not be saved.
@@ -85,7 +88,11 @@ pub(super) struct Station {
 
 impl Station {
     pub(super) fn new(service: Service) -> Self {
-        Self { service, state: Mutex::default(), unsaved: Mutex::default() }
+        // A lift is always locked. Others say so in an update.
+        let is_locked = |(entry, _): (&Entry, _)| entry.dialect() == Some(Dialect::Lift);
+        let asks_password = service.package.programs().any(is_locked);
+        let state = State { asks_password, ..State::default() };
+        Self { service, state: Mutex::new(state), unsaved: Mutex::default() }
     }
 
     /// Changes the state. The caller has all pages notified.
@@ -210,6 +217,7 @@ impl Station {
             "plan": number,
             "plans": own.plans,
             "device_number": own.device_number,
+            "asks_password": own.asks_password,
             "rows": rows,
             "foreign": foreign,
             "saved": own.saved,

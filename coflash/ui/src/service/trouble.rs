@@ -1,7 +1,7 @@
 //! Which message an error has: what a person at the machine can do about it.
 
-use coflash_core::device::Error;
-use coflash_core::machine::{Bad, DeviceFault};
+use coflash_core::device::{Doing, Error};
+use coflash_core::machine::{Bad, DeviceFault, Outcome};
 use coflash_core::update::DeviceState;
 
 use super::message::Message;
@@ -16,6 +16,7 @@ pub(super) const KEYS: &[&str] = &[
     "trouble-busy",
     "trouble-other-device",
     "trouble-password",
+    "trouble-wrong-password",
     "trouble-not-alone",
     "trouble-no-start",
     "trouble-renewal",
@@ -39,6 +40,8 @@ pub(super) fn of_error(error: &Error) -> Message {
         Error::Adapter(_) => "trouble-adapter",
         Error::Cancelled => "trouble-cancelled",
         Error::NoAnswer { .. } | Error::ShortAnswer { .. } => "trouble-no-answer",
+        Error::NoPassword { .. } => "trouble-password",
+        Error::Refused { doing: Doing::Unlock, .. } => "trouble-wrong-password",
         Error::Refused { .. } | Error::Failed { .. } | Error::Protocol { .. } => "trouble-refused",
         Error::Busy { .. } => "trouble-busy",
         Error::WrongTarget { .. }
@@ -47,7 +50,6 @@ pub(super) fn of_error(error: &Error) -> Message {
         | Error::OtherRegion { .. }
         | Error::OtherIdentity { .. }
         | Error::NotInDialect { .. } => "trouble-other-device",
-        Error::NoPassword { .. } => "trouble-password",
         Error::NotAlone { .. } | Error::Occupied { .. } => "trouble-not-alone",
         Error::NoBootloader { .. }
         | Error::TrialFailed { .. }
@@ -81,6 +83,12 @@ pub(super) fn of_device(fault: &DeviceFault) -> Message {
         _ => Message::new("trouble-other"),
     };
     message.detail(fault).number(fault.number())
+}
+
+/// Whether a device was not updated because its password is missing or wrong.
+pub(super) fn is_locked(outcome: &Outcome) -> bool {
+    let Err(Bad::Failed(failed)) = &outcome.result else { return false };
+    matches!(failed.error, Error::NoPassword { .. } | Error::Refused { doing: Doing::Unlock, .. })
 }
 
 /// The message of a bad outcome, and the key of what is in the device now, if it was begun.

@@ -8,7 +8,7 @@ use coboot_can::Link;
 use coflash_core::device::lock::Lock;
 use coflash_core::device::scan::ScanOptions;
 use coflash_core::machine::{self, Plan, PlanError, RunOptions, Todo};
-use coflash_core::update::{Event, FlashOptions, ManyOptions};
+use coflash_core::update::{Event, FlashOptions, ManyOptions, Password};
 use coflash_core::Error;
 
 use super::message::Message;
@@ -95,6 +95,8 @@ pub(super) struct Update {
     pub(super) plan: Arc<Plan>,
     /// The devices that the user has chosen.
     pub(super) nodes: BTreeSet<NodeId>,
+    /// The password of locked devices.
+    pub(super) unlock: Option<Password>,
     pub(super) entered: Entered,
 }
 
@@ -159,9 +161,12 @@ impl Work for Update {
             });
         };
         let many = ManyOptions::default().cancelled(shared.cancelled.clone());
-        let options = RunOptions::default().flash(FlashOptions::default()).many(many);
+        let options = RunOptions::default().flash(FlashOptions::default().unlock(self.unlock)).many(many);
         let outcomes = machine::run(&mut **adapter, &service.package, &self.chosen(), &options, &tell);
         note(&mut rows, &outcomes);
+        if outcomes.iter().any(trouble::is_locked) {
+            station.change(|own| own.asks_password = true);
+        }
         let manifest = service.package.manifest();
         let of = Of {
             date,

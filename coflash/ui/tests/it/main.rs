@@ -121,7 +121,8 @@ impl Ui {
     }
 
     fn file(&self, name: &str, bytes: &[u8]) -> Answer {
-        self.request("POST", &format!("{}firmware?name={name}", self.path), &[&self.host_line()], bytes)
+        let what = if name.to_ascii_lowercase().ends_with(".toml") { "board" } else { "firmware" };
+        self.request("POST", &format!("{}{what}?name={name}", self.path), &[&self.host_line()], bytes)
     }
 
     /// Follows the events until `wanted` accepts the state; returns the state.
@@ -288,7 +289,7 @@ fn the_page_keeps_to_itself() {
     }
 }
 
-/// A board that is not built in: its memory map is taken like a firmware file, and chosen.
+/// A board that is not built in: its memory map is taken, and chosen.
 #[test]
 fn a_memory_map_is_taken_and_chosen_and_a_bad_one_is_refused_with_its_line() {
     use shared_abi::layout::nucleo_f446re::LAYOUT;
@@ -316,7 +317,7 @@ fn a_memory_map_is_taken_and_chosen_and_a_bad_one_is_refused_with_its_line() {
     ] {
         let refused = ui.file("a.TOML", bytes);
         assert!(refused.status == 400 && refused.body.contains(says), "{}: {}", refused.status, refused.body);
-        assert!(refused.json()["advice"].as_str().unwrap().contains("cargo xtask layout --toml"));
+        assert!(refused.json()["advice"].as_str().unwrap().contains("my-board.toml"));
     }
     ui.until("the board stays", |state| state["settings"]["board"] == "my-board");
     // Each map stays in memory.
@@ -561,9 +562,14 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
     let file = sealed(Sealer::default());
     for (status, phase, words, advice) in [
         (0, "done", "done in", None),
-        (0x8A, "failed", "the program's signature is wrong", Some("coflash verify")),
-        (0x8C, "failed", "its counter or the epoch of its key is too low", Some("coflash info")),
-        (0x8E, "failed", "the device has no key for this program", Some("coflash show")),
+        (0x8A, "failed", "the program's signature is wrong", Some("root's public key")),
+        (
+            0x8C,
+            "failed",
+            "its counter or the epoch of its key is too low",
+            Some("counter and epoch in Contents of the file"),
+        ),
+        (0x8E, "failed", "the device has no key for this program", Some("key ids in Contents of the file")),
     ] {
         let kept: Arc<Mutex<Vec<u8>>> = Arc::default();
         let mut fake = Fake::new(kit::fake::BOOTLOADER);
@@ -601,6 +607,40 @@ fn a_sealed_image_is_sent_as_it_is_and_the_device_judges_it() {
             assert!(failed.answers.iter().any(|line| line.starts_with(&reads)), "{failed:?}");
         }
     }
+}
+
+/// A new bootloader is written only after a confirmation; the page shows its steps and its outcome.
+#[test]
+fn a_bootloader_is_renewed_when_that_is_confirmed() {
+    use kit::fake::renewal::{device, image, NEW};
+    let (fake, log) = device(kit::fake::BOOTLOADER, |_| {});
+    let (bus, _server) = kit::fake::serve(fake);
+    let ui = Ui::new(Some(bus));
+    ui.until("the adapter", |state| state["adapter"]["state"] == "open");
+    assert_eq!(ui.file("new.bin", &image(NEW)).status, 200);
+    let order = |renew| json!({ "nodes": [kit::fake::NODE], "trial": true, "start": true, "renew": renew });
+    let refused = ui.post("update", &order(false));
+    assert!(refused.status == 409 && refused.body.contains("nobody has confirmed"), "{}", refused.body);
+    assert!(log.lock().unwrap().is_empty());
+    let answer = ui.post("update", &order(true));
+    assert_eq!(answer.status, 200, "{}", answer.body);
+    let state = ui.until("the end", |state| !state["notice"].is_null() && state["task"].is_null());
+    let (update, report) = (&state["updates"][0], &state["reports"][0]);
+    assert_eq!(update["phase"], "done", "{update}");
+    assert!(update["words"].as_str().unwrap().ends_with("bootloader 1.2 -> 1.3, installed"), "{update}");
+    let steps = update["lines"].as_array().unwrap();
+    assert!(
+        steps.iter().any(|step| step.as_str().unwrap().contains("starting it for its trial")),
+        "{update}"
+    );
+    assert!(report["words"].as_str().unwrap().ends_with("bootloader 1.2 -> 1.3, installed"), "{report}");
+    assert_eq!(state["notice"]["words"], "1 of 1 devices have the bootloader of new.bin");
+    let device = &state["devices"][kit::fake::NODE.to_string()];
+    assert!(device["renewable"].as_str().unwrap().starts_with("version 1.3"), "{device}");
+    let wrong =
+        json!({ "nodes": [5], "trial": true, "start": true, "renew": true, "password": "x".repeat(65) });
+    let refused = ui.post("update", &wrong);
+    assert!(refused.status == 400 && !refused.body.contains("xxx"), "{}", refused.body);
 }
 
 /// A device whose erase takes longer than the test.

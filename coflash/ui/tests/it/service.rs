@@ -9,7 +9,7 @@ use canopen::{Frame, NodeId};
 use coflash_core::device::lock::Lock;
 use coflash_core::machine::{make, Package, Recipe};
 use coflash_core::update::FailedUpdate;
-use coflash_ui::{Failed, Service};
+use coflash_ui::{Failed, Origin, Service};
 use embedded_can::{Frame as _, StandardId};
 use kit::fake::{Bus, Deed, Fake, Maker, Outcome, APPLICATION};
 use kit::folder::Folder;
@@ -67,7 +67,8 @@ const DRIVES: &str =
 
 /// A station with the reports, and what it remembers, in this folder.
 fn station(folder: &Folder, package: Package, bus: Option<String>) -> Ui {
-    let service = Service::new(package, "press.cpk".as_ref(), false, &folder.join("reports")).unwrap();
+    let service =
+        Service::new(package, "press.cpk".as_ref(), Origin::Package, &folder.join("reports")).unwrap();
     let service = service.memory(Some(folder.join("bus")));
     Ui::with(|options| (options.bus, options.service) = (bus, Some(service)))
 }
@@ -362,8 +363,13 @@ fn what_a_failed_device_has_shown_is_reported() {
     let mut five = device(5, 1234).0;
     five.on_block = Box::new(|_| Outcome::Status(0x06));
     let (bus, _server) = kit::fake::serve(Bus(vec![five, device(6, 1234).0]));
-    let service =
-        Service::new(package(&folder, DRIVES), "press.cpk".as_ref(), false, &folder.join("reports")).unwrap();
+    let service = Service::new(
+        package(&folder, DRIVES),
+        "press.cpk".as_ref(),
+        Origin::Package,
+        &folder.join("reports"),
+    )
+    .unwrap();
     let reported: Arc<Mutex<Vec<FailedUpdate>>> = Arc::default();
     let report = reported.clone();
     let ui = Ui::with(|options| {
@@ -379,4 +385,140 @@ fn what_a_failed_device_has_shown_is_reported() {
     let failed = &reported[0];
     assert!(failed.answers.iter().any(|line| line.starts_with("1F57h reads 06h")), "{failed:?}");
     assert!(!failed.tried.is_empty() && !failed.frames.is_empty(), "{failed:?}");
+}
+
+/// A lift device (CiA 814-1 clause 6.3): its application and its bootloader, which is node 126, want the password.
+struct Lift {
+    kept: Arc<Mutex<Vec<u8>>>,
+    is_armed: bool,
+    is_unlocked: bool,
+}
+
+const LIFT: u32 = 0xFE00_01A1;
+const PASSWORD: &str = "Si8Kopen sesame";
+
+impl Lift {
+    fn restart(&mut self) -> (u8, u32) {
+        self.is_unlocked = false;
+        if std::mem::take(&mut self.is_armed) {
+            (126, LIFT)
+        } else {
+            (5, APPLICATION)
+        }
+    }
+}
+
+impl Maker for Lift {
+    fn value(&mut self, at: (u16, u8), running: u32) -> Option<Result<Vec<u8>, u32>> {
+        match at {
+            (0x6005, 1) => Some(Err(0x0601_0001)),
+            (0x6005, _) => Some(Err(0x0609_0011)),
+            (0x1F50, 1) if running != APPLICATION && !self.is_unlocked => Some(Err(0x0800_0022)),
+            (0x1F50 | 0x1F56 | 0x1F57, _) => Some(Err(0x0602_0000)),
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, at: (u16, u8), data: &[u8], running: u32) -> Option<Result<Deed, u32>> {
+        let in_bootloader = running != APPLICATION;
+        Some(match at {
+            (0x6005, 1) if data != PASSWORD.as_bytes() => Err(0x0609_0030),
+            (0x6005, 1) => {
+                *(if in_bootloader { &mut self.is_unlocked } else { &mut self.is_armed }) = true;
+                Ok(Deed::Nothing)
+            }
+            (0x1F51, 1) if data == [2] => {
+                let (node, next) = self.restart();
+                Ok(Deed::Restart(node, next))
+            }
+            (0x1F50, 1) if in_bootloader && self.is_unlocked => {
+                *self.kept.lock().unwrap() = data.to_vec();
+                Ok(Deed::Nothing)
+            }
+            _ => Err(0x0800_0022),
+        })
+    }
+
+    fn reset(&mut self, _: u32) -> Option<(u8, u32)> {
+        Some(self.restart())
+    }
+}
+
+/// The page asks for the password of a locked device; it is in no state, no report and no message.
+#[test]
+fn a_locked_device_gets_its_password_from_the_page_and_nothing_keeps_it() {
+    let folder = kit::folder!("service-password");
+    let kept = Arc::new(Mutex::new(Vec::new()));
+    let mut fake = Fake::new(APPLICATION);
+    fake.maker = Some(Box::new(Lift { kept: kept.clone(), is_armed: false, is_unlocked: false }));
+    let (bus, _server) = kit::fake::serve(fake);
+    let programs = "[[program]]\nname = 'door'\nimage = 'app.hex'\nnodes = [5]\ndialect = 'lift'\n";
+    let ui = station(&folder, package(&folder, programs), Some(bus));
+    let mut seen = String::new();
+    for (password, state, trouble) in [
+        ("", "state-failed", Some("trouble-password")),
+        ("PLANTED-wrong", "state-failed", Some("trouble-wrong-password")),
+        (PASSWORD, "state-updated", None),
+    ] {
+        let plan = planned(&ui);
+        assert_eq!(plan["asks_password"], true, "{plan}");
+        let mut order = confirmed(&plan, &[5]);
+        order["password"] = password.into();
+        let answer = ui.post("update", &order);
+        assert_eq!(answer.status, 200, "{}", answer.body);
+        let end = ended(&ui);
+        assert_eq!(rows(&end), [(5, state)], "{end}");
+        assert_eq!(end["rows"][0]["trouble"]["key"].as_str(), trouble, "{end}");
+        seen += &end.to_string();
+    }
+    assert!(!kept.lock().unwrap().is_empty());
+    let texts = saved(&folder, "html").into_iter().chain(saved(&folder, "csv"));
+    seen.extend(texts.map(|(name, text)| name + &text));
+    seen += &ui.get("station").body;
+    for secret in [PASSWORD, "PLANTED"] {
+        assert!(!seen.contains(secret), "{seen}");
+    }
+    let mut order = confirmed(&planned(&ui), &[5]);
+    order["password"] = "PLANTED".repeat(10).into();
+    let refused = ui.post("update", &order);
+    assert!(refused.status == 400 && !refused.body.contains("PLANTED"), "{}", refused.body);
+}
+
+/// A job file does what a package does: its devices with the same settings get one program together.
+#[test]
+fn a_job_file_is_a_machine() {
+    let folder = kit::folder!("service-job");
+    folder.write("app.hex", HEX);
+    let job = "image = 'app.hex'\n[[device]]\nnode = 5\n[[device]]\nnode = 6\n[[device]]\nnode = 7\ntrial-run = false\n";
+    let Recipe { parts, images, .. } = Recipe::of_job(job, &folder).unwrap();
+    assert_eq!(images, [folder.join("app.hex"), folder.join("app.hex")]);
+    let entries: Vec<_> = parts.iter().map(|part| &part.entry).collect();
+    assert_eq!((&entries[0].nodes[..], entries[0].trial_run), (&[5, 6][..], true));
+    assert_eq!((&entries[1].nodes[..], entries[1].trial_run), (&[7][..], false));
+    let names: Vec<_> = entries.iter().map(|entry| entry.name.as_str()).collect();
+    assert_eq!(names, ["app", "app (2)"]);
+    let package = Package::parse(&make(None, None, &parts, &[]).unwrap()).unwrap();
+    let (bus, _server) = kit::fake::serve(Bus([5, 6, 7].map(|node| device(node, 1234).0).into()));
+    let service = Service::new(package, "press.toml".as_ref(), Origin::Job, &folder.join("reports")).unwrap();
+    let ui = Ui::with(|options| (options.bus, options.service) = (Some(bus), Some(service)));
+    assert_eq!(ui.get("station").json()["package"]["kind"], "job-file");
+    let plan = planned(&ui);
+    assert_eq!(plan["asks_password"], false);
+    assert_eq!(confirm(&ui, &plan, &[5, 6, 7]).status, 200);
+    let end = ended(&ui);
+    assert_eq!(rows(&end), [(5, "state-updated"), (6, "state-updated"), (7, "state-updated")], "{end}");
+    for (more, words) in [
+        ("start = false\n", "device 1: each program of a machine is started"),
+        ("lss = { vendor = 1, product = 2, revision = 3, serial = 4 }\n", "device 1: a machine has node-IDs"),
+        ("check-target = true\n", "device 1: the file does not say for which device it is"),
+        ("image = 'none.hex'\n", "none.hex"),
+    ] {
+        let fault = Recipe::of_job(
+            &format!("[[device]]\nnode = 5\nimage = 'app.hex'\n{more}")
+                .replace("image = 'app.hex'\nimage", "image"),
+            &folder,
+        );
+        let words_of = fault.unwrap_err().to_string();
+        assert!(words_of.contains(words), "{words_of}");
+    }
 }

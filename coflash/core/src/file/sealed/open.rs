@@ -12,6 +12,7 @@ use seal::wire::{
 use super::cipher::{chacha20, hash, wrap};
 use super::key::{Kek, PublicKey};
 use super::{key_block, lzma};
+use crate::advice::Advice;
 use crate::file::checksum::CRC;
 use crate::file::program::{Target, MAX_PROGRAM_SIZE};
 
@@ -305,45 +306,25 @@ impl Refusal {
 
     /// What to do next.
     #[must_use]
-    pub fn advice(&self) -> &'static str {
+    pub const fn advice(&self) -> Advice {
         match self {
-            Self::NotSealed => "give a file that `coflash seal` made",
-            Self::Head | Self::CutOff { .. } | Self::TooLong { .. } | Self::Chain { .. } => {
-                "copy the file again from where it was sealed, or seal the program again"
-            }
-            Self::Field(_) => "seal the program again, with the coflash that belongs to the bootloader",
-            Self::Vendor { .. } | Self::Product { .. } | Self::Program { .. } => {
-                "give the file of this device and program, or seal the program for it"
-            }
-            Self::UniqueId => "seal the program for this device (--device), or for all of the product",
-            Self::Hardware { .. } => {
-                "seal the program for this revision (--hardware), if it supports that revision"
-            }
-            Self::TooLarge { .. } => {
-                "make the program smaller: --compress makes the file smaller, not the program"
-            }
-            Self::Counter { .. } => {
-                "seal the program with a higher --counter, if it is to replace the newer one"
-            }
-            Self::Epoch { .. } => {
-                "the key was revoked by a higher epoch: sign with the key that is valid now"
-            }
-            Self::Certificate(_) => "have the key certified for this program: `coflash key certify`",
-            Self::Root(_) | Self::NoCertificate => {
-                "give the public key of the root that certified it (--root); `coflash show` shows its id"
-            }
-            Self::Test => "sign it with a release key, or check it for a device for tests (--for-tests)",
-            Self::Kek | Self::WrongKek(_) => {
-                "give one of the keys that it is encrypted for (--kek); `coflash show` shows their ids"
-            }
-            Self::CertificateSignature(_) => "do not use this file: the origin of its certificate is unknown",
-            Self::NoSignature(_) | Self::Signature(_) => {
-                "do not use this file: its origin is unknown; seal the program again"
-            }
-            Self::Dictionary => "give the program that it was sealed with as --base",
-            Self::Compression | Self::Hash | Self::Crc { .. } => {
-                "seal the program again: the tool that made this file has a fault"
-            }
+            Self::NotSealed => Advice::GiveSealed,
+            Self::Head | Self::CutOff { .. } | Self::TooLong { .. } | Self::Chain { .. } => Advice::CopyAgain,
+            Self::Field(_) => Advice::SealedByOther,
+            Self::Vendor { .. } | Self::Product { .. } | Self::Program { .. } => Advice::SealedForOther,
+            Self::UniqueId => Advice::SealedForChip,
+            Self::Hardware { .. } => Advice::SealedForRevision,
+            Self::TooLarge { .. } => Advice::Smaller,
+            Self::Counter { .. } => Advice::HigherCounter,
+            Self::Epoch { .. } => Advice::RevokedKey,
+            Self::Certificate(_) => Advice::Certify,
+            Self::Root(_) | Self::NoCertificate => Advice::GiveRoot,
+            Self::Test => Advice::ReleaseKey,
+            Self::Kek | Self::WrongKek(_) => Advice::GiveKek,
+            Self::CertificateSignature(_) => Advice::UnknownCertificate,
+            Self::NoSignature(_) | Self::Signature(_) => Advice::UnknownOrigin,
+            Self::Dictionary => Advice::GiveBase,
+            Self::Compression | Self::Hash | Self::Crc { .. } => Advice::SealAgain,
         }
     }
 }

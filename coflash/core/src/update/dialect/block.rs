@@ -9,6 +9,7 @@ use shared_abi::block_file::{NUMBER_CONTROL, NUMBER_LAST};
 
 use super::cia302;
 use super::procedure::{enter_by_call, Downloaded, Procedure};
+use crate::advice::Advice;
 use crate::device::partial_download::{partial_download, PartialDownload};
 use crate::device::region::program_region;
 use crate::device::{DeviceType, Dialect, Doing, Error, Session, Timing, Transfers};
@@ -157,7 +158,7 @@ fn cut_up<'f>(
     let not_cut = |why: &str| Error::NoProgram {
         number: Fault::NUMBER,
         why: format!("cannot be sent in blocks: {why}"),
-        advice: "send it in one download: leave out --blocks",
+        advice: Advice::OneDownload,
     };
     let region = program_region(session, program)?;
     let region =

@@ -256,7 +256,7 @@ fn nobody_there_and_refusals_have_words() {
         master.store().unwrap_err(),
     ] {
         assert_eq!(error.number(), 0x6000_0013, "{error}");
-        assert!(!error.advice().is_empty());
+        assert!(!error.advice().to_string().is_empty());
     }
     let mut refusing = bus([Slave::new(ADDRESS, 5)]);
     refusing.slaves[0].refusal = (1, 0);
@@ -267,7 +267,7 @@ fn nobody_there_and_refusals_have_words() {
         (error.number(), error.to_string().as_str()),
         (0x6000_0201, "the device refuses storing node-ID and bit rate: error 1")
     );
-    assert!(error.advice().contains("cannot store"));
+    assert!(error.advice().to_string().contains("cannot store"));
     refusing.slaves[0].refusal = (0xFF, 7);
     let mut master = Master::new(&mut refusing, ANSWER);
     let error = master.set_bit_rate(BitRate::K800).unwrap_err();

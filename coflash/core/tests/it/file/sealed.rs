@@ -262,7 +262,7 @@ fn the_device_tells_which_rule_is_broken() {
     for (device, expected, fault) in cases {
         let found = refusal(&file, &device);
         assert_eq!((found.fault(), &found), (fault, &expected));
-        assert!(!found.advice().is_empty());
+        assert!(!found.advice().to_string().is_empty());
     }
     for (device, fits) in [(Some(32), true), (Some(0), true), (Some(1), false)] {
         assert_eq!(verify(&file, &Device { revision: device, ..good }).is_ok(), fits);

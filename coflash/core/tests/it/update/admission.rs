@@ -184,7 +184,7 @@ fn a_stack_over_the_handoff_is_refused_before_anything_is_erased() {
     let error = refused(&mut other(F446, None), &file, FlashOptions::default());
     let words = "its stack begins at 20020000h, over the handoff (2001FFC0h)";
     assert!(error.to_string().contains(words), "{error}");
-    assert!(error.advice().contains("LENGTH = 128K - 64"), "{}", error.advice());
+    assert!(error.advice().to_string().contains("LENGTH = 128K - 64"), "{}", error.advice());
     // Only the bootloader tells its name: the program was stopped, and is started again.
     let mut fake = other(F446, Some(BOOTLOADER));
     let error = run(&mut fake, &file, FlashOptions::default()).0.unwrap_err();
@@ -368,7 +368,7 @@ fn a_sealed_device_gets_sealed_images_only() {
             fake.maker = Some(Box::new(Sealed(vec![APPLICATION, BOOTLOADER])));
             let error = refused(&mut fake, &file, speaks(dialect));
             assert_eq!((error.to_string().as_str(), error.number()), (words, 0x6000_0184));
-            assert!(error.advice().contains("coflash seal"), "{}", error.advice());
+            assert!(error.advice().to_string().contains("coflash seal"), "{}", error.advice());
         }
     }
     let mut fake = Fake::new(APPLICATION);

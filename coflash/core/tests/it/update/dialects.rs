@@ -208,7 +208,7 @@ fn a_lift_that_refuses_is_left_as_it_was_found() {
     let (result, events, _) = run_at(&mut fake, NODE, &locked("wrong"));
     let error = result.unwrap_err();
     assert!(matches!(error, Error::Refused { doing: Doing::Unlock, .. }), "{error}");
-    assert!(error.advice().contains("password"), "{}", error.advice());
+    assert!(error.advice().to_string().contains("password"), "{}", error.advice());
     assert_eq!(left(&events), DeviceState::Untouched);
 
     let (mut fake, _) = Lift::fake(APPLICATION, |_| {});

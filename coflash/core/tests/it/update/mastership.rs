@@ -255,7 +255,7 @@ fn a_node_126_that_only_sends_heartbeats_is_noticed() {
     let (result, _) = run(&mut bus, &options());
     assert!(matches!(result, Err(Error::Occupied { node }) if node.get() == 126), "{result:?}");
     assert!(bus.0.writes().is_empty(), "{:?}", bus.0.writes());
-    let advice = result.unwrap_err().advice();
+    let advice = result.unwrap_err().advice().to_string();
     assert!(advice.contains("node 126"), "{advice}");
 }
 

@@ -51,7 +51,7 @@ function translate() {
   for (const button of $("languages").children) button.ariaPressed = String(button.dataset.language === language);
   const { name, release, file, signature } = station.package;
   const named = [name, release].filter((part) => part !== null).join(" ");
-  text($("package"), `${t("package")}: ${named ? `${named} (${file})` : file} · ${t(signature)}`);
+  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file} · ${t(signature)}`);
   document.title = `${named || file} – coflash`;
   shown = "";
   if (state) show(state);
@@ -98,6 +98,7 @@ function adapter() {
   const isOpen = state.open && !changes;
   $("adapter-open").hidden = !isOpen;
   $("adapter-form").hidden = isOpen;
+  $("password-field").hidden = !state.asks_password;
   $("report").hidden = $("devices").hidden = !state.open && state.rows.length === 0;
   text($("adapter-name"), state.adapter);
   for (const id of ["change", "connect"]) $(id).disabled = state.busy;
@@ -240,7 +241,7 @@ function barcodes() {
   }
   document.addEventListener("keydown", (event) => {
     const isCharacter = event.key.length === 1 && event.key !== " " && !event.ctrlKey && !event.altKey && !event.metaKey;
-    if (!isCharacter || $("report").hidden || $("confirm").open || event.target.matches("input[type=text], select")) return;
+    if (!isCharacter || $("report").hidden || $("confirm").open || event.target.matches("input[type=text], input[type=password], select")) return;
     event.preventDefault();
     // Of a station at work, the number is what changes from machine to machine.
     const field = next() ?? $("device-number");
@@ -288,7 +289,9 @@ function start() {
     const nodes = [...chosen].sort((a, b) => a - b);
     sent = number;
     // The number belongs to this machine; what is read from now on is for the next one.
-    if (await ask("update", { plan: state.plan, nodes, operator, order, device_number: number, language })) enter($("device-number"), "");
+    const password = $("password").value;
+    $("password").value = "";
+    if (await ask("update", { plan: state.plan, nodes, password, operator, order, device_number: number, language })) enter($("device-number"), "");
   });
   $("stop").addEventListener("click", () => (state.station === "working" ? $("confirm").showModal() : ask("cancel")));
   $("confirm").addEventListener("close", () => {
