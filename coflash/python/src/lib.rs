@@ -14,10 +14,8 @@ use canopen::NodeId;
 use coboot_can::decode::state_words;
 use coboot_can::Link;
 use coflash_core::device::{self, Dialect, ScanOptions, Session, Timing};
-use coflash_core::file::convert::{program_of, ConvertError, Options, Region};
-use coflash_core::file::sealed::SealedFile;
 use coflash_core::file::{self, limit, Format};
-use coflash_core::update::{self, FlashOptions, NewBootloader, Password, Payload};
+use coflash_core::update::{self, ContentFault, FlashOptions, Judging, Password, Payload, Reading};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -210,34 +208,22 @@ fn payload_of(
     address: Option<u32>,
     program: u8,
 ) -> Result<Payload, Fault> {
-    let region = match board {
-        None => Region::Unknown,
-        Some(name) => {
-            let layout = file::board::named(name).map_err(|error| Fault::Value(error.to_string()))?;
-            let region = layout.programs.get(usize::from(program) - 1);
-            let region = region.ok_or_else(|| Fault::Value(format!("{name} has no program {program}")))?;
-            Region::Strict((*region).into())
-        }
-    };
-    let fault = |error: file::ReadError| Fault::File(error.of(path.display()));
-    let bytes = limit::read(path).map_err(|cause| fault(file::Place::File.fault(cause)))?;
-    let format = address.map(|_| Format::Raw).or_else(|| Format::detect(&bytes));
-    let bootloader = NewBootloader::in_file(&bytes, format);
-    if let Some(new) = bootloader.map_err(|fault| Fault::Bootloader(path.display().to_string(), fault))? {
-        return Ok(new.into());
-    }
-    if Format::detect(&bytes) == Some(Format::Sealed) {
-        let sealed = SealedFile::for_program(bytes, program);
-        let sealed = sealed.map_err(|refusal| Fault::Sealed(path.display().to_string(), refusal))?;
-        return Ok(Arc::new(sealed).into());
-    }
-    let format = address.map(|_| Format::Raw);
-    let firmware = file::read(&bytes, format, address).map_err(fault)?;
-    match program_of(firmware, &Options::default().region(region)) {
-        Ok(converted) => Ok(Arc::new(converted.program).into()),
-        Err(ConvertError::File(error)) => Err(fault(error)),
-        Err(error) => Err(Fault::Value(error.to_string())),
-    }
+    let board = board.map(file::board::named).transpose().map_err(|error| Fault::Value(error.to_string()))?;
+    let name = || path.display().to_string();
+    let bytes = limit::read(path).map_err(|cause| Fault::File(file::Place::File.fault(cause).of(name())))?;
+    let reading = Reading::new(program)
+        .format(address.map(|_| Format::Raw))
+        .address(address)
+        .board(board)
+        // The update judges it.
+        .judging(Judging::Nothing);
+    let loaded = reading.read(path, &bytes).map_err(|fault| match fault {
+        ContentFault::Bootloader(fault) => Fault::Bootloader(name(), fault),
+        ContentFault::Sealed(refusal) => Fault::Sealed(name(), refusal),
+        ContentFault::File(error) => Fault::File(error.of(name())),
+        fault => Fault::Value(fault.to_string()),
+    })?;
+    Ok(loaded.payload)
 }
 
 fn node_id(number: u8) -> PyResult<NodeId> {

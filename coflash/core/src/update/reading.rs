@@ -34,6 +34,8 @@ pub struct Reading {
     pub program: u8,
     /// The format, in place of that of the first bytes and the name. A sealed image is one in any format.
     pub format: Option<Format>,
+    /// The address of a raw binary, in place of the start of the board's region.
+    pub address: Option<u32>,
     /// The memory map of the device: the program must lie in its region there.
     pub board: Option<&'static Layout>,
     /// The dialect of the device. `None` if it is found later: then a program above 1 may be data.
@@ -97,6 +99,7 @@ impl Reading {
         Self {
             program,
             format: None,
+            address: None,
             board: None,
             dialect: None,
             convert: Options::default(),
@@ -107,6 +110,7 @@ impl Reading {
 
     setters! {
         format: Option<Format>,
+        address: Option<u32>,
         board: Option<&'static Layout>,
         dialect: Option<Dialect>,
         convert: Options,
@@ -128,7 +132,7 @@ impl Reading {
             return Ok(only(new.into()));
         }
         let convert = self.convert.region(self.region()?);
-        let raw_address = convert.raw_address().or_else(|| {
+        let raw_address = self.address.or_else(|| convert.raw_address()).or_else(|| {
             // These take an image without addresses.
             matches!(self.dialect, Some(Dialect::Raw | Dialect::Lift)).then_some(0)
         });

@@ -62,6 +62,10 @@ fn a_sealed_image_is_the_same_in_a_file_and_in_blocks() {
 fn a_raw_binary_is_where_the_board_or_the_dialect_says() {
     let (bytes, on) = (program(GOOD), |dialect| Reading::new(1).dialect(dialect));
     assert_eq!(start(read(Reading::new(1).board(Some(DEFAULT)), "a.bin", &bytes)), START);
+    let given = Reading::new(1).address(Some(START + 0x400)).judging(Judging::Nothing);
+    assert_eq!(start(read(given, "a.bin", &bytes)), START + 0x400);
+    // The region is still that of the board.
+    assert!(read(given.address(Some(START - 0x400)).board(Some(DEFAULT)), "a.bin", &bytes).is_err());
     // Their images have no addresses.
     for dialect in [Dialect::Raw, Dialect::Lift] {
         assert_eq!(start(read(on(Some(dialect)).judging(Judging::Nothing), "a.bin", &bytes)), 0);
