@@ -512,8 +512,8 @@ def looks(bench):
         seen.append(here[0])
     else:
         raise AssertionError(f"the keys do not get out: {seen}")
-    order = ["adapter-list", "adapter-url", "connect", "file", "board", "program", "scan", "all", "trial", "bit-rate",
-             "filter", "trace", "frames", "fastscan", "lss-0", "lss-node", "assign", "run", "print"]
+    order = ["adapter-list", "adapter-url", "connect", "file", "board", "program", "map", "scan", "all", "trial", "password",
+             "fastscan", "lss-0", "lss-node", "assign", "run", "print", "bit-rate", "filter", "trace", "frames"]
     places = [seen.index(name) for name in order]
     assert places == sorted(places), list(zip(order, places))
     # The elements that report the state to a screen reader.
