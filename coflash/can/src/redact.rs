@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use canopen::debugger::DEBUGGER;
 use canopen::program::PROGRAM_DATA;
-use canopen::{Address, Frame, NodeId};
+use canopen::{Address, Frame};
 use embedded_can::{Frame as _, Id};
 
 /// The objects to which passwords are written: the access code of CiA 814-1, and the password of
@@ -22,12 +22,24 @@ pub fn is_password(at: Address) -> bool {
 
 /// Replaces the bytes of passwords by 0 in SDO downloads of every form; a redactor
 /// [of contents](Redactor::of_contents) also those of programs.
+///
+/// A product may have COB-IDs of its own for SDO, and a record does not say which: a frame on any COB-ID may be a
+/// request, and what names the object of a request is its answer.
 #[derive(Debug, Default)]
 pub struct Redactor {
     /// Whether programs and memory are removed, too.
     contents: bool,
-    /// The nodes with a transfer of something that is removed.
-    under_way: BTreeMap<NodeId, Form>,
+    /// The transfers of something that is removed, by the COB-ID of their requests.
+    under_way: BTreeMap<u16, Transfer>,
+    /// The COB-IDs of answers, with those of their requests.
+    answers: BTreeMap<u16, u16>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Transfer {
+    form: Form,
+    /// Index and sub-index, as in the frame.
+    object: [u8; 3],
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,64 +62,92 @@ impl Redactor {
     /// bus.
     pub fn frame(&mut self, frame: &Frame) -> Frame {
         let Id::Standard(id) = frame.id() else { return *frame };
-        let Some(node) = NodeId::new((id.as_raw() & 0x7F) as u8) else { return *frame };
-        let data = frame.data();
+        let (id, data) = (id.as_raw(), frame.data());
         let Some(first) = data.first() else { return *frame };
-        match id.as_raw() & 0x780 {
-            0x580 if *first != 0x80 && self.under_way.get(&node) == Some(&Form::Upload) => {
-                // The first answer repeats the object, and may already have up to four bytes.
-                let begins = first >> 5 == 2 && self.has_contents(data);
-                without(frame, if begins { 4 } else { 1 })
-            }
-            0x580 => {
-                // An abort, or the answer to the end of a block download.
-                if *first == 0x80 || first & 0xE3 == 0xA1 {
-                    self.under_way.remove(&node);
-                }
-                *frame
-            }
-            0x600 => self.request(frame, node, *first),
-            _ => *frame,
+        match self.request_of(id, data) {
+            Some(request) => self.answer(frame, request, *first),
+            None => self.request(frame, id, *first),
         }
     }
 
-    fn request(&mut self, frame: &Frame, node: NodeId, first: u8) -> Frame {
+    /// The COB-ID of the request that a frame answers, if a transfer of something that is removed is under way
+    /// there.
+    fn request_of(&mut self, id: u16, data: &[u8]) -> Option<u16> {
+        // CiA 301, the predefined connection set.
+        let predefined = (id & 0x780 == 0x580).then_some(id + 0x80);
+        let known = self.answers.get(&id).copied().or(predefined);
+        if let Some(request) = known.filter(|request| self.under_way.contains_key(request)) {
+            return Some(request);
+        }
+        let answers = |transfer: &Transfer| match transfer.form {
+            Form::Segments | Form::Blocks => matches!(data[0] >> 5, 3 | 5),
+            Form::Upload => matches!(data[0] >> 5, 2 | 6),
+        };
+        let object = data.get(1..4)?;
+        let is_asked = |(request, transfer): &(&u16, &Transfer)| {
+            **request != id && transfer.object == object && (data[0] == 0x80 || answers(transfer))
+        };
+        let request = *self.under_way.iter().find(is_asked)?.0;
+        self.answers.insert(id, request);
+        Some(request)
+    }
+
+    fn answer(&mut self, frame: &Frame, request: u16, first: u8) -> Frame {
+        let is_upload = self.under_way.get(&request).is_some_and(|transfer| transfer.form == Form::Upload);
+        if is_upload && first != 0x80 {
+            // The first answer repeats the object, and may already have up to four bytes.
+            let begins = first >> 5 == 2 && self.has_contents(frame.data());
+            return without(frame, if begins { 4 } else { 1 });
+        }
+        // An abort, or the answer to the end of a block download.
+        if first == 0x80 || first & 0xE3 == 0xA1 {
+            self.under_way.remove(&request);
+        }
+        *frame
+    }
+
+    fn request(&mut self, frame: &Frame, id: u16, first: u8) -> Frame {
         let data = frame.data();
         let contents = self.has_contents(data);
         let secret = contents || has(data, &PASSWORDS);
+        let object = data.get(1..4).and_then(|object| object.try_into().ok()).unwrap_or_default();
         let begins = matches!((first >> 5, first & 3), (1 | 2, _) | (5, 0) | (6, 0 | 2));
-        match (self.under_way.get(&node), first >> 5) {
+        let under_way = self.under_way.get(&id).map(|transfer| transfer.form);
+        let mut begin = |form| {
+            self.under_way.insert(id, Transfer { form, object });
+        };
+        match (under_way, first >> 5) {
             // Requests for more of an upload have no data.
             (Some(Form::Upload), _) if first != 0x80 && !begins => *frame,
             (_, 0b100) if first == 0x80 => {
-                self.under_way.remove(&node);
+                self.under_way.remove(&id);
                 *frame
             }
             (Some(Form::Blocks), _) => without(frame, 1),
             (Some(Form::Segments), 0) => {
                 if first & 1 != 0 {
-                    self.under_way.remove(&node);
+                    self.under_way.remove(&id);
                 }
                 without(frame, 1)
             }
             (_, 1) if secret && first & 2 != 0 => {
-                self.under_way.remove(&node);
+                self.under_way.remove(&id);
                 without(frame, 4)
             }
             (_, 1) if secret => {
-                self.under_way.insert(node, Form::Segments);
+                begin(Form::Segments);
                 *frame
             }
             (_, 6) if secret && first & 1 == 0 => {
-                self.under_way.insert(node, Form::Blocks);
+                begin(Form::Blocks);
                 *frame
             }
             (_, 2 | 5) if contents => {
-                self.under_way.insert(node, Form::Upload);
+                begin(Form::Upload);
                 *frame
             }
             _ => {
-                self.under_way.remove(&node);
+                self.under_way.remove(&id);
                 *frame
             }
         }
@@ -132,19 +172,25 @@ fn without(frame: &Frame, from: usize) -> Frame {
 
 #[cfg(test)]
 mod tests {
-    use canopen::CobId;
+    use embedded_can::StandardId;
 
     use super::*;
 
     fn shown(frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
-        shown_by(Redactor::default(), frames)
+        shown_by(Redactor::default, frames)
     }
 
-    fn shown_by(mut redactor: Redactor, frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
-        let node = NodeId::new(5).unwrap();
-        let id = |to_node| if to_node { CobId::sdo_request(node) } else { CobId::sdo_response(node) };
-        let shown = frames.iter().map(|(to_node, data)| redactor.frame(&Frame::full(id(*to_node), *data)));
-        shown.map(|frame| frame.data().try_into().unwrap()).collect()
+    /// The frames as they are shown: with the predefined COB-IDs, and the same with those of a product.
+    fn shown_by(redactor: fn() -> Redactor, frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
+        let shown = [(0x605, 0x585), (0x5FE, 0x67D), (0x285, 0x385)].map(|(request, response)| {
+            let mut redactor = redactor();
+            let id = |to_node| StandardId::new(if to_node { request } else { response }).unwrap();
+            let frames = frames.iter().map(|(to_node, data)| Frame::new(id(*to_node), data).unwrap());
+            frames.map(|frame| redactor.frame(&frame).data().try_into().unwrap()).collect::<Vec<_>>()
+        });
+        assert!(shown.iter().all(|other| *other == shown[0]), "{shown:?}");
+        let [shown, ..] = shown;
+        shown
     }
 
     #[test]
@@ -226,7 +272,7 @@ mod tests {
         ];
         let after = [(true, [0x40, 0, 0x10, 0, 0, 0, 0, 0]), (false, [0x43, 0, 0x10, 0, P, 1, 0, 0])];
         for case in cases {
-            let all = shown_by(Redactor::of_contents(), &[case, &after].concat());
+            let all = shown_by(Redactor::of_contents, &[case, &after].concat());
             let (of_case, of_after) = all.split_at(case.len());
             assert!(!of_case.as_flattened().contains(&P), "{of_case:?}");
             assert_eq!(of_after, after.map(|(_, data)| data));
