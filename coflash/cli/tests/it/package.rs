@@ -139,6 +139,8 @@ fn the_command_makes_and_shows_a_package() {
     let named = folder.join("x.CPK");
     fs::copy(data("plain-400.blk"), &named).unwrap();
     let named = named.to_str().unwrap();
+    let job = folder.write("job.toml", b"image = 'a.blk'\nstart = false\n[[device]]\nnode = 5\n");
+    let job = job.to_str().unwrap();
     for (words, exit, error) in [
         (&["flash", package, "--config", config][..], 3, "[0x60000408]"),
         (&["flash", &data("plain-400.blk"), "--config", config], 2, "no CAN bus is given"),
@@ -168,6 +170,9 @@ fn the_command_makes_and_shows_a_package() {
         (&["ui", "--service", package, "--config", config], 3, "[0x60000408]"),
         (&["ui", "--service", named], 3, "[0x60000400]"),
         (&["ui", "--trust", &public], 2, "only the signers of a package"),
+        (&["ui", "--service", job, "--trust", &public], 2, "a job file has no signature"),
+        (&["ui", "--service", job, "--config", config], 2, "a job file has no signature"),
+        (&["ui", "--service", job], 3, "device 1: each program of a machine is started"),
     ] {
         let done = coflash(words);
         assert_eq!(done.exit, exit, "{words:?}: {}", done.err);
