@@ -129,7 +129,8 @@ impl Conform {
     /// The program of --image.
     fn image(&self, context: &Context) -> Result<Option<Payload>, Failure> {
         let Some(path) = &self.image else { return Ok(None) };
-        let done = self.source.program(path, 1, Label::OfImage { date: 0 })?;
+        let (firmware, _) = self.source.load(path, 1)?;
+        let done = self.source.convert(firmware, path, 1, Label::OfImage { date: 0 })?;
         warn(context, path, &done.notes, done.left_out);
         Ok(Some(Arc::new(done.program).into()))
     }

@@ -129,12 +129,6 @@ impl From<FormatName> for Format {
 }
 
 impl Source {
-    /// Reads `file` for program `number` and makes a program of it, without access to a device.
-    pub(super) fn program(&self, file: &Path, program: u8, label: Label) -> Result<Converted, Failure> {
-        let (firmware, _) = self.load(file, program)?;
-        self.convert(firmware, file, program, label)
-    }
-
     /// Reads `file`; also returns its format.
     pub(super) fn load(&self, file: &Path, program: u8) -> Result<(Firmware, Format), Failure> {
         self.place.load(file, program)

@@ -127,19 +127,6 @@ pub(super) fn read(path: &Path, trusted: &Trusted) -> Result<Checked, Failure> {
     Ok(Checked { package, known })
 }
 
-/// Makes the package that does what a job file says, for a service station.
-pub(super) fn of_job(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
-    if !trusted.trust.is_empty() {
-        let advice = "leave --trust out, or make a signed package (coflash package)";
-        return Err(Failure::usage("a job file has no signature", advice));
-    }
-    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
-    let Recipe { name, release, parts, .. } = Recipe::of_job(&text, path.parent().unwrap_or(Path::new("")))
-        .map_err(|fault| Failure::job(path, &fault))?;
-    let made = machine::make(name, release, &parts, &[]).and_then(|bytes| Package::parse(&bytes));
-    made.map_err(|fault| Failure::package(path, &fault))
-}
-
 /// Shows a package, for `inspect`.
 pub(super) fn inspect(context: &Context, path: &Path, trusted: &Trusted) -> Result<(), Failure> {
     show(context, "inspect", path, &read(path, trusted)?);
@@ -152,7 +139,7 @@ pub(super) struct Trusted {
     /// Take a package only if this root has signed it or certified its signer (public key); give the
     /// option once for each root.
     #[arg(long, value_name = "FILE")]
-    trust: Vec<PathBuf>,
+    pub(super) trust: Vec<PathBuf>,
 }
 
 /// Shows what is in a package.

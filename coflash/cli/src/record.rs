@@ -15,7 +15,7 @@ use coboot_can::candump::Line;
 use coboot_can::decode::Decoder;
 use coboot_can::redact::Redactor;
 use coboot_can::{Adapter, Tap};
-use coflash_core::update::{stamp, Event, FailedUpdate, Histories};
+use coflash_core::update::{stamp, Event, Histories};
 use serde_json::{json, Value};
 
 use super::secrets;
@@ -183,7 +183,8 @@ pub(super) fn event(node: NodeId, event: &Event) {
 }
 
 /// Records a failed update that a page or an agent has made, at once: they end last of all.
-pub(super) fn failed(update: &FailedUpdate, more: &[(&str, &str)]) {
+#[cfg(any(feature = "ui", feature = "agent"))]
+pub(super) fn failed(update: &coflash_core::update::FailedUpdate, more: &[(&str, &str)]) {
     let Some(report) = RECORD.get().and_then(|record| record.report.as_ref()) else { return };
     let mut value = json!(update);
     more.iter().for_each(|(name, word)| value[*name] = (*word).into());

@@ -3,6 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use coflash_core::file::limit;
+use coflash_core::machine::{self, Package, Recipe};
 use coflash_ui::{Failed, Options, Origin, Server, Service};
 use serde_json::json;
 
@@ -88,7 +90,7 @@ impl Ui {
     fn station(&self, context: &Context, path: &Path) -> Result<Service, Failure> {
         let (package, origin) = if path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("toml"))
         {
-            (package::of_job(path, &self.trusted)?, Origin::Job)
+            (of_job(path, &self.trusted)?, Origin::Job)
         } else {
             let checked = package::read(path, &self.trusted)?;
             checked.signers().iter().for_each(|line| context.out.say(line));
@@ -106,4 +108,17 @@ impl Ui {
         context.out.say(format_args!("reports are saved in {}", service.report_dir().display()));
         Ok(service.memory(memory::file("service-bus")))
     }
+}
+
+/// Makes the package that does what a job file says, for a service station.
+fn of_job(path: &Path, trusted: &Trusted) -> Result<Package, Failure> {
+    if !trusted.trust.is_empty() {
+        let advice = "leave --trust out, or make a signed package (coflash package)";
+        return Err(Failure::usage("a job file has no signature", advice));
+    }
+    let text = limit::read_text(path).map_err(|error| Failure::unreadable(path, &error))?;
+    let Recipe { name, release, parts, .. } = Recipe::of_job(&text, path.parent().unwrap_or(Path::new("")))
+        .map_err(|fault| Failure::job(path, &fault))?;
+    let made = machine::make(name, release, &parts, &[]).and_then(|bytes| Package::parse(&bytes));
+    made.map_err(|fault| Failure::package(path, &fault))
 }
