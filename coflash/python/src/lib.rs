@@ -215,8 +215,8 @@ fn payload_of(
         .format(address.map(|_| Format::Raw))
         .address(address)
         .board(board)
-        // The update judges it.
-        .judging(Judging::Nothing);
+        // The update judges the rest, but does not know the board.
+        .judging(Judging::Handoff);
     let loaded = reading.read(path, &bytes).map_err(|fault| match fault {
         ContentFault::Bootloader(fault) => Fault::Bootloader(name(), fault),
         ContentFault::Sealed(refusal) => Fault::Sealed(name(), refusal),
