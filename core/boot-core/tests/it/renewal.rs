@@ -6,10 +6,10 @@ use boot_core::bootloader::{entries, entry_count, Bootloader, Choices, Config, E
 use boot_core::control::{Policy, Renewal, Step};
 use boot_core::crc::CrcKind;
 use boot_core::crc32;
-use boot_core::flash::{Flash, FlashFault, Next};
+use boot_core::flash::{Flash, FlashFault};
 use boot_core::program::verify;
 use boot_core::renewal::{header, Places};
-use boot_core::store::{Journal, Key, Parameters, RenewalRecord, StoreError, Value};
+use boot_core::store::{Journal, RenewalRecord};
 use canopen::lss::LssDevice as _;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
@@ -66,23 +66,7 @@ impl Choices for Renews {
 }
 
 /// The journal of a device with renewal.
-struct Store(Journal);
-
-impl Parameters for Store {
-    const RENEWS: bool = true;
-
-    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        self.0.get(flash, key)
-    }
-
-    fn store(&mut self, key: Key, value: Value) {
-        self.0.store(key, value);
-    }
-
-    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
-        self.0.next(flash, outcome)
-    }
-}
+type Store = kit::boot::Store<true, true>;
 
 const CLEAR: u8 = 3;
 const START: u8 = 1;
@@ -238,7 +222,7 @@ impl Board {
         self.request = None;
         self.ran = Some(origin);
         let report = BootReport { renewal: word(origin, trial_end), ..BootReport::NONE };
-        let journal = Store(Journal::open(&self.flash, LAYOUT.parameters));
+        let journal = kit::boot::Store(Journal::open(&self.flash, LAYOUT.parameters));
         let (buffer, sealed) = leaked(512);
         let boot = Boot { report, ..Boot::new(&CONFIG, node()) };
         Node(boot.with(journal, &mut self.flash, buffer, sealed))
@@ -934,9 +918,8 @@ fn an_older_image_from_a_probe_makes_the_record_of_an_installed_one_void() {
     board.flash.poke(HOME.base, &old);
     let mut node = board.start();
     assert_eq!(node.progress(), Progress::default());
-    // A damage of it is none that the newer one repairs behind the owner's back.
+    // So its damage is none that the newer one repairs behind the owner's back.
     board.off();
-    assert_eq!(PLACES.order(&board.flash, None, false)[1], None);
     let journal = Journal::open(&board.flash, LAYOUT.parameters);
     assert_eq!(RenewalRecord::load(&journal, &board.flash), None);
 }
@@ -1204,7 +1187,7 @@ fn a_password_opens_the_bootloader_too() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
     let mut flash = ModelFlash::new(&CHIP);
     flash.poke(HOME.base, &old);
-    let journal = Store(Journal::open(&flash, LAYOUT.parameters));
+    let journal = kit::boot::Store(Journal::open(&flash, LAYOUT.parameters));
     let (buffer, sealed) = leaked(512);
     let boot = Boot::new(&LIFT, node()).with(journal, &mut flash, buffer, sealed);
     let mut node = Node::<Locked>(boot);

@@ -3,13 +3,12 @@
 use boot_core::bootloader::{Bootloader, Config};
 use boot_core::control::Step;
 use boot_core::crc::CrcKind;
-use boot_core::flash::{Flash, FlashFault, Next};
 use boot_core::program::verify;
-use boot_core::store::{Journal, Key, Parameters, StoreError, Value};
+use boot_core::store::Journal;
 use canopen::od::{Address, Objects};
 use canopen::AbortCode;
 use kit::bench::{self, block, block_file, last, program, Bench, CLEAR, CONFIG, DATA, LAYOUT, PROGRAM};
-use kit::boot::{leaked, Boot};
+use kit::boot::{leaked, Boot, Store};
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
@@ -137,31 +136,12 @@ fn a_host_that_comes_back_goes_on_with_the_next_block() {
     assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0), "nothing is left to go on with");
 }
 
-/// The store of a product without resumption.
-struct BeginsAnew(Journal);
-
-impl Parameters for BeginsAnew {
-    const RESUMES: bool = false;
-
-    fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value> {
-        self.0.get(flash, key)
-    }
-
-    fn store(&mut self, key: Key, value: Value) {
-        self.0.store(key, value);
-    }
-
-    fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
-        self.0.next(flash, outcome)
-    }
-}
-
 /// Whoever comes after it, as a bootloader with resumption, finds no download to go on with.
 #[test]
 fn a_product_without_resumption_leaves_no_begun_download() {
     let file = named(&program(0xC00, 0x33));
     let mut flash = ModelFlash::new(&CHIP);
-    let journal = BeginsAnew(Journal::open(&flash, LAYOUT.parameters));
+    let journal = Store::<false, false>(Journal::open(&flash, LAYOUT.parameters));
     let (buffer, sealed) = leaked(256);
     let mut node: Bootloader<'_, _, _, 1> =
         Boot::new(&CONFIG, bench::node()).with(journal, &mut flash, buffer, sealed);
