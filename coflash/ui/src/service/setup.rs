@@ -42,7 +42,8 @@ impl std::fmt::Debug for Service {
 }
 
 impl Service {
-    /// A station for this package, which was read from `file`, or made of the job in it. The reports go into a folder, which is made if it is not there.
+    /// A station for this package, which was read from `file`, or made of the job in it. The reports go into a
+    /// folder, which is made if it is not there.
     ///
     /// # Errors
     /// The folder cannot be made, or no file can be written into it.

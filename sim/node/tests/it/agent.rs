@@ -121,6 +121,26 @@ fn nothing_is_started_that_was_not_verified() {
     }
 }
 
+/// Ends the agent at the moment for which `begun` waits, and starts it again: the action of the first target is
+/// resumed and succeeds.
+fn goes_on(server: &Server, config: &Config, begun: impl FnOnce()) -> Action {
+    let cancelled = Arc::new(AtomicBool::new(false));
+    let endless = options().once(false).cancelled(cancelled.clone());
+    thread::scope(|scope| {
+        let agent = scope.spawn(|| serve(config, &endless));
+        begun();
+        cancelled.store(true, Ordering::Relaxed);
+        agent.join().unwrap();
+    });
+    assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
+    let (ended, said) = serve(config, &options());
+    assert_eq!(ended.updated, 1, "{said}");
+    let action = server.action(IDS[0]);
+    assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
+    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
+    action
+}
+
 /// The agent is ended in the middle of an update, when the device has no program.
 #[test]
 fn an_agent_that_was_ended_goes_on() {
@@ -129,23 +149,12 @@ fn an_agent_that_was_ended_goes_on() {
     let server = Server::start(&IDS);
     server.assign(IDS[0], Action::new(1, &file(0xA5)));
     let config = config(&server, nodes.url(), &folder, &IDS[..1]);
-    let cancelled = Arc::new(AtomicBool::new(false));
-    let endless = options().once(false).cancelled(cancelled.clone());
-    thread::scope(|scope| {
-        let agent = scope.spawn(|| serve(&config, &endless));
+    goes_on(&server, &config, || {
         let begun = |state: &kit::hawkbit::State| {
             state.targets[IDS[0]].action.as_ref().is_some_and(|action| !action.progress.is_empty())
         };
         server.wait("progress", begun);
-        cancelled.store(true, Ordering::Relaxed);
-        agent.join().unwrap();
     });
-    assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
-    let (ended, said) = serve(&config, &options());
-    assert_eq!(ended.updated, 1, "{said}");
-    let action = server.action(IDS[0]);
-    assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
-    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
     assert!(folder.read("1.flash")[0x2_0000..0x2_0000 + 40 * 1024] == program(0xA5));
 }
 
@@ -348,21 +357,8 @@ fn the_update_of_a_machine_goes_on_after_a_restart() {
     drives.await_line("serial 14, node 14: bootloader");
     valves.await_line("serial 23, node 23: bootloader");
     server.assign(IDS[0], Action::new(1, &file));
-    let cancelled = Arc::new(AtomicBool::new(false));
-    let endless = options().once(false).cancelled(cancelled.clone());
-    thread::scope(|scope| {
-        let agent = scope.spawn(|| serve(&config, &endless));
-        // The first bytes after the vectors, so that each drive has half a program.
-        folder.await_bytes("11.flash", 0x2_0000);
-        cancelled.store(true, Ordering::Relaxed);
-        agent.join().unwrap();
-    });
-    assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
-    let (ended, said) = serve(&config, &options());
-    assert_eq!(ended.updated, 1, "{said}");
-    let action = server.action(IDS[0]);
-    assert_eq!(action.result.as_deref(), Some("success"), "{action:?}");
-    assert!(action.told.iter().any(|(execution, _)| execution == "resumed"));
+    // The first bytes after the vectors, so that each drive has half a program.
+    let action = goes_on(&server, &config, || folder.await_bytes("11.flash", 0x2_0000));
     let details = action.details("closed");
     for line in ["panel: had it before: node 1", "drive: updated: node 11, 12, 13, 14"] {
         assert!(details.lines().any(|its| its == line), "{line}: {details}");
