@@ -706,9 +706,19 @@ def service_full(bench):
     stationed(page, "planned")
     away(folder)
     page.get_by_label("Device number").fill("4711")
+    # The answer to the request comes after the states that it has led to.
+    held = []
+    page.route("**/update", lambda route: held.append((route, route.fetch())))
     page.get_by_role("button", name="Update 2 devices").click()
     expect(page.locator("#message")).to_contain_text("Reports cannot be saved in")
     expect(page.locator("#message")).to_contain_text("until then no device is changed")
+    while not held:
+        page.wait_for_timeout(20)
+    ((route, answer),) = held
+    route.fulfill(response=answer)
+    page.unroute("**/update")
+    # A request after it: its answer is read later.
+    page.evaluate("fetch('station').then((answer) => answer.text())")
     stationed(page, "planned")
     expect(page.locator("#device-number")).to_have_value("4711")
     back(folder)

@@ -22,8 +22,10 @@ let chosen = new Set();
 let plan = null;
 /** Whether the user changes the adapter. */
 let changes = false;
-/** The device number of the last update, which comes back if the update was not begun. */
-let sent = "";
+/** The device number that was sent with an update, until the server shows that it took the update. */
+let sent = null;
+/** The device number of the update at work, which comes back if no device was changed. */
+let taken = "";
 let sound = null;
 let shown = "";
 
@@ -67,8 +69,7 @@ function show(next) {
   if (state.open && !before?.open) changes = false;
   const from = before?.station;
   if (from === "working" && ["good", "good-unsaved", "bad"].includes(state.station)) play(state.station === "good");
-  // An update that was not begun leaves the number to be used.
-  if (from === "working" && state.plan !== null && $("device-number").value === "") enter($("device-number"), sent);
+  numbers(from);
   banner();
   adapter();
   unsaved();
@@ -77,6 +78,18 @@ function show(next) {
   text($("saved-count"), state.saved.length === 1 ? t("saved-one") : t("saved-many", { count: state.saved.length }));
   $("saved").hidden = state.saved.length === 0;
   $("saved-names").replaceChildren(...state.saved.map((name) => el("li", {}, el("code", {}, `${name}.html, .csv`))));
+}
+
+/**
+ * The device number belongs to one machine: what is read after it was taken is for the next one. Only the server's states
+ * decide, in their order: the answer to the request may come before or after any of them, and a short state may be missing.
+ */
+function numbers(from) {
+  const field = $("device-number");
+  if (from === "working" && state.plan !== null && field.value === "") enter(field, taken);
+  if (sent === null || sent !== state.device_number) return;
+  if (field.value.trim() === sent) enter(field, "");
+  [taken, sent] = [sent, null];
 }
 
 function banner() {
@@ -287,11 +300,10 @@ function start() {
   $("update").addEventListener("click", async () => {
     const [operator, order, number] = FIELDS.map((id) => $(id).value.trim());
     const nodes = [...chosen].sort((a, b) => a - b);
-    sent = number;
-    // The number belongs to this machine; what is read from now on is for the next one.
     const password = $("password").value;
     $("password").value = "";
-    if (await ask("update", { plan: state.plan, nodes, password, operator, order, device_number: number, language })) enter($("device-number"), "");
+    sent = number;
+    if (!(await ask("update", { plan: state.plan, nodes, password, operator, order, device_number: number, language }))) sent = null;
   });
   $("stop").addEventListener("click", () => (state.station === "working" ? $("confirm").showModal() : ask("cancel")));
   $("confirm").addEventListener("close", () => {
