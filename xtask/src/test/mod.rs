@@ -2,7 +2,7 @@
 //!
 //! | file | what it does |
 //! |---|---|
-//! | `plan.rs` | the table: which test runs when, and with which images |
+//! | `plan.rs` | which test runs when, and with which images |
 //! | `programs.rs` | builds the test programs and lists their tests |
 //! | `runner.rs` | runs them, and sums up |
 
@@ -83,7 +83,7 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     if args.flag("--list") {
-        print!("{}", plan::table());
+        println!("{}", plan::table());
         return args.none_left();
     }
     let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));

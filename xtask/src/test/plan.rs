@@ -1,4 +1,5 @@
-//! Which test runs when: a table of what does not run in every `cargo xtask test`, with the reason.
+//! Which test runs when, and with which images. docs/testing.md has the table of what does not run in every
+//! `cargo xtask test`, with the reasons.
 
 use shared_abi::layout::{
     nucleo_f446re, stm32f407g_disc1, stm32f407g_disc1_can2, stm32f407g_disc1_two, stm32f429i_disc1, Layout,
@@ -17,91 +18,26 @@ pub enum Tier {
     All,
 }
 
-/// Tests that do not run in every `cargo xtask test`.
-pub struct Later {
-    /// A test program of the package `coboot-tests`, or a package.
-    pub program: &'static str,
-    /// The beginning of the tests' paths in it; empty for all of them.
-    pub tests: &'static str,
-    /// The first tier in which they run.
-    pub tier: Tier,
-    /// Why not earlier.
-    pub why: &'static str,
+/// The page with the table of the tests that do not run in every `cargo xtask test`.
+const PAGE: &str = include_str!("../../../docs/testing.md");
+
+/// That table: a row for the beginning of tests' paths, with the first run that has them and why it is not an
+/// earlier one.
+pub fn table() -> &'static str {
+    let begin = PAGE.find("| tests | first run by |").expect("docs/testing.md has the table");
+    PAGE[begin..].split("\n\n").next().unwrap_or_default()
 }
 
-const fn later(program: &'static str, tests: &'static str, tier: Tier, why: &'static str) -> Later {
-    Later { program, tests, tier, why }
+/// The rows of [`table`]: the beginning of `program::path` of tests, and their tier.
+fn later() -> impl Iterator<Item = (&'static str, Tier)> {
+    table().lines().skip(2).map(|row| match row.split('`').collect::<Vec<_>>()[..] {
+        ["| ", tests, " | ", ".ci/run", _why] => (tests, Tier::Ci),
+        ["| ", tests, " | ", "--all", _why] => (tests, Tier::All),
+        _ => panic!(
+            "docs/testing.md: a row is | `TESTS` | `.ci/run` or `--all` | why not earlier |, not {row}"
+        ),
+    })
 }
-
-/// The reason of tests on a board whose images `cargo xtask test` does not build.
-const TWO: &str = "images of the board with two programs";
-/// The same where it takes all of them.
-const ALL_OF_TWO: &str = "all images of the board with two programs";
-/// The reason of tests that measure; a broken time is seen in `.ci/run`.
-const TIMES: &str = "measures times, 1 minute";
-/// The reason of tests of sealed images beyond a download, its blocks and strangers.
-const SEALED: &str = "sealed images beyond the main flow";
-/// The reason of a second client of others.
-const OTHERS: &str = "one more client of others";
-
-/// What runs later, in the order of the programs.
-pub const LATER: &[Later] = &[
-    later("coboot-kit/abi", "header::it_compiles_for_the_chip", Tier::Ci, "arm-none-eabi-gcc"),
-    later("device", "application::", Tier::All, "builds an application anew, 2 minutes"),
-    later("device", "boot_time::", Tier::Ci, TIMES),
-    later("device", "c_application::the_other_program", Tier::All, ALL_OF_TWO),
-    later("device", "image::gdb_loads_it", Tier::Ci, "gdb"),
-    later("device", "leftovers::whatever", Tier::Ci, "sixteen states of a chip, 1 minute"),
-    later("device", "stuck_bus::", Tier::All, "minutes of a bus that does not move"),
-    later("device", "supply::with_every_combination", Tier::All, "32 combinations of option bytes, 1 minute"),
-    later("device", "supply::", Tier::Ci, "supply voltages and option bytes, 1 minute"),
-    later(
-        "device",
-        "silicon::each_scenario_works_with_the_chips",
-        Tier::All,
-        "more chips than the worst one",
-    ),
-    later("device", "virtual_can::", Tier::All, "CAN over UART, an option, 1 minute"),
-    later("device", "ways_in::", Tier::Ci, "entries that are off by default, 1 minute"),
-    later("update", "attacker::", Tier::All, "the standing attacker on boards, 2 minutes"),
-    later("update", "coflash_dialects::the_profile_of_lifts", Tier::Ci, TWO),
-    later("update", "dialects::a_lift", Tier::Ci, TWO),
-    later("update", "fleet::", Tier::All, "groups of devices, 3 minutes"),
-    later("update", "powercut::no_cut_bricks", Tier::All, "each power cut of the model, 3 minutes"),
-    later("update", "powercut_board::", Tier::All, "the sample on the built firmware, 2 minutes"),
-    later(
-        "update",
-        "resume::",
-        Tier::All,
-        "whole programs, cut anywhere, 3 minutes; the model is cut in each run",
-    ),
-    later("update", "renewal::", Tier::Ci, "a renewal by the host tool, 2 minutes"),
-    later("update", "streams::", Tier::All, "whole programs at the slowest flash, 2 minutes"),
-    later("update", "throughput::", Tier::All, TIMES),
-    later("update", "two_programs::", Tier::Ci, TWO),
-    later("sealed", "blocks::eight_sealed_devices", Tier::All, "groups of devices"),
-    later("sealed", "powercut::", Tier::All, "each power cut of the model, 1 minute"),
-    later("sealed", "attacker::", Tier::Ci, SEALED),
-    later("sealed", "client::", Tier::Ci, SEALED),
-    later("sealed", "confirmation::", Tier::Ci, SEALED),
-    later("sealed", "model::", Tier::Ci, SEALED),
-    later("sealed", "refusals::", Tier::Ci, SEALED),
-    later("sealed", "renewal::", Tier::Ci, SEALED),
-    later("foreign", "block_upload::", Tier::Ci, OTHERS),
-    later("foreign", "eds::", Tier::Ci, OTHERS),
-    later("foreign", "examples::", Tier::All, "builds a project of each tool chain"),
-    later("foreign", "gdb_door::", Tier::Ci, "gdb"),
-    later("foreign", "pages::", Tier::All, "types each page, 3 minutes"),
-    later("foreign", "peers::", Tier::All, OTHERS),
-    later("foreign", "python_package::", Tier::All, "builds the wheel, 8 minutes"),
-    later("foreign", "ui::", Tier::Ci, "Chromium"),
-    later("port", "matrix::", Tier::All, ALL_OF_TWO),
-    later("port", "porting::", Tier::All, "builds a copy of the repository"),
-    later("coboot-emulator/it", "emulate::gdb_stops_steps_looks_and_changes", Tier::Ci, "gdb"),
-    later("coboot-zencan/zencan", "", Tier::Ci, OTHERS),
-    later("xtask", "", Tier::Ci, "the repository and its pages, not the product"),
-    later("xtask/hil", "", Tier::All, "builds and flashes for 4 minutes"),
-];
 
 /// Test modules that take longest, the slowest first: they begin first, so that no core waits for
 /// one of them at the end.
@@ -218,22 +154,6 @@ pub const NEEDS: &[Needs] = &[
     },
 ];
 
-/// The table [`LATER`], as a page has it.
-pub fn table() -> String {
-    let mut table = String::from("| tests | first run by | why not earlier |\n|---|---|---|\n");
-    for Later { program, tests, tier, why } in LATER {
-        let colons = if tests.is_empty() { "" } else { "::" };
-        let by = match tier {
-            Tier::Product => "`cargo xtask test`",
-            Tier::Ci => "`.ci/run`",
-            Tier::All => "`--all`",
-        };
-        let program = program.replace('/', "::");
-        table += &format!("| `{program}{colons}{}` | {by} | {why} |\n", tests.trim_end_matches("::"));
-    }
-    table
-}
-
 impl Tier {
     /// What the tests up to this tier need on the machine.
     pub fn needs(self) -> &'static [Part] {
@@ -247,31 +167,24 @@ impl Tier {
 
     /// The first tier in which a test runs.
     pub fn of(program: &str, test: &str) -> Self {
-        let row = LATER.iter().find(|row| row.program == program && test.starts_with(row.tests));
-        row.map_or(Self::Product, |row| row.tier)
+        let path = format!("{program}::{test}");
+        later().find(|(tests, _)| path.starts_with(tests)).map_or(Self::Product, |(_, tier)| tier)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::workspace;
-
-    #[test]
-    fn the_page_has_the_table() {
-        let page = std::fs::read_to_string(workspace::root().join("docs/testing.md")).unwrap();
-        assert!(page.contains(&table()), "docs/testing.md needs this table:\n{}", table());
-    }
 
     #[test]
     fn each_test_has_one_tier() {
-        for (number, row) in LATER.iter().enumerate() {
-            for other in &LATER[..number] {
-                let overlap = row.program == other.program && row.tests.starts_with(other.tests);
-                assert!(!overlap, "{}::{} is hidden by {}", row.program, row.tests, other.tests);
-            }
+        let rows: Vec<_> = later().collect();
+        for (number, (tests, _)) in rows.iter().enumerate() {
+            let hides = rows[..number].iter().find(|(other, _)| tests.starts_with(other));
+            assert_eq!(hides, None, "{tests}");
         }
         assert_eq!(Tier::of("foreign", "ui::a_test"), Tier::Ci);
         assert_eq!(Tier::of("device", "line::a_test"), Tier::Product);
+        assert_eq!((Tier::of("xtask", "a_test"), Tier::of("xtask/hil", "a_test")), (Tier::Ci, Tier::All));
     }
 }
