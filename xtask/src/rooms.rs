@@ -197,57 +197,46 @@ mod tests {
     }
 
     #[test]
-    fn files_that_use_each_other_are_told_even_inside_a_room() {
-        let all = sources(&[
+    fn modules_and_files_that_use_each_other_are_told_in_every_crate() {
+        let room = [
             ("device/mod.rs", "pub use self::hub::Hub;"),
             ("device/hub.rs", "use super::{port::Port, adapter::Adapter};"),
             ("device/port.rs", "use crate::device::hub;"),
             ("device/adapter.rs", ""),
-        ]);
-        let words = "these files use each other in a circle: device::hub -> device::port";
-        for krate in ["coflash-core", "emulator"] {
-            assert_eq!(broken(krate, &all), [format!("{krate}: {words}")]);
-        }
-    }
-
-    #[test]
-    fn rooms_that_use_each_other_are_told_in_every_crate() {
-        let all = sources(&[
+        ];
+        let rooms = [
             ("a/mod.rs", ""),
             ("a/one.rs", "use crate::b::X;"),
             ("a/two.rs", ""),
             ("b.rs", "use crate::a::two::Y;"),
-        ]);
-        let words = "these modules use each other in a circle: a -> b";
-        assert_eq!(broken("emulator", &all), [format!("emulator: {words}")]);
-    }
-
-    /// The firmware has a second program in a folder of its own.
-    #[test]
-    fn files_of_a_program_in_a_folder_are_files_of_the_crate() {
-        let all = sources(&[
+        ];
+        // The firmware has a second program in a folder of its own.
+        let programs = [
             ("main.rs", "mod services;"),
             ("services.rs", ""),
             ("resident/main.rs", "mod stage; mod storing; fn main() { stage::run() }"),
             ("resident/stage.rs", "use crate::services::X;\nuse crate::storing;"),
             ("resident/storing.rs", "use crate::stage::Stage;"),
-        ]);
-        let words = "these files use each other in a circle: resident::stage -> resident::storing";
-        assert_eq!(broken("bootloader", &all), [format!("bootloader: {words}")]);
-    }
-
-    /// `main.rs` is a file like others, unless a library beside it is what `crate::` means.
-    #[test]
-    fn a_program_and_its_files_do_not_use_each_other() {
-        let main = |path, more: &[_]| {
-            let uses =
-                [(path, "mod a; use a::f;"), ("a.rs", "use crate::X;"), ("bin/b/a.rs", "use super::Y;")];
-            broken("x", &sources(&[&uses, more].concat()))
-        };
-        let words = |circle: &str| format!("x: these files use each other in a circle: {circle}");
-        assert_eq!(main("main.rs", &[]), [words("(root) -> a")]);
-        assert_eq!(main("bin/b/main.rs", &[]), [words("bin::b -> bin::b::a")]);
-        assert_eq!(main("main.rs", &[("lib.rs", "pub struct X;")]), [""; 0]);
+        ];
+        // `main.rs` is a file like others, unless a library beside it is what `crate::` means.
+        let main =
+            |path| [(path, "mod a; use a::f;"), ("a.rs", "use crate::X;"), ("bin/b/a.rs", "use super::Y;")];
+        let with_library = [&main("main.rs")[..], &[("lib.rs", "pub struct X;")]].concat();
+        for (krate, files, circle) in [
+            ("coflash-core", &room[..], "files use each other in a circle: device::hub -> device::port"),
+            ("emulator", &room, "files use each other in a circle: device::hub -> device::port"),
+            ("emulator", &rooms, "modules use each other in a circle: a -> b"),
+            (
+                "bootloader",
+                &programs,
+                "files use each other in a circle: resident::stage -> resident::storing",
+            ),
+            ("x", &main("main.rs"), "files use each other in a circle: (root) -> a"),
+            ("x", &main("bin/b/main.rs"), "files use each other in a circle: bin::b -> bin::b::a"),
+        ] {
+            assert_eq!(broken(krate, &sources(files)), [format!("{krate}: these {circle}")]);
+        }
+        assert_eq!(broken("x", &sources(&with_library)), [""; 0]);
     }
 
     #[test]
