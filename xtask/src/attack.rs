@@ -12,10 +12,8 @@ use crate::{build, evidence, outcome::Outcome, process};
 pub const HELP: &str = "\
 usage: cargo xtask attack [--frames N | --silicon N] [--seed S]
 
-Attacks emulated boards with the built firmware, and nodes without a chip, in virtual time: two
-masters that do what masters do, mixed with noise, floods, frames that are nearly right, errors on
-the bus and power cuts. After each burst it checks that the device answers in time, and that only what was asked for has changed.
-Fails if a rule is broken, and prints the seed and the last frames. The same seed gives the same
+Attacks emulated boards with the built firmware, and nodes without a chip, in virtual time (docs/testing.md
+has the rules). Fails if one is broken, and prints the seed and the last frames. The same seed gives the same
 attack. The counts go to target/evidence/attacker.json.
 
   --frames N      the frames of the masters on the boards (default: 200000, about two minutes); the

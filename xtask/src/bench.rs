@@ -9,12 +9,8 @@ use crate::{build, evidence, outcome::Outcome, process, workspace};
 pub const HELP: &str = "\
 usage: cargo xtask bench [--json] [--board BOARD]
 
-Downloads programs of 64, 256 and 896 KiB at 125 to 1000 kbit/s into an emulated board, in virtual
-time, and prints how long that took beside what the wire and the flash allow at best; how busy the
-bus is while `coflash flash` sends a program; what it costs or gains to seal and to compress one; and
-how long several boards on one bus take.
-Then, in real time: what a frame costs the host, in an update over socketcand into a node whose flash
-is a file.
+Measures downloads into emulated boards in virtual time, beside what wire and flash allow; then, in real time,
+what a frame costs the host. docs/bench.md has the tables and what they mean.
 
   --json          prints the tables as JSON: downloads, bus, forms, fleets, host; and keeps them in
                   target/evidence/bench.json

@@ -12,8 +12,6 @@ Runs firmware of others in the emulator, unmodified, and plays a check with it. 
 sources, with their tool chain; docs/foreign.md says which configuration, and what ran when. Names:
 katapult, klipper, chibios, openblt, stm32f4xx-hal, canopennode; and
 klipper-katapult=KATAPULT.elf,KLIPPER.elf for Klipper that Katapult starts.
-
-A firmware that is not given is not run, which is no success.
 ";
 
 pub fn run(args: Args) -> Outcome {

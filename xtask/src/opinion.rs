@@ -11,11 +11,9 @@ use crate::{build, evidence, outcome::Outcome, process};
 pub const HELP: &str = "\
 usage: cargo xtask opinion [--json]
 
-Runs the programs of sim/emulator/tests/it/second_opinion on the emulator's CPU and on QEMU's Cortex-M4
-(mps2-an386), and compares their results word for word. A difference that is not explained in the
-table of the programs is a failure. Then updates the bootloader with CAN over UART through the serial
-port of the emulated board and of QEMU's STM32F405 (netduinoplus2), and compares every sector of the
-two flashes.
+Runs the same programs on the emulator's CPU and on QEMU's, and the same update on the emulated board and
+on QEMU's, and compares what comes of them. A difference that is not explained is a failure. docs/testing.md
+has the differences.
 
   --json          also writes the result of the programs to target/evidence/cpu.json: commit, counts,
                   differences

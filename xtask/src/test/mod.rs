@@ -37,10 +37,6 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   WORDS           go to cargo test, for one kind of test:
                   `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
-
-The tests find what was built by these variables: COBOOT_BOARD, COBOOT_FIRMWARE_DIR (bootloader.elf,
-app-v1.elf, app-v2.elf, app-c.elf), COBOOT_COFLASH (the command line of the host tool), COBOOT_NODE (the node
-without hardware) and COBOOT_PYTHON (an interpreter with tests/python/requirements.txt installed).
 ";
 
 /// A stage of a run.
