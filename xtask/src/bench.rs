@@ -26,10 +26,8 @@ pub fn run(mut args: Args) -> Outcome {
     let mut bench = build::tests_program(board, "bench");
     // Optimised, as a user runs it.
     let cost = || {
-        process::run(process::cargo("build").args(["--release", "--package", "coboot-node"]))?;
-        let mut cost = process::cargo("run");
-        cost.args(["--release", "--package", "coboot-node", "--example", "cost", "--"]);
-        Ok::<_, String>(cost)
+        process::run(&mut process::cargo("build --release --package coboot-node"))?;
+        Ok::<_, String>(process::cargo("run --release --package coboot-node --example cost --"))
     };
     if json {
         let mut facts = process::json(&process::output(bench.arg("--json"))?)?;

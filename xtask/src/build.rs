@@ -349,11 +349,8 @@ pub fn tests_args(board: &Layout) -> Vec<String> {
 /// The command that runs a program of that crate with the firmware of a board; its arguments follow.
 pub fn tests_program(board: &Layout, name: &str) -> Command {
     let mut cargo = process::cargo("run");
-    cargo.args(tests_args(board)).args(["--bin", name]);
-    cargo
-        .env("COBOOT_BOARD", board.board)
-        .env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board))
-        .arg("--");
+    cargo.args(tests_args(board)).args(["--bin", name, "--"]);
+    cargo.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board));
     cargo
 }
 
@@ -366,8 +363,7 @@ fn target_dir(board: &Layout) -> PathBuf {
 /// The cargo command that builds an image.
 fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -> Command {
     let mut cargo = process::cargo("build");
-    cargo.args(firmware_args(package, board, features)).args(product.args());
-    cargo.args(["--bin", package]);
+    cargo.args(firmware_args(package, board, features)).args(product.args()).args(["--bin", package]);
     cargo
 }
 

@@ -23,9 +23,8 @@ pub fn run(args: Args) -> Outcome {
     let mut problems = lint::formatting()?;
     problems.extend(lint::clippy(lint::HOST_CRATES));
     problems.extend(arrows::run(Args::new(std::iter::empty())).err());
-    let mut tests = process::cargo("test");
-    tests.current_dir(workspace::root()).args(["--quiet", "--lib"]);
+    let mut tests = process::cargo("test --quiet --lib");
     tests.args(PURE.iter().flat_map(|package| ["--package", package]));
-    problems.extend(process::run(&mut tests).err());
+    problems.extend(process::run(tests.current_dir(workspace::root())).err());
     lint::all_good(&problems)
 }

@@ -37,8 +37,7 @@ pub fn run(mut args: Args) -> Outcome {
     let (has_bootloader, has_serial) = (args.has("--bootloader"), args.has("--serial"));
     let options = args.rest();
 
-    let mut emulator = process::cargo("run");
-    emulator.args(["--package", "coboot-emulator", "--bin", "emulate", "--", "--board"]);
+    let mut emulator = process::cargo("run --package coboot-emulator --bin emulate -- --board");
     if has_bootloader {
         // The emulator reads the memory map of any board.
         setup::prepare(&[Part::Emulator])?;

@@ -93,12 +93,10 @@ fn by_cmake(folder: &Path, work: &Path, is_second: bool) -> Outcome<PathBuf> {
 
 /// Builds a package; returns the program. All packages share `work`, and so their dependencies.
 fn by_cargo(folder: &Path, work: &Path, program: &str, is_second: bool) -> Outcome<PathBuf> {
-    let features = if is_second { "version-2" } else { "" };
-    let mut cargo = process::cargo_on(folder, "build");
+    let mut cargo = process::cargo_on(folder, "build --locked --release --target-dir");
+    cargo.arg(work).args(is_second.then_some("--features=version-2"));
     // Cargo looks for the folder's own settings from its current folder.
-    cargo.current_dir(folder).args(["--locked", "--release", "--features", features]);
-    cargo.arg("--target-dir").arg(work);
-    process::output(&mut cargo)?;
+    process::output(cargo.current_dir(folder))?;
     Ok(work.join(workspace::TARGET).join("release").join(program))
 }
 
@@ -126,9 +124,8 @@ fn template(folder: &Path, work: &Path) -> Outcome<PathBuf> {
     process::output(&mut generate)?;
     // The versions that the example is tested with; cargo writes the project's name into the copy.
     files::copy(&folder.join("Cargo.lock"), &project.join("Cargo.lock"))?;
-    let mut cargo = process::cargo_on(&project, "build");
-    cargo.current_dir(&project).args(["--release", "--target-dir"]).arg(work.join("rust"));
-    process::output(&mut cargo)?;
+    let mut cargo = process::cargo_on(&project, "build --release --target-dir");
+    process::output(cargo.arg(work.join("rust")).current_dir(&project))?;
     Ok(work.join("rust").join(workspace::TARGET).join("release").join(NAME))
 }
 

@@ -78,9 +78,7 @@ pub fn run(mut args: Args) -> Outcome {
         None => {
             setup::prepare(&[Part::Firmware])?;
             let images = build::images(board, &[&build::MAIN[..], &["bootloader-watchdog"]].concat())?;
-            process::run(
-                process::cargo("build").current_dir(workspace::root()).args(["--package", "coflash"]),
-            )?;
+            process::run(process::cargo("build --package coflash").current_dir(workspace::root()))?;
             (images.join("bootloader.elf"), built)
         }
     };

@@ -39,16 +39,16 @@ pub fn run(mut args: Args) -> Outcome {
     let mut resident = build::firmware_args("bootloader", board, "resident");
     resident.push("--bin=resident".to_owned());
     problems.extend(clippy(&resident));
-    let mut doc = process::cargo("doc");
-    doc.current_dir(workspace::root()).args(["--quiet", "--no-deps", "--keep-going"]);
-    problems.extend(process::run(doc.env("RUSTDOCFLAGS", "--deny=warnings")).err());
+    let mut doc = process::cargo("doc --quiet --no-deps --keep-going");
+    doc.current_dir(workspace::root()).env("RUSTDOCFLAGS", "--deny=warnings");
+    problems.extend(process::run(&mut doc).err());
     all_good(&problems)
 }
 
 /// Checks the formatting of all files; returns the problems.
 pub fn formatting() -> Outcome<Vec<String>> {
     let mut problems = Vec::new();
-    if process::run(process::cargo("fmt").args(["--all", "--check"])).is_err() {
+    if process::run(&mut process::cargo("fmt --all --check")).is_err() {
         problems.push("some files are not formatted; `cargo fmt --all` does it.".to_owned());
     }
     // The files of the boards and products: build scripts find them, `cargo fmt` does not.

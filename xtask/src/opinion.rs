@@ -29,9 +29,8 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 fn cpu(json: bool) -> Outcome {
-    let mut test = process::cargo("test");
-    test.args(["--quiet", "--package", "coboot-emulator", "--test", "it"]);
-    test.args(["--", "second_opinion::", "--include-ignored", "--nocapture", "--test-threads=1"]);
+    let mut test = process::cargo("test --quiet --package coboot-emulator --test it");
+    test.args("-- second_opinion:: --include-ignored --nocapture --test-threads=1".split(' '));
     if !json {
         return process::run(&mut test);
     }
@@ -44,9 +43,7 @@ fn cpu(json: bool) -> Outcome {
 
 fn board() -> Outcome {
     let images = build::images(DEFAULT, &["bootloader-virtual-can", "app-virtual-can"])?;
-    let mut test = process::cargo("test");
-    test.args(build::tests_args(DEFAULT));
-    test.args(["--quiet", "--test", "foreign", "second_board::"]);
-    test.args(["--", "--include-ignored", "--nocapture"]);
+    let mut test = process::cargo("test --quiet --test foreign second_board::");
+    test.args(build::tests_args(DEFAULT)).args(["--", "--include-ignored", "--nocapture"]);
     process::run(test.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", images))
 }

@@ -12,15 +12,16 @@ use serde_json::Value;
 use crate::outcome::Outcome;
 use crate::workspace;
 
-/// The cargo that started this program, on this workspace, in the caller's folder.
-pub fn cargo(subcommand: &str) -> Command {
-    cargo_on(workspace::root(), subcommand)
+/// The cargo that started this program, on this workspace, in the caller's folder. `line` is the subcommand with
+/// its arguments, with blanks between them.
+pub fn cargo(line: &str) -> Command {
+    cargo_on(workspace::root(), line)
 }
 
 /// The cargo that started this program, on the package in a folder, in the caller's folder.
-pub fn cargo_on(folder: &Path, subcommand: &str) -> Command {
-    let mut command = bare_cargo();
-    command.arg(subcommand).arg("--manifest-path").arg(folder.join("Cargo.toml"));
+pub fn cargo_on(folder: &Path, line: &str) -> Command {
+    let (mut command, mut words) = (bare_cargo(), line.split(' '));
+    command.args(words.next()).arg("--manifest-path").arg(folder.join("Cargo.toml")).args(words);
     if env::var_os("CARGO_TARGET_DIR").is_some() {
         // The path may be relative, and a job may start cargo in another folder.
         command.env("CARGO_TARGET_DIR", workspace::target_dir());
@@ -35,13 +36,12 @@ pub fn bare_cargo() -> Command {
 
 /// What cargo says of the crates of the workspace.
 pub fn metadata() -> Outcome<Value> {
-    json(&output(cargo("metadata").args(["--no-deps", "--format-version", "1"]))?)
+    json(&output(&mut cargo("metadata --no-deps --format-version 1"))?)
 }
 
 /// The crates that `cargo tree` lists, as `NAME VERSION`.
 pub fn tree(words: &[&str]) -> Outcome<BTreeSet<String>> {
-    let form = ["--locked", "--prefix", "none", "--no-dedupe", "--format", "{p}"];
-    let said = output(cargo("tree").args(form).args(words))?;
+    let said = output(cargo("tree --locked --prefix none --no-dedupe --format {p}").args(words))?;
     // `name v1.2.3`, and more.
     let krate = |line: &str| {
         let mut words = line.split(' ');

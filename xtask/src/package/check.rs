@@ -98,7 +98,7 @@ pub fn wheel(release: &Release, root: &Path) -> Outcome {
     process::run(Command::new(&python).args(pip).arg(&release.dist).arg("coflash"))?;
     let said = process::output(Command::new(root.join("venv/bin/coflash")).arg("--version"))?;
     said_in(&said, VERSION, "coflash --version")?;
-    process::run(process::cargo("build").args(["--quiet", "--package", "coboot-node"]))?;
+    process::run(&mut process::cargo("build --quiet --package coboot-node"))?;
     let node = workspace::target_dir().join("debug/coboot-node");
     files::write(&root.join("program.bin"), sample())?;
     let mut flash = Command::new(&python);

@@ -19,7 +19,7 @@ const NOTICES: [&str; 6] = ["LICENSE", "LICENCE", "COPYING", "COPYRIGHT", "NOTIC
 /// gives the same text.
 pub fn text() -> Outcome<String> {
     let linked = process::tree(&["--package", "coflash", "--edges", "normal", "--target", "all"])?;
-    let metadata = process::output(process::cargo("metadata").args(["--locked", "--format-version", "1"]))?;
+    let metadata = process::output(&mut process::cargo("metadata --locked --format-version 1"))?;
     let mut crates = BTreeMap::new();
     for package in process::list(&process::json(&metadata)?, "packages") {
         if let Some((line, folder)) = of(package, &linked) {

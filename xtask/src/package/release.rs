@@ -63,14 +63,11 @@ impl Release {
 /// `cargo package` of all crates that may be published. One call does all, since they depend on
 /// each other and none is in the registry yet.
 pub fn package_crates(release: &Release) -> Outcome<Command> {
-    let mut command = process::cargo("package");
-    command.args(["--locked", "--target-dir"]).arg(&release.build);
+    let mut command = process::cargo("package --locked --target-dir");
+    command.arg(&release.build).args(release.draft.then_some("--allow-dirty"));
     // The packages without `publish = false`.
     let metadata = process::metadata()?;
     let published = list(&metadata, "packages").filter(|package| package["publish"].is_null());
     command.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
-    if release.draft {
-        command.arg("--allow-dirty");
-    }
     Ok(command)
 }

@@ -204,9 +204,8 @@ fn board_programs(board: &Layout, tier: Tier) -> Outcome<Vec<Program>> {
 
 /// Builds the programs that tests start, for tests that are chosen by words.
 fn programs_of_ours() -> Outcome {
-    let mut cargo = process::cargo("build");
-    cargo.current_dir(workspace::root()).args(workspace::on_host());
-    process::run(cargo.args(["--bin=coflash", "--bin=coboot-node", "--bin=emulate"]))
+    let mut cargo = process::cargo("build --bin=coflash --bin=coboot-node --bin=emulate");
+    process::run(cargo.args(workspace::on_host()).current_dir(workspace::root()))
 }
 
 /// Builds the images of a tier, and of those before it.
@@ -290,9 +289,9 @@ fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
 fn ci(summary: &mut Summary) -> Outcome {
     let jobs = beside_images(Tier::Ci, || later(Tier::Ci, summary))?;
     runner::run(jobs, summary);
-    let mut doc = process::cargo("test");
+    let mut doc = process::cargo("test --doc --workspace --quiet");
     let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
-    doc.current_dir(workspace::root()).args(["--doc", "--workspace", "--quiet"]).args(without);
+    doc.current_dir(workspace::root()).args(without);
     runner::count("documentation", process::run(&mut doc), summary);
     other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
 }

@@ -26,9 +26,8 @@ pub struct Program {
 
 /// Builds the test programs of packages; `arguments` select them for cargo.
 pub fn build(arguments: &[String]) -> Outcome<Vec<Program>> {
-    let mut cargo = process::cargo("test");
-    cargo.args(["--no-run", "--message-format=json-render-diagnostics"]).args(arguments);
-    cargo.current_dir(workspace::root()).stderr(std::process::Stdio::inherit());
+    let mut cargo = process::cargo("test --no-run --message-format=json-render-diagnostics");
+    cargo.args(arguments).current_dir(workspace::root()).stderr(std::process::Stdio::inherit());
     // On its standard output are messages for programs; the errors it has shown.
     let messages = process::output(&mut cargo)
         .map_err(|_| "the test programs do not build; what cargo printed above says why.".to_owned())?;
