@@ -59,7 +59,7 @@ pub struct Images {
 }
 
 /// The images for a board of another chip.
-const OF_A_CHIP: &str = "bootloader bootloader-least bootloader-paulus bootloader-watchdog app-v1 app-v2";
+const OF_A_CHIP: &str = "bootloader bootloader-paulus bootloader-watchdog app-v1 app-v2";
 
 /// The images for the board with two programs.
 const OF_TWO_PROGRAMS: &str =
@@ -80,11 +80,9 @@ pub const IMAGES: &[Images] = &[
 pub const OF_EACH_CHIP: &[(&str, &str)] = &[
     ("device", "device::"),
     ("device", "watchdog::"),
-    ("device", "supply::"),
     ("device", "abi::"),
     ("device", "handover::"),
     ("update", "main_job::"),
-    ("update", "conform::"),
 ];
 
 /// Tests that need what not every board has.
