@@ -17,6 +17,11 @@ fn main() {
     let shown = commit.map(|name| format!(" ({})", &name[..DIGITS])).unwrap_or_default();
     println!("cargo:rustc-env=COFLASH_VERSION={version}{shown}");
     println!("cargo:rerun-if-changed=build.rs");
+    // The pages, and the kit that reads them, are in the repository and in no package.
+    println!("cargo:rustc-check-cfg=cfg(repository)");
+    if Path::new("tests").exists() {
+        println!("cargo:rustc-cfg=repository");
+    }
 }
 
 /// In the archive of the sources: `git archive` has written it into this file.

@@ -443,23 +443,6 @@ mod tests {
         assert!(!format!("{config:?}").contains("secret"), "{config:?}");
     }
 
-    #[test]
-    fn the_documentations_example_is_a_configuration() {
-        let page = include_str!("../../../docs/agent.md");
-        let example = page.split("```toml\n").nth(1).and_then(|block| block.split("```").next()).unwrap();
-        let folder = std::env::temp_dir().join(format!("coflash-agent-example-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        std::fs::write(folder.join("gateway.token"), "t").unwrap();
-        std::fs::write(folder.join("root.pub"), root().to_pem()).unwrap();
-        let config = Config::read(example, &folder, (None, None), &|_| Some("t".to_string()));
-        std::fs::remove_dir_all(&folder).unwrap();
-        match config {
-            Ok(config) => assert!(config.targets.len() > 1),
-            // The example's server is at https://.
-            Err(why) => assert!(!cfg!(feature = "tls") && why.contains("feature tls"), "{why}"),
-        }
-    }
-
     /// A machine trusts somebody, and a bus is that of one machine; devices may be on it, too.
     #[test]
     fn a_machine_names_the_roots_that_it_trusts() {

@@ -150,6 +150,7 @@ mod tests {
 
     /// Each option of `flash` must have a line in the example on the page, which shows everything
     /// that a file may contain, and the command line's reader must accept each line.
+    #[cfg(repository)]
     #[test]
     fn the_documentations_example_has_every_option_of_flash() {
         let page = include_str!("../../../docs/coflash.md");

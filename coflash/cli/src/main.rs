@@ -43,7 +43,7 @@ mod nmt;
 mod objects;
 mod output;
 mod package;
-#[cfg(test)]
+#[cfg(all(test, repository))]
 mod pages;
 mod program;
 mod progress;

@@ -119,11 +119,13 @@ finally:
     node.kill()
 ";
 
-/// The crates build from the files for the registry, and `coflash` installs from its folder.
+/// The crates build from the files for the registry, each by itself, and their tests pass from there;
+/// `coflash` installs from its folder.
 pub fn crates(release: &Release, root: &Path) -> Outcome {
     // One of the crates is the emulator.
     setup::prepare(&[setup::Part::Emulator])?;
     process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
+    tests_of_crates(release, &root.join("crates"))?;
     let mut install = process::bare_cargo();
     install.args(["install", "--locked", "--debug", "--quiet", "--no-track", "--path"]);
     install.arg(workspace::root().join("coflash/cli")).arg("--root").arg(root);
@@ -132,6 +134,28 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
     let installed = root.join("bin/coflash");
     let said = process::output(Command::new(&installed).arg("--version").current_dir(root))?;
     said_in(&said, VERSION, "coflash --version")
+}
+
+/// Runs the tests that the files for the registry have, in a folder without the repository. None of
+/// the crates is in the registry yet: a workspace has them find each other.
+fn tests_of_crates(release: &Release, folder: &Path) -> Outcome {
+    files::make(folder)?;
+    let mut workspace = "[workspace]\nmembers = [\"*\"]\nresolver = \"2\"\n\n[patch.crates-io]\n".to_owned();
+    let packed = files::within(&release.build.join("package"))?;
+    for file in packed.iter().filter(|file| files::is(file, "crate")) {
+        files::unpack(file, folder)?;
+        let place = file.file_stem().unwrap_or_default().to_string_lossy();
+        let name = place.strip_suffix(VERSION).unwrap_or(&place).trim_end_matches('-');
+        workspace += &format!("{name} = {{ path = \"{place}\" }}\n");
+    }
+    files::write(&folder.join("Cargo.toml"), workspace)?;
+    files::copy(&workspace::root().join("Cargo.lock"), &folder.join("Cargo.lock"))?;
+    let mut tests = process::bare_cargo();
+    tests
+        .args(["test", "--workspace", "--quiet"])
+        .current_dir(folder)
+        .env("CARGO_TARGET_DIR", &release.build);
+    process::run(tests.env("CARGO_PROFILE_DEV_OPT_LEVEL", "1").env("CARGO_PROFILE_DEV_DEBUG", "0"))
 }
 
 /// Runs the program in a folder without any other file of a system: with `root` as its root if the

@@ -32,8 +32,8 @@ Makes what is handed out, in target/dist. Without a PART it makes all of them:
 SHA256SUMS has the sums of all files in target/dist.
 
   --check   installs each part into an empty root and runs it; builds coflash from the source archive in another
-            folder and compares the two programs byte by byte; verifies the crates against each other. This takes
-            a quarter of an hour and more on two cores, so it is a job of its own and no part of .ci/run.
+            folder and compares the two programs byte by byte; verifies the crates against each other, and runs
+            their tests from their packages. This takes half an hour and more on two cores, so it is a job of its own and no part of .ci/run.
   --draft   a trial: also packs a tree with changes that are not committed (the source archive is without them),
             or a commit without the tag of its version, and by another Rust than a release has
 ";

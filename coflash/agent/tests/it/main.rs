@@ -8,6 +8,7 @@ macro_rules! data {
     };
 }
 
+mod config;
 mod package;
 mod tls;
 

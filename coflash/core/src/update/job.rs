@@ -169,18 +169,6 @@ mod tests {
     }
 
     #[test]
-    fn the_documentations_example_is_a_job() {
-        let page = include_str!("../../../../docs/coflash.md");
-        let example = page.split("```toml\n").skip(1).filter_map(|block| block.split("```").next());
-        let example = example.into_iter().find(|block| block.contains("[[device]]")).unwrap();
-        let entries = job(example).unwrap();
-        let nodes: Vec<_> = entries.iter().filter_map(|entry| entry.node).map(NodeId::get).collect();
-        assert_eq!(nodes, [5, 6, 9]);
-        assert_eq!((entries[1].settings.start, entries[0].settings.trial_run), (Some(false), Some(true)));
-        assert!(entries[2].address.is_some());
-    }
-
-    #[test]
     fn a_fault_is_named_with_its_place() {
         for (text, words) in [
             ("", "line 1: it names no device"),

@@ -10,4 +10,5 @@ macro_rules! data {
 mod device;
 mod file;
 mod machine;
+mod pages;
 mod update;

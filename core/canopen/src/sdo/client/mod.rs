@@ -6,7 +6,7 @@
 //! all of them.
 //!
 //! ```
-//! use canopen::sdo::client::{Config, Step, Transfer, Upload};
+//! use canopen::sdo::client::{Buffer, Config, Step, Transfer, Upload};
 //! use canopen::{Address, Frame, Instant, NodeId};
 //!
 //! # fn send(_: &Frame) {}
@@ -14,7 +14,9 @@
 //! # let mut clock = (0..).step_by(100).map(Instant::from_millis);
 //! # let mut now = || clock.next().unwrap();
 //! let node = NodeId::new(5).unwrap();
-//! let mut upload = Upload::new(node, Address::new(0x1018, 1), Vec::new(), Config::default());
+//! let mut bytes = [0; 4];
+//! let vendor_id = Buffer::new(&mut bytes);
+//! let mut upload = Upload::new(node, Address::new(0x1018, 1), vendor_id, Config::default());
 //! let result = loop {
 //!     match upload.poll(now()) {
 //!         Step::Send(frame) => send(&frame),
@@ -26,7 +28,8 @@
 //!         Step::Done(result) => break result,
 //!     }
 //! };
-//! let bytes = upload.into_sink();
+//! let vendor_id = upload.into_sink();
+//! let bytes = vendor_id.filled();
 //! # assert_eq!(result, Err(canopen::sdo::SdoError::NoAnswer));
 //! ```
 //!
