@@ -11,7 +11,7 @@ use canopen::Frame;
 use embedded_can::Frame as _;
 use socketcan::{CanFrame, CanSocket, Socket, SocketOptions};
 
-use super::adapter::{Adapter, AdapterError};
+use super::adapter::{Adapter, AdapterError, Obstacle};
 use super::found::shown;
 use super::health::{Controller, Health};
 use super::links;
@@ -52,7 +52,7 @@ impl SocketCan {
         if is_up(interface) == Some(false) {
             let advice =
                 format!("switch it on, with the bit rate of the bus: sudo ip link set {interface} up type can bitrate 500000");
-            return Err(AdapterError::unusable(name, "it is switched off", advice));
+            return Err(AdapterError::unusable(name, Obstacle::Other, "it is switched off", advice));
         }
         // The bus also works without error frames, but the tool knows less about it.
         let _ = socket.set_error_filter_accept_all();
@@ -115,7 +115,7 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     } else {
         (error.to_string(), those_there())
     };
-    AdapterError::unusable(name, what, advice)
+    AdapterError::unusable(name, Obstacle::Other, what, advice)
 }
 
 /// A list of the CAN interfaces, for advice.
