@@ -92,8 +92,8 @@ fn close_other(port: &str) -> String {
 /// The advice for a port that the user may not open, as only this group may.
 fn permit(group: &str) -> String {
     format!(
-        "the port belongs to the group {group}: sudo usermod -aG {group} $USER, then log out and in; or, for \
-         this kind of adapter and everybody at this computer, a udev rule: put SUBSYSTEM==\"tty\", \
+        "join the group {group}, which the port belongs to: sudo usermod -aG {group} $USER, then log out and in; or, for \
+         this kind of adapter and everybody at this computer, add a udev rule: put SUBSYSTEM==\"tty\", \
          ATTRS{{idVendor}}==\"16d0\", TAG+=\"uaccess\" (with the vendor that lsusb shows) into \
          /etc/udev/rules.d/70-slcan.rules, and plug the adapter in again"
     )

@@ -76,13 +76,10 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
         };
         unusable(Obstacle::Absent, what, "plug it in")
     })?;
+    let rule = udev_rule(device.vendor_id(), device.product_id());
     let refused = |error: nusb::Error| {
         let (obstacle, advice) = match error.kind() {
-            ErrorKind::PermissionDenied => (
-                Obstacle::Other,
-                "allow it by a udev rule: put SUBSYSTEM==\"usb\", ATTRS{idVendor}==\"1d50\", ATTRS{idProduct}==\"606f\", \
-                 TAG+=\"uaccess\" into /etc/udev/rules.d/70-candlelight.rules, and plug the adapter in again",
-            ),
+            ErrorKind::PermissionDenied => (Obstacle::Other, rule.as_str()),
             ErrorKind::Busy => (
                 Obstacle::InUse,
                 "the kernel's driver or another program uses it: on Linux use the interface that the kernel made of it \
@@ -101,6 +98,15 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
     let interface = opened.claim_interface(0).wait().map_err(refused)?;
     let advice = "it must speak gs_usb (candleLight)";
     Device::new(interface).map_err(|what| unusable(Obstacle::Other, what, advice))
+}
+
+/// The advice for a device that the user may not use, by its USB vendor and product ID.
+fn udev_rule(vendor: u16, product: u16) -> String {
+    format!(
+        "allow it by a udev rule: put SUBSYSTEM==\"usb\", ATTRS{{idVendor}}==\"{vendor:04x}\", \
+         ATTRS{{idProduct}}==\"{product:04x}\", TAG+=\"uaccess\" into /etc/udev/rules.d/70-gs_usb.rules, and plug the \
+         adapter in again"
+    )
 }
 
 /// An open device.
@@ -201,5 +207,17 @@ impl Usb for Device {
         buffer.clear();
         self.incoming.submit(buffer);
         Ok(Some(bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// udev compares with the files of sysfs, which have four small digits.
+    #[test]
+    fn the_rule_names_the_device_as_udev_does() {
+        let advice = udev_rule(0x16D0, 0x0AB8);
+        assert!(advice.contains(r#"ATTRS{idVendor}=="16d0", ATTRS{idProduct}=="0ab8","#), "{advice}");
     }
 }
