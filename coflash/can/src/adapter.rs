@@ -162,10 +162,8 @@ pub enum AdapterError {
         what: String,
         /// What to do.
         advice: String,
-        /// Whether another program uses the adapter.
-        in_use: bool,
-        /// Whether the URL names what is not there: a list of the adapters helps.
-        absent: bool,
+        /// The kind of reason.
+        obstacle: Obstacle,
     },
     /// The adapter accepts no more frames, because its queued frames do not reach the bus.
     #[error("{adapter} accepts no more frames: its queued frames do not reach the bus")]
@@ -219,7 +217,7 @@ impl AdapterError {
     /// Whether the URL names no adapter of this computer: a list of those that are there helps.
     #[must_use]
     pub const fn is_absent(&self) -> bool {
-        matches!(self, Self::Url { .. } | Self::Unusable { absent: true, .. })
+        matches!(self, Self::Url { .. } | Self::Unusable { obstacle: Obstacle::Absent, .. })
     }
 
     /// What to do next, wherever the user has entered the URL.
@@ -276,26 +274,28 @@ impl AdapterError {
             vendor_can::LoadError::Missing { .. } => from.to_string(),
             vendor_can::LoadError::Old { .. } => format!("it is too old, or another library: {from}"),
         };
-        Self::unusable(adapter, error.to_string(), advice)
+        Self::unusable(adapter, Obstacle::Other, error.to_string(), advice)
     }
 
     /// An adapter that cannot be opened.
     pub(crate) fn unusable(
         adapter: impl Into<String>,
+        obstacle: Obstacle,
         what: impl Into<String>,
         advice: impl Into<String>,
     ) -> Self {
         let (adapter, what, advice) = (adapter.into(), what.into(), advice.into());
-        Self::Unusable { adapter, what, advice, in_use: false, absent: false }
+        Self::Unusable { adapter, what, advice, obstacle }
     }
+}
 
-    /// An adapter that is not there.
-    pub(crate) fn missing(
-        adapter: impl Into<String>,
-        what: impl Into<String>,
-        advice: impl Into<String>,
-    ) -> Self {
-        let (adapter, what, advice) = (adapter.into(), what.into(), advice.into());
-        Self::Unusable { adapter, what, advice, in_use: false, absent: true }
-    }
+/// Why an adapter cannot be used, as far as what comes next depends on it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Obstacle {
+    /// The URL names what is not there: a list of the adapters helps.
+    Absent,
+    /// Another program uses the adapter.
+    InUse,
+    /// Anything else.
+    Other,
 }

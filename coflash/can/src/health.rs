@@ -125,13 +125,13 @@ impl Health {
         Some(match self.trouble()? {
             Trouble::Stopped => {
                 "the adapter's CAN controller is switched off: switch the interface on (sudo ip link set can0 up, with \
-                 its own name)"
+                 its name in place of can0)"
                     .to_string()
             }
             Trouble::Off => format!(
                 "the adapter is bus-off: all its frames were disturbed, for example by a wrong bit rate{rate} or a short circuit \
                  between CAN-H and CAN-L; check both, then switch the adapter off and on (sudo ip link set can0 down, \
-                 then up, with its own name)"
+                 then up, with its interface's name in place of can0)"
             ),
             Trouble::Disturbed => format!(
                 "frames on the bus are disturbed ({} bit, stuff, form or CRC errors): the bit rate is wrong{rate}, or a \

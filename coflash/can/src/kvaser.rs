@@ -9,7 +9,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::canlib::{Canlib, Message};
 
-use super::adapter::{AdapterError, ABSENT};
+use super::adapter::{AdapterError, Obstacle, ABSENT};
 use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
@@ -80,30 +80,24 @@ fn parameters(rate: u32) -> Option<(i32, (u32, u32))> {
 
 /// Opens a channel at a bit rate in bit/s.
 pub(super) fn open(channel: &str, rate: u32) -> Result<Driven, AdapterError> {
-    let channel = number(channel)
-        .map_err(|what| AdapterError::unusable("Kvaser adapter", what, "choose another one"))?;
+    let channel = number(channel).map_err(|what| {
+        AdapterError::unusable("Kvaser adapter", Obstacle::Other, what, "choose another one")
+    })?;
     let name = format!("Kvaser channel {channel}");
     let adapter = name.clone();
-    let unusable = move |what: String, advice: &str, in_use| AdapterError::Unusable {
-        adapter,
-        what,
-        advice: advice.to_string(),
-        in_use,
-        absent: advice == ABSENT,
+    let unusable = move |what, (obstacle, advice): (Obstacle, &str)| {
+        AdapterError::unusable(adapter, obstacle, what, advice)
     };
     let Some((given, segments)) = parameters(rate) else {
-        return Err(unusable(
-            format!("it does not support {rate} bit/s"),
-            "choose one from 20k to 1M",
-            false,
-        ));
+        let advice = (Obstacle::Other, "choose one from 20k to 1M");
+        return Err(unusable(format!("it does not support {rate} bit/s"), advice));
     };
     Driven::open(name, move || {
         let library =
             Canlib::load().map_err(|error| AdapterError::library("Kvaser adapter", &error, FROM))?;
         let handle = library.open(channel.into(), ACCEPT_VIRTUAL);
         if handle < 0 {
-            return Err(unusable(words(handle), advice(handle), matches!(handle, NO_CHANNELS | NO_ACCESS)));
+            return Err(unusable(words(handle), advice(handle)));
         }
         let opened = Kvaser { library, handle, health: Health { bit_rate: Some(rate), ..Health::default() } };
         let jump_width = u32::from(segments.0 != 0);
@@ -111,7 +105,7 @@ pub(super) fn open(channel: &str, rate: u32) -> Result<Driven, AdapterError> {
         let status = if status < 0 { status } else { opened.library.bus_on(handle) };
         if status < 0 {
             opened.library.close(handle);
-            return Err(unusable(words(status), advice(status), status == NO_ACCESS));
+            return Err(unusable(words(status), advice(status)));
         }
         Ok(opened)
     })
@@ -239,19 +233,36 @@ fn words(status: i32) -> String {
     format!("{why}, status {status}")
 }
 
-/// The advice for a `canStatus`.
-fn advice(status: i32) -> &'static str {
+/// The kind of error of a `canStatus`, and the advice.
+fn advice(status: i32) -> (Obstacle, &'static str) {
     match status {
-        -3 | -26 => ABSENT,
-        NO_CHANNELS | NO_ACCESS => "close the other program (CanKing, for example), and try again",
-        -23 | -24 => FROM,
-        _ => "unplug the adapter, plug it in and try again",
+        -3 | -26 => (Obstacle::Absent, ABSENT),
+        NO_CHANNELS | NO_ACCESS => {
+            (Obstacle::InUse, "close the other program (CanKing, for example), and try again")
+        }
+        -23 | -24 => (Obstacle::Other, FROM),
+        _ => (Obstacle::Other, "unplug the adapter, plug it in and try again"),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Values of canstat.h.
+    #[test]
+    fn a_channel_in_use_and_one_that_is_not_there_are_told_apart() {
+        for (status, obstacle) in [
+            (-3, Obstacle::Absent),
+            (-26, Obstacle::Absent),
+            (-5, Obstacle::InUse),
+            (-31, Obstacle::InUse),
+            (-23, Obstacle::Other),
+            (-15, Obstacle::Other),
+        ] {
+            assert_eq!(advice(status).0, obstacle, "{status}");
+        }
+    }
 
     #[test]
     fn a_message_that_is_no_frame_is_nonsense_and_named() {

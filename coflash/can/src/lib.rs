@@ -41,7 +41,7 @@ mod target;
 mod tcp;
 mod trace;
 
-pub use self::adapter::{Adapter, AdapterError, URLS};
+pub use self::adapter::{Adapter, AdapterError, Obstacle, URLS};
 pub use self::cia309::Cia309;
 pub use self::found::{Found, Kind, Missing};
 pub use self::gateway::{Gateway, GatewayError};

@@ -10,7 +10,7 @@ use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::pcan::{Message, Pcan};
 
-use super::adapter::{AdapterError, ABSENT};
+use super::adapter::{AdapterError, Obstacle, ABSENT};
 use super::driven::{Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
@@ -116,21 +116,18 @@ fn registers(rate: u32) -> Option<u16> {
 pub(super) fn open(channel_name: &str, rate: u32) -> Result<Driven, AdapterError> {
     let name = format!("PEAK adapter {channel_name}");
     let adapter = name.clone();
-    let unusable = move |what: String, advice: &str, in_use| AdapterError::Unusable {
-        adapter,
-        what,
-        advice: advice.to_string(),
-        in_use,
-        absent: advice == ABSENT,
+    let unusable = move |what, (obstacle, advice): (Obstacle, &str)| {
+        AdapterError::unusable(adapter, obstacle, what, advice)
     };
     let (Some(channel), Some(registers)) = (channel(channel_name), registers(rate)) else {
-        return Err(unusable(format!("it does not support {rate} bit/s"), "choose one from 5k to 1M", false));
+        let advice = (Obstacle::Other, "choose one from 5k to 1M");
+        return Err(unusable(format!("it does not support {rate} bit/s"), advice));
     };
     Driven::open(name, move || {
         let library = Pcan::load().map_err(|error| AdapterError::library("PEAK adapter", &error, FROM))?;
         let status = library.initialize(channel, registers);
         if status & !status::HARMLESS != 0 {
-            return Err(unusable(words(status), advice(status), status & 0xC00 != 0 && status & 0x1000 == 0));
+            return Err(unusable(words(status), advice(status)));
         }
         // A library from before 2018 does not know this parameter; it reports the controller's
         // state all the same.
@@ -288,19 +285,34 @@ fn words(status: u32) -> String {
     format!("{why}, status {status:X}h")
 }
 
-/// The advice for the error in a status.
-fn advice(status: u32) -> &'static str {
+/// The kind of the error in a status, and the advice.
+fn advice(status: u32) -> (Obstacle, &'static str) {
     match status & !status::HARMLESS {
-        0x100 | 0x1400 => ABSENT,
-        0x200 => FROM,
-        0x400 | 0x800 => "close the other program (PCAN-View, for example), and try again",
-        _ => "unplug the adapter, plug it in and try again",
+        0x100 | 0x1400 => (Obstacle::Absent, ABSENT),
+        0x200 => (Obstacle::Other, FROM),
+        0x400 | 0x800 => (Obstacle::InUse, "close the other program (PCAN-View, for example), and try again"),
+        _ => (Obstacle::Other, "unplug the adapter, plug it in and try again"),
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Values of PCANBasic.h.
+    #[test]
+    fn an_adapter_in_use_and_one_that_is_not_there_are_told_apart() {
+        for (status, obstacle) in [
+            (0x100, Obstacle::Absent),
+            (0x1400, Obstacle::Absent),
+            (0x400, Obstacle::InUse),
+            (0x800 | status::BUS_LIGHT, Obstacle::InUse),
+            (0x200, Obstacle::Other),
+            (0x1800, Obstacle::Other),
+        ] {
+            assert_eq!(advice(status).0, obstacle, "{status:X}h");
+        }
+    }
 
     /// Values of PCANBasic.h.
     #[test]

@@ -2,7 +2,7 @@
 
 use serialport::{ErrorKind, SerialPortInfo, SerialPortType};
 
-use super::adapter::AdapterError;
+use super::adapter::{AdapterError, Obstacle};
 use super::found::{shown, Found, Kind, Missing};
 
 /// USB vendor and product IDs of adapters that speak only SLCAN (CANable: current and first IDs).
@@ -58,45 +58,45 @@ pub(super) fn refused(adapter: String, port: &str, error: &serialport::Error) ->
         (ErrorKind::NoDevice, _) => there,
         _ => false,
     };
-    let (what, advice) = match (error.kind(), io) {
-        _ if in_use => busy(port),
+    let said = shown(error.to_string().as_bytes());
+    let (obstacle, what, advice) = match (error.kind(), io) {
+        _ if in_use => (Obstacle::InUse, "another program uses the port".to_string(), close_other(port)),
         (_, Some(std::io::ErrorKind::PermissionDenied)) => {
-            let group = group(port);
-            (
-                "permission denied".to_string(),
-                format!(
-                    "the port belongs to the group {group}: sudo usermod -aG {group} $USER, then log out and in; or, for \
-                     this kind of adapter and everybody at this computer, a udev rule: put SUBSYSTEM==\"tty\", \
-                     ATTRS{{idVendor}}==\"16d0\", TAG+=\"uaccess\" (with the vendor that lsusb shows) into \
-                     /etc/udev/rules.d/70-slcan.rules, and plug the adapter in again"
-                ),
-            )
+            (Obstacle::Other, "permission denied".to_string(), permit(&group(port)))
         }
-        (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => {
-            let advice =
-                format!("{}; plug the adapter in, or name the right one: slcan:PORT@500k", those_there());
-            return AdapterError::missing(adapter, "no serial port has this name", advice);
-        }
-        _ if there => {
-            let what = format!("it is not a serial port ({})", shown(error.to_string().as_bytes()));
-            let advice = format!("{}; name the right one: slcan:PORT@500k", those_there());
-            return AdapterError::missing(adapter, what, advice);
-        }
-        _ => (
-            shown(error.to_string().as_bytes()),
-            format!("{}; unplug the adapter and plug it in again", those_there()),
+        (ErrorKind::NoDevice, _) | (_, Some(std::io::ErrorKind::NotFound)) => (
+            Obstacle::Absent,
+            "no serial port has this name".to_string(),
+            format!("{}; plug the adapter in, or name the right one: slcan:PORT@500k", those_there()),
         ),
+        _ if there => (
+            Obstacle::Absent,
+            format!("it is not a serial port ({said})"),
+            format!("{}; name the right one: slcan:PORT@500k", those_there()),
+        ),
+        _ => (Obstacle::Other, said, format!("{}; unplug the adapter and plug it in again", those_there())),
     };
-    AdapterError::Unusable { adapter, what, advice, in_use, absent: false }
+    AdapterError::unusable(adapter, obstacle, what, advice)
 }
 
-fn busy(port: &str) -> (String, String) {
+/// The advice for a port that another program uses.
+fn close_other(port: &str) -> String {
     let who = if cfg!(unix) {
         format!("sudo fuser -v {port} names it; ModemManager opens new ports for some seconds")
     } else {
         "a terminal program, for example".to_string()
     };
-    ("another program uses the port".to_string(), format!("close the other program ({who}), and try again"))
+    format!("close the other program ({who}), and try again")
+}
+
+/// The advice for a port that the user may not open, as only this group may.
+fn permit(group: &str) -> String {
+    format!(
+        "join the group {group}, which the port belongs to: sudo usermod -aG {group} $USER, then log out and in; or, for \
+         this kind of adapter and everybody at this computer, add a udev rule: put SUBSYSTEM==\"tty\", \
+         ATTRS{{idVendor}}==\"16d0\", TAG+=\"uaccess\" (with the vendor that lsusb shows) into \
+         /etc/udev/rules.d/70-slcan.rules, and plug the adapter in again"
+    )
 }
 
 /// The group that may use a port; `dialout` if this is unknown.

@@ -11,7 +11,7 @@ use canopen::Frame;
 use embedded_can::Frame as _;
 use socketcan::{CanFrame, CanSocket, Socket, SocketOptions};
 
-use super::adapter::{Adapter, AdapterError};
+use super::adapter::{Adapter, AdapterError, Obstacle};
 use super::found::shown;
 use super::health::{Controller, Health};
 use super::links;
@@ -23,6 +23,8 @@ const PATIENCE: Duration = Duration::from_secs(1);
 const QUEUE_FULL: i32 = 105;
 /// `ENODEV` and `ENXIO`: no interface has this name, or it is not a CAN interface.
 const NONE: [i32; 2] = [19, 6];
+/// The message for an interface that is switched off.
+const SWITCHED_OFF: &str = "it is switched off";
 /// `ENETDOWN`: the interface is switched off.
 const DOWN: i32 = 100;
 /// `EAFNOSUPPORT`, `EPROTONOSUPPORT` and `ESOCKTNOSUPPORT`: the kernel has no CAN support, or has
@@ -50,9 +52,7 @@ impl SocketCan {
         let name = format!("CAN interface {interface}");
         let socket = CanSocket::open(interface).map_err(|source| refused(&name, interface, &source))?;
         if is_up(interface) == Some(false) {
-            let advice =
-                format!("switch it on, with the bit rate of the bus: sudo ip link set {interface} up type can bitrate 500000");
-            return Err(AdapterError::unusable(name, "it is switched off", advice));
+            return Err(AdapterError::unusable(name, Obstacle::Other, SWITCHED_OFF, switch_on(interface)));
         }
         // The bus also works without error frames, but the tool knows less about it.
         let _ = socket.set_error_filter_accept_all();
@@ -102,10 +102,7 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     } else if NONE.contains(&code) {
         ("no interface has this name".to_string(), those_there())
     } else if code == DOWN {
-        (
-            "it is switched off".to_string(),
-            format!("sudo ip link set {interface} up type can bitrate 500000 (with the bit rate of the bus)"),
-        )
+        (SWITCHED_OFF.to_string(), switch_on(interface))
     } else if error.kind() == ErrorKind::PermissionDenied {
         (
             "permission denied".to_string(),
@@ -115,7 +112,14 @@ fn refused(name: &str, interface: &str, error: &io::Error) -> AdapterError {
     } else {
         (error.to_string(), those_there())
     };
-    AdapterError::unusable(name, what, advice)
+    AdapterError::unusable(name, Obstacle::Other, what, advice)
+}
+
+/// The advice for an interface that is switched off.
+fn switch_on(interface: &str) -> String {
+    format!(
+        "switch it on, with the bit rate of the bus: sudo ip link set {interface} up type can bitrate 500000"
+    )
 }
 
 /// A list of the CAN interfaces, for advice.
@@ -124,7 +128,7 @@ fn those_there() -> String {
     let names: Vec<String> = links.iter().map(|link| shown(link.name.as_bytes())).take(16).collect();
     match names.as_slice() {
         [] => "this computer has no CAN interface at present: plug the adapter in; its driver creates one (ip link shows it); \
-               then sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter works without an interface: \
+               then switch that on: sudo ip link set can0 up type can bitrate 500000; an SLCAN adapter works without an interface: \
                slcan:/dev/ttyACM0@500k"
             .to_string(),
         names => format!("this computer has these CAN interfaces: {}", names.join(", ")),

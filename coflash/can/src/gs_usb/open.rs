@@ -3,7 +3,7 @@
 use super::driver::GsUsb;
 use super::usb;
 use super::which::{Choice, Which};
-use crate::adapter::AdapterError;
+use crate::adapter::{AdapterError, Obstacle};
 use crate::driven::Driven;
 use crate::found::{shown, Found, Kind, Missing};
 
@@ -18,7 +18,12 @@ const NO_DEVICE: &str = "it names no device by place or serial number: gs_usb:0@
 /// Opens a device at a bit rate in bit/s.
 pub(crate) fn open(which: &str, rate: u32) -> Result<Driven, AdapterError> {
     let Some(which) = Which::parse(which) else {
-        return Err(AdapterError::unusable("gs_usb adapter", NO_DEVICE, "choose another one"));
+        return Err(AdapterError::unusable(
+            "gs_usb adapter",
+            Obstacle::Other,
+            NO_DEVICE,
+            "choose another one",
+        ));
     };
     let name = format!("gs_usb adapter {which}");
     let adapter = name.clone();
@@ -26,7 +31,7 @@ pub(crate) fn open(which: &str, rate: u32) -> Result<Driven, AdapterError> {
         let usb = usb::open(&adapter, &which.device)?;
         GsUsb::start(usb, which.channel, rate).map_err(|what| {
             let advice = "unplug the adapter, plug it in and try again; it must speak gs_usb (candleLight)";
-            AdapterError::unusable(adapter, what, advice)
+            AdapterError::unusable(adapter, Obstacle::Other, what, advice)
         })
     })
 }

@@ -8,7 +8,7 @@ use nusb::{DeviceInfo, Endpoint, ErrorKind, Interface, MaybeFuture};
 
 use super::driver::{Usb, MOST_UNDER_WAY};
 use super::which::Choice;
-use crate::adapter::AdapterError;
+use crate::adapter::{AdapterError, Obstacle};
 
 /// USB vendor and product IDs of gs_usb adapters (the list of the Linux driver, and CANnectivity).
 const DEVICES: [(u16, u16); 5] =
@@ -59,10 +59,11 @@ fn kernel_has(_: &DeviceInfo) -> bool {
 
 /// Opens a device. `name` is for messages.
 pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
-    let unusable = |what: String, advice: &str| AdapterError::unusable(name, what, advice);
+    let unusable =
+        |obstacle, what: String, advice: &str| AdapterError::unusable(name, obstacle, what, advice);
     let devices = devices().map_err(|error| {
         let advice = "check that USB works on this computer";
-        unusable(format!("the USB devices cannot be listed: {error}"), advice)
+        unusable(Obstacle::Other, format!("the USB devices cannot be listed: {error}"), advice)
     })?;
     let device = match which {
         Choice::Place(place) => devices.get(*place),
@@ -73,35 +74,39 @@ pub(super) fn open(name: &str, which: &Choice) -> Result<Device, AdapterError> {
             0 => "no such adapter is connected to USB".to_string(),
             count => format!("it is not connected ({count} other(s) are)"),
         };
-        AdapterError::missing(name, what, "plug it in")
+        unusable(Obstacle::Absent, what, "plug it in")
     })?;
+    let rule = udev_rule(device.vendor_id(), device.product_id());
     let refused = |error: nusb::Error| {
-        let advice = match error.kind() {
-            ErrorKind::PermissionDenied => {
-                "allow it by a udev rule: put SUBSYSTEM==\"usb\", ATTRS{idVendor}==\"1d50\", ATTRS{idProduct}==\"606f\", \
-                 TAG+=\"uaccess\" into /etc/udev/rules.d/70-candlelight.rules, and plug the adapter in again"
-            }
-            ErrorKind::Busy => {
+        let (obstacle, advice) = match error.kind() {
+            ErrorKind::PermissionDenied => (Obstacle::Other, rule.as_str()),
+            ErrorKind::Busy => (
+                Obstacle::InUse,
                 "the kernel's driver or another program uses it: on Linux use the interface that the kernel made of it \
-                 (socketcan:can0)"
-            }
-            ErrorKind::Unsupported => {
+                 (socketcan:can0)",
+            ),
+            ErrorKind::Unsupported => (
+                Obstacle::Other,
                 "on Windows the device needs the driver WinUSB, which candleLight asks for by itself; Zadig installs it \
-                 for others"
-            }
-            _ => "unplug the adapter, plug it in and try again",
+                 for others",
+            ),
+            _ => (Obstacle::Other, "unplug the adapter, plug it in and try again"),
         };
-        AdapterError::Unusable {
-            adapter: name.to_string(),
-            what: error.to_string(),
-            advice: advice.to_string(),
-            in_use: error.kind() == ErrorKind::Busy,
-            absent: false,
-        }
+        unusable(obstacle, error.to_string(), advice)
     };
     let opened = device.open().wait().map_err(refused)?;
     let interface = opened.claim_interface(0).wait().map_err(refused)?;
-    Device::new(interface).map_err(|what| unusable(what, "it must speak gs_usb (candleLight)"))
+    let advice = "it must speak gs_usb (candleLight)";
+    Device::new(interface).map_err(|what| unusable(Obstacle::Other, what, advice))
+}
+
+/// The advice for a device that the user may not use, by its USB vendor and product ID.
+fn udev_rule(vendor: u16, product: u16) -> String {
+    format!(
+        "allow it by a udev rule: put SUBSYSTEM==\"usb\", ATTRS{{idVendor}}==\"{vendor:04x}\", \
+         ATTRS{{idProduct}}==\"{product:04x}\", TAG+=\"uaccess\" into /etc/udev/rules.d/70-gs_usb.rules, and plug the \
+         adapter in again"
+    )
 }
 
 /// An open device.
@@ -202,5 +207,17 @@ impl Usb for Device {
         buffer.clear();
         self.incoming.submit(buffer);
         Ok(Some(bytes))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// udev compares with the files of sysfs, which have four small digits.
+    #[test]
+    fn the_rule_names_the_device_as_udev_does() {
+        let advice = udev_rule(0x16D0, 0x0AB8);
+        assert!(advice.contains(r#"ATTRS{idVendor}=="16d0", ATTRS{idProduct}=="0ab8","#), "{advice}");
     }
 }

@@ -328,13 +328,9 @@ fn copy(error: &AdapterError) -> AdapterError {
     };
     match error {
         AdapterError::Url { url, why } => AdapterError::Url { url: url.clone(), why: why.clone() },
-        AdapterError::Unusable { adapter, what, advice, in_use, absent } => AdapterError::Unusable {
-            adapter: adapter.clone(),
-            what: what.clone(),
-            advice: advice.clone(),
-            in_use: *in_use,
-            absent: *absent,
-        },
+        AdapterError::Unusable { adapter, what, advice, obstacle } => {
+            AdapterError::unusable(adapter, *obstacle, what, advice)
+        }
         AdapterError::Stuck { adapter, health } => {
             AdapterError::Stuck { adapter: adapter.clone(), health: *health }
         }

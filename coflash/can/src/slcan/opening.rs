@@ -19,7 +19,7 @@
 use std::time::Duration;
 
 use super::{is_version, Line, Message, Slcan, ANSWER};
-use crate::adapter::AdapterError;
+use crate::adapter::{AdapterError, Obstacle};
 use crate::found::shown;
 use crate::ports;
 
@@ -261,7 +261,7 @@ impl<L: Line> Slcan<L> {
             let what = format!("it acknowledges {done}, but not {undone}");
             let advice =
                 "unplug the adapter and plug it in again; if it has a fixed bit rate, leave out @BITRATE";
-            Err(AdapterError::unusable(self.name.clone(), what, advice))
+            Err(AdapterError::unusable(&self.name, Obstacle::Other, what, advice))
         };
         match outcome {
             Some(Outcome::Open | Outcome::OpenWithWords) => Ok(self),
@@ -287,6 +287,6 @@ impl<L: Line> Slcan<L> {
             "this is not an SLCAN adapter, or another port of it: {}; some adapters must be switched to SLCAN, or speak gs_usb",
             ports::those_there()
         );
-        AdapterError::missing(self.name.clone(), what, advice)
+        AdapterError::unusable(&self.name, Obstacle::Absent, what, advice)
     }
 }

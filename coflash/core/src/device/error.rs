@@ -22,13 +22,16 @@ mod advice;
 /// Why a conversation with a device ended early.
 ///
 /// `Display` says what happened, [`advice`](Self::advice) what to do next.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// The CAN adapter failed.
-    Adapter(AdapterError),
+    #[error("{0}")]
+    Adapter(#[from] AdapterError),
     /// The user cancelled.
+    #[error("cancelled")]
     Cancelled,
     /// The device does not answer.
+    #[error("node {node} does not answer ({doing})")]
     NoAnswer {
         /// The device.
         node: NodeId,
@@ -36,6 +39,7 @@ pub enum Error {
         doing: Doing,
     },
     /// The device answers with frames that are too short for SDO.
+    #[error("node {node} answers, but with frames of {len} bytes where SDO has 8 ({doing})")]
     ShortAnswer {
         /// The device.
         node: NodeId,
@@ -45,6 +49,7 @@ pub enum Error {
         len: usize,
     },
     /// The device answered with an SDO abort, and 1F57h gives no further reason.
+    #[error("node {node} refuses {doing}: abort {code}")]
     Refused {
         /// The device.
         node: NodeId,
@@ -54,6 +59,7 @@ pub enum Error {
         code: AbortCode,
     },
     /// The device sent an invalid answer: wrong toggle bit, wrong command, wrong length.
+    #[error("the answer to {doing} is invalid: {code}")]
     Protocol {
         /// The action.
         doing: Doing,
@@ -61,6 +67,13 @@ pub enum Error {
         code: AbortCode,
     },
     /// 1F57h reports that the bootloader could not carry out a command.
+    #[error(
+        "{doing} failed: {what} (1F57h reads {:02X}h{number}{abort})",
+        .error.code(),
+        what = failure_words(*.error, *.detail),
+        number = detail_words(Some(*.error), *.detail),
+        abort = .code.map_or(String::new(), |code| format!(", abort {code}"))
+    )]
     Failed {
         /// The action.
         doing: Doing,
@@ -72,6 +85,7 @@ pub enum Error {
         code: Option<AbortCode>,
     },
     /// 1F57h stays busy.
+    #[error("node {node} is still busy {doing} after {:.1} s", .waited.as_secs_f64())]
     Busy {
         /// The device.
         node: NodeId,
@@ -81,6 +95,7 @@ pub enum Error {
         waited: Duration,
     },
     /// The file is for another device.
+    #[error("the program is for {} {file:08X}h, and node {node} has {device:08X}h", .what.words())]
     WrongTarget {
         /// The device.
         node: NodeId,
@@ -92,6 +107,7 @@ pub enum Error {
         file: u32,
     },
     /// The device takes sealed images only, and the file is none.
+    #[error("node {node} takes sealed images only{}", roots_in_brackets(.roots))]
     SealedOnly {
         /// The device.
         node: NodeId,
@@ -99,6 +115,7 @@ pub enum Error {
         roots: Vec<u32>,
     },
     /// The image cannot be a program of this device.
+    #[error("the image {why}")]
     NoProgram {
         /// The stable error number.
         number: u32,
@@ -108,6 +125,10 @@ pub enum Error {
         advice: Advice,
     },
     /// The device has the program at another address than the image.
+    #[error(
+        "the image is for {:#010x}..={:#010x}, and node {node} has program {program} at {:#010x}..={:#010x}",
+        .image.0, .image.1, .region.0, .region.1
+    )]
     OtherRegion {
         /// The device.
         node: NodeId,
@@ -119,6 +140,12 @@ pub enum Error {
         region: (u32, u32),
     },
     /// The program on trial reports another identity than its bootloader.
+    #[error(
+        "the program on trial tells {} {is}, and the bootloader of node {node} {was}",
+        .what.words(),
+        is = identity_words(*.application),
+        was = identity_words(*.bootloader)
+    )]
     OtherIdentity {
         /// The device.
         node: NodeId,
@@ -130,6 +157,12 @@ pub enum Error {
         application: Option<u32>,
     },
     /// The application does not return to the bootloader.
+    #[error(
+        "node {node} {runs}{}{refuses}",
+        elsewhere_words(*.elsewhere),
+        runs = running_words(*.running, "does not come back in the bootloader"),
+        refuses = .code.map_or(String::new(), |code| format!(": it refuses the call with abort {code}"))
+    )]
     NoBootloader {
         /// The device.
         node: NodeId,
@@ -141,6 +174,7 @@ pub enum Error {
         elsewhere: Option<NodeId>,
     },
     /// The program in the device is not the program of the file.
+    #[error("the program in the device has CRC {device:08X}h, that of the file {file:08X}h")]
     WrongCrc {
         /// The value of 1F56h.
         device: u32,
@@ -148,6 +182,7 @@ pub enum Error {
         file: u32,
     },
     /// The device's dialect does not support an option.
+    #[error("in the dialect {}: {what}", .dialect.name())]
     NotInDialect {
         /// The dialect.
         dialect: Dialect,
@@ -155,16 +190,19 @@ pub enum Error {
         what: &'static str,
     },
     /// The device is locked, and the user gave no password.
+    #[error("node {node} is locked, and no password was given")]
     NoPassword {
         /// The device.
         node: NodeId,
     },
     /// Another device has the node-ID that the bootloader of this device uses.
+    #[error("another device is in its bootloader and answers as node {node}")]
     Occupied {
         /// The node-ID.
         node: NodeId,
     },
     /// Another tool is using the device.
+    #[error("{}", .who.words(*.node))]
     NotAlone {
         /// The device.
         node: NodeId,
@@ -172,6 +210,7 @@ pub enum Error {
         who: Intruder,
     },
     /// A layer setting service failed.
+    #[error("{}", .failure.words(*.doing))]
     Lss {
         /// The master's action.
         doing: LssDoing,
@@ -180,6 +219,7 @@ pub enum Error {
     },
     /// The program on trial did not answer, or could not be called back: it is not released for
     /// autostart.
+    #[error("the trial failed, and the program is not released for autostart: {}", .how.words(*.node))]
     TrialFailed {
         /// The device.
         node: NodeId,
@@ -187,6 +227,13 @@ pub enum Error {
         how: TrialFailure,
     },
     /// The program does not start.
+    #[error(
+        "the program does not start: node {node} {runs}{}{}{}",
+        elsewhere_words(*.elsewhere),
+        status_words(*.status),
+        why_words(*.state),
+        runs = running_words(*.running, "does not answer")
+    )]
     StartFailed {
         /// The device.
         node: NodeId,
@@ -200,6 +247,7 @@ pub enum Error {
         elsewhere: Option<NodeId>,
     },
     /// The program has started, and ended soon after.
+    #[error("the program of node {node} has ended: {ended}")]
     ProgramEnded {
         /// The device.
         node: NodeId,
@@ -207,11 +255,13 @@ pub enum Error {
         ended: Ended,
     },
     /// The bootloader of the device cannot be renewed over the bus.
+    #[error("the bootloader of node {node} cannot be renewed over the bus")]
     NotRenewable {
         /// The device.
         node: NodeId,
     },
     /// The new bootloader did not come up, or was not installed: the old one runs.
+    #[error("the new bootloader of node {node} {}; the old one runs", trial_end(*.end))]
     RenewalFailed {
         /// The device.
         node: NodeId,
@@ -219,6 +269,7 @@ pub enum Error {
         end: TrialEnd,
     },
     /// Nothing has answered since the new bootloader was started on trial.
+    #[error("the new bootloader of node {node} was started on trial, and nothing has answered for {} s", .waited.as_secs())]
     SilentOnTrial {
         /// The device.
         node: NodeId,
@@ -226,16 +277,19 @@ pub enum Error {
         waited: Duration,
     },
     /// The new bootloader runs on trial, and cannot be confirmed: it is built without renewal.
+    #[error("the new bootloader of node {node} cannot be confirmed: it is built without renewal; a reset brings the old one back")]
     Unconfirmable {
         /// The device.
         node: NodeId,
     },
     /// The bootloader of the first device could not be renewed, so that of this one was left alone.
+    #[error("not renewed: the bootloader of node {first} was the first, and could not be renewed")]
     FirstFailed {
         /// The first device.
         first: NodeId,
     },
     /// The program has started and answered, and the device does not answer any more.
+    #[error("the program does not answer any more: {}", silence_words(*.node, *.elsewhere))]
     FellSilent {
         /// The device.
         node: NodeId,
@@ -264,6 +318,34 @@ pub enum TrialFailure {
     Ended(Ended),
 }
 
+impl TrialFailure {
+    /// The failure in words, for the device with this node-ID.
+    fn words(self, node: NodeId) -> String {
+        match self {
+            Self::Silent(elsewhere) => {
+                let elsewhere = elsewhere_words(elsewhere);
+                format!("node {node} has not answered since the program was started{elsewhere}")
+            }
+            Self::FellSilent(elsewhere) => silence_words(node, elsewhere),
+            Self::NotStarted(status, state) => {
+                let (status, why) = (status_words(status), why_words(state));
+                format!("it does not start, node {node} stays in the bootloader{status}{why}")
+            }
+            Self::Stays(None) => {
+                format!("it runs in node {node} and does not return to the bootloader when called")
+            }
+            Self::Stays(Some(code)) => {
+                format!("it runs in node {node}, and refuses the call to the bootloader with abort {code}")
+            }
+            Self::Lost(elsewhere) => {
+                let elsewhere = elsewhere_words(elsewhere);
+                format!("node {node} has not answered since the program was called back{elsewhere}")
+            }
+            Self::Ended(ended) => format!("{ended} (node {node})"),
+        }
+    }
+}
+
 /// The end of a program that ran for a while.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ended {
@@ -289,6 +371,22 @@ pub enum Intruder {
     Process(Option<u32>),
 }
 
+impl Intruder {
+    /// The intruder in words, and what it does with the device with this node-ID.
+    fn words(self, node: NodeId) -> String {
+        match self {
+            Self::Requests(None) => format!("another tool is using node {node}: it sends SDO requests"),
+            Self::Requests(Some(at)) => {
+                format!("another tool is using node {node}: it sends SDO requests, the last one for {at}")
+            }
+            Self::Process(None) => format!("another coflash on this computer is using node {node}"),
+            Self::Process(Some(id)) => {
+                format!("another coflash on this computer, process {id}, is using node {node}")
+            }
+        }
+    }
+}
+
 /// How a layer setting service failed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LssFailure {
@@ -303,6 +401,21 @@ pub enum LssFailure {
         /// The manufacturer's error code.
         detail: u8,
     },
+}
+
+impl LssFailure {
+    /// The failure of this action in words.
+    fn words(self, doing: LssDoing) -> String {
+        let doing = doing.words();
+        match self {
+            Self::NoAnswer => format!("no device answers ({doing})"),
+            Self::None => "the device has no node-ID".to_string(),
+            Self::Refused { code, detail: 0 } => format!("the device refuses {doing}: error {code}"),
+            Self::Refused { code, detail } => {
+                format!("the device refuses {doing}: error {code}, manufacturer's code {detail}")
+            }
+        }
+    }
 }
 
 /// A part of the identity object, 1018h.
@@ -352,11 +465,12 @@ impl Mismatch {
             Self::ProductCode => FlashError::WrongProductId,
         }
     }
-}
 
-impl From<AdapterError> for Error {
-    fn from(error: AdapterError) -> Self {
-        Self::Adapter(error)
+    const fn words(self) -> &'static str {
+        match self {
+            Self::VendorId => "vendor-ID",
+            Self::ProductCode => "product code",
+        }
     }
 }
 
@@ -475,192 +589,38 @@ pub const fn flash_error_number(error: FlashError) -> u32 {
     }
 }
 
-impl fmt::Display for Error {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Adapter(error) => error.fmt(f),
-            Self::Cancelled => f.write_str("cancelled"),
-            Self::NoAnswer { node, doing } => write!(f, "node {node} does not answer ({doing})"),
-            Self::ShortAnswer { node, doing, len } => {
-                write!(f, "node {node} answers, but with frames of {len} bytes where SDO has 8 ({doing})")
-            }
-            Self::Refused { node, doing, code } => write!(f, "node {node} refuses {doing}: abort {code}"),
-            Self::Protocol { doing, code } => write!(f, "the answer to {doing} is invalid: {code}"),
-            Self::Failed { doing, error, detail, code } => {
-                let words = failure_words(*error, *detail);
-                write!(f, "{doing} failed: {words} (1F57h reads {:02X}h", error.code())?;
-                if has_number(Some(*error), *detail) {
-                    write!(f, ", detail {detail:04X}h")?;
-                }
-                match code {
-                    Some(code) => write!(f, ", abort {code})"),
-                    None => f.write_str(")"),
-                }
-            }
-            Self::Busy { node, doing, waited } => {
-                write!(f, "node {node} is still busy {doing} after {:.1} s", waited.as_secs_f64())
-            }
-            Self::WrongTarget { node, what, device, file } => {
-                let what = match what {
-                    Mismatch::VendorId => "vendor-ID",
-                    Mismatch::ProductCode => "product code",
-                };
-                write!(f, "the program is for {what} {file:08X}h, and node {node} has {device:08X}h")
-            }
-            Self::SealedOnly { node, roots } => {
-                write!(f, "node {node} takes sealed images only")?;
-                match roots.as_slice() {
-                    [] => Ok(()),
-                    roots => write!(f, " ({})", roots_words(roots)),
-                }
-            }
-            Self::NoProgram { why, .. } => write!(f, "the image {why}"),
-            Self::OtherRegion { node, program, image: (first, last), region: (from, to) } => {
-                write!(
-                    f,
-                    "the image is for {first:#010x}..={last:#010x}, and node {node} has program {program} at \
-                     {from:#010x}..={to:#010x}"
-                )
-            }
-            Self::OtherIdentity { node, what, bootloader, application } => {
-                let number = |number: &Option<u32>| {
-                    number.map_or("none".to_string(), |number| format!("{number:08X}h"))
-                };
-                let (was, is) = (number(bootloader), number(application));
-                let what = what.words();
-                write!(f, "the program on trial tells {what} {is}, and the bootloader of node {node} {was}")
-            }
-            Self::NoBootloader { node, running, code, elsewhere } => {
-                match running {
-                    Some(running) => write!(f, "node {node} stays in {running}")?,
-                    None => write!(f, "node {node} does not come back in the bootloader")?,
-                }
-                write_elsewhere(f, *elsewhere)?;
-                match code {
-                    Some(code) => write!(f, ": it refuses the call with abort {code}"),
-                    None => Ok(()),
-                }
-            }
-            Self::WrongCrc { device, file } => {
-                write!(f, "the program in the device has CRC {device:08X}h, that of the file {file:08X}h")
-            }
-            Self::NotInDialect { dialect, what } => write!(f, "in the dialect {}: {what}", dialect.name()),
-            Self::NoPassword { node } => write!(f, "node {node} is locked, and no password was given"),
-            Self::Occupied { node } => {
-                write!(f, "another device is in its bootloader and answers as node {node}")
-            }
-            Self::NotAlone { node, who } => match who {
-                Intruder::Requests(None) => {
-                    write!(f, "another tool is using node {node}: it sends SDO requests")
-                }
-                Intruder::Requests(Some(at)) => {
-                    write!(
-                        f,
-                        "another tool is using node {node}: it sends SDO requests, the last one for {at}"
-                    )
-                }
-                Intruder::Process(None) => {
-                    write!(f, "another coflash on this computer is using node {node}")
-                }
-                Intruder::Process(Some(id)) => {
-                    write!(f, "another coflash on this computer, process {id}, is using node {node}")
-                }
-            },
-            Self::Lss { doing, failure: LssFailure::NoAnswer } => {
-                write!(f, "no device answers ({})", doing.words())
-            }
-            Self::Lss { failure: LssFailure::None, .. } => f.write_str("the device has no node-ID"),
-            Self::Lss { doing, failure: LssFailure::Refused { code, detail } } => {
-                write!(f, "the device refuses {}: error {code}", doing.words())?;
-                match detail {
-                    0 => Ok(()),
-                    detail => write!(f, ", manufacturer's code {detail}"),
-                }
-            }
-            Self::TrialFailed { node, how } => {
-                write!(f, "the trial failed, and the program is not released for autostart: ")?;
-                match how {
-                    TrialFailure::Silent(elsewhere) => {
-                        write!(f, "node {node} has not answered since the program was started")?;
-                        write_elsewhere(f, *elsewhere)
-                    }
-                    TrialFailure::FellSilent(elsewhere) => write_silence(f, *node, *elsewhere),
-                    TrialFailure::NotStarted(status, state) => {
-                        write!(f, "it does not start, node {node} stays in the bootloader")?;
-                        match status.and_then(|status| status.error) {
-                            Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
-                            None => Ok(()),
-                        }?;
-                        write_why(f, *state)
-                    }
-                    TrialFailure::Stays(None) => {
-                        write!(f, "it runs in node {node} and does not return to the bootloader when called")
-                    }
-                    TrialFailure::Stays(Some(code)) => {
-                        write!(f, "it runs in node {node}, and refuses the call to the bootloader with abort {code}")
-                    }
-                    TrialFailure::Lost(elsewhere) => {
-                        write!(f, "node {node} has not answered since the program was called back")?;
-                        write_elsewhere(f, *elsewhere)
-                    }
-                    TrialFailure::Ended(ended) => write!(f, "{ended} (node {node})"),
-                }
-            }
-            Self::ProgramEnded { node, ended } => write!(f, "the program of node {node} has ended: {ended}"),
-            Self::NotRenewable { node } => {
-                write!(f, "the bootloader of node {node} cannot be renewed over the bus")
-            }
-            Self::RenewalFailed { node, end } => {
-                write!(f, "the new bootloader of node {node} {}; the old one runs", trial_end(*end))
-            }
-            Self::SilentOnTrial { node, waited } => write!(
-                f,
-                "the new bootloader of node {node} was started on trial, and nothing has answered for {} s",
-                waited.as_secs()
-            ),
-            Self::Unconfirmable { node } => write!(
-                f,
-                "the new bootloader of node {node} cannot be confirmed: it is built without renewal; a reset brings \
-                 the old one back"
-            ),
-            Self::FirstFailed { first } => {
-                write!(
-                    f,
-                    "not renewed: the bootloader of node {first} was the first, and could not be renewed"
-                )
-            }
-            Self::FellSilent { node, elsewhere } => {
-                f.write_str("the program does not answer any more: ")?;
-                write_silence(f, *node, *elsewhere)
-            }
-            Self::StartFailed { node, running, status, state, elsewhere } => {
-                match running {
-                    Some(running) => write!(f, "the program does not start: node {node} stays in {running}")?,
-                    None => write!(f, "the program does not start: node {node} does not answer")?,
-                }
-                write_elsewhere(f, *elsewhere)?;
-                match status.and_then(|status| status.error) {
-                    Some(error) => write!(f, "; {error} (1F57h reads {:02X}h)", error.code()),
-                    None => Ok(()),
-                }?;
-                write_why(f, *state)
-            }
-        }
+/// The ids of root keys in brackets, if there are any.
+fn roots_in_brackets(roots: &[u32]) -> String {
+    if roots.is_empty() {
+        return String::new();
     }
+    format!(" ({})", roots_words(roots))
+}
+
+/// What runs in the place of the expected program; `silence` if nothing answers.
+fn running_words(running: Option<DeviceType>, silence: &str) -> String {
+    running.map_or(silence.to_string(), |running| format!("stays in {running}"))
 }
 
 /// A program that answered once.
-fn write_silence(f: &mut fmt::Formatter<'_>, node: NodeId, elsewhere: Option<NodeId>) -> fmt::Result {
-    write!(f, "it answered after its start, and node {node} is silent since then")?;
-    write_elsewhere(f, elsewhere)
+fn silence_words(node: NodeId, elsewhere: Option<NodeId>) -> String {
+    format!("it answered after its start, and node {node} is silent since then{}", elsewhere_words(elsewhere))
 }
 
 /// A node that may be the device under another node-ID.
-fn write_elsewhere(f: &mut fmt::Formatter<'_>, elsewhere: Option<NodeId>) -> fmt::Result {
-    match elsewhere {
-        Some(other) => write!(f, ", but node {other} has booted up since then"),
-        None => Ok(()),
-    }
+fn elsewhere_words(elsewhere: Option<NodeId>) -> String {
+    elsewhere.map_or(String::new(), |other| format!(", but node {other} has booted up since then"))
+}
+
+/// A value of the identity object.
+fn identity_words(value: Option<u32>) -> String {
+    value.map_or("none".to_string(), |value| format!("{value:08X}h"))
+}
+
+/// The error in 1F57h of a device that stays in its bootloader.
+fn status_words(status: Option<FlashStatus>) -> String {
+    let error = status.and_then(|status| status.error);
+    error.map_or(String::new(), |error| format!("; {error} (1F57h reads {:02X}h)", error.code()))
 }
 
 /// An error of 1F57h in words, with its detail: for a protected sector that is its number
@@ -681,32 +641,21 @@ pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
 /// The detail of [`FlashError::NoAccess`] for a supply that is too low.
 pub(crate) const LOW_SUPPLY: u16 = SUPPLY_DETAIL as u16;
 
-/// Whether the detail of an error of 1F57h is shown as a number: [`failure_words`] do not have it.
-pub(crate) fn has_number(error: Option<FlashError>, detail: u16) -> bool {
-    let is_in_words = matches!(
-        (error, detail),
-        (Some(FlashError::Secured | FlashError::NotCleared), _) | (Some(FlashError::NoAccess), LOW_SUPPLY)
-    );
-    detail != 0 && !is_in_words
+/// The detail of an error of 1F57h as a number, unless it is 0 or [`failure_words`] have it.
+pub(crate) fn detail_words(error: Option<FlashError>, detail: u16) -> String {
+    match (error, detail) {
+        (_, 0)
+        | (Some(FlashError::Secured | FlashError::NotCleared), _)
+        | (Some(FlashError::NoAccess), LOW_SUPPLY) => String::new(),
+        _ => format!(", detail {detail:04X}h"),
+    }
 }
 
 /// Why a device stays in its bootloader, and how its program ended.
-fn write_why(f: &mut fmt::Formatter<'_>, state: Option<BootloaderState>) -> fmt::Result {
-    let Some(state) = state else { return Ok(()) };
-    write!(f, "; {}", reason(state.reason))?;
-    match state.ended_by() {
-        Some(by) => write!(f, "; the program was ended by {}", source(by)),
-        None => Ok(()),
-    }
-}
-
-impl std::error::Error for Error {
-    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
-        match self {
-            Self::Adapter(error) => Some(error),
-            _ => None,
-        }
-    }
+fn why_words(state: Option<BootloaderState>) -> String {
+    let Some(state) = state else { return String::new() };
+    let ended = state.ended_by().map(|by| format!("; the program was ended by {}", source(by)));
+    format!("; {}{}", reason(state.reason), ended.unwrap_or_default())
 }
 
 /// Translates a gateway's error into the error of a transfer over the bus.

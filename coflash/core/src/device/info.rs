@@ -11,7 +11,7 @@ use shared_abi::block_file::ProgramVersion;
 use super::access::{security, Security};
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
-use super::error::{failure_words, has_number, told, Error};
+use super::error::{detail_words, failure_words, told, Error};
 use super::read_state::read_state;
 use super::recognise::recognise;
 use super::renewal::{self, Bootloader};
@@ -316,10 +316,8 @@ impl fmt::Display for ProgramInfo {
                     write!(f, "{} ({:02X}h)", failure_words(error, status.detail), error.code())?;
                 }
             }
-            if has_number(status.error, status.detail) {
-                write!(f, ", detail {:04X}h", status.detail)?;
-            }
-            writeln!(f, "{}", if status.busy { ", busy" } else { "" })?;
+            let detail = detail_words(status.error, status.detail);
+            writeln!(f, "{detail}{}", if status.busy { ", busy" } else { "" })?;
         }
         Ok(())
     }

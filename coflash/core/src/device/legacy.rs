@@ -10,7 +10,7 @@ use std::io::ErrorKind;
 use canopen::program::FlashError;
 
 use super::error::{Error, LssFailure};
-use coboot_can::AdapterError;
+use coboot_can::{AdapterError, Obstacle};
 
 /// `ERR_BL_ERROR`: the bootloader reports an error that the tool does not know.
 pub const UNKNOWN: u32 = 0x6000_0008;
@@ -50,10 +50,8 @@ pub fn exit_code(error: &Error) -> u32 {
             ErrorKind::ResourceBusy | ErrorKind::AddrInUse => IN_USE,
             _ => NO_CONTROLLER,
         },
-        Error::Adapter(AdapterError::Unusable { in_use, .. }) => match in_use {
-            true => IN_USE,
-            false => NO_CONTROLLER,
-        },
+        Error::Adapter(AdapterError::Unusable { obstacle: Obstacle::InUse, .. }) => IN_USE,
+        Error::Adapter(AdapterError::Unusable { .. }) => NO_CONTROLLER,
         Error::Adapter(AdapterError::Protocol { .. }) => DRIVER_INIT,
         Error::Adapter(AdapterError::Stuck { .. }) => HOST,
         Error::Adapter(AdapterError::Lost { .. }) => HOST,
@@ -109,6 +107,12 @@ mod tests {
         let node = NodeId::new(5).unwrap();
         let adapter = || "can0".to_string();
         let open = |kind| AdapterError::Open { adapter: adapter(), source: io::Error::from(kind) };
+        let unusable = |obstacle| AdapterError::Unusable {
+            adapter: adapter(),
+            what: String::new(),
+            advice: String::new(),
+            obstacle,
+        };
         let lss = |failure| Error::Lss { doing: LssDoing::Select, failure };
         for (error, number) in [
             (Error::Cancelled, 0x6000_0011),
@@ -121,6 +125,9 @@ mod tests {
             (Error::Adapter(AdapterError::Url { url: adapter(), why: String::new() }), 0x6000_1019),
             (Error::Adapter(open(ErrorKind::NotFound)), 0x6000_101B),
             (Error::Adapter(open(ErrorKind::ResourceBusy)), 0x6000_101E),
+            (Error::Adapter(unusable(Obstacle::Absent)), 0x6000_101B),
+            (Error::Adapter(unusable(Obstacle::InUse)), 0x6000_101E),
+            (Error::Adapter(unusable(Obstacle::Other)), 0x6000_101B),
             (Error::Adapter(AdapterError::Protocol { adapter: adapter(), said: String::new() }), 0x6000_1013),
             (lss(LssFailure::NoAnswer), 0x6000_10D4),
             (lss(LssFailure::Refused { code: 1, detail: 0 }), 0x6000_10D5),

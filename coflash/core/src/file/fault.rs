@@ -74,6 +74,7 @@ impl fmt::Display for FileError {
     }
 }
 
+// By hand: `Display` has the text of the cause, so the source is that of the cause, two fields down.
 impl std::error::Error for FileError {
     fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
         std::error::Error::source(&self.error.cause)
