@@ -140,15 +140,15 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
 /// the crates is in the registry yet: a workspace has them find each other.
 fn tests_of_crates(release: &Release, folder: &Path) -> Outcome {
     files::make(folder)?;
-    let mut workspace = "[workspace]\nmembers = [\"*\"]\nresolver = \"2\"\n\n[patch.crates-io]\n".to_owned();
+    let mut manifest = "[workspace]\nmembers = [\"*\"]\nresolver = \"2\"\n\n[patch.crates-io]\n".to_owned();
     let packed = files::within(&release.build.join("package"))?;
     for file in packed.iter().filter(|file| files::is(file, "crate")) {
         files::unpack(file, folder)?;
         let place = file.file_stem().unwrap_or_default().to_string_lossy();
         let name = place.strip_suffix(VERSION).unwrap_or(&place).trim_end_matches('-');
-        workspace += &format!("{name} = {{ path = \"{place}\" }}\n");
+        manifest += &format!("{name} = {{ path = \"{place}\" }}\n");
     }
-    files::write(&folder.join("Cargo.toml"), workspace)?;
+    files::write(&folder.join("Cargo.toml"), manifest)?;
     files::copy(&workspace::root().join("Cargo.lock"), &folder.join("Cargo.lock"))?;
     let mut tests = process::bare_cargo();
     tests
