@@ -25,6 +25,10 @@ pub fn is_password(at: Address) -> bool {
 ///
 /// A product may have COB-IDs of its own for SDO, and a record does not say which: a frame on any COB-ID may be a
 /// request, and what names the object of a request is its answer.
+///
+/// A record may begin in the middle of a transfer, of which nothing tells the object: on the COB-IDs of the
+/// predefined connection set, what may be its data is removed, too, until a transfer begins. On the COB-IDs of a
+/// product such frames are like any process data, and stay.
 #[derive(Debug, Default)]
 pub struct Redactor {
     /// Whether programs and memory are removed, too.
@@ -33,6 +37,24 @@ pub struct Redactor {
     under_way: BTreeMap<u16, Transfer>,
     /// The COB-IDs of answers, with those of their requests.
     answers: BTreeMap<u16, u16>,
+    /// What is known of the transfers of each node, by the predefined COB-ID of its requests.
+    channels: BTreeMap<u16, Channel>,
+}
+
+/// The SDO channel of a node: whether the transfer under way has an object that was seen.
+#[derive(Clone, Copy, Debug)]
+enum Channel {
+    /// No frame yet has begun a transfer for certain: what looks like the beginning may be a segment of a block
+    /// with that number.
+    Open {
+        /// The COB-ID of the latest frame.
+        id: u16,
+        /// Its first byte.
+        first: u8,
+        is_beginning: bool,
+    },
+    /// A transfer has begun, or ended with an abort.
+    Seen,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -64,10 +86,41 @@ impl Redactor {
         let Id::Standard(id) = frame.id() else { return *frame };
         let (id, data) = (id.as_raw(), frame.data());
         let Some(first) = data.first() else { return *frame };
+        let is_unseen = self.is_of_unseen(id, *first);
         match self.request_of(id, data) {
             Some(request) => self.answer(frame, request, *first),
+            None if is_unseen && !self.under_way.contains_key(&id) => without(frame, 1),
             None => self.request(frame, id, *first),
         }
+    }
+
+    /// Whether a frame may have data of a transfer whose beginning was not seen.
+    fn is_of_unseen(&mut self, id: u16, first: u8) -> bool {
+        // CiA 301, the predefined connection set.
+        let request = match (id & 0x780, id & 0x7F) {
+            (_, 0) => return false,
+            (0x600, _) => id,
+            (0x580, _) => id + 0x80,
+            _ => return false,
+        };
+        // The segments of a block follow each other without an answer; all other frames are answered.
+        let (is_next, was_beginning) = match self.channels.get(&request) {
+            Some(Channel::Seen) => return false,
+            Some(Channel::Open { id: latest, first: number, is_beginning }) => {
+                ((*latest, number.wrapping_add(1) & 0x7F) == (id, first & 0x7F), *is_beginning)
+            }
+            None => (false, false),
+        };
+        let is_abort = first == 0x80;
+        if is_abort || (was_beginning && !is_next) {
+            self.channels.insert(request, Channel::Seen);
+            return false;
+        }
+        // What is neither a segment nor an acknowledgement names an object, or has no data.
+        let has_no_data = matches!((first >> 5, first & 3), (1..=3, _) | (5, 0) | (6, 0 | 2)) && !is_next;
+        let is_beginning = has_no_data && id == request && begins(first);
+        self.channels.insert(request, Channel::Open { id, first, is_beginning });
+        !has_no_data && (self.contents || id == request)
     }
 
     /// The COB-ID of the request that a frame answers, if a transfer of something that is removed is under way
@@ -111,7 +164,7 @@ impl Redactor {
         let contents = self.has_contents(data);
         let secret = contents || has(data, &PASSWORDS);
         let object = data.get(1..4).and_then(|object| object.try_into().ok()).unwrap_or_default();
-        let begins = matches!((first >> 5, first & 3), (1 | 2, _) | (5, 0) | (6, 0 | 2));
+        let begins = begins(first);
         let under_way = self.under_way.get(&id).map(|transfer| transfer.form);
         let mut begin = |form| {
             self.under_way.insert(id, Transfer { form, object });
@@ -156,6 +209,11 @@ impl Redactor {
     fn has_contents(&self, data: &[u8]) -> bool {
         self.contents && has(data, &CONTENTS)
     }
+}
+
+/// Whether a request with this first byte begins a transfer.
+fn begins(first: u8) -> bool {
+    matches!((first >> 5, first & 3), (1 | 2, _) | (5, 0) | (6, 0 | 2))
 }
 
 /// Whether an SDO frame names one of these objects.
@@ -279,6 +337,97 @@ mod tests {
             assert_eq!(of_case[0], case[0].1);
             // Where only passwords are removed, the program stays.
             assert_eq!(shown(case), case.iter().map(|(_, data)| *data).collect::<Vec<_>>());
+        }
+    }
+
+    /// The frames as a record shows them that begins with the first of them.
+    fn recorded(redactor: fn() -> Redactor, frames: &[(bool, [u8; 8])]) -> Vec<[u8; 8]> {
+        let mut redactor = redactor();
+        let of = |(to_node, data): &(bool, [u8; 8])| {
+            let id = StandardId::new(if *to_node { 0x605 } else { 0x585 }).unwrap();
+            redactor.frame(&Frame::new(id, data).unwrap()).data().try_into().unwrap()
+        };
+        frames.iter().map(of).collect()
+    }
+
+    const S: u8 = 0xEE;
+
+    /// CiA 301: what comes after the request and the answer that name the object, from each frame on.
+    #[test]
+    fn a_password_is_not_in_a_record_that_begins_within_its_transfer() {
+        let segments = [
+            (true, [0x00, S, S, S, S, S, S, S]),
+            (false, [0x20, 0, 0, 0, 0, 0, 0, 0]),
+            (true, [0x10, S, S, S, S, S, S, S]),
+            (false, [0x30, 0, 0, 0, 0, 0, 0, 0]),
+            (true, [0x0B, S, S, 0, 0, 0, 0, 0]),
+            (false, [0x20, 0, 0, 0, 0, 0, 0, 0]),
+        ];
+        let blocks = [
+            (true, [0x01, S, S, S, S, S, S, S]),
+            (true, [0x02, S, S, S, S, S, S, S]),
+            (true, [0x83, S, S, S, S, S, S, S]),
+            (false, [0xA2, 3, 127, 0, 0, 0, 0, 0]),
+            (true, [0xC1, S, S, 0, 0, 0, 0, 0]),
+            (false, [0xA1, 0, 0, 0, 0, 0, 0, 0]),
+        ];
+        // Without a password: an upload in two forms, and a download in segments.
+        let after = [
+            (true, [0x40, 0, 0x10, 0, 0, 0, 0, 0]),
+            (false, [0x43, 0, 0x10, 0, 0x92, 1, 2, 0]),
+            (true, [0x40, 8, 0x10, 0, 0, 0, 0, 0]),
+            (false, [0x41, 8, 0x10, 0, 9, 0, 0, 0]),
+            (true, [0x60, 0, 0, 0, 0, 0, 0, 0]),
+            (false, [0x00, b'c', b'o', b'b', b'o', b'o', b't', b' ']),
+            (true, [0x21, 0x0A, 0x10, 1, 7, 0, 0, 0]),
+            (false, [0x60, 0x0A, 0x10, 1, 0, 0, 0, 0]),
+            (true, [0x01, b'v', b'e', b'r', b's', b'i', b'o', b'n']),
+        ];
+        for transfer in [segments, blocks] {
+            for begin in 0..transfer.len() {
+                let rest = &transfer[begin..];
+                for redactor in [Redactor::default, Redactor::of_contents] {
+                    let all = recorded(redactor, &[rest, &after].concat());
+                    let (of_rest, of_after) = all.split_at(rest.len());
+                    assert!(!of_rest.as_flattened().contains(&S), "{begin}: {of_rest:02X?}");
+                    assert!(of_rest.iter().zip(rest).all(|(shown, (_, data))| shown[0] == data[0]));
+                    assert_eq!(of_after, after.map(|(_, data)| data), "{begin}");
+                }
+            }
+        }
+        // The answer alone names the object, and then the segments come.
+        let answered = [(false, [0x60, 0x05, 0x60, 1, 0, 0, 0, 0])];
+        let all = recorded(Redactor::default, &[&answered[..], &segments].concat());
+        assert!(!all.as_flattened().contains(&S) && all[0] == answered[0].1, "{all:02X?}");
+        // An abort ends the transfer.
+        let aborted = [segments[0], (false, [0x80, 0, 0, 0, 0, 0, 4, 5]), segments[2]];
+        assert_eq!(recorded(Redactor::default, &aborted)[1..], [aborted[1].1, aborted[2].1]);
+    }
+
+    /// The numbers of a block's segments are the commands of other requests, and the other nodes have transfers of
+    /// their own.
+    #[test]
+    fn a_program_is_not_in_a_record_that_begins_within_its_blocks() {
+        for to_node in [true, false] {
+            for begin in [0x01, 0x1F, 0x3E, 0x41, 0x58, 0x5F] {
+                let block: Vec<_> =
+                    (begin..=0x7F).map(|number| (to_node, [number, S, S, S, S, S, S, S])).collect();
+                let all = recorded(Redactor::of_contents, &block);
+                // The first one alone may be a request that names its object.
+                assert!(!all[1..].as_flattened().contains(&S), "{to_node} {begin:X}: {all:02X?}");
+            }
+        }
+        let mut redactor = Redactor::default();
+        let mut shown = |id, data: [u8; 8]| {
+            let frame = Frame::new(StandardId::new(id).unwrap(), &data).unwrap();
+            redactor.frame(&frame).data().to_vec()
+        };
+        let (read, segment) = ([0x40, 0, 0x10, 0, 0, 0, 0, 0], [0x00, S, S, S, S, S, S, S]);
+        assert_eq!(shown(0x606, read), read);
+        assert_eq!(shown(0x605, segment), [0; 8]);
+        // Process data, emergencies and the other services have no transfers.
+        for id in [0x000, 0x080, 0x085, 0x185, 0x585, 0x600, 0x705, 0x7E5] {
+            assert_eq!(shown(id, segment), segment, "{id:X}");
         }
     }
 

@@ -230,6 +230,8 @@ mod tests {
     fn a_password_is_neither_on_the_page_nor_in_the_log() {
         let mut frames = Frames::default();
         for data in [
+            // The end of one that began before the page was there.
+            [0x07, b'S', b'i', b'8', b'K', 0, 0, 0],
             [0x21, 0x05, 0x60, 1, 4, 0, 0, 0],
             [0x07, b'S', b'i', b'8', b'K', 0, 0, 0],
             [0x23, 0x50, 0x7F, 1, b'T', b'I', b'N', b'I'],

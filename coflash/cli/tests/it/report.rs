@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use crate::tool::{command, data, folder, run, Done};
+use canopen::{CobId, Frame};
 use coflash_core::machine::zip;
 use kit::fake::{serve, Blocks, Fake, Outcome, BOOTLOADER};
 use kit::folder::Folder;
@@ -25,6 +26,11 @@ fn bootloader() -> Fake {
 fn recorded(folder: &Folder, words: &[&str], variables: &[(&str, &str)]) -> Done {
     let variables = variables.iter().copied();
     run(command().current_dir(folder.path("")).envs(variables).args(words).args(["--report-dir", "reports"]))
+}
+
+/// A run in the folder that is not recorded.
+fn run_in(folder: &Folder, words: &[&str]) -> Done {
+    run(command().current_dir(folder.path("")).args(words))
 }
 
 /// The members of an archive.
@@ -136,6 +142,42 @@ fn a_bundle_has_no_secret_and_no_firmware() {
     assert!(text(&members, &format!("{first}-log.txt")).contains("  said     "));
     assert!(text(&members, &format!("{first}-trace.log")).contains(" 605#C6501F01"));
     assert_eq!(text(&members, "20000101T000000-flash-log.txt"), "");
+}
+
+/// `monitor` begins while another tool sends a password in segments: what names its object has passed before.
+#[test]
+fn a_record_that_begins_within_a_password_does_not_have_it() {
+    let folder = folder("within-password");
+    let mut fake = bootloader();
+    let frames: [(u16, [u8; 8]); 5] = [
+        (0x605, *b"\x00PLANTED"),
+        (0x585, [0x20, 0, 0, 0, 0, 0, 0, 0]),
+        (0x605, *b"\x15PLAN\0\0\0"),
+        (0x605, [0x23, 0x0A, 0x10, 1, b's', b'h', b'o', b'w']),
+        (0x605, [0x40, 0x57, 0x1F, 1, 0, 0, 0, 0]),
+    ];
+    for (id, data) in frames {
+        fake.inject(Frame::of(CobId::new(id).unwrap(), &data));
+    }
+    let (url, _device) = serve(fake);
+    let words = ["monitor", "--bus", &url, "--count", "5", "--for", "20000", "--log-file", "all.log"];
+    let done = recorded(&folder, &words, &[]);
+    assert_eq!(done.exit, 0, "{}{}", done.out, done.err);
+    let run = runs(&folder).pop().unwrap();
+    let bundle = ["report", "bundle", "reports", "-o", "fault.zip"];
+    let done = run_in(&folder, &bundle);
+    assert_eq!(done.exit, 0, "{}", done.err);
+    let members = members(&folder.path("fault.zip"));
+    let read = |path: PathBuf| fs::read_to_string(path).unwrap();
+    let trace = read(run.join("trace.log"));
+    let lines = ["605#0000000000000000", "605#1500000000000000", "605#230A100173686F77"];
+    for text in [&trace, &text(&members, "-trace.log")] {
+        assert!(lines.iter().all(|line| text.contains(line)), "{text}");
+    }
+    for text in [trace, read(run.join("log.txt")), read(folder.path("all.log").into())] {
+        assert!(!text.is_empty() && !text.contains("PLAN"), "{text}");
+        assert!(!text.contains("504C414E") && !text.contains("50 4C 41 4E"), "{text}");
+    }
 }
 
 /// What the device says now, and the versions; a run of `read` keeps its frames alone, without what was

@@ -121,17 +121,29 @@ fn nothing_is_started_that_was_not_verified() {
     }
 }
 
-/// Ends the agent at the moment for which `begun` waits, and starts it again: the action of the first target is
-/// resumed and succeeds.
-fn goes_on(server: &Server, config: &Config, begun: impl FnOnce()) -> Action {
+/// Ends the agent when `act` has ended.
+fn while_it_runs(config: &Config, act: impl FnOnce()) {
     let cancelled = Arc::new(AtomicBool::new(false));
     let endless = options().once(false).cancelled(cancelled.clone());
     thread::scope(|scope| {
         let agent = scope.spawn(|| serve(config, &endless));
-        begun();
+        act();
         cancelled.store(true, Ordering::Relaxed);
         agent.join().unwrap();
     });
+}
+
+/// Waits until the action of the first target has a result.
+fn await_result(server: &Server) {
+    server.wait("the end", |state| {
+        state.targets[IDS[0]].action.as_ref().is_some_and(|action| action.result.is_some())
+    });
+}
+
+/// Ends the agent at the moment for which `begun` waits, and starts it again: the action of the first target is
+/// resumed and succeeds.
+fn goes_on(server: &Server, config: &Config, begun: impl FnOnce()) -> Action {
+    while_it_runs(config, begun);
     assert_eq!(server.action(IDS[0]).result, None, "the end of the agent is no result");
     let (ended, said) = serve(config, &options());
     assert_eq!(ended.updated, 1, "{said}");
@@ -246,10 +258,7 @@ fn a_bus_that_is_not_there_is_waited_for() {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let url = format!("socketcand://127.0.0.1:{port}/can0");
     let config = config(&server, &url, &folder, &IDS[..1]);
-    let cancelled = Arc::new(AtomicBool::new(false));
-    let endless = options().once(false).cancelled(cancelled.clone());
-    thread::scope(|scope| {
-        let agent = scope.spawn(|| serve(&config, &endless));
+    while_it_runs(&config, || {
         let waits = |state: &kit::hawkbit::State| {
             let action = state.targets[IDS[0]].action.as_ref();
             action.is_some_and(|action| action.details("proceeding").contains("the update waits"))
@@ -257,14 +266,8 @@ fn a_bus_that_is_not_there_is_waited_for() {
         server.wait("a message", waits);
         let listen = format!("127.0.0.1:{port}");
         let arguments = ["--listen", &listen, "--node", "5", "--flash", "instant", "--stand-in"];
-        let node = crate::bus::node(&folder, &arguments);
-        let ended = |state: &kit::hawkbit::State| {
-            state.targets[IDS[0]].action.as_ref().is_some_and(|action| action.result.is_some())
-        };
-        server.wait("the end", ended);
-        cancelled.store(true, Ordering::Relaxed);
-        agent.join().unwrap();
-        drop(node);
+        let _node = crate::bus::node(&folder, &arguments);
+        await_result(&server);
     });
     assert_eq!(server.action(IDS[0]).result.as_deref(), Some("success"));
 }
@@ -273,10 +276,10 @@ fn a_bus_that_is_not_there_is_waited_for() {
 fn of_machine(
     test: &str,
     server: &Server,
-    panel: &dyn Fn(&Folder) -> Nodes,
+    first: &dyn Fn(&Folder) -> Nodes,
 ) -> (Folder, Nodes, Config, File) {
     let folder = machine::folder(test);
-    let nodes = panel(&folder);
+    let nodes = first(&folder);
     let coflash = Coflash::new(&folder, &nodes);
     coflash.done(&["key", "new", "--role", "root", "-o", "root.pem"]);
     coflash.done(&["package", "machine.toml", "--key", "root.pem"]);
@@ -301,8 +304,7 @@ fn a_machine_is_updated_by_one_package_and_each_outcome_is_told() {
     let (folder, panel, config, file) = of_machine("agent-machine", &server, &start);
     let drives = Nodes::join(&folder, panel.url(), &machine::drives("11"));
     let valves = Nodes::join(&folder, panel.url(), &machine::valves("21", "3"));
-    let foreign = ["--node", "77", "--serial", "77", "--vendor-id", "9", "--product-code", "9"];
-    let _stranger = Nodes::join(&folder, panel.url(), &foreign);
+    let _stranger = Nodes::join(&folder, panel.url(), machine::STRANGER);
     drives.await_line("serial 14, node 14: bootloader");
     valves.await_line("serial 23, node 23: bootloader");
     for (number, what) in [(1, "updated"), (2, "had it before")] {
@@ -350,9 +352,7 @@ fn the_update_of_a_machine_goes_on_after_a_restart() {
     let server = Server::start(&IDS);
     let start = |folder: &Folder| Nodes::start(folder, machine::PANEL);
     let (folder, panel, config, file) = of_machine("agent-machine-restart", &server, &start);
-    let slow: Vec<&str> =
-        machine::drives("11").into_iter().filter(|word| !["--flash", "instant"].contains(word)).collect();
-    let drives = Nodes::join(&folder, panel.url(), &slow);
+    let drives = Nodes::join(&folder, panel.url(), &machine::slow_drives("11"));
     let valves = Nodes::join(&folder, panel.url(), &machine::valves("21", "3"));
     drives.await_line("serial 14, node 14: bootloader");
     valves.await_line("serial 23, node 23: bootloader");
@@ -363,4 +363,125 @@ fn the_update_of_a_machine_goes_on_after_a_restart() {
     for line in ["panel: had it before: node 1", "drive: updated: node 11, 12, 13, 14"] {
         assert!(details.lines().any(|its| its == line), "{line}: {details}");
     }
+}
+
+/// Checks the result of the first target's action, and that its details have these lines, or lines with these
+/// beginnings and these numbers of errors.
+#[track_caller]
+fn assert_ended(server: &Server, result: &str, lines: &[&str], errors: &[(&str, &str)]) {
+    let action = server.action(IDS[0]);
+    let details = action.details("closed");
+    assert_eq!(action.result.as_deref(), Some(result), "{details}");
+    for line in lines {
+        assert!(details.lines().any(|its| its == *line), "{line}: {details}");
+    }
+    for (whom, number) in errors {
+        let is_it = |its: &str| its.starts_with(&format!("{whom}: ")) && its.contains(number);
+        assert!(details.lines().any(is_it), "{whom}, {number}: {details}");
+    }
+    assert_eq!(details.matches("what to do: ").count(), errors.len(), "{details}");
+}
+
+/// The drives lose their plug in mid-update: the others get their programs, and the next action goes on with the
+/// drives alone. In between a valve has got another program, and then another device has come in place of the panel;
+/// a node that the package does not name is left alone all the time.
+#[test]
+fn a_pulled_plug_another_program_and_another_device_are_told_and_the_others_go_on() {
+    let server = Server::start(&IDS);
+    let start = |folder: &Folder| Nodes::start(folder, &machine::valves("21", "3"));
+    let (folder, valves, config, file) = of_machine("agent-machine-plug", &server, &start);
+    let url = valves.url();
+    let panel = Nodes::join(&folder, url, machine::PANEL);
+    let drives = Nodes::join(&folder, url, &machine::slow_drives("11"));
+    let _stranger = Nodes::join(&folder, url, machine::STRANGER);
+    drives.await_line("serial 14, node 14: bootloader");
+    panel.await_line("serial 1, node 1: bootloader");
+    server.assign(IDS[0], Action::new(1, &file));
+    while_it_runs(&config, || {
+        // The first bytes after the vectors, so that each drive has half a program.
+        folder.await_bytes("11.flash", 0x2_0000);
+        drop(drives);
+        await_result(&server);
+    });
+    let gone = ["node 11: drive", "node 12: drive", "node 13: drive", "node 14: drive"]
+        .map(|whom| (whom, "[0x60000013]"));
+    let others =
+        ["4 of 8 programs are in their devices", "panel: updated: node 1", "valve: updated: node 21, 22, 23"];
+    assert_ended(&server, "failure", &others, &gone);
+
+    let older = ["flash", "older.bin", "-I", "binary", "--board", "stm32f407g-disc1", "--node", "22"];
+    Coflash::new(&folder, &valves).done(&older);
+    let drives = Nodes::join(&folder, url, &machine::drives("11"));
+    drives.await_line("serial 14, node 14: bootloader");
+    server.assign(IDS[0], Action::new(2, &file));
+    serve(&config, &options());
+    let all = [
+        "8 of 8 programs are in their devices",
+        "panel: had it before: node 1",
+        "drive: updated: node 11, 12, 13, 14",
+        "valve: updated: node 22",
+        "valve: had it before: node 21, 23",
+    ];
+    assert_ended(&server, "success", &all, &[]);
+
+    drop(panel);
+    let other = ["--node", "1", "--serial", "101", "--vendor-id", "0x3F", "--product-code", "4"];
+    let other = Nodes::join(&folder, url, &other);
+    other.await_line("serial 101, node 1: bootloader");
+    server.assign(IDS[0], Action::new(3, &file));
+    serve(&config, &options());
+    let rest = [
+        "7 of 8 programs are in their devices",
+        "drive: had it before: node 11, 12, 13, 14",
+        "valve: had it before: node 21, 22, 23",
+    ];
+    assert_ended(&server, "failure", &rest, &[("node 1: panel", "[0x6000040B]")]);
+    let plan = server.action(IDS[0]).details("proceeding").to_string();
+    assert!(plan.contains("node 77: not in the package, and left alone"), "{plan}");
+    for serial in ["77", "101"] {
+        assert!(folder.read(&format!("{serial}.flash")).iter().all(|byte| *byte == 0xFF), "{serial}");
+    }
+}
+
+/// The adapter loses its plug in mid-update, and comes back: each device's outcome is told, and the next action goes
+/// on, without the panel.
+#[test]
+fn an_adapter_that_is_unplugged_in_mid_update_costs_the_next_action_only_the_rest() {
+    let server = Server::start(&IDS);
+    let start = |folder: &Folder| Nodes::start(folder, &machine::valves("21", "3"));
+    let (folder, bus, config, file) = of_machine("agent-machine-adapter", &server, &start);
+    let (url, address) = (bus.url().to_owned(), bus.address().to_owned());
+    let panel = Nodes::join(&folder, &url, machine::PANEL);
+    let drives = Nodes::join(&folder, &url, &machine::slow_drives("11"));
+    drives.await_line("serial 14, node 14: bootloader");
+    panel.await_line("serial 1, node 1: bootloader");
+    server.assign(IDS[0], Action::new(1, &file));
+    while_it_runs(&config, || {
+        folder.await_bytes("11.flash", 0x2_0000);
+        drop((bus, panel, drives));
+        await_result(&server);
+    });
+    let whom = [11, 12, 13, 14].map(|node| format!("node {node}: drive"));
+    let whom = whom.into_iter().chain([21, 22, 23].map(|node| format!("node {node}: valve")));
+    let lost: Vec<_> = whom.collect();
+    let lost: Vec<_> = lost.iter().map(|whom| (whom.as_str(), "[0x60000303]")).collect();
+    let one = ["1 of 8 programs are in their devices", "panel: updated: node 1"];
+    assert_ended(&server, "failure", &one, &lost);
+
+    let again = [&["--listen", address.as_str()][..], &machine::valves("21", "3")].concat();
+    let again = crate::bus::node(&folder, &again);
+    again.await_text("bus: ");
+    let panel = Nodes::join(&folder, &url, machine::PANEL);
+    let drives = Nodes::join(&folder, &url, &machine::drives("11"));
+    drives.await_line("serial 14, node 14: bootloader");
+    panel.await_line("serial 1, node 1: would start program 1");
+    server.assign(IDS[0], Action::new(2, &file));
+    serve(&config, &options());
+    let all = [
+        "8 of 8 programs are in their devices",
+        "panel: had it before: node 1",
+        "drive: updated: node 11, 12, 13, 14",
+        "valve: updated: node 21, 22, 23",
+    ];
+    assert_ended(&server, "success", &all, &[]);
 }

@@ -48,10 +48,18 @@ pub fn folder(test: &str) -> Folder {
 pub const PANEL: &[&str] =
     &["--node", "1", "--vendor-id", "0x3F", "--product-code", "3", "--flash", "instant", "--stand-in"];
 
+/// A node that the package does not name.
+pub const STRANGER: &[&str] = &["--node", "77", "--serial", "77", "--vendor-id", "9", "--product-code", "9"];
+
 /// Four drives, from this node-ID on.
 pub fn drives(node: &'static str) -> Vec<&'static str> {
     let identity = ["--vendor-id", "0x3F", "--product-code", "1", "--flash", "instant", "--stand-in"];
     [&["--node", node, "--serial", node, "--count", "4"][..], &identity].concat()
+}
+
+/// The same with flashes that take their time.
+pub fn slow_drives(node: &'static str) -> Vec<&'static str> {
+    drives(node).into_iter().filter(|word| !["--flash", "instant"].contains(word)).collect()
 }
 
 pub fn valves(node: &'static str, count: &'static str) -> Vec<&'static str> {
@@ -85,8 +93,7 @@ fn eight_nodes_of_three_types_are_updated_by_one_package() {
     let url = panel.url().to_owned();
     let three = Nodes::join(&folder, &url, &drives("11"));
     let _valves = Nodes::join(&folder, &url, &valves("21", "3"));
-    let foreign = ["--node", "77", "--serial", "77", "--vendor-id", "9", "--product-code", "9"];
-    let _stranger = Nodes::join(&folder, &url, &foreign);
+    let _stranger = Nodes::join(&folder, &url, STRANGER);
     for node in ["11", "12", "13", "14"] {
         three.await_line(&format!("serial {node}, node {node}: bootloader"));
     }
@@ -220,9 +227,7 @@ fn an_interrupted_update_goes_on_with_the_next_run() {
     let folder = folder("machine-interrupted");
     let panel = Nodes::start(&folder, PANEL);
     let url = panel.url().to_owned();
-    let slow: Vec<&str> =
-        drives("11").into_iter().filter(|word| !["--flash", "instant"].contains(word)).collect();
-    let mut four = Some(Nodes::join(&folder, &url, &slow));
+    let mut four = Some(Nodes::join(&folder, &url, &slow_drives("11")));
     let valves = Nodes::join(&folder, &url, &valves("21", "3"));
     four.as_ref().unwrap().await_line("serial 14, node 14: bootloader");
     valves.await_line("serial 23, node 23: bootloader");
