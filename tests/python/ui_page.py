@@ -640,7 +640,7 @@ def service(bench):
     expect(page.locator('.device[data-node="5"]')).to_contain_text("00000100h")
     expect(page.locator('.device[data-node="5"]')).to_contain_text("drive: kein Programm → CRC ")
     # A number that is read again replaces the last one.
-    reach(page, "2 Geräte updaten")
+    reach(page, "2 Geräte aktualisieren")
     page.keyboard.type("4712\n")
     expect(page.locator("#device-number")).to_have_value("4712")
     # Enter leads to the button; it is pressed by a person.
