@@ -30,7 +30,7 @@ use crate::state::Notice;
 pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
 
 const FILES: [(&str, &str, &str); 9] = [
-    ("", HTML, include_str!("page/service.html")),
+    ("", HTML, concat!(include_str!("../page/head.html"), include_str!("page/service.html"))),
     ("colours.css", CSS, include_str!("../page/colours.css")),
     ("service.css", CSS, include_str!("page/service.css")),
     ("service.js", SCRIPT, include_str!("page/service.js")),
