@@ -108,13 +108,16 @@ class Bench:
         subprocess.run([self.arguments.coflash, "--quiet", "package", recipe, "-o", package], check=True)
         return package
 
-    def picture(self, page, name, height=None):
-        """Saves a screenshot: a number of pixels from the top, or the whole page."""
+    def picture(self, page, name, last=None):
+        """Saves a screenshot: from the top to the end of the last element shown, or of the whole page."""
         if self.arguments.pictures:
             Path(self.arguments.pictures).mkdir(parents=True, exist_ok=True)
             page.evaluate("scrollTo(0, 0)")
             size = page.viewport_size
-            clip = {"x": 0, "y": 0, "width": size["width"], "height": height} if height else None
+            clip = None
+            if last:
+                box = page.locator(last).bounding_box()
+                clip = {"x": 0, "y": 0, "width": size["width"], "height": box["y"] + box["height"] + 12}
             page.screenshot(path=f"{self.arguments.pictures}/ui-{name}.png", full_page=True, clip=clip)
 
 
@@ -203,7 +206,7 @@ def two_nodes(bench):
     page.get_by_label("Choose all devices").check()
     page.get_by_role("button", name="Update 2 devices").click()
     sending(page)
-    bench.picture(page, "update", 1090)
+    bench.picture(page, "update", "#devices")
     for node in [5, 6]:
         expect(update_line(page, node)).to_have_attribute("data-phase", "done")
     idle(page)
@@ -258,7 +261,7 @@ def unplugged(bench):
     expect(page.locator("#adapter-state")).to_have_class("pill lost")
     expect(page.locator("#adapter-words")).to_contain_text("The adapter is lost")
     expect(page.locator("#report-rows")).to_contain_text("failed")
-    bench.picture(page, "unplugged", 1010)
+    bench.picture(page, "unplugged", "#devices")
     # Without the adapter the page allows no requests to it.
     expect(page.get_by_role("button", name="Search the bus")).to_be_disabled()
     bench.nodes(port, *TWO)
@@ -280,7 +283,7 @@ def refused(bench):
     expect(page.locator("#notice")).to_have_attribute("role", "alert")
     expect(page.locator("#notice")).to_contain_text("not for node 5")
     expect(page.locator("#notice")).to_contain_text("no device was changed")
-    bench.picture(page, "refused", 860)
+    bench.picture(page, "refused", "#devices")
     expect(page.locator(".update")).to_have_count(0)
     folder = bench.folder / "folder"
     folder.mkdir(exist_ok=True)
@@ -452,7 +455,7 @@ def readable(page, width, where):
     wide = page.evaluate("document.documentElement.scrollWidth")
     assert wide <= width, f"{where}: the page is {wide} wide"
     out = page.evaluate(
-        "width => [...document.querySelectorAll('main *:not(.hidden, .hidden *, .hidden-input, thead, thead *)')]"
+        "width => [...document.querySelectorAll(':is(main, dialog) *:not(.hidden, .hidden *, .hidden-input, thead, thead *)')]"
         ".filter(e => e.checkVisibility() && !e.closest('pre, #frames, #plot') && e.getBoundingClientRect().right"
         " > width + 1).map(e => e.outerHTML.slice(0, 80))", width)
     assert out == [], f"{where}: {out}"
@@ -464,16 +467,41 @@ def readable(page, width, where):
     assert nameless == [], f"{where}: {nameless}"
 
 
+# Gives the page a sealed device and a bootloader's file, which these nodes do not have: what it shows of them is as long
+# as it can be.
+SEALED = """async () => {
+  const devices = await import(new URL("devices.js", location));
+  const state = await new Promise((done) => {
+    const events = new EventSource("events");
+    events.onmessage = ({ data }) => {
+      const told = JSON.parse(data).state;
+      if (!told) return;
+      events.close();
+      done(told);
+    };
+  });
+  Object.assign(state.devices[5], {
+    security: { sealed: true, roots: ["1A2B3C4Dh", "5E6F7081h"], counters: [12, 4294967295], epoch: 3 },
+    state: "stays in the bootloader: the program has crashed; 3 resets in a row that nobody requested",
+    supply: "sufficient", option_bytes: "RDP level 1, BOR level 3, nWRP FFEh",
+    renewable: "version 1.4.0, services 3, renewed as program 254",
+    warnings: ["the device's read protection is off: everybody with a debugger can read its keys"],
+  });
+  state.firmware = { ...state.firmware, name: "bootloader.blk", version: "1.5.0", is_bootloader: true };
+  devices.show(state);
+}"""
+
+
 @scenario
 def looks(bench):
-    """No part is cut off at 1280 and 390 pixels, light and dark; fields have names; no key trap."""
+    """No part is cut off at 1280, 800 and 390 pixels, light and dark; fields have names; no key trap."""
     first, url, _, _, _ = page_with_two_nodes(bench)
     drop(first, bench.image("app"))
     first.get_by_label("Choose all devices").check()
     first.get_by_role("button", name="Update 2 devices").click()
     expect(update_line(first, 6)).to_have_attribute("data-phase", "done")
     idle(first)
-    for width, height in [(1280, 900), (390, 844)]:
+    for width, height in [(1280, 900), (800, 900), (390, 844)]:
         for scheme in ["light", "dark"]:
             page = bench.page(url, width, height, color_scheme=scheme)
             expect(page.locator("#rows tr")).to_have_count(2)
@@ -490,7 +518,7 @@ def looks(bench):
                     expect(page.locator("#frame-rows tr").first).to_be_visible()
                 bench.picture(page, name)
                 if name == "390-dark-update":
-                    bench.picture(page, "small", 1500)
+                    bench.picture(page, "small", "#table")
                 readable(page, width, name)
             if width == 390:
                 # What leads to another part opens it.
@@ -498,6 +526,18 @@ def looks(bench):
                 page.get_by_role("button", name="More about node 5").click()
                 page.get_by_role("button", name="Use its address for LSS").click()
                 expect(page.get_by_label("New node-ID")).to_be_focused()
+                page.get_by_role("button", name="Update", exact=True).click()
+            page.evaluate(SEALED)
+            expect(page.locator('#rows tr[data-node="5"]')).to_contain_text("sealed")
+            for button, dialog in [("More about node 5", "device"), ("Renew the bootloader of node 5", "renew")]:
+                if dialog == "renew":
+                    page.get_by_label("Choose node 5").check()
+                page.get_by_role("button", name=button).click()
+                # A long dialog begins with its head, not with the first of its buttons.
+                expect(page.locator(f"#{dialog} h2")).to_be_in_viewport()
+                bench.picture(page, f"{width}-{scheme}-{dialog}", f"#{dialog}")
+                readable(page, width, f"{width} {scheme} {dialog}")
+                page.keyboard.press("Escape")
             page.context.close()
     # The tab key moves through all elements, in the order of the page, and then out of it.
     page = bench.page(url)
@@ -640,7 +680,7 @@ def service(bench):
     expect(page.locator('.device[data-node="5"]')).to_contain_text("00000100h")
     expect(page.locator('.device[data-node="5"]')).to_contain_text("drive: kein Programm → CRC ")
     # A number that is read again replaces the last one.
-    reach(page, "2 Geräte updaten")
+    reach(page, "2 Geräte aktualisieren")
     page.keyboard.type("4712\n")
     expect(page.locator("#device-number")).to_have_value("4712")
     # Enter leads to the button; it is pressed by a person.
@@ -810,6 +850,16 @@ def service_looks(bench):
         (bench.image("valve", vendor=0x63, product=2), "nodes = [9]\nvendor = 0x63\nproduct = 2"))
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", package, "--report-dir", bench.folder / "reports")
     kinds = [(width, scheme, locale) for width in (1280, 800, 390) for scheme in ("light", "dark") for locale in ("en-GB", "de-DE")]
+
+    def look(url, step):
+        for width, scheme, locale in kinds:
+            page = bench.page(url, width, 844 if width == 390 else 900, color_scheme=scheme, locale=locale)
+            expect(page.locator("#banner")).to_have_attribute("data-station", re.compile("ready|bad|none|planned"))
+            assert page.locator("html").get_attribute("lang") == locale[:2]
+            bench.picture(page, f"service-{step}-{width}-{scheme}-{locale[:2]}")
+            readable(page, width, f"{step} {width} {scheme} {locale}")
+            page.context.close()
+
     first = bench.page(url, locale="en-GB")
     for step in ["ready", "bad", "working", "ended"]:
         if step == "bad":
@@ -818,18 +868,25 @@ def service_looks(bench):
         elif step == "working":
             first.get_by_role("button", name="Update 1 device").click()
             writing(first)
-            bench.picture(first, "service", 830)
+            bench.picture(first, "service", "#devices")
             continue
         elif step == "ended":
             stationed(first, "bad")
             expect(first.locator("#message")).to_be_hidden()
-        for width, scheme, locale in kinds:
-            page = bench.page(url, width, 844 if width == 390 else 900, color_scheme=scheme, locale=locale)
-            expect(page.locator("#banner")).to_have_attribute("data-station", re.compile("ready|bad"))
-            assert page.locator("html").get_attribute("lang") == locale[:2]
-            bench.picture(page, f"service-{step}-{width}-{scheme}-{locale[:2]}")
-            readable(page, width, f"{step} {width} {scheme} {locale}")
-            page.context.close()
+        look(url, step)
+    # A job file whose device is not there; a package for a lift, which is always locked.
+    job = bench.folder / "job.toml"
+    job.write_text("[[device]]\nnode = 9\nimage = 'drive.blk'\n")
+    lift = bench.package((bench.image("door"), "nodes = [6]\ndialect = 'lift'"))
+    for step, file, end in [("job", job, "none"), ("password", lift, "planned")]:
+        _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", file, "--report-dir", bench.folder / "reports")
+        page = bench.page(url, locale="en-GB")
+        expect(page.locator("#package")).to_contain_text("Job file" if file == job else "Package")
+        page.get_by_role("button", name="Search the devices").click()
+        stationed(page, end)
+        expect(page.locator("#password")).to_be_visible(visible=file == lift)
+        look(url, step)
+
 
 @scenario
 def emulated(bench):

@@ -1,9 +1,10 @@
 //! The requests of the page and their answers.
 
+use std::fmt::Display;
 use std::sync::{Arc, Mutex};
 
-use axum::body::{Body, Bytes};
-use axum::extract::{DefaultBodyLimit, Query, State};
+use axum::body::Bytes;
+use axum::extract::{DefaultBodyLimit, FromRequest, Query, Request, State};
 use axum::http::{header, HeaderMap, StatusCode};
 use axum::middleware;
 use axum::response::{IntoResponse, Response};
@@ -109,7 +110,7 @@ impl From<Refusal> for Refused {
 
 /// The files of the engineer's page. They are part of the program, so nothing must be installed or downloaded.
 const FILES: [(&str, &str, &str); 15] = [
-    ("", HTML, include_str!("page/index.html")),
+    ("", HTML, concat!(include_str!("page/head.html"), include_str!("page/index.html"))),
     ("icon.svg", "image/svg+xml", include_str!("page/icon.svg")),
     ("colours.css", CSS, include_str!("page/colours.css")),
     ("style.css", CSS, include_str!("page/style.css")),
@@ -177,8 +178,11 @@ pub(super) fn body<T: DeserializeOwned>(headers: &HeaderMap, bytes: &Bytes) -> R
             Notice::failed("the request is not JSON", "send it as application/json"),
         ));
     }
-    serde_json::from_slice(bytes)
-        .map_err(|error| bad(format!("the request cannot be read: {error}"), "reload the page"))
+    serde_json::from_slice(bytes).map_err(unreadable)
+}
+
+fn unreadable(error: impl Display) -> Refused {
+    bad(format!("the request cannot be read: {error}"), "reload the page")
 }
 
 #[derive(Deserialize)]
@@ -267,16 +271,28 @@ struct Named {
     name: String,
 }
 
-async fn take_file(
-    State(site): State<Site>,
-    Query(named): Query<Named>,
-    headers: HeaderMap,
-    body: Body,
-) -> Answer {
-    idle(&site)?;
-    let Upload { bytes, room } = site.room.read(&headers, body).await?;
+/// A file in a request. It is taken only while nothing is being done.
+struct Sent {
+    name: String,
+    upload: Upload,
+}
+
+impl FromRequest<Site> for Sent {
+    type Rejection = Refused;
+
+    async fn from_request(request: Request, site: &Site) -> Result<Self, Refused> {
+        let Query(Named { name }) = Query::try_from_uri(request.uri()).map_err(unreadable)?;
+        idle(site)?;
+        let (parts, body) = request.into_parts();
+        let upload = site.room.read(&parts.headers, body).await?;
+        Ok(Self { name, upload })
+    }
+}
+
+async fn take_file(State(site): State<Site>, Sent { name, upload }: Sent) -> Answer {
+    let Upload { bytes, room } = upload;
     let settings = site.shared.look(|state| state.settings.clone());
-    let answer = load(&site, Arc::new(bytes), named.name, settings).await;
+    let answer = load(&site, Arc::new(bytes), name, settings).await;
     drop(room);
     answer
 }
@@ -310,20 +326,13 @@ fn boards(site: &Site) -> Vec<&'static Layout> {
 }
 
 /// Takes the file with the memory map of a board, and chooses that board.
-async fn take_board(
-    State(site): State<Site>,
-    Query(named): Query<Named>,
-    headers: HeaderMap,
-    body: Body,
-) -> Answer {
-    idle(&site)?;
-    let Upload { bytes, .. } = site.room.read(&headers, body).await?;
-    let name = firmware::printable(&named.name);
+async fn take_board(State(site): State<Site>, Sent { name, upload }: Sent) -> Answer {
+    let name = firmware::printable(&name);
     let is_full = lock(&site.own_boards).len() >= BOARDS_MAX;
     if is_full {
         return Err(bad("this coflash has taken too many memory maps", "start it again"));
     }
-    let layout = board::parse(&String::from_utf8_lossy(&bytes)).map_err(|error| {
+    let layout = board::parse(&String::from_utf8_lossy(&upload.bytes)).map_err(|error| {
         bad(
             format!("{name}: {error}"),
             "choose the memory map that the build of the board has written (my-board.toml)",

@@ -77,7 +77,7 @@ function buttons() {
   const ready = state.adapter.state === "open" && !busy;
   for (const id of ["scan", "fastscan", "assign"]) $(id).disabled = !ready;
   for (const id of ["connect", "disconnect", "board", "program", "file", "map"]) $(id).disabled = busy;
-  $("drop").classList.toggle("off", busy);
+  for (const id of ["file", "map"]) $(id).parentElement.classList.toggle("off", busy);
   $("all").checked = list.length > 0 && chosen.size === list.length;
   $("all").indeterminate = chosen.size > 0 && chosen.size < list.length;
   const count = chosen.size;
@@ -148,9 +148,9 @@ export function start() {
     event.preventDefault();
     if (!state.firmware?.is_bootloader) return update(false);
     const { name, version } = state.firmware;
-    text($("renew-words"), `${chosen.size === 1 ? `Node ${[...chosen][0]} gets` : `${chosen.size} devices get`} the bootloader ` +
-      `${version} of ${name} in place of their own. The programs stay. A new bootloader runs on trial first; until it has answered ` +
-      "and is installed, a reset brings the old one back.");
+    const [who, own] = chosen.size === 1 ? [`Node ${[...chosen][0]} gets`, "its own"] : [`${chosen.size} devices get`, "their own"];
+    text($("renew-words"), `${who} the bootloader ${version} of ${name} in place of ${own}. The programs stay. ` +
+      "A new bootloader runs on trial first; until it has answered and is installed, a reset brings the old one back.");
     $("renew").showModal();
   });
   $("renew").addEventListener("close", () => {

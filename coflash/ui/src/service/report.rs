@@ -10,6 +10,7 @@ use serde::Deserialize;
 
 use super::message::Message;
 use super::row::{Row, RowState, Step};
+use super::setup::Origin;
 use super::words::Language;
 
 /// The keys of this module, for the test of the table.
@@ -36,7 +37,6 @@ pub(super) const KEYS: &[&str] = &[
     "from",
     "to",
     "no-program",
-    "package",
     "what-happened",
     "disk-full",
     "not-saved",
@@ -71,6 +71,7 @@ pub(super) struct Of {
     /// Seconds since 1970, UTC.
     pub(super) date: u64,
     pub(super) entered: Entered,
+    pub(super) origin: Origin,
     /// The name of the machine in the package.
     pub(super) package: Option<String>,
     pub(super) release: Option<String>,
@@ -172,7 +173,7 @@ impl Report {
     /// A page that needs no other file, in the language of the user.
     fn html(&self) -> String {
         let Self { row, of } = self;
-        let Of { date, entered, package, release, file, adapter, missing } = &**of;
+        let Of { date, entered, origin, package, release, file, adapter, missing } = &**of;
         let language = entered.language;
         let text = |key: &'static str| escaped(language.text(key));
         let unknown = || language.text("report-unknown").to_owned();
@@ -194,7 +195,7 @@ impl Report {
             ("node", row.node.map_or_else(unknown, |node| node.to_string())),
             ("serial", hex(serial)),
             ("identity", parts.join(" / ")),
-            ("package", [&*some(package), &*some(release), file].join(" ").trim().to_owned()),
+            (origin.key(), [&*some(package), &*some(release), file].join(" ").trim().to_owned()),
             ("report-missing", missing.iter().map(|it| language.message(it)).collect::<Vec<_>>().join(" ")),
             ("report-adapter", adapter.clone()),
             ("report-tool", format!("coflash {}", env!("CARGO_PKG_VERSION"))),
@@ -309,6 +310,7 @@ mod tests {
         let of = Of {
             date: 1_420_070_400,
             entered,
+            origin: Origin::Job,
             package: Some("Press 4".to_owned()),
             release: None,
             file: "press.cpk".to_owned(),
@@ -345,6 +347,8 @@ mod tests {
         let html = |report: &Report| report.contents()[0].1.clone();
         assert!(html(&german).contains("lang=\"de\"") && html(&german).contains("Seriennummer"));
         assert!(html(&english).contains("lang=\"en\"") && html(&english).contains("Serial number"));
+        // What the programs came from has its name in either language.
+        assert!(html(&german).contains("Auftragsdatei") && html(&english).contains("Job file"));
         assert_eq!(german.csv(), english.csv());
     }
 

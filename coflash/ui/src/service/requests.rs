@@ -27,11 +27,10 @@ use crate::state::Notice;
 
 /// The keys of this module, for the test of the table.
 #[cfg(test)]
-pub(super) const KEYS: &[&str] =
-    &["signature-good", "signature-unknown", "signature-none", "job-file", "package"];
+pub(super) const KEYS: &[&str] = &["signature-good", "signature-unknown", "signature-none"];
 
 const FILES: [(&str, &str, &str); 9] = [
-    ("", HTML, include_str!("page/service.html")),
+    ("", HTML, concat!(include_str!("../page/head.html"), include_str!("page/service.html"))),
     ("colours.css", CSS, include_str!("../page/colours.css")),
     ("service.css", CSS, include_str!("page/service.css")),
     ("service.js", SCRIPT, include_str!("page/service.js")),
@@ -69,7 +68,6 @@ async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Statio
         (Origin::Package | Origin::Job, []) => "signature-none",
         (Origin::Package | Origin::Job, _) => "signature-unknown",
     };
-    let kind = if service.origin == Origin::Job { "job-file" } else { "package" };
     let programs = service.package.programs().map(|(entry, program)| {
         json!({ "name": entry.name, "version": version(program), "nodes": entry.nodes, "count": entry.count })
     });
@@ -77,7 +75,7 @@ async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Statio
         "adapters": found,
         "last": service.last_bus(),
         "package": {
-            "kind": kind,
+            "kind": service.origin.key(),
             "file": service.file,
             "name": manifest.name,
             "release": manifest.release,

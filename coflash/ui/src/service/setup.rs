@@ -11,6 +11,10 @@ use super::folder::Folder;
 /// The most bytes of the file with the adapter.
 const URL_MAX: usize = 1000;
 
+/// The keys of this module, for the test of the table.
+#[cfg(test)]
+pub(super) const KEYS: &[&str] = &["package", "job-file"];
+
 /// Where the programs of a station come from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Origin {
@@ -20,6 +24,16 @@ pub enum Origin {
     Package,
     /// A job file.
     Job,
+}
+
+impl Origin {
+    /// The key of what the file is.
+    pub(super) const fn key(self) -> &'static str {
+        match self {
+            Self::Trusted | Self::Package => "package",
+            Self::Job => "job-file",
+        }
+    }
 }
 
 /// What a service station works with.

@@ -63,7 +63,7 @@ impl Language {
 mod tests {
     use std::collections::BTreeSet;
 
-    use super::super::{report, requests, row, station, trouble, work};
+    use super::super::{report, requests, row, setup, station, trouble, work};
     use super::*;
 
     const PAGE: &str = include_str!("page/service.html");
@@ -92,6 +92,15 @@ mod tests {
         assert_eq!(lines.len(), TEXTS.len(), "one text a line, and no key twice");
     }
 
+    /// A station works with a package or with a job file: one text names the package, and the others suit both.
+    #[test]
+    fn a_station_with_a_job_file_speaks_of_no_package() {
+        let speaks = |text: &Text| text.en.to_lowercase().contains("package") || text.de.contains("Paket");
+        let keys: Vec<&str> =
+            TEXTS.iter().filter(|(_, text)| speaks(text)).map(|(key, _)| key.as_str()).collect();
+        assert_eq!(keys, ["package"]);
+    }
+
     /// Each key of the page and of the server is in the table, and the table has no other one.
     #[test]
     fn each_key_is_in_the_table_and_each_text_is_used() {
@@ -100,7 +109,9 @@ mod tests {
             used.extend(after(PAGE, attribute));
         }
         used.extend(after(SCRIPT, " t(\"").into_iter().chain(after(SCRIPT, "(t(\"")));
-        for keys in [station::KEYS, row::KEYS, trouble::KEYS, report::KEYS, work::KEYS, requests::KEYS] {
+        for keys in
+            [station::KEYS, row::KEYS, trouble::KEYS, report::KEYS, work::KEYS, requests::KEYS, setup::KEYS]
+        {
             used.extend(keys);
         }
         let known: BTreeSet<&str> = TEXTS.keys().map(String::as_str).collect();

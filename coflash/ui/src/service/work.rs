@@ -171,6 +171,7 @@ impl Work for Update {
         let of = Of {
             date,
             entered: self.entered.clone(),
+            origin: service.origin,
             package: manifest.name.clone(),
             release: manifest.release.clone(),
             file: service.file.clone(),

@@ -341,6 +341,9 @@ fn what_is_no_request_of_the_page_is_refused_with_words() {
     for (what, body) in [
         ("open", "{}"),
         ("open", "x"),
+        // A file without its name.
+        ("firmware", "x"),
+        ("board", "x"),
         ("open", r#"{"url":5}"#),
         ("update", r#"{"nodes":[0],"trial":false,"start":true}"#),
         ("update", r#"{"nodes":[300],"trial":false,"start":true}"#),
