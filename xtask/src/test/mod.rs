@@ -324,6 +324,8 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
     if tier == Tier::All {
         build::boards(&[(board, "")])?;
     }
+    // cargo builds the programs that tests start for those of their own packages alone.
+    programs_of_ours()?;
     let programs = board_programs(board, tier)?;
     let mut jobs = Vec::new();
     let is_among = |rows: &[(&str, &str)], program: &str, test: &str| {

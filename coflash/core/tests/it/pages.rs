@@ -4,7 +4,7 @@ use std::path::Path;
 
 use canopen::{Address, NodeId};
 use coflash_core::device::eds::Eds;
-use coflash_core::device::DataType;
+use coflash_core::device::value::DataType;
 use coflash_core::update::job;
 
 #[test]

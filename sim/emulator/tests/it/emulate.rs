@@ -5,9 +5,6 @@ use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
 
-use shared_abi::layout::stm32f407g_disc1;
-use shared_abi::layout::toml::Toml;
-
 use crate::assembler::assemble;
 
 fn emulate(args: &[&str]) -> Output {
@@ -62,6 +59,7 @@ fn runs_for_the_time_it_is_told() {
 /// A board that the emulator was not built with.
 #[test]
 fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
+    let map = include_str!("my-board.toml");
     let folder = folder("board");
     let image = program(&folder, "forever");
     let board = |text: &str| {
@@ -69,8 +67,7 @@ fn takes_the_memory_map_of_a_board_and_refuses_a_bad_one() {
         std::fs::write(&file, text).unwrap();
         emulate(&["--board", file.to_str().unwrap(), &image, "--speed", "max", "--for", "0.01"])
     };
-    let map = Toml(&stm32f407g_disc1::LAYOUT).to_string().replace("stm32f407g-disc1", "my-board");
-    let output = board(&map);
+    let output = board(map);
     assert!(output.status.success(), "{output:?}");
     let huge = map
         .replace("ccm = { base = 0x10000000, size = 0x10000", "ccm = { base = 0x10000000, size = 0xe0000000");
