@@ -1,9 +1,10 @@
 //! `cargo xtask build`: builds the images for the chip.
 
 use std::collections::BTreeSet;
-use std::fs;
+use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::time::SystemTime;
 
 use shared_abi::geometry::Region;
 use shared_abi::layout::{Image, Layout};
@@ -205,13 +206,69 @@ pub fn run(mut args: Args) -> Outcome {
     Ok(())
 }
 
-/// Builds images of a board by their names, and prints their sizes; returns their folder.
+/// Builds images of a board by their names, and prints their sizes; returns their folder. An image that was
+/// built after the last change of its sources is not built again: cargo keeps only the last product of a
+/// program, and would link all others once more.
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
+    let (folder, changed) = (workspace::firmware_dir(board), last_change()?);
     for name in names {
         let variant = Variant::by_name(board, name)?;
-        image(board, variant, variant.name, &variant.product()?)?;
+        let (file, stamp) = (elf_of(board, name), folder.join(name).with_extension("built"));
+        if file.exists()
+            && fs::metadata(&stamp).and_then(|stamp| stamp.modified()).is_ok_and(|at| at > changed)
+        {
+            report(&file, &variant.regions(board))?;
+            continue;
+        }
+        let begun = SystemTime::now();
+        image(board, variant, name, &variant.product()?)?;
+        files::write(&stamp, "")?;
+        // A source that changed in the meantime is newer.
+        let dated = File::options().write(true).open(&stamp).and_then(|file| file.set_modified(begun));
+        dated.map_err(|error| format!("{}: {error}", stamp.display()))?;
     }
-    Ok(workspace::firmware_dir(board))
+    Ok(folder)
+}
+
+/// What the images are made of. The crates of others are in Cargo.lock.
+const SOURCES: [&str; 12] = [
+    ".cargo",
+    "Cargo.lock",
+    "Cargo.toml",
+    "app-template",
+    "bootloader",
+    "bsp",
+    "coboot-app",
+    "core",
+    "linker",
+    "rust-toolchain.toml",
+    "shared-abi",
+    "tests/apps",
+];
+
+/// The time of the last change of the sources of the images, or of this program, which builds them.
+fn last_change() -> Outcome<SystemTime> {
+    fn newest(path: &Path) -> std::io::Result<SystemTime> {
+        // A folder changes when a file in it goes.
+        let mut last = fs::metadata(path)?.modified()?;
+        if path.is_dir() {
+            for entry in fs::read_dir(path)? {
+                last = last.max(newest(&entry?.path())?);
+            }
+        }
+        Ok(last)
+    }
+    let program = std::env::current_exe().map_err(|error| format!("this program has no path: {error}"))?;
+    let mut last = SystemTime::UNIX_EPOCH;
+    for path in SOURCES.map(|path| workspace::root().join(path)).into_iter().chain([program]) {
+        last = last.max(newest(&path).map_err(|error| format!("{}: {error}", path.display()))?);
+    }
+    Ok(last)
+}
+
+/// The file of an image.
+fn elf_of(board: &Layout, name: &str) -> PathBuf {
+    workspace::firmware_dir(board).join(format!("{name}.elf"))
 }
 
 /// Builds the images with these names for several boards, the applications in C if their name is the last, or
@@ -311,8 +368,16 @@ fn rust_lld() -> Outcome<PathBuf> {
 pub fn bootloader_size(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u32>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
     process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
-    let file = ram_image::seal(built(board, "bootloader")?)?;
-    elf::used(&elf::segments(&file)?, &bootloader_flash(board))
+    used(board, &ram_image::seal(built(board, "bootloader")?)?)
+}
+
+/// The same of a bootloader that was built under a name.
+pub fn size_of(board: &Layout, name: &str) -> Outcome<Vec<u32>> {
+    used(board, &files::bytes(&elf_of(board, name))?)
+}
+
+fn used(board: &Layout, bootloader: &[u8]) -> Outcome<Vec<u32>> {
+    elf::used(&elf::segments(bootloader)?, &bootloader_flash(board))
 }
 
 /// The folders with the files of the boards.
@@ -380,7 +445,7 @@ fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Ou
     if variant.is_bootloader() {
         file = ram_image::seal(file).map_err(|problem| format!("{name} gets no CRC: {problem}"))?;
     }
-    let to = workspace::firmware_dir(board).join(format!("{name}.elf"));
+    let to = elf_of(board, name);
     // An unchanged file is not written, so that its time does not change.
     if fs::read(&to).ok().as_ref() != Some(&file) {
         files::write(&to, file)?;

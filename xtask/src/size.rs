@@ -4,8 +4,9 @@ use serde_json::json;
 use shared_abi::layout::{Layout, BOARDS};
 
 use crate::args::Args;
+use crate::build::{self, Variant};
 use crate::setup::{self, Part};
-use crate::{build, elf, evidence, outcome::Outcome, toolchain, workspace};
+use crate::{elf, evidence, outcome::Outcome, toolchain, workspace};
 
 pub const HELP: &str = "\
 usage: cargo xtask size [--board BOARD]
@@ -23,20 +24,28 @@ const COMPACT: u32 = 32_256;
 const RESIDENT: u32 = 12 * 1024;
 const RAM_IMAGE: u32 = 56 * 1024;
 
+/// The bootloaders that are compared, in each map.
+const COMPACT_MAP: &str = "bootloader";
+const SPLIT_MAP: &str = "bootloader bootloader-sealed";
+
 pub fn run(mut args: Args) -> Outcome {
     let chosen = args.has("--board").then(|| workspace::board(&mut args)).transpose()?;
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
     if let Some(board) = chosen {
+        let names: Vec<_> = Variant::of(board).filter(|it| it.is_bootloader()).map(|it| it.name).collect();
+        build::images(board, &names)?;
         println!("bootloader                      bytes");
-        for variant in build::Variant::of(board).filter(|variant| variant.is_bootloader()) {
-            let used = build::bootloader_size(board, variant.features, &variant.product()?)?;
-            let used: Vec<String> = used.iter().map(u32::to_string).collect();
-            println!("{:<31} {}", variant.name, used.join(" + "));
+        for name in names {
+            let used: Vec<String> = build::size_of(board, name)?.iter().map(u32::to_string).collect();
+            println!("{name:<31} {}", used.join(" + "));
         }
         println!();
     }
 
+    let names = |board: &Layout| if board.home.is_some() { SPLIT_MAP } else { COMPACT_MAP };
+    let gated: Vec<_> = BOARDS.iter().map(|board| (*board, names(board))).collect();
+    build::boards(&gated)?;
     println!("board                    image                      at         bytes     of");
     let mut problems = Vec::new();
     let (mut images, mut count) = (Vec::new(), 0);
@@ -46,8 +55,7 @@ pub fn run(mut args: Args) -> Outcome {
                 continue;
             }
             count += 1;
-            let variant = build::Variant::by_name(board, name)?;
-            let used = build::bootloader_size(board, variant.features, &variant.product()?)
+            let used = build::size_of(board, name)
                 .map_err(|problem| format!("{}, {name}: {problem}", board.board))?;
             let regions = build::bootloader_flash(board);
             for ((bytes, region), budget) in used.iter().zip(regions).zip(budgets(board)) {
