@@ -858,6 +858,9 @@ def service_looks(bench):
             assert page.locator("html").get_attribute("lang") == locale[:2]
             bench.picture(page, f"service-{step}-{width}-{scheme}-{locale[:2]}")
             readable(page, width, f"{step} {width} {scheme} {locale}")
+            if step == "bad":
+                part = "Hersteller-ID" if locale == "de-DE" else "Vendor-ID"
+                expect(page.locator("#others li")).to_have_text(re.compile(rf"6: .+ · {part}.+: [0-9A-F]{{8}}h / [0-9A-F]{{8}}h / "))
             page.context.close()
 
     first = bench.page(url, locale="en-GB")
@@ -881,7 +884,10 @@ def service_looks(bench):
     for step, file, end in [("job", job, "none"), ("password", lift, "planned")]:
         _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", file, "--report-dir", bench.folder / "reports")
         page = bench.page(url, locale="en-GB")
-        expect(page.locator("#package")).to_contain_text("Job file" if file == job else "Package")
+        if file == job:
+            expect(page.locator("#package")).to_have_text("Job file: job.toml")
+        else:
+            expect(page.locator("#package")).to_contain_text("Not signed")
         page.get_by_role("button", name="Search the devices").click()
         stationed(page, end)
         expect(page.locator("#password")).to_be_visible(visible=file == lift)

@@ -810,8 +810,13 @@ impl Controller {
 
     /// What became of the order to flash.
     pub(super) fn flashed(&mut self, now: Duration, flashed: Flashed) {
-        let Work::Flashing { task, first, tries, .. } = &self.work else { return };
+        let Work::Flashing { task, first, tries, progress, .. } = &mut self.work else { return };
         let (task, first, tries) = (task.clone(), *first, *tries + 1);
+        let phases = std::mem::take(&mut progress.phases);
+        // An update without much to do ends before its plan was sent.
+        if progress.news && !phases.is_empty() {
+            self.tell(&task.action, Execution::Proceeding, &phases);
+        }
         match flashed {
             Flashed::Done(details) => self.end(&task.action, true, details),
             Flashed::Failed(details) => self.end(&task.action, false, details),

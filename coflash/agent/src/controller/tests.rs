@@ -562,6 +562,21 @@ fn progress_is_told_sparingly_and_the_device_waits_for_no_message() {
     assert_eq!(messages.len(), 100);
 }
 
+/// A plan that nothing follows would be lost, and with it what is left alone.
+#[test]
+fn what_was_not_told_before_the_end_is_told_with_it() {
+    let mut drive = Drive::new();
+    drive.go_to_flash();
+    for line in ["node 5: door: it has 1.0.0", "node 77: left alone"] {
+        drive.controller.news(News::Phase(line.into()));
+    }
+    drive.controller.flashed(drive.now, Flashed::Done(vec!["door: had it before: node 5".into()]));
+    let Request::Post(_, body) = drive.asks() else { panic!("no feedback") };
+    assert_eq!(body["status"]["details"], json!(["node 5: door: it has 1.0.0", "node 77: left alone"]));
+    drive.answer(200, &json!({}));
+    assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
+}
+
 #[test]
 fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
     let mut drive = Drive::new();

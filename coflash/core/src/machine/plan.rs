@@ -106,8 +106,28 @@ pub struct Foreign {
     /// Its node-ID.
     #[serde(serialize_with = "json::node")]
     pub node: NodeId,
-    /// What it is, or why it is not known.
-    pub what: String,
+    /// What it is.
+    #[serde(serialize_with = "json::words")]
+    pub what: Stranger,
+}
+
+/// What a node is that nothing of the package is for.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Stranger {
+    /// A device that has said what it is.
+    Device {
+        /// 1008h, device name.
+        name: Option<String>,
+        /// 1018h/1 to 4.
+        identity: info::Identity,
+    },
+    /// It does not answer.
+    Silent,
+    /// It answers, but not as a device has to.
+    Mute {
+        /// What is wrong, as the rest of a sentence after "answers, but".
+        but: String,
+    },
 }
 
 impl Todo {
@@ -172,16 +192,16 @@ pub fn matched(package: &Package, found: &BTreeMap<NodeId, Found>) -> Result<Pla
     let mut plan = Plan { devices: Vec::new(), missing: Vec::new(), foreign: Vec::new() };
     for (node, found) in found {
         let Some(info) = &found.info else {
-            let what = found
-                .but
-                .as_ref()
-                .map_or("it does not answer".to_owned(), |but| format!("it answers, but {but}"));
+            let what = found.but.clone().map_or(Stranger::Silent, |but| Stranger::Mute { but });
             plan.foreign.push(Foreign { node: *node, what });
             continue;
         };
         let steps = steps(package, *node, info)?;
         if steps.is_empty() {
-            plan.foreign.push(Foreign { node: *node, what: words(info) });
+            plan.foreign.push(Foreign {
+                node: *node,
+                what: Stranger::Device { name: info.name.clone(), identity: info.identity },
+            });
         } else {
             let (name, identity) = (info.name.clone(), info.identity);
             plan.devices.push(Device { node: *node, name, identity, steps });
@@ -312,13 +332,6 @@ fn versions(info: &DeviceInfo, entry: &Entry, program: &Payload) -> (Option<Stri
     }
 }
 
-/// What a foreign node is.
-fn words(info: &DeviceInfo) -> String {
-    let [vendor, product, ..] = info.identity.map(hex);
-    let name = info.name.as_ref().map_or(String::new(), |name| format!("{name}, "));
-    format!("{name}vendor {vendor}, product {product}")
-}
-
 impl Plan {
     /// How many programs are written.
     #[must_use]
@@ -331,6 +344,20 @@ impl Plan {
     pub fn nodes(&self) -> impl Iterator<Item = NodeId> + '_ {
         let is_changed = |device: &&Device| device.steps.iter().any(|step| step.todo == Todo::Update);
         self.devices.iter().filter(is_changed).map(|device| device.node)
+    }
+}
+
+impl fmt::Display for Stranger {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Device { name, identity } => {
+                let [vendor, product, ..] = identity.map(hex);
+                let name = name.as_ref().map_or(String::new(), |name| format!("{name}, "));
+                write!(f, "{name}vendor {vendor}, product {product}")
+            }
+            Self::Silent => f.write_str("it does not answer"),
+            Self::Mute { but } => write!(f, "it answers, but {but}"),
+        }
     }
 }
 

@@ -64,9 +64,11 @@ async fn tell(State(site): State<Site>, Extension(station): Extension<Arc<Statio
     let service = &station.service;
     let manifest = service.package.manifest();
     let signature = match (service.origin, service.package.signers()) {
-        (Origin::Trusted, _) => "signature-good",
-        (Origin::Package | Origin::Job, []) => "signature-none",
-        (Origin::Package | Origin::Job, _) => "signature-unknown",
+        (Origin::Trusted, _) => Some("signature-good"),
+        (Origin::Package, []) => Some("signature-none"),
+        (Origin::Package, _) => Some("signature-unknown"),
+        // Nobody can sign one.
+        (Origin::Job, _) => None,
     };
     let programs = service.package.programs().map(|(entry, program)| {
         json!({ "name": entry.name, "version": version(program), "nodes": entry.nodes, "count": entry.count })

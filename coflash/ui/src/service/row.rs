@@ -1,7 +1,7 @@
 //! The devices of a plan or an update, as the page and the reports have them.
 
 use canopen::NodeId;
-use coflash_core::machine::{Good, Outcome, Plan, Todo};
+use coflash_core::machine::{Foreign, Good, Outcome, Plan, Stranger, Todo};
 use serde::Serialize;
 
 use super::message::Message;
@@ -18,6 +18,8 @@ pub(super) const KEYS: &[&str] = &[
     "state-working",
     "state-updated",
     "state-failed",
+    "other-silent",
+    "other-mute",
 ];
 
 /// A device, or one that is missing.
@@ -36,6 +38,18 @@ pub(super) struct Row {
     pub(super) left: Option<&'static str>,
     /// In percent, while it is being written.
     pub(super) percent: Option<usize>,
+}
+
+/// A device that nothing of the package is for.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Other {
+    pub(super) node: u8,
+    /// 1008h.
+    pub(super) name: Option<String>,
+    /// 1018h/1 to 4; none of a device that did not say what it is.
+    pub(super) identity: Option<[Option<u32>; 4]>,
+    /// Why it did not.
+    pub(super) trouble: Option<Message>,
 }
 
 /// A program of a device.
@@ -112,6 +126,19 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
         percent: None,
     });
     devices.chain(missing).collect()
+}
+
+/// The devices of a plan that are left alone.
+pub(super) fn others(plan: &Plan) -> Vec<Other> {
+    let other = |Foreign { node, what }: &Foreign| {
+        let (name, identity, trouble) = match what {
+            Stranger::Device { name, identity } => (name.clone(), Some(*identity), None),
+            Stranger::Silent => (None, None, Some(Message::new("other-silent"))),
+            Stranger::Mute { but } => (None, None, Some(Message::new("other-mute").detail(but))),
+        };
+        Other { node: node.get(), name, identity, trouble }
+    };
+    plan.foreign.iter().map(other).collect()
 }
 
 impl Row {

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use coflash_core::device::Dialect;
-use coflash_core::machine::{Entry, Foreign, Plan};
+use coflash_core::machine::{Entry, Plan};
 use serde_json::{json, Value};
 
 use super::message::Message;
@@ -157,12 +157,12 @@ impl Station {
         use state::Connection;
         let own = lock(&self.state);
         let adapter = &shown.adapter;
-        let (mut rows, mut number, mut foreign): (_, _, &[Foreign]) = (Vec::new(), None, &[]);
+        let (mut rows, mut number, mut others) = (Vec::new(), None, Vec::new());
         match &own.stage {
             Stage::Waiting | Stage::Searching => {}
             Stage::Planned { number: its, plan } => {
                 rows = row::rows(plan);
-                (number, foreign) = (Some(*its), &plan.foreign);
+                (number, others) = (Some(*its), row::others(plan));
             }
             Stage::Working(all) | Stage::Ended(all) => rows.clone_from(all),
         }
@@ -219,7 +219,7 @@ impl Station {
             "device_number": own.device_number,
             "asks_password": own.asks_password,
             "rows": rows,
-            "foreign": foreign,
+            "others": others,
             "saved": own.saved,
             "unsaved": own.unsaved,
             "why": own.why,

@@ -177,7 +177,8 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     assert_eq!(plan["rows"][0]["steps"][0]["from"], "CRC 12345678h");
     assert_eq!(plan["rows"][2]["trouble"]["key"], "trouble-absent");
     assert_eq!(plan["rows"][2]["trouble"]["number"], 0x6000_0013);
-    assert_eq!(plan["foreign"][0]["node"], 20);
+    assert_eq!((&plan["others"][0]["node"], &plan["others"][0]["identity"][1]), (&json!(20), &json!(99)));
+    assert_eq!((plan["others"].as_array().unwrap().len(), &plan["others"][0]["trouble"]), (1, &Value::Null));
     for (nodes, status) in
         [(&[][..], 400), (&[6], 400), (&[5, 20], 400), (&[9], 400), (&[0], 400), (&[128], 400)]
     {
@@ -501,7 +502,8 @@ fn a_job_file_is_a_machine() {
     let (bus, _server) = kit::fake::serve(Bus([5, 6, 7].map(|node| device(node, 1234).0).into()));
     let service = Service::new(package, "press.toml".as_ref(), Origin::Job, &folder.join("reports")).unwrap();
     let ui = Ui::with(|options| (options.bus, options.service) = (Some(bus), Some(service)));
-    assert_eq!(ui.get("station").json()["package"]["kind"], "job-file");
+    let told = ui.get("station").json();
+    assert_eq!((&told["package"]["kind"], &told["package"]["signature"]), (&json!("job-file"), &Value::Null));
     let plan = planned(&ui);
     assert_eq!(plan["asks_password"], false);
     assert_eq!(confirm(&ui, &plan, &[5, 6, 7]).status, 200);

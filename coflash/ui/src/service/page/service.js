@@ -53,7 +53,7 @@ function translate() {
   for (const button of $("languages").children) button.ariaPressed = String(button.dataset.language === language);
   const { name, release, file, signature } = station.package;
   const named = [name, release].filter((part) => part !== null).join(" ");
-  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file} · ${t(signature)}`);
+  text($("package"), `${t(station.package.kind)}: ${named ? `${named} (${file})` : file}${signature === null ? "" : ` · ${t(signature)}`}`);
   document.title = `${named || file} – coflash`;
   shown = "";
   if (state) show(state);
@@ -149,15 +149,14 @@ function buttons() {
 
 /** The devices. They are made anew only when one has changed. */
 function rows() {
-  const now = JSON.stringify([state.rows.map((row) => ({ ...row, percent: null })), state.plan, state.foreign, language]);
+  const now = JSON.stringify([state.rows.map((row) => ({ ...row, percent: null })), state.plan, state.others, language]);
   if (now !== shown) {
     shown = now;
     const focused = document.activeElement?.id;
     $("rows").replaceChildren(...state.rows.map(row));
     if (focused) $(focused)?.focus();
-    $("foreign").hidden = state.foreign.length === 0;
-    $("foreign").replaceChildren(el("p", {}, t("foreign")),
-      el("ul", {}, ...state.foreign.map((one) => el("li", {}, `${t("node")} ${one.node}: `, el("span", { lang: "en" }, one.what)))));
+    $("others").hidden = state.others.length === 0;
+    $("others").replaceChildren(el("p", {}, t("others")), el("ul", {}, ...state.others.map(other)));
   }
   state.rows.forEach((row, index) => {
     const bar = $("rows").children[index].querySelector("progress");
@@ -195,6 +194,12 @@ function row(one) {
       one.state === "state-working" ? el("progress", { max: "100", "aria-label": head }) : null,
       ...(one.trouble ? message(one.trouble, one.left) : [])),
     el("p", { class: "state" }, t(one.state), el("span", { class: "percent" })));
+}
+
+/** A device that is left alone. */
+function other(one) {
+  const said = [one.name, one.identity && `${t("identity")}: ${one.identity.slice(0, 3).map((part) => (part === null ? t("report-unknown") : hex(part))).join(" / ")}`];
+  return el("li", {}, `${t("node")} ${one.node}: `, said.filter(Boolean).join(" · "), ...(one.trouble ? message(one.trouble) : []));
 }
 
 /** Two tones up for a good end, two down for a bad one. */
