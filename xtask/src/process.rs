@@ -20,7 +20,12 @@ pub fn cargo(line: &str) -> Command {
 
 /// The cargo that started this program, on the package in a folder, in the caller's folder.
 pub fn cargo_on(folder: &Path, line: &str) -> Command {
-    let (mut command, mut words) = (bare_cargo(), line.split(' '));
+    on_workspace(bare_cargo(), folder, line)
+}
+
+/// The same for a program that takes the words of cargo.
+pub fn on_workspace(mut command: Command, folder: &Path, line: &str) -> Command {
+    let mut words = line.split_ascii_whitespace();
     command.args(words.next()).arg("--manifest-path").arg(folder.join("Cargo.toml")).args(words);
     if env::var_os("CARGO_TARGET_DIR").is_some() {
         // The path may be relative, and a job may start cargo in another folder.
@@ -60,10 +65,7 @@ pub fn clang() -> Command {
     Command::new(env::var_os("CLANG").unwrap_or_else(|| "clang".into()))
 }
 
-/// The exit code of a program that [`within`] has ended.
-pub const TOO_LATE: i32 = 124;
-
-/// A program that is ended after this time, with the exit code [`TOO_LATE`].
+/// A program that is ended after this time, with the exit code 124.
 pub fn within(limit: Duration, program: impl AsRef<OsStr>) -> Command {
     let mut command = Command::new("timeout");
     // In the foreground it passes signals on to the program alone.

@@ -3,16 +3,14 @@
 //! | file | what it does |
 //! |---|---|
 //! | `plan.rs` | which test runs when, and with which images |
-//! | `programs.rs` | builds the test programs and lists their tests |
-//! | `runner.rs` | runs them, and sums up |
+//! | `runner.rs` | builds and runs tests by cargo-nextest, and sums up |
 
 use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
 use self::plan::{Tier, IMAGES, NEEDS, OF_EACH_CHIP};
-use self::programs::Program;
-use self::runner::{Job, Summary, Variables};
+use self::runner::{Summary, Variables};
 use crate::args::Args;
 use crate::{
     attack, build, chips, evidence, examples, files, fuzz, opinion, outcome::Outcome, powercut, process,
@@ -20,7 +18,6 @@ use crate::{
 };
 
 mod plan;
-mod programs;
 mod runner;
 
 pub const HELP: &str = "\
@@ -187,19 +184,11 @@ fn room() -> Outcome {
     }
 }
 
-/// The test programs, those with firmware for the default board; and the programs that tests start, the
+/// What selects the test programs, those with firmware for the default board; and the programs that tests start, the
 /// host tool and the node, which cargo builds for their tests. The jobs of the repository are tested in
 /// .ci/run.
-fn test_programs() -> Outcome<Vec<Program>> {
-    programs::build(&[&build::board_args(DEFAULT)[..], &workspace::on_host()].concat())
-}
-
-/// The test programs that run the firmware of a board, up to a tier.
-fn board_programs(board: &Layout, tier: Tier) -> Outcome<Vec<Program>> {
-    let all = ["device", "update", "sealed", "foreign", "port"].into_iter();
-    let tests = all.filter(|name| tier == Tier::All || OF_EACH_CHIP.iter().any(|(of, _)| of == name));
-    let tests: Vec<_> = tests.map(|name| format!("--test={name}")).collect();
-    programs::build(&[&build::board_args(board)[..], &workspace::on_host(), &tests].concat())
+fn ours() -> Vec<String> {
+    [&build::board_args(DEFAULT)[..], &workspace::on_host()].concat()
 }
 
 /// Builds the programs that tests start, for tests that are chosen by words.
@@ -229,29 +218,12 @@ fn variables(board: &Layout) -> Variables {
     ]
 }
 
-/// Adds the tests of programs that run now; `place` names what is special about them.
-fn add(
-    jobs: &mut Vec<Job>,
-    summary: &mut Summary,
-    programs: &[Program],
-    place: Option<&str>,
-    variables: Variables,
-    chosen: impl Fn(&str, &str) -> bool,
-) -> Outcome {
-    for program in programs {
-        let (more, skipped) = runner::jobs(program, place, &variables, |test| chosen(&program.name, test))?;
-        summary.skipped += if more.is_empty() { 0 } else { skipped };
-        jobs.extend(more);
-    }
-    Ok(())
-}
-
-/// Builds the images of a tier, and test programs beside them: the link of an image uses one core, and so
-/// does much of what cargo builds.
-fn beside_images<T>(tier: Tier, programs: impl FnOnce() -> Outcome<T>) -> Outcome<T> {
+/// Builds the images of a tier, and the test programs that these arguments select beside them: the link of an image uses
+/// one core, and so does much of what cargo builds.
+fn build_all(tier: Tier, programs: &[Vec<String>]) -> Outcome {
     std::thread::scope(|scope| {
         let images = scope.spawn(|| build_images(tier));
-        let programs = programs();
+        let programs = programs.iter().try_for_each(|programs| runner::build(programs));
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         programs
     })
@@ -259,53 +231,36 @@ fn beside_images<T>(tier: Tier, programs: impl FnOnce() -> Outcome<T>) -> Outcom
 
 /// The tests of the product on its default board.
 fn product(summary: &mut Summary) -> Outcome {
-    let mut jobs = Vec::new();
-    let programs = beside_images(Tier::Product, test_programs)?;
-    let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
-    add(&mut jobs, summary, &programs, None, variables(DEFAULT), chosen)?;
-    runner::run(jobs, summary);
-    Ok(())
+    build_all(Tier::Product, &[ours()])?;
+    runner::run(&ours(), &Tier::Product.filter(), "", &variables(DEFAULT), summary)
 }
 
-/// Tests of the default board that run from a tier on.
-fn later(tier: Tier, summary: &mut Summary) -> Outcome<Vec<Job>> {
-    let mut jobs = Vec::new();
-    let ours = test_programs()?;
-    let mut more = build::board_args(DEFAULT).to_vec();
-    more.push("--package=xtask".to_owned());
-    if tier == Tier::All {
-        more.push("--package=coboot-zencan".to_owned());
-    }
-    let more = programs::build(&more)?;
-    let chosen = |program: &str, test: &str| Tier::of(program, test) == tier;
-    add(&mut jobs, summary, &[&ours[..], &more].concat(), None, variables(DEFAULT), chosen)?;
-    if tier == Tier::Ci {
-        // The product's tests once more, for a device that takes sealed images and has no keys yet.
-        let core: Vec<_> = ours.into_iter().filter(|program| program.name == "coboot-core/it").collect();
-        let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
-        let chosen = |program: &str, test: &str| Tier::of(program, test) == Tier::Product;
-        add(&mut jobs, summary, &core, Some("sealed"), takes_sealed, chosen)?;
-    }
-    Ok(jobs)
+/// Tests of the default board that run from a tier on: ours, and those of more packages, which are built apart.
+fn later(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
+    let more = more.iter().map(|package| format!("--package={package}"));
+    let programs = [ours(), build::board_args(DEFAULT).into_iter().chain(more).collect()];
+    build_all(tier, &programs)?;
+    programs.iter().try_for_each(|of| runner::run(of, &tier.filter(), "", &variables(DEFAULT), summary))
 }
 
 /// What `.ci/run` adds.
 fn ci(summary: &mut Summary) -> Outcome {
-    let jobs = beside_images(Tier::Ci, || later(Tier::Ci, summary))?;
-    runner::run(jobs, summary);
+    later(Tier::Ci, &["xtask"], summary)?;
+    // The product's tests once more, for a device that takes sealed images and has no keys yet.
+    let core = format!("{} & ({})", plan::of("coboot-core/it", ""), Tier::Product.filter());
+    let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
+    runner::run(&ours(), &core, "[sealed] ", &takes_sealed, summary)?;
     let mut doc = process::cargo("test --doc --workspace --quiet");
     let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
     doc.current_dir(workspace::root()).args(without);
-    runner::count("documentation", process::run(&mut doc), summary);
+    summary.count("documentation", process::run(&mut doc));
     other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
 }
 
 /// The tests that take minutes.
 fn slow(summary: &mut Summary) -> Outcome {
-    let jobs = beside_images(Tier::All, || later(Tier::All, summary))?;
     examples::all()?;
-    runner::run(jobs, summary);
-    Ok(())
+    later(Tier::All, &["xtask", "coboot-zencan"], summary)
 }
 
 /// Every test that runs firmware, for each other chip.
@@ -326,19 +281,19 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
     }
     // cargo builds the programs that tests start for those of their own packages alone.
     programs_of_ours()?;
-    let programs = board_programs(board, tier)?;
-    let mut jobs = Vec::new();
-    let is_among = |rows: &[(&str, &str)], program: &str, test: &str| {
-        rows.iter().any(|(of, tests)| *of == program && test.starts_with(tests))
+    let programs = ["device", "update", "sealed", "foreign", "port"];
+    let programs = programs
+        .into_iter()
+        .filter(|name| tier == Tier::All || OF_EACH_CHIP.iter().any(|(of, _)| of == name));
+    let arguments = build::board_args(board).into_iter().chain(workspace::on_host());
+    let arguments: Vec<_> = arguments.chain(programs.map(|name| format!("--test={name}"))).collect();
+    let without =
+        plan::any_of(NEEDS.iter().filter(|needs| !(needs.has)(board)).flat_map(|needs| needs.tests));
+    let filter = match tier {
+        Tier::All => format!("!({without})"),
+        _ => format!("({}) - ({without}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter()),
     };
-    let chosen = |program: &str, test: &str| {
-        let has = NEEDS.iter().all(|needs| (needs.has)(board) || !is_among(needs.tests, program, test));
-        let of_tier = is_among(OF_EACH_CHIP, program, test) && Tier::of(program, test) != Tier::All;
-        has && (tier == Tier::All || of_tier)
-    };
-    add(&mut jobs, summary, &programs, Some(board.board), variables(board), chosen)?;
-    runner::run(jobs, summary);
-    Ok(())
+    runner::run(&arguments, &filter, &format!("[{}] ", board.board), &variables(board), summary)
 }
 
 /// Jobs of the night that end by themselves.
@@ -355,7 +310,7 @@ fn jobs(summary: &mut Summary) -> Outcome {
     for (name, run) in all {
         println!("== cargo xtask {name}");
         let words = name.split(' ').skip(1).map(str::to_owned);
-        runner::count(&format!("cargo xtask {name}"), run(Args::new(words)), summary);
+        summary.count(&format!("cargo xtask {name}"), run(Args::new(words)));
     }
     Ok(())
 }

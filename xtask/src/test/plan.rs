@@ -39,15 +39,6 @@ fn later() -> impl Iterator<Item = (&'static str, Tier)> {
     })
 }
 
-/// Test modules that take longest, the slowest first: they begin first, so that no core waits for
-/// one of them at the end.
-pub const SLOW: &str =
-    "powercut fleet powercut_board streams application ui device conform cli resume blocks \
-                        commands nodes refusals clients client model program_control attacker throughput";
-
-/// Test programs that mostly wait: their tests start programs that talk to each other in real time.
-pub const WAITING: [&str; 4] = ["coboot-node/it", "coflash/it", "coflash-agent/it", "coflash-ui/it"];
-
 /// The images of a board that the tests of a tier need.
 pub struct Images {
     /// The first tier that needs them.
@@ -163,11 +154,31 @@ impl Tier {
         }
     }
 
-    /// The first tier in which a test runs.
-    pub fn of(program: &str, test: &str) -> Self {
-        let path = format!("{program}::{test}");
-        later().find(|(tests, _)| path.starts_with(tests)).map_or(Self::Product, |(_, tier)| tier)
+    /// The tests that run first in this tier, as a filter of nextest.
+    pub fn filter(self) -> String {
+        // The first row that a test begins with has it: each one takes it from those after it.
+        let rows = later().collect::<Vec<_>>().into_iter().rev();
+        rows.fold(
+            if self == Self::Product { "all()" } else { "none()" }.to_owned(),
+            |filter, (tests, tier)| {
+                let (program, path) = tests.split_once("::").unwrap_or((tests, ""));
+                format!("({filter}) {} {}", if tier == self { '+' } else { '-' }, of(program, path))
+            },
+        )
     }
+}
+
+/// The tests of a program whose paths begin like this, as a filter of nextest. A program without a package is one
+/// of coboot-tests, or has the unit tests of a package.
+pub fn of(program: &str, path: &str) -> String {
+    let program = program.replace('/', "::");
+    format!("(binary_id(/^(coboot-tests::)?{program}(::bin.*)?$/) & test(/^{path}/))")
+}
+
+/// The tests of these rows, as a filter of nextest.
+pub fn any_of<'r>(rows: impl IntoIterator<Item = &'r (&'r str, &'r str)>) -> String {
+    rows.into_iter()
+        .fold("none()".to_owned(), |filter, (program, path)| format!("{filter} + {}", of(program, path)))
 }
 
 #[cfg(test)]
@@ -181,8 +192,18 @@ mod tests {
             let hides = rows[..number].iter().find(|(other, _)| tests.starts_with(other));
             assert_eq!(hides, None, "{tests}");
         }
-        assert_eq!(Tier::of("foreign", "ui::a_test"), Tier::Ci);
-        assert_eq!(Tier::of("device", "line::a_test"), Tier::Product);
-        assert_eq!((Tier::of("xtask", "a_test"), Tier::of("xtask/hil", "a_test")), (Tier::Ci, Tier::All));
+        let (first, last) = (of("device", "application::"), of("xtask/hil", ""));
+        assert_eq!(last, "(binary_id(/^(coboot-tests::)?xtask::hil(::bin.*)?$/) & test(/^/))");
+        for (tier, all, first_mark, last_mark) in [
+            (Tier::Product, "all()", '-', '-'),
+            (Tier::Ci, "none()", '-', '-'),
+            (Tier::All, "none()", '+', '+'),
+        ] {
+            let filter = tier.filter();
+            let rows = filter.trim_start_matches('(');
+            assert!(rows.starts_with(all) && rows.contains(&format!(" {last_mark} {last}")), "{filter}");
+            assert!(filter.contains(&format!(" {first_mark} {first}")), "{filter}");
+        }
+        assert!(Tier::Ci.filter().contains(&format!(" + {}", of("foreign", "ui::"))));
     }
 }

@@ -1,65 +1,28 @@
-//! Runs test programs side by side, module by module, and sums up what they print.
+//! Runs tests with cargo-nextest, and sums up what it reports; `.config/nextest.toml` says in which order, and when a
+//! test counts as hanging.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::ffi::{OsStr, OsString};
-use std::fs::File;
-use std::io::Write;
-use std::process::Stdio;
-use std::sync::{Mutex, PoisonError};
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::process::{Command, Stdio};
 use std::thread;
-use std::time::Instant;
 
 use serde_json::{json, Value};
 
-use super::plan::{SLOW, WAITING};
-use super::programs::{Program, PATIENCE};
-use crate::{files, outcome::Outcome, process, workspace};
+use crate::{outcome::Outcome, process, setup, workspace};
 
 /// Variables for test programs.
 pub type Variables = Vec<(&'static str, OsString)>;
 
-/// The tests of one module, which run in a process of their own.
-pub struct Job {
-    /// `device::line`, with the board where it is not the default one.
-    name: String,
-    program: Program,
-    tests: Vec<String>,
-    variables: Variables,
-}
-
-/// The jobs of a program with the tests that `chosen` takes; and how many tests it has with
-/// `#[ignore]`.
-pub fn jobs(
-    program: &Program,
-    place: Option<&str>,
-    variables: &Variables,
-    chosen: impl Fn(&str) -> bool,
-) -> Outcome<(Vec<Job>, usize)> {
-    let (tests, ignored) = program.tests()?;
-    let mut modules = BTreeMap::<String, Vec<String>>::new();
-    for test in tests.into_iter().filter(|test| chosen(test)) {
-        let module = test.split_once("::").map_or("", |(module, _)| module).to_owned();
-        modules.entry(module).or_default().push(test);
-    }
-    let place = place.map(|board| format!("[{board}] ")).unwrap_or_default();
-    let jobs = modules.into_iter().map(|(module, tests)| Job {
-        name: format!("{place}{}{}{module}", program.name, if module.is_empty() { "" } else { "::" }),
-        program: program.clone(),
-        tests,
-        variables: variables.clone(),
-    });
-    Ok((jobs.collect(), ignored))
-}
-
 /// What has run so far.
 #[derive(Default)]
 pub struct Summary {
-    /// Passed and failed tests, and seconds, by job.
+    /// Passed and failed tests, and seconds, by module: `device::line`, with the board where it is not the
+    /// default one.
     counts: BTreeMap<String, (usize, usize, f64)>,
     /// What failed, and what did not get as far as a test.
     pub failed: Vec<String>,
     /// Tests with `#[ignore]`.
-    pub skipped: usize,
+    skipped: u64,
 }
 
 impl Summary {
@@ -94,169 +57,140 @@ impl Summary {
         })
     }
 
-    fn add(&mut self, job: &Job, ran: &Ran) {
-        let failed = job.tests.iter().filter(|test| !ran.passed.contains(*test));
-        let failed: Vec<String> = failed.map(|test| format!("{} {test}", job.name)).collect();
-        let counts = (ran.passed.len(), failed.len(), ran.seconds);
-        self.counts.insert(job.name.clone(), counts);
-        self.failed.extend(failed);
-    }
-}
-
-/// Counts a job that is one test in itself.
-pub fn count(name: &str, ended: Outcome, summary: &mut Summary) {
-    let failed = ended.is_err();
-    if let Err(problem) = ended {
-        println!("{name}: {problem}");
-        summary.failed.push(name.to_owned());
-    }
-    summary.counts.insert(name.to_owned(), (usize::from(!failed), usize::from(failed), 0.0));
-}
-
-/// Runs jobs, as many side by side as there are cores, and one more of those that mostly wait; the
-/// slow ones begin first.
-pub fn run(mut jobs: Vec<Job>, summary: &mut Summary) {
-    let rank = |job: &Job| {
-        let module = job.tests.first().and_then(|test| test.split("::").next());
-        SLOW.split(' ').position(|slow| Some(slow) == module).unwrap_or(usize::MAX)
-    };
-    jobs.sort_by_key(|job| std::cmp::Reverse(rank(job)));
-    let (waiting, computing): (Vec<_>, Vec<_>) =
-        jobs.into_iter().partition(|job| WAITING.contains(&job.program.name.as_str()));
-    let (waiting, computing, shared) = (Mutex::new(waiting), Mutex::new(computing), Mutex::new(summary));
-    let work = |queue: &Mutex<Vec<Job>>| {
-        let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        while let Some(job) = next() {
-            let ran = job.run();
-            job.report(&ran);
-            shared.lock().unwrap_or_else(PoisonError::into_inner).add(&job, &ran);
+    /// Counts a job that is one test in itself.
+    pub fn count(&mut self, name: &str, ended: Outcome) {
+        self.add(name.to_owned(), name, ended.is_ok(), 0.0);
+        if let Err(problem) = ended {
+            println!("{name}: {problem}");
         }
-    };
-    thread::scope(|scope| {
-        scope.spawn(|| work(&waiting));
-        for _ in 0..thread::available_parallelism().map_or(2, usize::from) {
-            scope.spawn(|| {
-                work(&computing);
-                work(&waiting);
-            });
-        }
-    });
-}
+    }
 
-/// What a job did.
-#[derive(Default)]
-struct Ran {
-    passed: BTreeSet<String>,
-    seconds: f64,
-    /// What the program printed, if a test failed.
-    printed: Vec<u8>,
-    /// Tests that did not come to an end.
-    hung: Vec<String>,
-}
+    fn add(&mut self, module: String, test: &str, passed: bool, seconds: f64) {
+        let counts = self.counts.entry(module).or_default();
+        counts.0 += usize::from(passed);
+        counts.1 += usize::from(!passed);
+        counts.2 += seconds;
+        self.failed.extend((!passed).then(|| test.to_owned()));
+    }
 
-impl Job {
-    /// Runs the tests in one process. If they do not end, each that is left runs in one of its own,
-    /// so that the one that hangs is named and ends alone.
-    fn run(&self) -> Ran {
-        let started = Instant::now();
-        let mut ran = Ran::default();
-        if let Some(mut left) = self.attempt(&self.tests, &mut ran) {
-            if left.len() > 1 {
-                left.retain(|test| self.attempt(std::slice::from_ref(test), &mut ran).is_some());
+    /// Counts what a message of nextest reports, in the form of libtest's JSON with `PACKAGE::PROGRAM$MODULE::TEST` as
+    /// the name of a test.
+    fn read(&mut self, message: &Value, place: &str) {
+        let seconds = message["exec_time"].as_f64().unwrap_or(0.0);
+        let name = message["name"].as_str().unwrap_or_default().replacen('$', "::", 1);
+        let name = format!("{place}{}", name.strip_prefix("coboot-tests::").unwrap_or(&name));
+        match (message["type"].as_str(), message["event"].as_str()) {
+            (Some("test"), Some(event @ ("ok" | "failed"))) => {
+                let module = name.splitn(3, "::").take(2).collect::<Vec<_>>().join("::");
+                self.add(module, &name, event == "ok", seconds);
             }
-            ran.hung = left;
+            (Some("suite"), _) => self.skipped += message["ignored"].as_u64().unwrap_or(0),
+            _ => {}
         }
-        ran.seconds = started.elapsed().as_secs_f64();
-        ran
-    }
-
-    /// Runs some tests in one process; returns those that were not finished in time.
-    fn attempt(&self, tests: &[String], ran: &mut Ran) -> Option<Vec<String>> {
-        let (printed, code) = self.output(tests).unwrap_or_else(|problem| (problem.into_bytes(), None));
-        if code == Some(0) {
-            ran.passed.extend(tests.iter().cloned());
-            return None;
-        }
-        let text = String::from_utf8_lossy(&printed);
-        let results: BTreeMap<&str, bool> = text.lines().filter_map(result).collect();
-        ran.passed.extend(results.iter().filter(|(_, ok)| **ok).map(|(test, _)| (*test).to_owned()));
-        let unfinished = tests.iter().filter(|test| !results.contains_key(test.as_str())).cloned().collect();
-        ran.printed.extend_from_slice(&printed);
-        (code == Some(process::TOO_LATE)).then_some(unfinished)
-    }
-
-    /// Runs some tests in one process; returns what it printed, and its exit code.
-    fn output(&self, tests: &[String]) -> Outcome<(Vec<u8>, Option<i32>)> {
-        // In a file no program that a test has left holds the output up.
-        let log = workspace::target_dir().join("tests").join(self.name.replace(['/', ':'], "-"));
-        files::write(&log, "")?;
-        let unusable = |error: std::io::Error| format!("{}: {error}.", log.display());
-        // Both streams are in one file, so that they stay in order.
-        let file = File::options().append(true).open(&log).map_err(unusable)?;
-        let mut command = self.program.command();
-        command.envs(self.variables.iter().map(|(name, value)| (name, OsStr::new(value))));
-        // The results are lines of their own, whatever the tests print.
-        command.args(["--exact", "--color=never"]).args(tests);
-        command.stdin(Stdio::null()).stdout(file.try_clone().map_err(unusable)?).stderr(file);
-        let status = command.status().map_err(|error| process::not_started(&command, &error))?;
-        Ok((files::bytes(&log)?, status.code()))
-    }
-
-    /// Prints a line, and what a failed test printed.
-    fn report(&self, ran: &Ran) {
-        let mut out = std::io::stdout().lock();
-        let failed = self.tests.len() - ran.passed.len();
-        if failed > 0 {
-            let _ = out.write_all(&ran.printed);
-        }
-        for test in &ran.hung {
-            let _ = writeln!(out, "{test} did not end within {} s; it was ended.", PATIENCE.as_secs());
-        }
-        let failed = if failed > 0 { format!(", {failed} FAILED") } else { String::new() };
-        let _ =
-            writeln!(out, "{:<44} {:>4} passed{failed} {:>7.1} s", self.name, ran.passed.len(), ran.seconds);
     }
 }
 
-/// The result in a line of libtest, `test line::silence ... ok`; `None` for every other line.
-fn result(line: &str) -> Option<(&str, bool)> {
-    let (test, result) = line.trim_end().strip_prefix("test ")?.split_once(" ... ")?;
-    let test = test.strip_suffix(" - should panic").unwrap_or(test);
-    match result {
-        "ok" => Some((test, true)),
-        _ if result.ends_with("FAILED") => Some((test, false)),
-        // What a test writes past the capture may come between name and result.
-        _ => None,
+/// nextest of the Python environment on this workspace; `line` is its subcommand with options.
+fn nextest(line: &str, arguments: &[String]) -> Command {
+    let mut nextest = Command::new(setup::python().with_file_name("cargo-nextest"));
+    nextest.arg("nextest");
+    let mut nextest = process::on_workspace(nextest, workspace::root(), line);
+    nextest.args(arguments).current_dir(workspace::root());
+    nextest
+}
+
+/// Builds the test programs of packages; `arguments` select them for cargo.
+pub fn build(arguments: &[String]) -> Outcome {
+    process::run(&mut nextest("run --no-run", arguments))
+}
+
+/// Runs the tests of these packages that a filter of nextest takes; `place` names what is special about them.
+///
+/// # Errors
+/// When the programs do not build, or nextest cannot be started.
+pub fn run(
+    arguments: &[String],
+    filter: &str,
+    place: &str,
+    variables: &Variables,
+    summary: &mut Summary,
+) -> Outcome {
+    const LINE: &str = "run --no-fail-fast --no-tests=pass --status-level=slow --final-status-level=fail \
+                        --message-format=libtest-json";
+    let mut nextest = nextest(LINE, arguments);
+    // One more than there are cores, since some tests mostly wait for other programs.
+    let threads = thread::available_parallelism().map_or(2, usize::from) + 1;
+    nextest.args(["-E", filter, "--test-threads", &threads.to_string()]);
+    nextest.envs(variables.iter().cloned()).env("NEXTEST_EXPERIMENTAL_LIBTEST_JSON", "1");
+    // It shows the failed tests on its standard error, and reports all on its standard output.
+    let output = nextest.stdin(Stdio::null()).stderr(Stdio::inherit()).output();
+    let output = output.map_err(|error| process::not_started(&nextest, &error))?;
+    // 100: a test failed.
+    if !matches!(output.status.code(), Some(0 | 100)) {
+        return Err("the tests could not be built or run; what is printed above says why.".into());
     }
+    let mut ran = Summary::default();
+    for line in String::from_utf8_lossy(&output.stdout).lines() {
+        ran.read(&process::json(line)?, place);
+    }
+    for (module, (passed, failed, seconds)) in &ran.counts {
+        let failed = if *failed > 0 { format!(", {failed} FAILED") } else { String::new() };
+        println!("{module:<44} {passed:>4} passed{failed} {seconds:>7.1} s");
+    }
+    for (module, ran) in ran.counts {
+        // A module may have tests in several tiers.
+        let counts = summary.counts.entry(module).or_default();
+        *counts = (counts.0 + ran.0, counts.1 + ran.1, counts.2 + ran.2);
+    }
+    summary.failed.extend(ran.failed);
+    summary.skipped += ran.skipped;
+    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use std::path::Path;
 
+    use super::*;
+    use crate::files;
+
+    /// Messages as nextest 0.9 prints them.
     #[test]
-    fn a_result_is_read_in_the_form_of_libtest() {
-        assert_eq!(result("test line::silence ... ok"), Some(("line::silence", true)));
-        assert_eq!(result("test line::silence ... FAILED\n"), Some(("line::silence", false)));
-        assert_eq!(result("test a::b - should panic ... ok"), Some(("a::b", true)));
-        assert_eq!(result("test line::silence has been running for over 60 seconds"), None);
-        assert_eq!(result("test result: ok. 20 passed; 0 failed"), None);
+    fn a_report_of_nextest_is_counted_by_module() {
+        let mut summary = Summary::default();
+        for message in [
+            r#"{"type":"suite","event":"started","test_count":4}"#,
+            r#"{"type":"test","event":"started","name":"coboot-tests::device$line::silence"}"#,
+            r#"{"type":"test","event":"ok","name":"coboot-tests::device$line::silence","exec_time":0.25}"#,
+            r#"{"type":"test","event":"failed","name":"coboot-tests::device$line::noise","exec_time":0.5}"#,
+            r#"{"type":"test","event":"ok","name":"coboot-seal::coboot_seal$judge::tests::a_key","exec_time":1.0}"#,
+            r#"{"type":"suite","event":"failed","passed":3,"failed":1,"ignored":2,"filtered_out":7}"#,
+        ] {
+            summary.read(&process::json(message).unwrap(), "[a-board] ");
+        }
+        assert_eq!(summary.line(), "2 passed, 1 failed, 2 skipped");
+        assert_eq!(summary.failed, ["[a-board] device::line::noise"]);
+        let device = json!({"tests": "[a-board] device::line", "passed": 1, "failed": 1, "seconds": 0.8});
+        assert_eq!(summary.as_json()["jobs"][1], device);
+        summary.count("a job", Err("it broke off".into()));
+        assert_eq!(summary.line(), "2 passed, 2 failed, 2 skipped");
     }
 
+    /// `test = false` saves a link, and would let a test rest in silence.
     #[test]
-    fn what_did_not_report_counts_as_failed() {
-        let program = Program::of_a_test("device", "false".into());
-        let tests = ["line::a", "line::b", "line::c"].map(str::to_owned).to_vec();
-        let job = Job { name: "device::line".into(), program, tests, variables: Vec::new() };
-        let ran = Ran { passed: BTreeSet::from(["line::b".to_owned()]), ..Ran::default() };
-        let mut summary = Summary { skipped: 2, ..Summary::default() };
-        summary.add(&job, &ran);
-        assert_eq!(summary.line(), "1 passed, 2 failed, 2 skipped");
-        assert_eq!(summary.failed, ["device::line line::a", "device::line line::c"]);
-        assert_eq!(summary.as_json()["jobs"][0]["failed"], 2);
-        // A program that fails and prints no result: nothing passed.
-        assert!(job.run().passed.is_empty());
-        let good = Job { program: Program::of_a_test("device", "true".into()), ..job };
-        assert_eq!(good.run().passed.len(), 3);
+    fn what_cargo_builds_no_tests_of_has_none() {
+        let metadata = process::metadata().unwrap();
+        let targets =
+            process::list(&metadata, "packages").flat_map(|package| process::list(package, "targets"));
+        let kinds = ["lib", "bin", "cdylib"];
+        let without =
+            |target: &&Value| kinds.iter().any(|kind| target["kind"][0] == **kind) && target["test"] == false;
+        for target in targets.filter(without) {
+            let folder = Path::new(target["src_path"].as_str().unwrap()).parent().unwrap();
+            for file in files::below(folder, &[]).unwrap() {
+                let is_test = |line: &str| line.trim() == "#[test]";
+                assert!(!files::text(&file).unwrap().lines().any(is_test), "{}", file.display());
+            }
+        }
     }
 }
