@@ -26,7 +26,6 @@ It takes hours in all: nightly CI runs it in shards. cargo-mutants is installed 
 
 /// The version that the job installs.
 const VERSION: &str = "27.1.0";
-const PACKAGES: [&str; 5] = ["coboot-abi", "coboot-canopen", "coboot-core", "coboot-app", "coboot-seal"];
 /// The changes in the files of coboot-core that only sealed images use.
 const SEALED: &str = r"/(unseal|intake/sealed|control/(rights|sealed))\b";
 /// The options for them. Their tests are in another crate, too, where cargo-mutants does not look for
@@ -38,8 +37,8 @@ const WITH_SEALED: &str = "--features=coboot-core/sealed --test-package=coboot-c
 
 pub fn run(mut args: Args) -> Outcome {
     let (package, base, shard) = (args.value("--package")?, args.value("--in-diff")?, args.value("--shard")?);
-    if let Some(name) = package.as_deref().filter(|name| !PACKAGES.contains(name)) {
-        return Err(format!("there is no crate \"{name}\"; there is: {}.", PACKAGES.join(", ")));
+    if let Some(name) = package.as_deref().filter(|name| !coverage::PACKAGES.contains(name)) {
+        return Err(format!("there is no crate \"{name}\"; there is: {}.", coverage::PACKAGES.join(", ")));
     }
     // The tests of sealed images are in the crate that builds the emulator.
     setup::prepare(&[Part::Emulator])?;
@@ -79,7 +78,9 @@ pub fn run(mut args: Args) -> Outcome {
         Ok(list("missed.txt"))
     };
     let mut missed = Vec::new();
-    for name in PACKAGES.iter().filter(|name| package.as_deref().is_none_or(|package| package == **name)) {
+    for name in
+        coverage::PACKAGES.iter().filter(|name| package.as_deref().is_none_or(|package| package == **name))
+    {
         if *name != "coboot-core" {
             missed.extend(mutants(name, name, &options)?);
             continue;
@@ -111,7 +112,7 @@ pub fn run(mut args: Args) -> Outcome {
 }
 
 /// A text as the regular expression that matches it.
-fn exactly(text: &str) -> String {
+pub fn exactly(text: &str) -> String {
     let is_meta = |letter: &char| r"\.+*?()|[]{}^$#&-~".contains(*letter);
     text.chars().flat_map(|letter| is_meta(&letter).then_some('\\').into_iter().chain([letter])).collect()
 }
