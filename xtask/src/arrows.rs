@@ -107,10 +107,7 @@ pub fn run(args: Args) -> Outcome {
     for line in &broken {
         println!("{line}");
     }
-    Err(format!(
-        "{} rules of the house are broken; they stand in xtask/src/arrows.rs and ordered.rs.",
-        broken.len()
-    ))
+    Err(format!("{} rules of the house are broken; see xtask/src/arrows.rs and ordered.rs.", broken.len()))
 }
 
 /// A crate of the workspace.

@@ -14,7 +14,7 @@ pub const HELP: &str = "\
 usage: cargo xtask docs
 
 Makes the site of README.md and docs/ in target/book; open target/book/index.html. The order of the
-pages stands in docs/SUMMARY.md. Fails on every warning, on a link that leads nowhere, and on a page
+pages is that of docs/SUMMARY.md. Fails on every warning, on a link that leads nowhere, and on a page
 that the summary does not have.
 
 mdBook is installed into target/tools where it is missing, which takes some minutes once.

@@ -19,7 +19,7 @@ pub const HELP: &str = "\
 usage: cargo xtask build [NAME...] [--all] [--product FILE|NAME] [--board BOARD]
 
 Builds images of a board and puts them into target/firmware/BOARD/NAME.elf. Without a NAME it builds
-bootloader, app-v1 and app-v2; the other names stand in xtask/src/build.rs, and a wrong one lists them.
+bootloader, app-v1 and app-v2; a wrong NAME lists the others.
 app-c is the application in C, for each program of the board, and with the tests' objects (app-c-probe).
 
   --all           every image of the board and the applications in C: what the tests need

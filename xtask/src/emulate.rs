@@ -13,7 +13,7 @@ Sets the machine up, builds a bootloader and runs the emulated board with it in 
 
   --board BOARD   the board (default: stm32f407g-disc1), or with --bootloader the file with its memory map,
                   NAME.toml
-  --log[=WAY]     the bootloader that tells what it does, and what it tells. WAY: rtt (text for a debug
+  --log[=WAY]     the bootloader that logs what it does, and its log. WAY: rtt (text for a debug
                   probe; the default), defmt (the same by defmt), uart (text out of the board's UART)
   --virtual-can   the bootloader that speaks CAN over the board's UART, which a pseudo-terminal leads to
   OPTIONS         go to the emulator; `cargo xtask emulate -- --help` lists them. Among them:

@@ -58,7 +58,7 @@ pub fn run(mut args: Args) -> Outcome {
     for ((option, ..), hand) in HANDS.iter().zip(&mut hands).rev() {
         power_line = args.value(option)?;
         if power_line.as_ref().is_some_and(|line| !line.contains("{state}")) {
-            return Err(format!("{option} needs {{state}}; on and off stand in its place."));
+            return Err(format!("{option} needs {{state}}; on and off take its place."));
         }
         *hand = power_line.as_ref().map(|line| CommandLine::new(option, line)).transpose()?;
     }

@@ -7,7 +7,7 @@ use crate::{build, files, outcome::Outcome, process, product, words, workspace};
 pub const HELP: &str = "\
 usage: cargo xtask lint [--board BOARD]
 
-Checks the formatting of every crate and the words of comments and pages, runs clippy over host
+Checks the formatting of every crate and the words of sources and pages, runs clippy over host
 crates (with their tests; the Python package, too) and over the firmware of a board, and makes the
 documentation of the host crates, all with warnings denied.
 

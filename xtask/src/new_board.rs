@@ -47,7 +47,7 @@ pub fn run(mut args: Args) -> Outcome {
         println!("  new      {path}");
     }
     println!(
-        "\nNow go through the steps in the new files; docs/porting.md tells which test proves each.\n\
+        "\nNow go through the steps in the new files; docs/porting.md says which test proves each.\n\
          Then: cargo xtask build --board {name} && cargo xtask test --board {name} --test update main_job::"
     );
     Ok(())

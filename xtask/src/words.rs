@@ -1,128 +1,71 @@
-//! The words of comments and pages: for a few phrases there is an exact word.
+//! The words of sources and pages: for a few phrases there is an exact word.
 
-use std::fs;
+use std::path::Path;
 use std::process::Command;
 
 use crate::{outcome::Outcome, process, workspace};
 
-/// Pages about the past, which keep their words.
-const PAST: [&str; 2] = ["CHANGELOG.md", "docs/adr/"];
+/// The files that are read: not the pages about the past, which keep their words.
+const FILES: [&str; 4] = ["*.rs", "*.md", ":!CHANGELOG.md", ":!docs/adr"];
 
-/// Words that are wrong in front of certain words, and what to write.
-struct Rule {
-    words: &'static [&'static str],
-    before: &'static [&'static str],
-    write: &'static str,
-}
-
-const RULES: [Rule; 4] = [
+/// Words that are wrong in front of certain words, as regular expressions of Perl, and what to write.
+const RULES: [(&str, &str, &str); 4] = [
     // Time and order; a router and a trait have a place behind them.
-    Rule {
-        words: &["behind"],
-        before: &[
-            "abort", "answer", "boot-up", "burst", "bus-off", "cut", "download", "erase", "frame", "frames",
-            "header", "message", "power", "program", "request", "reset", "restart", "table", "vectors",
-        ],
-        write: "after",
-    },
-    Rule { words: &["tell", "tells", "told"], before: &["apart"], write: "distinguish" },
-    Rule {
-        words: &["tell", "tells", "told"],
-        before: &["how", "what", "which", "whether", "why", "where", "when", "who"],
-        write: "say, report, show or print",
-    },
-    Rule { words: &["stand", "stands"], before: &["at", "beside", "in", "there"], write: "is or are" },
+    (
+        "behind",
+        "abort|answer|boot-up|burst|bus-off|cut|download|erase|frames?|header|message|power|program|request|reset|\
+         restart|table|vectors",
+        "after",
+    ),
+    ("tells?|told", "apart", "distinguish"),
+    ("tells?|told", "how|what|which|whether|why|where|when|who", "say, report, show or print"),
+    // What takes the place of another thing may.
+    ("stands?", "at|beside|in(?! for)|there", "is or are"),
 ];
+/// What may be between the two: blanks or the end of a line, with the beginning of a comment in the next one, and an
+/// article.
+const BETWEEN: &str = r"(?<gap>\h*\n\h*(//[/!]?\h+)?|\h+)((an?|the|each|every|its)(?&gap))?";
 
-/// Words that may be between the two of a rule.
-const ARTICLES: [&str; 6] = ["a", "an", "the", "each", "every", "its"];
-
-/// The phrases in the comments of all Rust sources and on all pages of the repository, as messages.
+/// The phrases in all Rust sources and on all pages of the repository, as messages.
 ///
 /// # Errors
 /// When git does not list the files.
 pub fn faults() -> Outcome<Vec<String>> {
-    let mut git = Command::new("git");
-    git.arg("-C").arg(workspace::root()).args(["ls-files", "-z", "--", "*.rs", "*.md"]);
+    let files = process::git(&[&["ls-files", "-z", "--"], &FILES[..]].concat())?;
+    faults_of(workspace::root(), &files.split_terminator('\0').collect::<Vec<_>>())
+}
+
+fn faults_of(folder: &Path, files: &[&str]) -> Outcome<Vec<String>> {
     let mut faults = Vec::new();
-    for file in process::output(&mut git)?.split_terminator('\0') {
-        if PAST.iter().any(|past| file.starts_with(past)) {
-            continue;
-        }
-        // A file that is listed may have been deleted since the last commit.
-        let Ok(text) = fs::read_to_string(workspace::root().join(file)) else { continue };
-        let found = faults_of(&text, file.ends_with(".md"));
-        faults.extend(found.into_iter().map(|(line, fault)| format!("{file}:{line}: {fault}")));
+    for (words, before, write) in RULES {
+        // A file is one line for it, so that a phrase may have two; a listed file may have been deleted.
+        let mut grep = Command::new("grep");
+        grep.args(["-Pzois", "--with-filename"]).arg(format!(r"\b({words}){BETWEEN}({before})\b"));
+        let found = grep.args(files).current_dir(folder).output();
+        let found = found.map_err(|error| process::not_started(&grep, &error))?;
+        let found = String::from_utf8_lossy(&found.stdout).into_owned();
+        faults.extend(found.split_terminator('\0').map(|phrase| format!("{phrase:?}: write {write}")));
     }
     Ok(faults)
 }
 
-/// The faults of a file, each with the number of its line.
-fn faults_of(text: &str, is_page: bool) -> Vec<(usize, String)> {
-    let words = words(text, is_page);
-    let is_mark = |c: char| !c.is_alphanumeric();
-    let bare = |at: usize| words.get(at).map_or("", |(_, word)| word.trim_end_matches(is_mark));
-    let is = |at: usize, known: &[&str]| known.iter().any(|known| bare(at).eq_ignore_ascii_case(known));
-    let mut faults = Vec::new();
-    for (at, (line, word)) in words.iter().enumerate() {
-        let next = if is(at + 1, &ARTICLES) { at + 2 } else { at + 1 };
-        // Whatever stands for another thing takes its place.
-        let takes_its_place = is(next, &["in"]) && is(next + 1, &["for"]);
-        for rule in &RULES {
-            // After a word with a punctuation mark, another phrase begins.
-            let is_word = rule.words.iter().any(|known| known.eq_ignore_ascii_case(word));
-            if is_word && is(next, rule.before) && !takes_its_place {
-                faults.push((*line, format!("\"{word} {}\": write {}", bare(next), rule.write)));
-            }
-        }
-    }
-    faults
-}
-
-/// The words of the comments of a source, or of a page without its blocks of code, each with the
-/// number of its line and without punctuation marks in front. An empty word ends a phrase.
-fn words(text: &str, is_page: bool) -> Vec<(usize, &str)> {
-    let (mut words, mut is_code) = (Vec::new(), false);
-    for (number, line) in (1..).zip(text.lines()) {
-        let is_fence = is_page && line.trim_start().starts_with("```");
-        is_code ^= is_fence;
-        let read = if is_page { (!is_code && !is_fence).then_some(line) } else { comment(line) };
-        let read = read.unwrap_or_default().trim_start_matches(['/', '!']);
-        let is_mark = |c: char| !c.is_alphanumeric();
-        words.extend(read.split_whitespace().map(|word| (number, word.trim_start_matches(is_mark))));
-        if read.trim().is_empty() {
-            words.push((number, ""));
-        }
-    }
-    words
-}
-
-/// The comment in a line of Rust.
-fn comment(line: &str) -> Option<&str> {
-    let line = line.trim_start();
-    if line.starts_with("//") {
-        return Some(line);
-    }
-    line.split_once(" // ").map(|(_code, comment)| comment)
-}
-
 #[test]
-fn comments_and_pages_use_the_exact_words() {
+fn sources_and_pages_use_the_exact_words() {
     assert_eq!(faults().unwrap(), Vec::<String>::new());
 }
 
 #[test]
-fn a_phrase_is_found_in_comments_and_on_pages_also_across_lines() {
-    let lines = |text: &str, is_page: bool| {
-        faults_of(text, is_page).into_iter().map(|(line, _)| line).collect::<Vec<usize>>()
-    };
-    let source = "/! Asked behind\n/! each Frame.\nlet behind = tells(which);\nx(); / (Tells how) it\n\
-                  /\n/ behind a gateway, it stands in for a reset\n/ it stands. In front\n/ behind\n\n/ a cut\n";
-    assert_eq!(lines(&source.replace('/', "//"), false), [1, 4]);
-    let page = "It `tells` how.\n```\nbehind the reset\n```\n| stands | in |\nIt stands\nin *the* list.\n";
-    assert_eq!(lines(page, true), [6]);
-    assert_eq!(
-        faults_of("to tell them, to tell apart", true),
-        [(1, "\"tell apart\": write distinguish".to_owned())]
-    );
+fn a_phrase_is_found_also_across_lines() {
+    let folder = kit::folder::Folder::below(std::env::temp_dir(), "coboot-words");
+    let text = "//! Asked b~ehind\n//! each Frame.\nlet behind = tells(which);\nx(); // (T~ells how) it\n\
+                // behind a gateway, it stands in for a reset\n// it stands. In front\n// behind\n\n// a cut\n\
+                | stands | in |\nIt `tells` how, and s~tands\nin *the* list.\n";
+    std::fs::write(folder.join("a.rs"), text.replace('~', "")).unwrap();
+    let expected = [
+        r#""a.rs:behind\n//! each Frame": write after"#,
+        r#""a.rs:T~ells how": write say, report, show or print"#,
+        r#""a.rs:stands\nin": write is or are"#,
+    ]
+    .map(|fault| fault.replace('~', ""));
+    assert_eq!(faults_of(&folder, &["a.rs"]).unwrap(), expected);
 }

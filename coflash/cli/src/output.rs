@@ -233,7 +233,7 @@ Exit codes:
   5    the device does not answer
   6    the device refuses, or reports an error
   7    the program does not start, or the application does not go back to the bootloader
-  8    some of several devices failed; the summary tells which
+  8    some of several devices failed; the summary says which
   130  cancelled";
 
 /// The exit codes.

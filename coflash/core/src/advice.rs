@@ -269,7 +269,7 @@ advice! {
     /// For 1F57h: no valid program.
     NoValidProgram => "flash a program, and release it for autostart",
     /// For 1F57h: the format.
-    WrongFormat => "check that the file is for this bootloader and this board: coflash inspect --board tells whether its \
+    WrongFormat => "check that the file is for this bootloader and this board: coflash inspect --board says whether its \
                     stack and its reset vector are those of a program there",
     /// For 1F57h: a CRC.
     CheckBus => "run the command again; if it happens again, check bus and terminators",

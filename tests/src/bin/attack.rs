@@ -108,7 +108,7 @@ fn main() -> ExitCode {
         }
     });
     let work = work.into_inner().expect("no attack panics");
-    println!("setup          frames   bursts  resets  cuts  updates  slowest answer  behind bus-off  between feeds");
+    println!("setup          frames   bursts  resets  cuts  updates  slowest answer   after bus-off  between feeds");
     for Row { name, summary, .. } in &work.rows {
         let Summary { frames, bursts, resets, cuts, updates, slowest_us, slowest_off_us, unfed_us, .. } =
             summary;

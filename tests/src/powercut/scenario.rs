@@ -310,7 +310,7 @@ pub const SCENARIOS: &[Scenario] = &[
     },
     Scenario {
         name: "erase-and-install",
-        about: "a program taken away by two CLEARs, and behind a reset another one without CLEAR, which looks whether the flash is blank",
+        about: "a program taken away by two CLEARs, and after a reset another one without CLEAR, which looks whether the flash is blank",
         prepare: |device| install(device, 1, OLD, true),
         act: |device, tell| {
             tell(allowed(&[START_OLD, STAY]));

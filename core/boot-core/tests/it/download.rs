@@ -236,7 +236,7 @@ fn every_wrong_block_is_refused_and_the_next_attempt_works() {
         ("next block too early", good[2].clone(), AbortCode(0x0800_0022), 0x88),
         ("last block too early", last(&image), AbortCode(0x0800_0022), 0x88),
         ("huge number", block(0xFFFF_FFFE, at, &[0; 8]), AbortCode(0x0800_0022), 0x88),
-        ("behind the program", block(1, PROGRAM.end(), &[0; 8]), AbortCode(0x0800_0020), 0x0C),
+        ("after the program", block(1, PROGRAM.end(), &[0; 8]), AbortCode(0x0800_0020), 0x0C),
         ("over the program's end", block(1, PROGRAM.end() - 4, &[0; 8]), AbortCode(0x0800_0020), 0x0C),
         ("outside the flash", block(1, 0x2000_0000, &[0; 8]), AbortCode(0x0800_0020), 0x0C),
         ("wrapping round the address space", block(1, 0xFFFF_FFFC, &[0; 8]), AbortCode(0x0800_0020), 0x0C),

@@ -190,7 +190,7 @@ fn look(world: &mut World<'_>, seed: u64, random: &mut Random) {
         // A client that aborts the open transfer gets an answer at once.
         0 => {
             world.put(&sdo([0x80, 0, 0, 0, 0, 0, 0, 8]));
-            assert_eq!(world.ask(READ_1000, 1), Some(IS_1000), "seed {seed}, behind an abort");
+            assert_eq!(world.ask(READ_1000, 1), Some(IS_1000), "seed {seed}, after an abort");
         }
         // Other clients get an answer after the pause of a sub-block; one request may be taken for
         // the segment that is due, or for the rest of the previous answer.

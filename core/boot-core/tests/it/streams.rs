@@ -234,7 +234,7 @@ fn what_is_seen_in_time_erases_nothing() {
         ("unknown type", format!("{}\n", record(0, 6, &[])).into(), None, STORE, 0x04),
         ("over the bootloader", at(0x0800_0000, &[0; 16]).into(), None, STORE, 0x0E),
         ("over the parameters", at(0x0800_0400, &[0; 16]).into(), None, STORE, 0x0E),
-        ("behind the program", at(PROGRAM.end(), &[0; 16]).into(), None, STORE, 0x0C),
+        ("after the program", at(PROGRAM.end(), &[0; 16]).into(), None, STORE, 0x0C),
         ("over its end", at(PROGRAM.end() - 8, &[0; 16]).into(), None, STORE, 0x0C),
         ("RAM", at(0x2000_0000, &[0; 16]).into(), None, STORE, 0x0C),
         ("the end of the address space", at(0xFFFF_FFF8, &[0; 16]).into(), None, STORE, 0x0C),

@@ -418,7 +418,7 @@ mod tests {
             let by = |share, id| filters.accept(share, &standard(id)).map(|found| found.fifo);
             [by(Share::Can1, 0x081), by(Share::Can1, 0x181), by(Share::Can2, 0x081), by(Share::Can2, 0x181)]
         };
-        assert_eq!(taken(14), [Some(0), None, None, Some(1)], "the value behind a reset");
+        assert_eq!(taken(14), [Some(0), None, None, Some(1)], "the value after a reset");
         assert_eq!(taken(15), [Some(0), Some(1), None, None]);
         assert_eq!(taken(13), [None, None, Some(0), Some(1)]);
         assert_eq!(taken(0), [None, None, Some(0), Some(1)], "every bank is CAN2's");

@@ -49,7 +49,7 @@ pub fn observe(story: &Story, bench: &mut Bench) -> Result<Seen, String> {
     };
     let told = bench.session_with(node).device_type().map_err(|error| format!("no answer: {error}"))?;
     let outcome = match told {
-        None => return Err("it does not tell what it is".into()),
+        None => return Err("it does not say what it is".into()),
         Some(kind) if kind.is_bootloader() => Outcome::Bootloader,
         Some(_) => {
             let version = bench.session_with(node).read_text(VERSION).map_err(|error| error.to_string())?;
