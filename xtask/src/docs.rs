@@ -128,48 +128,30 @@ fn is_package(name: &str) -> bool {
 
 /// The fault of a job's arguments, if there is one.
 fn job_options(job: &str, help: &str, words: &[&str]) -> Option<String> {
-    let mut words = words.iter().take_while(|word| **word != "--").copied();
-    while let Some(word) = words.next() {
-        let (name, value) = word.split_once('=').map_or((word, None), |(name, value)| (name, Some(value)));
-        let known = help.split([' ', '[', '\n']).any(|known| known == name);
-        match name {
-            "--yes" => {}
-            _ if name.starts_with("--") && known => {
-                // In the help an option with a value has it in capitals, or has an example.
-                let line = help.lines().find(|line| line.split([' ', '[']).any(|known| known == name))?;
-                let behind = line.split_once(name).map(|(_, behind)| behind.trim_start_matches(' '));
-                let takes = behind.is_some_and(|behind| {
-                    let value = behind.split(' ').next().unwrap_or_default();
-                    line.contains(&format!("{name} {value}")) && !value.is_empty() && !value.starts_with('[')
-                });
-                let value = value.or_else(|| if takes { words.next() } else { None });
-                let board = value.filter(|_| name == "--board").filter(|board| !pages::is_placeholder(board));
-                // A guide creates a board with this name.
-                let unknown = board.filter(|board| {
-                    *board != "my-board" && !BOARDS.iter().any(|layout| layout.board == *board)
-                });
-                if let Some(unknown) = unknown {
-                    return Some(format!("there is no board {unknown}"));
-                }
+    let is_option = |name: &str| help.split([' ', '[', '\n']).any(|known| known == name) || name == "--yes";
+    let mut before = "";
+    for word in words.iter().take_while(|word| **word != "--") {
+        let (name, value) = word.split_once('=').unwrap_or((word, word));
+        // What follows an option may be its value. A guide creates a board with this name.
+        let is_board = [name, before].contains(&"--board") && !value.starts_with('-') && value != "my-board";
+        if is_board && !pages::is_placeholder(value) && !BOARDS.iter().any(|layout| layout.board == value) {
+            return Some(format!("there is no board {value}"));
+        }
+        if job == "test" {
+            // Other arguments go to cargo test.
+            let program = workspace::root().join("tests").join(name).join("main.rs");
+            if before == "--test" && !program.is_file() {
+                return Some(format!("there is no test {name}"));
             }
-            // The other arguments go to cargo test.
-            "--test" if job == "test" => {
-                let name = words.next().unwrap_or_default();
-                if !workspace::root().join("tests").join(name).join("main.rs").is_file() {
-                    return Some(format!("there is no test {name}"));
-                }
-            }
-            _ if job == "test" => {}
-            _ if name.starts_with('-') => return Some(format!("cargo xtask {job} has no {name}")),
-            _ if job == "build"
-                && !pages::is_placeholder(name)
-                && name != C_APPLICATION
-                && !VARIANTS.iter().any(|variant| variant.name == name) =>
-            {
+        } else if name.starts_with('-') && !is_option(name) {
+            return Some(format!("cargo xtask {job} has no {name}"));
+        } else if job == "build" && !name.starts_with('-') && !["--board", "--product"].contains(&before) {
+            let is_image = name == C_APPLICATION || VARIANTS.iter().any(|variant| variant.name == name);
+            if !is_image && !pages::is_placeholder(name) {
                 return Some(format!("there is no image {name}"));
             }
-            _ => {}
         }
+        before = name;
     }
     None
 }

@@ -9,10 +9,10 @@ use std::{fs, iter, thread};
 use serde_json::{json, Value};
 
 use crate::args::Args;
-use crate::{corpus, evidence, files, outcome::Outcome, process, setup, workspace};
+use crate::{evidence, files, outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--keep | --replay]
+usage: cargo xtask fuzz [--seconds N | --inputs N] [--target NAMES] [--replay]
 
 Runs the fuzz targets of tests/fuzz/fuzz_targets, as many at a time as there are cores. What they find
 in this run is built upon in the next one. The counts of a run of all targets go to
@@ -21,13 +21,13 @@ target/evidence/fuzz.json.
   --seconds N     how long each target runs (default: 30)
   --inputs N      how many inputs each target tries, in place of a time
   --target NAMES  these alone, with commas between them
-  --keep          afterwards, makes the smallest corpus that covers as much, and puts the shortest
-                  inputs of it into tests/fuzz/corpus, one archive for each target
   --replay        runs no fuzzer: every input of tests/fuzz/corpus and target/fuzz/corpus once, with
                   the Rust that builds the rest; it needs no nightly toolchain
 
 Without --replay, it needs a nightly toolchain of Rust and a C++ compiler. cargo-fuzz is installed into target/tools
-where it is missing.
+where it is missing. What it has found is kept, as small as it may be for the same coverage, by
+  rustup run nightly target/tools/bin/cargo-fuzz fuzz cmin --sanitizer none --fuzz-dir tests/fuzz NAME target/fuzz/corpus/NAME
+  tar -C target/fuzz/corpus/NAME -czf tests/fuzz/corpus/NAME.tar.gz .
 ";
 
 /// The version to install if there is none.
@@ -66,7 +66,7 @@ fn replay_all(targets: &[String]) -> Outcome {
         // They are unpacked anew: a name may have gone.
         let kept = target_dir().join("kept").join(target);
         files::remove(&kept)?;
-        program.arg(corpus::unpack(&kept_file(target), kept)?);
+        program.arg(unpack(target, kept)?);
         let found = found(target);
         program.args(found.is_dir().then_some(found));
         let said = process::output(&mut program)?;
@@ -75,9 +75,14 @@ fn replay_all(targets: &[String]) -> Outcome {
     Ok(())
 }
 
-/// The archive with the kept inputs of a target.
-fn kept_file(target: &str) -> PathBuf {
-    folder().join("corpus").join(format!("{target}.tar.gz"))
+/// Puts the kept inputs of a target, if there are any, into a folder, which it makes; returns the folder.
+fn unpack(target: &str, folder: PathBuf) -> Outcome<PathBuf> {
+    files::make(&folder)?;
+    let archive = workspace::root().join("tests/fuzz/corpus").join(format!("{target}.tar.gz"));
+    if archive.exists() {
+        files::unpack(&archive, &folder)?;
+    }
+    Ok(folder)
 }
 
 /// The folder of what the fuzzer has found in this clone, and of what it has begun with.
@@ -99,11 +104,8 @@ pub fn run(mut args: Args) -> Outcome {
         (seconds, None) => format!("-max_total_time={}", seconds.unwrap_or(30)),
     };
     let only = args.value("--target")?;
-    let (keep, replay) = (args.flag("--keep"), args.flag("--replay"));
+    let replay = args.flag("--replay");
     args.none_left()?;
-    if keep && replay {
-        return Err("--keep and --replay do not go together.".into());
-    }
     let folder = folder();
     let mut targets = targets(&folder)?;
     let is_whole = only.is_none();
@@ -126,14 +128,7 @@ pub fn run(mut args: Args) -> Outcome {
         process::run(&mut command(&cargo_fuzz, "build", target))?;
     }
     let next = AtomicUsize::new(0);
-    let one = |target: &String| -> Outcome<Value> {
-        let row = fuzz(&cargo_fuzz, target, &end)?;
-        if keep && !is_failed(&row) {
-            process::output(command(&cargo_fuzz, "cmin", target).arg(found(target)))?;
-            corpus::keep(&found(target), &kept_file(target))?;
-        }
-        Ok(row)
-    };
+    let one = |target: &String| fuzz(&cargo_fuzz, target, &end);
     let work = || iter::from_fn(|| targets.get(next.fetch_add(1, Ordering::Relaxed))).map(one).collect();
     if is_whole {
         evidence::begin("fuzz")?;
@@ -203,7 +198,7 @@ fn command(cargo_fuzz: &Path, word: &str, target: &str) -> Command {
 /// why it failed, if it did.
 fn fuzz(cargo_fuzz: &Path, target: &str, end: &str) -> Outcome<Value> {
     // The fuzzer puts only what is new there, and the smallest corpus is made of it alone.
-    let corpus = corpus::unpack(&kept_file(target), found(target))?;
+    let corpus = unpack(target, found(target))?;
     let log = target_dir().join(target).with_extension("log");
     let file = fs::File::create(&log).map_err(|error| format!("{}: {error}.", log.display()))?;
     let mut command = command(cargo_fuzz, "run", target);
@@ -269,6 +264,17 @@ mod tests {
         }
         for (name, _) in COMMANDS {
             assert!(manifest.contains(&format!("name = \"{name}\"")), "{name}");
+        }
+    }
+
+    #[test]
+    fn the_kept_inputs_are_whole_and_few() {
+        for file in files::within(&folder().join("corpus")).unwrap() {
+            if file.file_name().is_some_and(|name| name != ".gitattributes") {
+                let names = process::output(Command::new("tar").arg("--list").arg("--file").arg(&file));
+                assert!(names.unwrap().lines().any(|name| name != "./"), "{}", file.display());
+                assert!(file.metadata().unwrap().len() < 200_000, "{}", file.display());
+            }
         }
     }
 

@@ -15,7 +15,6 @@ mod book;
 mod build;
 mod check;
 mod chips;
-mod corpus;
 mod coverage;
 mod demo;
 mod deny;
@@ -30,7 +29,6 @@ mod examples;
 mod files;
 #[cfg(test)]
 mod fleet;
-mod foreign;
 mod fuzz;
 mod hil;
 mod layout;
@@ -114,7 +112,6 @@ const JOBS: &[Job] = jobs! {
     "mutants" mutants "changes of the code that a test must notice"
     "evidence" evidence "one page of what the jobs have measured of this commit"
     "attack" attack "the standing attacker of the bus, for millions of frames"
-    "foreign" foreign "firmware of others, unmodified, in the emulator: Klipper, Katapult, ChibiOS and more"
     "opinion" opinion "the emulated CPU against QEMU's, word for word"
     "size" size "the bootloader's flash against its budget"
     "pairs" pairs "bootloaders with every pair of a product's choices: they build and fit"
