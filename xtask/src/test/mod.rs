@@ -9,7 +9,7 @@ use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
-use self::plan::{Tier, IMAGES, NEEDS, OF_EACH_CHIP};
+use self::plan::{Tier, IMAGES, OF_EACH_CHIP};
 use self::runner::{Summary, Variables};
 use crate::args::Args;
 use crate::{
@@ -76,7 +76,7 @@ pub fn run(mut args: Args) -> Outcome {
     let chosen_board = args.has("--board");
     let board = workspace::board(&mut args)?;
     if args.flag("--list") {
-        println!("{}", plan::table());
+        println!("{}", plan::table(plan::LATER));
         return args.none_left();
     }
     let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
@@ -247,7 +247,7 @@ fn later(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
 fn ci(summary: &mut Summary) -> Outcome {
     later(Tier::Ci, &["xtask"], summary)?;
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
-    let core = format!("{} & ({})", plan::of("coboot-core/it", ""), Tier::Product.filter());
+    let core = format!("{} & ({})", plan::of("coboot-core/it"), Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
     runner::run(&ours(), &core, "[sealed] ", &takes_sealed, summary)?;
     let mut doc = process::cargo("test --doc --workspace --quiet");
@@ -281,18 +281,17 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
     }
     // cargo builds the programs that tests start for those of their own packages alone.
     programs_of_ours()?;
-    let programs = ["device", "update", "sealed", "foreign", "port"];
-    let programs = programs
-        .into_iter()
-        .filter(|name| tier == Tier::All || OF_EACH_CHIP.iter().any(|(of, _)| of == name));
-    let arguments = build::board_args(board).into_iter().chain(workspace::on_host());
-    let arguments: Vec<_> = arguments.chain(programs.map(|name| format!("--test={name}"))).collect();
-    let without =
-        plan::any_of(NEEDS.iter().filter(|needs| !(needs.has)(board)).flat_map(|needs| needs.tests));
-    let filter = match tier {
-        Tier::All => format!("!({without})"),
-        _ => format!("({}) - ({without}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter()),
+    let programs: &[&str] = match tier {
+        Tier::All => &["device", "update", "sealed", "foreign", "port"],
+        _ => &["device", "update"],
     };
+    let arguments = build::board_args(board).into_iter().chain(workspace::on_host());
+    let arguments: Vec<_> = arguments.chain(programs.iter().map(|name| format!("--test={name}"))).collect();
+    let tests = match tier {
+        Tier::All => "all()".to_owned(),
+        _ => format!("({}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter()),
+    };
+    let filter = format!("({tests}) - ({})", plan::any_of(plan::left_out(board)));
     runner::run(&arguments, &filter, &format!("[{}] ", board.board), &variables(board), summary)
 }
 
