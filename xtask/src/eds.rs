@@ -8,24 +8,23 @@ use crate::setup::{self, Part};
 use crate::{build, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask eds [--product FILE|NAME] [--board BOARD] [--out FOLDER]
+usage: cargo xtask eds [--product FILE|NAME] [--board BOARD]
 
 Writes the electronic data sheets of bootloader and application template (CiA 306-1). They are made
-from the tables of the object dictionaries; run this after a change there, a test compares.
+from the tables of the object dictionaries; run this after a change there, a test compares. They are in docs/eds;
+those of another product or board in target/eds/BOARD.
 
   --product FILE  those of this product, as for `build`: the bootloader, and the one for sealed images
   --board BOARD   the board whose identity and bit rates they have (default: stm32f407g-disc1)
-  --out FOLDER    where to (default: docs/eds; for another product or board target/eds/BOARD)
 ";
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
     let product = args.value("--product")?.map_or(Ok(Product::default()), |word| Product::chosen(&word))?;
     let is_committed = board.board == layout::DEFAULT.board && product.is_default();
-    let folder = match args.value("--out")? {
-        Some(folder) => folder.into(),
-        None if is_committed => workspace::root().join("docs/eds"),
-        None => workspace::target_dir().join("eds").join(board.board),
+    let folder = match is_committed {
+        true => workspace::root().join("docs/eds"),
+        false => workspace::target_dir().join("eds").join(board.board),
     };
     args.none_left()?;
     // The crate that makes them is the crate of the emulated tests.

@@ -34,11 +34,11 @@ pub fn run(mut args: Args) -> Outcome {
     let word = args.value("--board")?.unwrap_or_else(|| layout::DEFAULT.board.to_owned());
     let log = if args.flag("--log") { Some("rtt".to_owned()) } else { args.value("--log")? };
     let virtual_can = args.flag("--virtual-can");
-    let (has_bootloader, has_serial) = (args.has("--bootloader"), args.has("--serial"));
     let options = args.rest();
+    let has = |name: &str| options.iter().any(|word| word.split('=').next() == Some(name));
 
     let mut emulator = process::cargo("run --package coboot-emulator --bin emulate -- --board");
-    if has_bootloader {
+    if has("--bootloader") {
         // The emulator reads the memory map of any board.
         setup::prepare(&[Part::Emulator])?;
         emulator.arg(&word);
@@ -55,7 +55,7 @@ pub fn run(mut args: Args) -> Outcome {
         let dir = build::images(board, &[&bootloader])?;
         emulator.args([board.board, "--bootloader"]).arg(dir.join(format!("{bootloader}.elf")));
     }
-    if virtual_can && !has_serial {
+    if virtual_can && !has("--serial") {
         emulator.args(["--serial", "pty"]);
     }
     process::run(emulator.args(options.iter().filter(|word| *word != "--")))

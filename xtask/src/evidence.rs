@@ -47,7 +47,7 @@ const PARTS: [Part; 12] = [
     part("attacker", "frames", "attack", "A seeded attacker and a legal master on one bus."),
     part("silicon", "chips", "attack --silicon 2000", "The main scenarios on chips that seeds draw."),
     part("fuzz", "inputs", "fuzz", "Random inputs for what meets the bus or a file."),
-    part("cpu", "words", "opinion --json", "The same programs on QEMU's Cortex-M4 and on the emulator."),
+    part("cpu", "words", "opinion", "The same programs on QEMU's Cortex-M4 and on the emulator."),
     part("coverage", "percent", "coverage", "Lines of the device's crates that tests reach."),
     part("mutants", "tried", "mutants", "Changes of the code that the tests must notice."),
     part("bench", "percent", "bench --json", "A download, in percent of what wire and flash allow."),

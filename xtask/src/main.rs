@@ -151,7 +151,7 @@ fn main() -> ExitCode {
                 if args.flag("--yes") {
                     setup::may_use_sudo();
                 }
-                if args.asks_for_help() {
+                if args.flag(["-h", "--help"]) {
                     print!("{}\n{YES}", job.help);
                     Ok(())
                 } else {

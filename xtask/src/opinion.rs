@@ -9,31 +9,24 @@ use crate::setup::{self, Part};
 use crate::{build, evidence, outcome::Outcome, process};
 
 pub const HELP: &str = "\
-usage: cargo xtask opinion [--json]
+usage: cargo xtask opinion
 
 Runs the same programs on the emulator's CPU and on QEMU's, and the same update on the emulated board and
 on QEMU's, and compares what comes of them. A difference that is not explained is a failure. docs/testing.md
-has the differences.
-
-  --json          also writes the result of the programs to target/evidence/cpu.json: commit, counts,
-                  differences
+has the differences. Counts and differences of the programs go to target/evidence/cpu.json.
 ";
 
-pub fn run(mut args: Args) -> Outcome {
-    let json = args.flag("--json");
+pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     setup::prepare(&[Part::Firmware, Part::Emulator, Part::Qemu])?;
-    let cpu = cpu(json);
+    let cpu = cpu();
     let board = board();
     cpu.and(board)
 }
 
-fn cpu(json: bool) -> Outcome {
+fn cpu() -> Outcome {
     let mut test = process::cargo("test --quiet --package coboot-emulator --test it");
     test.args("-- second_opinion:: --include-ignored --nocapture --test-threads=1".split(' '));
-    if !json {
-        return process::run(&mut test);
-    }
     evidence::begin("cpu")?;
     let run = |file: &Path| process::run(test.env("COBOOT_CPU_EVIDENCE", file));
     let (facts, ended) = evidence::facts_of("cpu", run)?;

@@ -10,7 +10,7 @@ use crate::size::{budgets, within};
 use crate::{build, files, outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask pairs [--spread | --board BOARD]
+usage: cargo xtask pairs [--spread]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
 values of any two choices are together in one of them (a covering array), sealed images included, and
@@ -18,7 +18,6 @@ fails when one does not build or is over the budget of its flash. It prints the 
 of each.
 
   --spread        each of them for one board, the next for the next; without, each for every board
-  --board BOARD   all of them for this board
 ";
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
@@ -91,8 +90,6 @@ type Row = [u8; FIELDS.len()];
 
 pub fn run(mut args: Args) -> Outcome {
     let spread = args.flag("--spread");
-    let only = (!spread && args.has("--board")).then(|| workspace::board(&mut args)).transpose()?;
-    let all = only.as_ref().map_or(BOARDS, std::slice::from_ref);
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
     let rows = covering();
@@ -103,7 +100,7 @@ pub fn run(mut args: Args) -> Outcome {
         let path = folder.join(format!("pairs-{:02}.rs", number + 1));
         files::write(&path, file(row))?;
         let product = Product::of_file(&path)?;
-        let of_row = if spread { &all[number % all.len()..][..1] } else { all };
+        let of_row = if spread { &BOARDS[number % BOARDS.len()..][..1] } else { BOARDS };
         for board in of_row {
             let used = size(board, row, &product)?;
             largest = largest.max(used);

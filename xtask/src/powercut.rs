@@ -4,15 +4,14 @@ use std::path::Path;
 use std::process::Command;
 
 use serde_json::json;
-use shared_abi::layout::{Layout, BOARDS};
+use shared_abi::layout::{Layout, BOARDS, DEFAULT};
 
 use crate::args::Args;
 use crate::setup::{self, Part};
 use crate::{build, evidence, outcome::Outcome, process, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask powercut [--full] [--every-way] [--scenario NAME] [--json] [--reproduce POINT]
-                            [--board BOARD]
+usage: cargo xtask powercut [--full] [--scenario NAME] [--reproduce POINT] [--board BOARD]
 
 Cuts the power at flash operations of updates, stores and erasures, in every way, and once more in the
 recovery; then looks what the device does. Fails if it finds a device that cannot be reached, half a
@@ -23,17 +22,15 @@ On the model of the flash it cuts every operation; of the real firmware it cuts 
   --full             every operation of an update and of a renewal with the real firmware, and a
                      twentieth of those of the other scenarios; with a twentieth on the board of each other chip, and on the
                      one with two programs
-  --every-way        every way also for the second cut on the model; takes an hour
-  --json             prints the counts as JSON, an object for each board
   --reproduce POINT  tells one point in words, as update:37:torn:12:after
   --scenario NAME    this scenario alone (docs/powercut.md)
   --board BOARD      this board alone (default: stm32f407g-disc1)
 ";
 
 pub fn run(mut args: Args) -> Outcome {
-    let chosen_board = args.has("--board");
-    let board = workspace::board(&mut args)?;
-    let (full, every_way, json) = (args.flag("--full"), args.flag("--every-way"), args.flag("--json"));
+    let chosen = workspace::chosen_board(&mut args)?;
+    let board = chosen.unwrap_or(DEFAULT);
+    let full = args.flag("--full");
     let point = args.value("--reproduce")?;
     let scenario = args.value("--scenario")?;
     args.none_left()?;
@@ -41,8 +38,7 @@ pub fn run(mut args: Args) -> Outcome {
     if let Some(point) = point {
         return process::run(&mut command(board, &["--reproduce", &point])?);
     }
-    let mut only: Vec<_> =
-        full.then_some("--full").into_iter().chain(every_way.then_some("--every-way")).collect();
+    let mut only: Vec<_> = full.then_some("--full").into_iter().collect();
     if let Some(scenario) = &scenario {
         only.extend(["--scenario", scenario]);
     }
@@ -50,7 +46,6 @@ pub fn run(mut args: Args) -> Outcome {
     let (mut boards, mut problems) = (Vec::new(), Vec::new());
     let mut cut = |board, only: &[&str]| -> Outcome {
         let mut powercut = command(board, only)?;
-        powercut.args(json.then_some("--json"));
         let run = |file: &Path| process::run(powercut.arg("--evidence").arg(file));
         let (facts, ended) = evidence::facts_of("powercut", run)?;
         boards.push(facts);
@@ -58,7 +53,7 @@ pub fn run(mut args: Args) -> Outcome {
         Ok(())
     };
     cut(board, &only)?;
-    if full && !chosen_board {
+    if full && chosen.is_none() {
         let differs = |other: &&&Layout| other.board != board.board && is_of_its_own(other);
         for other in BOARDS.iter().filter(differs) {
             cut(other, &["--twentieth"])?;

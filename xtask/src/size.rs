@@ -29,7 +29,7 @@ const COMPACT_MAP: &str = "bootloader";
 const SPLIT_MAP: &str = "bootloader bootloader-sealed";
 
 pub fn run(mut args: Args) -> Outcome {
-    let chosen = args.has("--board").then(|| workspace::board(&mut args)).transpose()?;
+    let chosen = workspace::chosen_board(&mut args)?;
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
     if let Some(board) = chosen {

@@ -41,7 +41,12 @@ pub fn firmware_dir(board: &Layout) -> PathBuf {
 
 /// Takes `--board`: a name, or the file that `cargo xtask layout --toml` wrote for one of the boards.
 pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
-    args.value("--board")?.map_or(Ok(layout::DEFAULT), |name| board_named(&name))
+    Ok(chosen_board(args)?.unwrap_or(layout::DEFAULT))
+}
+
+/// The same; nothing without `--board`.
+pub fn chosen_board(args: &mut Args) -> Outcome<Option<&'static Layout>> {
+    args.value("--board")?.map(|name| board_named(&name)).transpose()
 }
 
 /// The board of a word after `--board`.

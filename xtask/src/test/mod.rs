@@ -73,8 +73,7 @@ const NOT_RUN: &str =
 const ROOM: u64 = 5 << 20;
 
 pub fn run(mut args: Args) -> Outcome {
-    let chosen_board = args.has("--board");
-    let board = workspace::board(&mut args)?;
+    let chosen_board = workspace::chosen_board(&mut args)?;
     if args.flag("--list") {
         println!("{}", plan::table(plan::LATER));
         return args.none_left();
@@ -82,7 +81,7 @@ pub fn run(mut args: Args) -> Outcome {
     let (for_ci, all) = (args.flag("--ci"), args.flag("--all"));
     let part = args.value("--part")?;
     let words = args.rest();
-    if for_ci && all || (for_ci || all) && (chosen_board || !words.is_empty()) {
+    if for_ci && all || (for_ci || all) && (chosen_board.is_some() || !words.is_empty()) {
         return Err("--ci and --all go with nothing else.".into());
     }
     if part.is_some() && !all {
@@ -111,31 +110,45 @@ pub fn run(mut args: Args) -> Outcome {
     let _alone = files::lock("tests", "Another `cargo xtask test` runs in this clone.")?;
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
-        let own = if chosen_board {
-            build::boards(&[(board, "")])?;
-            build::tests_args(board)
-        } else {
-            build_images(Tier::Product)?;
-            Vec::new()
+        let own = match chosen_board {
+            Some(board) => {
+                build::boards(&[(board, "")])?;
+                build::tests_args(board)
+            }
+            None => {
+                build_images(Tier::Product)?;
+                Vec::new()
+            }
         };
         programs_of_ours()?;
         let mut cargo = process::cargo("test");
-        cargo.current_dir(workspace::root()).args(own).args(words).envs(variables(board));
+        cargo
+            .current_dir(workspace::root())
+            .args(own)
+            .args(words)
+            .envs(variables(chosen_board.unwrap_or(DEFAULT)));
         return process::run(&mut cargo);
     }
 
     let started = Instant::now();
     // Each part of a run has a record of its own; the page adds them up.
-    let name = match &part {
-        Some(part) => format!("tests-all-{part}"),
-        None if all => "tests-all".into(),
-        None if for_ci => "tests-ci".into(),
-        None if chosen_board => format!("tests-{}", board.board),
-        None => "tests".to_owned(),
+    let name = match (&part, chosen_board) {
+        (Some(part), _) => format!("tests-all-{part}"),
+        (None, Some(board)) => format!("tests-{}", board.board),
+        _ => format!(
+            "tests{}",
+            if all {
+                "-all"
+            } else if for_ci {
+                "-ci"
+            } else {
+                ""
+            }
+        ),
     };
     evidence::begin(&name)?;
     let mut summary = Summary::default();
-    if chosen_board {
+    if let Some(board) = chosen_board {
         on_board(board, Tier::All, &mut summary)?;
     } else {
         for stage in &stages {
