@@ -90,7 +90,7 @@ pub fn run(mut args: Args) -> Outcome {
         let tests = coverage::SEALED_TESTS.map(|test| format!("--cargo-test-arg={test}"));
         let sealed: Vec<_> = WITH_SEALED.split(' ').map(str::to_owned).chain(tests).collect();
         let left = mutants(name, name, &[&options[..], &[format!("--exclude-re={SEALED}")]].concat())?;
-        let again: Vec<_> = left.iter().map(|line| format!("--re=^{}$", exactly(line))).collect();
+        let again: Vec<_> = left.iter().map(|line| format!("--re=^{}$", coverage::exactly(line))).collect();
         if !again.is_empty() {
             // cargo-mutants tries each deletion of a field or an arm in these files, whatever the pattern.
             let missed_again = mutants(name, "again", &[&sealed[..], &again].concat())?;
@@ -109,10 +109,4 @@ pub fn run(mut args: Args) -> Outcome {
         0 => Ok(()),
         count => Err(format!("no test notices these {count} changes:\n{}", missed.join("\n"))),
     }
-}
-
-/// A text as the regular expression that matches it.
-pub fn exactly(text: &str) -> String {
-    let is_meta = |letter: &char| r"\.+*?()|[]{}^$#&-~".contains(*letter);
-    text.chars().flat_map(|letter| is_meta(&letter).then_some('\\').into_iter().chain([letter])).collect()
 }
