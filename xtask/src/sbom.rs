@@ -12,20 +12,20 @@ use std::{fs, iter};
 
 use serde_json::{json, Value};
 use sha2::{Digest, Sha512_256};
+use shared_abi::layout::DEFAULT;
 
 use crate::args::Args;
 use crate::process::list;
 use crate::{build, evidence, files, outcome::Outcome, process, setup, workspace};
 
 pub const HELP: &str = "\
-usage: cargo xtask sbom [--board BOARD]
+usage: cargo xtask sbom
 
 Writes the software bills of materials of bootloader and host tool (CycloneDX 1.5, JSON) into
 target/sbom, and prints each with its SHA-512/256: the hash that the manifest of a sealed image has
 room for; the hashes go to target/evidence/sbom.json. The same sources give the same bytes. The host tool's one is that of all systems together.
 
-  --board BOARD   the board of the bootloader (default: stm32f407g-disc1)
-
+The bootloader is that of the default board.
 cargo-cyclonedx is installed into target/tools where it is missing, which takes some minutes once.
 ";
 
@@ -55,14 +55,13 @@ impl Released {
     }
 }
 
-pub fn run(mut args: Args) -> Outcome {
-    let board = workspace::board(&mut args)?;
+pub fn run(args: Args) -> Outcome {
     args.none_left()?;
     setup::rust_target(workspace::TARGET)?;
     evidence::begin("sbom")?;
     let cyclonedx = setup::tool("cargo-cyclonedx", VERSION, &[])?;
     let all = [
-        (board.board, Released::bootloader(&build::chip_feature(board))),
+        (DEFAULT.board, Released::bootloader(&build::chip_feature(DEFAULT))),
         ("all-systems", Released { package: "coflash", target: "all", features: Vec::new() }),
     ];
     let mut rows = Vec::new();
