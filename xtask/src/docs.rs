@@ -86,8 +86,28 @@ fn every_command_of_the_pages_is_one() {
     assert!(commands.len() > 120 && jobs > 50, "{} commands, {jobs} jobs", commands.len());
 }
 
+/// The same for the jobs in the workflows. (The forge itself refuses a workflow that it cannot read.) A variable of the
+/// forge is a job that is in the list above it.
+#[test]
+fn every_job_of_the_workflows_is_one() {
+    let mut jobs = Vec::new();
+    for name in ["ci.yml", "nightly.yml", "release.yml", "site.yml"] {
+        let workflow = files::ours(format!(".github/workflows/{name}")).unwrap();
+        let lists = workflow.lines().filter_map(|line| line.trim().strip_prefix("job: [")?.strip_suffix(']'));
+        jobs.extend(lists.flat_map(|list| list.split(", ")).map(|job| job.trim_matches('"').to_owned()));
+        let lines = workflow.lines().filter(|line| !line.trim_start().starts_with('#'));
+        let called = lines.filter_map(|line| Some(line.split_once("cargo xtask ")?.1.trim_end_matches('"')));
+        jobs.extend(called.filter(|job| !job.starts_with("${{")).map(str::to_owned));
+    }
+    let command = |job: &String| format!("cargo xtask {job}").split_whitespace().map(str::to_owned).collect();
+    let shown = |job: &String| Shown { place: job.clone(), words: command(job), inline: false };
+    let faults: Vec<_> = jobs.iter().filter_map(|job| check(&shown(job))).collect();
+    assert_eq!(faults, Vec::<String>::new());
+    assert!(jobs.len() > 20, "{jobs:?}");
+}
+
 /// The fault of a command, if it has one.
-pub fn check(shown: &Shown) -> Option<String> {
+fn check(shown: &Shown) -> Option<String> {
     let words: Vec<&str> = shown.words.iter().map(String::as_str).collect();
     match words.as_slice() {
         ["coflash" | "coboot-node", ..] => None,

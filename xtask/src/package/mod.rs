@@ -6,8 +6,6 @@ mod check;
 mod deb;
 mod notices;
 mod release;
-#[cfg(test)]
-mod workflow;
 
 use std::path::Path;
 use std::process::Command;
