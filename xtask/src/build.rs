@@ -299,69 +299,59 @@ pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
 /// Builds the application in C for each program of a board, and the same with the tests' object
 /// 2100h. A board without a header in examples/c/boards has none.
 pub fn c_applications(board: &Layout) -> Outcome {
-    let sources = workspace::root().join("examples/c");
-    if !sources.join("boards").join(board.board).with_extension("h").exists() {
-        eprintln!("  examples/c/boards has no {}.h: no application in C", board.board);
+    let (sources, dir) = (workspace::root().join("examples/c"), workspace::firmware_dir(board));
+    let header = format!("boards/{}.h", board.board);
+    if !sources.join(&header).exists() {
+        eprintln!("  examples/c has no {header}: no application in C");
         return Ok(());
     }
+    let probe = workspace::root().join("tests/c/probe.cmake");
     for (number, region) in (1..).zip(board.programs) {
-        for (name, more) in [(C_APPLICATION, None), ("app-c-probe", Some(PROBE))] {
+        for (name, more) in [(C_APPLICATION, None), ("app-c-probe", Some(&probe))] {
             let name = if number == 1 { name.to_owned() } else { format!("{name}-program-{number}") };
-            let elf = c_application(board, number, &name, more)?;
+            let work = dir.join("c").join(&name);
+            let mut options = vec![
+                format!("BOARD={header}"),
+                format!("INTERRUPT_LINES={}", board.chip.interrupts),
+                format!("LAYOUT={}", work.display()),
+                format!("COBOOT_LD={}", lld()?.display()),
+                "CMAKE_BUILD_TYPE=MinSizeRel".to_owned(),
+                "CMAKE_COMPILE_WARNING_AS_ERROR=ON".to_owned(),
+            ];
+            options.extend(more.map(|file| format!("CMAKE_PROJECT_app_INCLUDE={}", file.display())));
+            files::write(&work.join("layout.x"), board.linker_script(Image::Program(number)).to_string())?;
+            let elf = dir.join(name).with_extension("elf");
+            files::copy(&by_cmake(&sources, &work.join("build"), "clang", &options)?, &elf)?;
             report(&elf, &[*region])?;
         }
     }
     Ok(())
 }
 
-/// Builds the application in C for a program of a board, from its sources and an additional one;
-/// returns the ELF file.
-fn c_application(board: &Layout, number: u8, name: &str, more: Option<&str>) -> Outcome<PathBuf> {
-    let sources = workspace::root().join("examples/c");
-    let dir = workspace::firmware_dir(board);
-    let work = dir.join("c").join(name);
-    files::write(&work.join("layout.x"), board.linker_script(Image::Program(number)).to_string())?;
-    let mut objects = Vec::new();
-    for source in C_SOURCES.into_iter().chain(more) {
-        let file_name = Path::new(source).file_name().expect("a source is a file");
-        let object = work.join(file_name).with_extension("o");
-        let mut clang = process::clang();
-        clang.current_dir(&sources).args(C_FLAGS.split(' '));
-        clang.arg(format!("-DBOARD=\"boards/{}.h\"", board.board));
-        clang.arg(format!("-DINTERRUPT_LINES={}", board.chip.interrupts));
-        process::run(clang.arg("-c").arg(source).arg("-o").arg(&object))?;
-        objects.push(object);
-    }
-    let elf = dir.join(name).with_extension("elf");
-    let mut linker = Command::new(rust_lld()?);
-    linker.args(["-flavor", "gnu", "--gc-sections", "--nmagic", "--fatal-warnings", "-o"]).arg(&elf);
-    linker.arg("-L").arg(&work).arg("-L").arg(sources.join("coboot"));
-    linker.arg("-T").arg(sources.join("app.x"));
-    process::run(linker.args(objects))?;
-    Ok(elf)
+/// Builds an example with CMake, by a toolchain file of `examples/c/cmake` and these variables; returns the program.
+pub fn by_cmake(folder: &Path, work: &Path, toolchain: &str, variables: &[String]) -> Outcome<PathBuf> {
+    // The folder is deleted first: CMake keeps the compiler and the folders of the previous run.
+    files::remove(work)?;
+    let toolchain = workspace::root().join("examples/c/cmake").join(toolchain).with_extension("cmake");
+    let mut configure = Command::new("cmake");
+    configure.arg("-S").arg(folder).arg("-B").arg(work);
+    configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
+    // Its output helps only to find a mistake.
+    process::output(configure.args(variables.iter().map(|variable| format!("-D{variable}"))))?;
+    process::output(Command::new("cmake").arg("--build").arg(work))?;
+    Ok(work.join("app.elf"))
 }
 
 /// The name of the application in C; for a build it stands for all applications in C.
 pub const C_APPLICATION: &str = "app-c";
-/// The sources of the application in C.
-const C_SOURCES: [&str; 8] =
-    ["startup.c", "board.c", "can.c", "coboot/reentry.c", "coboot/program.c", "objects.c", "sdo.c", "main.c"];
-/// The source of the tests' objects.
-const PROBE: &str = "../../tests/c/probe.c";
-/// The compiler's arguments. The application does not use the FPU, so it is compiled for a chip
-/// without one; the functions of the bootloader that it calls have no floating-point arguments or
-/// results.
-const C_FLAGS: &str =
-    "--target=thumbv7em-none-eabi -mcpu=cortex-m4 -mfloat-abi=soft -std=c11 -ffreestanding -fno-builtin \
-    -ffunction-sections -fdata-sections -Os -g -fdebug-compilation-dir=examples/c -I. -Wall -Wextra -Werror";
 
 /// The linker of the Rust toolchain, which also links the rest of the firmware.
-fn rust_lld() -> Outcome<PathBuf> {
+fn lld() -> Outcome<PathBuf> {
     let said = process::output(Command::new("rustc").args(["--version", "--verbose"]))?;
     let host = said.lines().find_map(|line| line.strip_prefix("host: ")).unwrap_or_default();
     let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
-    let tools = Path::new(sysroot.trim()).join("lib/rustlib").join(host).join("bin");
-    Ok(tools.join("rust-lld").with_extension(std::env::consts::EXE_EXTENSION))
+    let tools = Path::new(sysroot.trim()).join("lib/rustlib").join(host).join("bin/gcc-ld");
+    Ok(tools.join(format!("ld.lld{}", std::env::consts::EXE_SUFFIX)))
 }
 
 /// Builds a bootloader; returns what it takes of each of [`bootloader_flash`], in bytes.

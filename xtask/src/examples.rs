@@ -7,7 +7,7 @@ use std::process::Command;
 use shared_abi::layout::{stm32f407g_disc1, Layout};
 
 use crate::args::Args;
-use crate::build::report;
+use crate::build::{by_cmake, report};
 use crate::setup::{self, Part};
 use crate::{files, outcome::Outcome, process, workspace};
 
@@ -66,29 +66,16 @@ fn build(name: &str) -> Outcome {
     let folder = workspace::root().join("examples").join(name_of_folder);
     let work = workspace::target_dir().join("examples");
     let built = match EXAMPLES.iter().find(|(known, _)| *known == name_of_folder) {
-        Some((_, None)) => by_cmake(&folder, &work.join(name), is_second)?,
+        Some((_, None)) => {
+            let (toolchain, version) = if is_second { ("clang", 2) } else { ("arm-none-eabi-gcc", 1) };
+            by_cmake(&folder, &work.join(name), toolchain, &[format!("VERSION={version}")])?
+        }
         Some((_, Some(program))) => by_cargo(&folder, &work.join("rust"), program, is_second)?,
         None => template(&workspace::root().join("examples/no-stack"), &work)?,
     };
     let image = workspace::firmware_dir(BOARD).join(format!("example-{}.elf", name));
     files::copy(&built, &image)?;
     report(&image, &BOARD.programs[..1])
-}
-
-/// Builds a folder with CMake; returns the program.
-fn by_cmake(folder: &Path, work: &Path, is_second: bool) -> Outcome<PathBuf> {
-    let (toolchain, version) = if is_second { ("clang", 2) } else { ("arm-none-eabi-gcc", 1) };
-    // The folder is deleted first: CMake keeps the compiler and the folders of the previous run.
-    files::remove(work)?;
-    let toolchain = workspace::root().join("examples/c/cmake").join(toolchain).with_extension("cmake");
-    let mut configure = Command::new("cmake");
-    configure.arg("-S").arg(folder).arg("-B").arg(work);
-    configure.arg(format!("-DCMAKE_TOOLCHAIN_FILE={}", toolchain.display()));
-    configure.arg(format!("-DVERSION={version}"));
-    // Its output helps only to find a mistake.
-    process::output(&mut configure)?;
-    process::output(Command::new("cmake").arg("--build").arg(work))?;
-    Ok(work.join("app.elf"))
 }
 
 /// Builds a package; returns the program. All packages share `work`, and so their dependencies.

@@ -30,7 +30,7 @@ anyone else it stops with the line to run, or, with --yes, runs that line.
 pub enum Part {
     /// Code for the chip: the Rust target.
     Firmware,
-    /// The application in C: a compiler for the chip.
+    /// The application in C: a compiler for the chip, and CMake.
     C,
     /// The fuzzer: a compiler for C++.
     Cpp,
@@ -177,7 +177,7 @@ impl Part {
             // Without pkg-config the configure script inside Unicorn stops, and the build then lacks a
             // header.
             Self::Emulator => &["build-essential", "make", "cmake", "pkg-config", "libclang-dev", "clang"],
-            Self::C => &["clang"],
+            Self::C => &["clang", "cmake", "make"],
             Self::Cpp => &["g++"],
             Self::Examples => &["gcc-arm-none-eabi", "clang", "make", "cmake"],
             Self::Gdb => &["gdb-multiarch"],
@@ -338,7 +338,7 @@ mod tests {
             missing_packages(&[Part::Emulator], |package| !["cmake", "libclang-dev"].contains(&package)),
             ["cmake", "libclang-dev"]
         );
-        assert_eq!(missing_packages(&[Part::C], nothing), ["clang"]);
+        assert_eq!(missing_packages(&[Part::C], nothing), ["clang", "cmake", "make"]);
         assert_eq!(
             missing_packages(&[Part::Examples, Part::C], nothing),
             ["clang", "cmake", "gcc-arm-none-eabi", "make"]

@@ -3,6 +3,10 @@
 set(CMAKE_SYSTEM_NAME Generic)
 set(CMAKE_SYSTEM_PROCESSOR cortex-m4)
 set(CMAKE_C_COMPILER clang)
+# Another one for C: CLANG=clang-19 cmake ...
+if(DEFINED ENV{CLANG})
+    set(CMAKE_C_COMPILER "$ENV{CLANG}")
+endif()
 set(CMAKE_CXX_COMPILER clang++)
 set(CMAKE_C_COMPILER_TARGET thumbv7em-none-eabi)
 set(CMAKE_CXX_COMPILER_TARGET thumbv7em-none-eabi)

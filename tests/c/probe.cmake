@@ -1,0 +1,3 @@
+# Adds object 2100h of the tests to the application in C: cmake -DCMAKE_PROJECT_app_INCLUDE=...
+cmake_language(EVAL CODE "cmake_language(DEFER CALL target_sources app PRIVATE \"${CMAKE_CURRENT_LIST_DIR}/probe.c\")")
+cmake_language(DEFER CALL target_include_directories app PRIVATE "${CMAKE_CURRENT_SOURCE_DIR}")
