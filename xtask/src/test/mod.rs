@@ -110,23 +110,14 @@ pub fn run(mut args: Args) -> Outcome {
     let _alone = files::lock("tests", "Another `cargo xtask test` runs in this clone.")?;
     if !words.is_empty() {
         // With a board: its images, and the programs that are compiled for it.
-        let own = match chosen_board {
-            Some(board) => {
-                build::boards(&[(board, "")])?;
-                build::tests_args(board)
-            }
-            None => {
-                build_images(Tier::Product)?;
-                Vec::new()
-            }
-        };
+        match chosen_board {
+            Some(board) => build::boards(&[(board, "")])?,
+            None => build_images(Tier::Product)?,
+        }
         programs_of_ours()?;
         let mut cargo = process::cargo("test");
-        cargo
-            .current_dir(workspace::root())
-            .args(own)
-            .args(words)
-            .envs(variables(chosen_board.unwrap_or(DEFAULT)));
+        cargo.current_dir(workspace::root()).args(chosen_board.map(build::tests_args).into_iter().flatten());
+        cargo.args(words).envs(variables(chosen_board.unwrap_or(DEFAULT)));
         return process::run(&mut cargo);
     }
 
@@ -135,16 +126,9 @@ pub fn run(mut args: Args) -> Outcome {
     let name = match (&part, chosen_board) {
         (Some(part), _) => format!("tests-all-{part}"),
         (None, Some(board)) => format!("tests-{}", board.board),
-        _ => format!(
-            "tests{}",
-            if all {
-                "-all"
-            } else if for_ci {
-                "-ci"
-            } else {
-                ""
-            }
-        ),
+        _ if all => "tests-all".into(),
+        _ if for_ci => "tests-ci".into(),
+        _ => "tests".to_owned(),
     };
     evidence::begin(&name)?;
     let mut summary = Summary::default();
@@ -172,8 +156,7 @@ pub fn run(mut args: Args) -> Outcome {
     match summary.failed.len() {
         0 if summary.is_empty() => Err("no test ran.".into()),
         0 => Ok(()),
-        1 => Err("1 test failed; its output is above.".into()),
-        failed => Err(format!("{failed} tests failed; their output is above.")),
+        failed => Err(format!("failed tests: {failed}; their output is above.")),
     }
 }
 
