@@ -373,39 +373,33 @@ fn used(board: &Layout, bootloader: &[u8]) -> Outcome<Vec<u32>> {
 /// The folders with the files of the boards.
 pub const BOARD_FOLDERS: [&str; 2] = ["shared-abi/src/layout/boards", "bsp/src/boards"];
 
-/// The arguments that set the board for cargo; they override the variable `COBOOT_BOARD`.
-pub fn board_args(board: &Layout) -> [String; 4] {
-    let value = format!("env.COBOOT_BOARD.value=\"{}\"", board.board);
-    ["--config", &value, "--config", "env.COBOOT_BOARD.force=true"].map(str::to_owned)
-}
-
 /// The feature that selects the HAL of a board's chip.
 pub fn chip_feature(board: &Layout) -> String {
     format!("bsp/chip-{}", board.chip.line.name())
 }
 
-/// The arguments for cargo to build a firmware package for a board; also for `cargo clippy`.
-pub fn firmware_args(package: &str, board: &Layout, features: &str) -> Vec<String> {
+/// Cargo on a firmware package for a board, whatever the `COBOOT_BOARD` of the caller says.
+pub fn firmware(subcommand: &str, package: &str, board: &Layout, features: &str) -> Command {
     let features = format!("{},{features}", chip_feature(board));
-    let target_dir = target_dir(board).display().to_string();
-    let mut args: Vec<String> = board_args(board).into();
-    let choices =
-        ["--package", package, "--no-default-features", "--features", features.trim_end_matches(',')];
-    let place = ["--target", TARGET, "--profile", PROFILE, "--target-dir", &target_dir];
-    args.extend(choices.into_iter().chain(place).map(str::to_owned));
-    args
+    let mut cargo = process::cargo(subcommand);
+    cargo.env("COBOOT_BOARD", board.board).arg("--target-dir").arg(target_dir(board));
+    cargo.args(["--target", TARGET, "--profile", PROFILE, "--package", package, "--no-default-features"]);
+    cargo.args(["--features", features.trim_end_matches(',')]);
+    cargo
 }
 
-/// The arguments for cargo to build the crate of the emulated tests for a board.
-pub fn tests_args(board: &Layout) -> Vec<String> {
-    board_args(board).into_iter().chain(["--package=coboot-tests".to_owned()]).collect()
-}
-
-/// The command that runs a program of that crate with the firmware of a board; its arguments follow.
-pub fn tests_program(board: &Layout, name: &str) -> Command {
-    let mut cargo = process::cargo("run");
-    cargo.args(tests_args(board)).args(["--bin", name, "--"]);
+/// The same on the crate of the emulated tests, with the firmware of a board.
+pub fn tests(subcommand: &str, board: &Layout) -> Command {
+    let mut cargo = process::cargo(subcommand);
     cargo.env("COBOOT_BOARD", board.board).env("COBOOT_FIRMWARE_DIR", workspace::firmware_dir(board));
+    cargo.arg("--package=coboot-tests");
+    cargo
+}
+
+/// The command that runs a program of that crate; its arguments follow.
+pub fn tests_program(board: &Layout, name: &str) -> Command {
+    let mut cargo = tests("run", board);
+    cargo.args(["--bin", name, "--"]);
     cargo
 }
 
@@ -417,8 +411,8 @@ fn target_dir(board: &Layout) -> PathBuf {
 
 /// The cargo command that builds an image.
 fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -> Command {
-    let mut cargo = process::cargo("build");
-    cargo.args(firmware_args(package, board, features)).args(product.args()).args(["--bin", package]);
+    let mut cargo = firmware("build", package, board, features);
+    cargo.args(product.args()).args(["--bin", package]);
     cargo
 }
 

@@ -21,7 +21,7 @@ pub fn run(args: Args) -> Outcome {
     setup::prepare(&[Part::Emulator])?;
     // All checks run, so that one run shows all problems.
     let mut problems = lint::formatting()?;
-    problems.extend(lint::clippy(lint::HOST_CRATES));
+    problems.extend(lint::clippy(process::cargo(lint::HOST_CRATES)));
     problems.extend(arrows::run(Args::new(std::iter::empty())).err());
     let mut tests = process::cargo("test --quiet --lib");
     tests.args(PURE.iter().flat_map(|package| ["--package", package]));

@@ -30,8 +30,7 @@ pub fn run(args: Args) -> Outcome {
     setup::prepare(&[Part::Firmware, Part::Emulator])?;
     let chips: Vec<_> = chips.iter().map(|chip| chip.chip).collect();
     println!("{}", chips.join(", "));
-    let mut test = process::cargo("test");
-    test.args(build::tests_args(DEFAULT));
+    let mut test = build::tests("test", DEFAULT);
     test.args("--test=port -- porting:: --ignored --nocapture".split(' '));
     process::run(test.env("COBOOT_CHIPS", chips.join(",")))
 }

@@ -29,7 +29,7 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     // The crate that makes them is the crate of the emulated tests.
     setup::prepare(&[Part::Emulator])?;
-    let mut cargo = process::cargo("run");
-    cargo.args(build::tests_args(board)).args(product.args()).args(["--bin", "eds", "--"]);
+    let mut cargo = build::tests("run", board);
+    cargo.args(product.args()).args(["--bin", "eds", "--"]);
     process::run(cargo.arg(&folder))
 }

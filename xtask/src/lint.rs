@@ -1,5 +1,7 @@
 //! `cargo xtask lint`: checks formatting and words, and runs clippy and rustdoc, with warnings denied.
 
+use std::process::Command;
+
 use crate::args::Args;
 use crate::setup::{self, Part};
 use crate::{build, files, outcome::Outcome, process, product, words, workspace};
@@ -14,8 +16,8 @@ documentation of the host crates, all with warnings denied.
   --board BOARD   the board (default: stm32f407g-disc1)
 ";
 
-/// What selects the host crates and their tests for clippy.
-pub const HOST_CRATES: &[&str] = &["--all-targets", "--keep-going"];
+/// Clippy on the host crates and their tests.
+pub const HOST_CRATES: &str = "clippy --all-targets --keep-going";
 
 pub fn run(mut args: Args) -> Outcome {
     let board = workspace::board(&mut args)?;
@@ -25,20 +27,20 @@ pub fn run(mut args: Args) -> Outcome {
     // All checks run, so that one run shows all problems.
     let mut problems = formatting()?;
     problems.extend(words::faults()?);
-    problems.extend(clippy(HOST_CRATES));
+    problems.extend(clippy(process::cargo(HOST_CRATES)));
     // The host tool without the adapters of vendors and the other features; and the package for Python,
     // which is not a default member.
-    problems.extend(clippy(&["--package", "coflash", "--no-default-features"]));
-    problems.extend(clippy(&["--package", "coflash-python"]));
+    problems.extend(clippy(process::cargo("clippy --package coflash --no-default-features")));
+    problems.extend(clippy(process::cargo("clippy --package coflash-python")));
     // Without sealed images, which its own tests give it above.
-    problems.extend(clippy(&["--package", "coboot-core", "--lib"]));
-    problems.extend(clippy(&build::firmware_args("bsp", board, "")));
+    problems.extend(clippy(process::cargo("clippy --package coboot-core --lib")));
+    problems.extend(clippy(build::firmware("clippy", "bsp", board, "")));
     for variant in build::Variant::of(board) {
-        problems.extend(clippy(&build::firmware_args(variant.package, board, variant.features)));
+        problems.extend(clippy(build::firmware("clippy", variant.package, board, variant.features)));
     }
-    let mut resident = build::firmware_args("bootloader", board, "resident");
-    resident.push("--bin=resident".to_owned());
-    problems.extend(clippy(&resident));
+    let mut resident = build::firmware("clippy", "bootloader", board, "resident");
+    resident.arg("--bin=resident");
+    problems.extend(clippy(resident));
     let mut doc = process::cargo("doc --quiet --no-deps --keep-going");
     doc.current_dir(workspace::root()).env("RUSTDOCFLAGS", "--deny=warnings");
     problems.extend(process::run(&mut doc).err());
@@ -53,7 +55,7 @@ pub fn formatting() -> Outcome<Vec<String>> {
     }
     // The files of the boards and products: build scripts find them, `cargo fmt` does not.
     for folder in build::BOARD_FOLDERS.into_iter().chain([product::FOLDER]) {
-        let mut rustfmt = std::process::Command::new("rustfmt");
+        let mut rustfmt = Command::new("rustfmt");
         rustfmt.current_dir(workspace::root()).args(["--check", "--edition", "2021"]);
         if process::run(rustfmt.args(files::within(&workspace::root().join(folder))?)).is_err() {
             problems.push(format!("a file in {folder} is not formatted; `rustfmt` on the file does it."));
@@ -62,10 +64,9 @@ pub fn formatting() -> Outcome<Vec<String>> {
     Ok(problems)
 }
 
-/// Runs clippy, warnings denied; returns the problem if there is one.
-pub fn clippy(args: &[impl AsRef<std::ffi::OsStr>]) -> Option<String> {
-    let mut clippy = process::cargo("clippy");
-    clippy.current_dir(workspace::root()).args(args).args(["--", "--deny", "warnings"]);
+/// Runs clippy with warnings denied; returns the problem if there is one.
+pub fn clippy(mut clippy: Command) -> Option<String> {
+    clippy.current_dir(workspace::root()).args(["--", "--deny", "warnings"]);
     process::run(&mut clippy).err()
 }
 

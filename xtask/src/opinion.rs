@@ -35,8 +35,7 @@ fn cpu() -> Outcome {
 }
 
 fn board() -> Outcome {
-    let images = build::images(DEFAULT, &["bootloader-virtual-can", "app-virtual-can"])?;
-    let mut test = process::cargo("test --quiet --test foreign second_board::");
-    test.args(build::tests_args(DEFAULT)).args(["--", "--include-ignored", "--nocapture"]);
-    process::run(test.env("COBOOT_BOARD", DEFAULT.board).env("COBOOT_FIRMWARE_DIR", images))
+    build::images(DEFAULT, &["bootloader-virtual-can", "app-virtual-can"])?;
+    let line = "--quiet --test foreign second_board:: -- --include-ignored --nocapture";
+    process::run(build::tests("test", DEFAULT).args(line.split(' ')))
 }

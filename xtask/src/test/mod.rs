@@ -116,7 +116,7 @@ pub fn run(mut args: Args) -> Outcome {
         }
         programs_of_ours()?;
         let mut cargo = process::cargo("test");
-        cargo.current_dir(workspace::root()).args(chosen_board.map(build::tests_args).into_iter().flatten());
+        cargo.current_dir(workspace::root()).args(chosen_board.map(|_| "--package=coboot-tests"));
         cargo.args(words).envs(variables(chosen_board.unwrap_or(DEFAULT)));
         return process::run(&mut cargo);
     }
@@ -184,7 +184,7 @@ fn room() -> Outcome {
 /// host tool and the node, which cargo builds for their tests. The jobs of the repository are tested in
 /// .ci/run.
 fn ours() -> Vec<String> {
-    [&build::board_args(DEFAULT)[..], &workspace::on_host()].concat()
+    workspace::on_host()
 }
 
 /// Builds the programs that tests start, for tests that are chosen by words.
@@ -219,7 +219,7 @@ fn variables(board: &Layout) -> Variables {
 fn build_all(tier: Tier, programs: &[Vec<String>]) -> Outcome {
     std::thread::scope(|scope| {
         let images = scope.spawn(|| build_images(tier));
-        let programs = programs.iter().try_for_each(|programs| runner::build(programs));
+        let programs = programs.iter().try_for_each(|programs| runner::build(programs, &variables(DEFAULT)));
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         programs
     })
@@ -234,7 +234,7 @@ fn product(summary: &mut Summary) -> Outcome {
 /// Tests of the default board that run from a tier on: ours, and those of more packages, which are built apart.
 fn later(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
     let more = more.iter().map(|package| format!("--package={package}"));
-    let programs = [ours(), build::board_args(DEFAULT).into_iter().chain(more).collect()];
+    let programs = [ours(), more.collect()];
     build_all(tier, &programs)?;
     programs.iter().try_for_each(|of| runner::run(of, &tier.filter(), "", &variables(DEFAULT), summary))
 }
@@ -281,8 +281,10 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
         Tier::All => &["device", "update", "sealed", "foreign", "port"],
         _ => &["device", "update"],
     };
-    let arguments = build::board_args(board).into_iter().chain(workspace::on_host());
-    let arguments: Vec<_> = arguments.chain(programs.iter().map(|name| format!("--test={name}"))).collect();
+    let arguments: Vec<_> = workspace::on_host()
+        .into_iter()
+        .chain(programs.iter().map(|name| format!("--test={name}")))
+        .collect();
     let tests = match tier {
         Tier::All => "all()".to_owned(),
         _ => format!("({}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter()),

@@ -87,8 +87,8 @@ fn nextest(line: &str, arguments: &[String]) -> Command {
 }
 
 /// Builds the test programs of packages; `arguments` select them for cargo.
-pub fn build(arguments: &[String]) -> Outcome {
-    process::run(&mut nextest("run --no-run", arguments))
+pub fn build(arguments: &[String], variables: &Variables) -> Outcome {
+    process::run(nextest("run --no-run", arguments).envs(variables.iter().cloned()))
 }
 
 /// Runs the tests of these packages that a filter of nextest takes; `place` names what is special about them.
