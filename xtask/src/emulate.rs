@@ -43,7 +43,8 @@ pub fn run(mut args: Args) -> Outcome {
         setup::prepare(&[Part::Emulator])?;
         emulator.arg(&word);
     } else {
-        let board = workspace::board_named(&word)?;
+        let board = workspace::board_named(&word)
+            .map_err(|problem| format!("{problem} The map of another one goes with --bootloader FILE."))?;
         let bootloader = match log {
             Some(way) => format!("bootloader-log-{way}"),
             None if virtual_can => "bootloader-virtual-can".to_owned(),

@@ -4,7 +4,6 @@ use std::env;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-use shared_abi::layout::toml::Toml;
 use shared_abi::layout::{self, Layout};
 
 use crate::args::Args;
@@ -39,7 +38,7 @@ pub fn firmware_dir(board: &Layout) -> PathBuf {
     target_dir().join("firmware").join(board.board)
 }
 
-/// Takes `--board`: a name, or the file that `cargo xtask layout --toml` wrote for one of the boards.
+/// Takes `--board`.
 pub fn board(args: &mut Args) -> Outcome<&'static Layout> {
     Ok(chosen_board(args)?.unwrap_or(layout::DEFAULT))
 }
@@ -51,17 +50,6 @@ pub fn chosen_board(args: &mut Args) -> Outcome<Option<&'static Layout>> {
 
 /// The board of a word after `--board`.
 pub fn board_named(name: &str) -> Outcome<&'static Layout> {
-    if name.contains(['.', '/', '\\']) {
-        let map =
-            std::fs::read_to_string(name).map_err(|error| format!("{name} cannot be read: {error}."))?;
-        let is_map_of = |board: &&&Layout| Toml(board).to_string().trim() == map.trim();
-        return layout::BOARDS.iter().find(is_map_of).copied().ok_or_else(|| {
-            format!(
-                "{name}: it is not the map of a board of this repository as `cargo xtask layout --toml` writes it, \
-                 and firmware is built for those alone. `emulate` takes another map with --bootloader FILE."
-            )
-        });
-    }
     layout::by_name(name).ok_or_else(|| {
         let known: Vec<_> = layout::BOARDS.iter().map(|layout| layout.board).collect();
         format!("there is no board \"{name}\"; there is: {}.", known.join(", "))
@@ -85,21 +73,8 @@ pub fn on_host() -> Vec<String> {
     ["--workspace".to_owned()].into_iter().chain(without).collect()
 }
 
-#[cfg(test)]
-mod tests {
-    use kit::folder::Folder;
-    use shared_abi::layout::nucleo_f446re::LAYOUT;
-
-    use super::*;
-
-    #[test]
-    fn a_board_is_a_name_or_the_file_of_its_map() {
-        let folder = Folder::below(std::env::temp_dir(), "coboot-board");
-        let map = Toml(&LAYOUT).to_string();
-        assert_eq!(board_named(&folder.file("map.toml", map.as_bytes())).unwrap().board, "nucleo-f446re");
-        let own = folder.file("own.toml", map.replace("nucleo", "own").as_bytes());
-        assert!(board_named(&own).unwrap_err().contains("--bootloader FILE"));
-        assert!(board_named(&folder.path("none.toml")).unwrap_err().contains("cannot be read"));
-        assert!(board_named("arduino").unwrap_err().contains("there is: nucleo-f446re"));
-    }
+#[test]
+fn an_unknown_board_lists_those_that_there_are() {
+    assert_eq!(board_named("nucleo-f446re").unwrap().board, "nucleo-f446re");
+    assert!(board_named("arduino").unwrap_err().contains("there is: nucleo-f446re"));
 }
