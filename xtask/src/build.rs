@@ -1,10 +1,9 @@
 //! `cargo xtask build`: builds the images for the chip.
 
 use std::collections::BTreeSet;
-use std::fs::{self, File};
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::SystemTime;
 
 use shared_abi::geometry::Region;
 use shared_abi::layout::{Image, Layout};
@@ -181,89 +180,74 @@ pub fn run(mut args: Args) -> Outcome {
     let every = args.flag("--all");
     let product = args.value("--product")?.map(|word| Product::chosen(&word)).transpose()?;
     let product = product.filter(|product| !product.is_default());
-    let mut names = args.rest();
-    let all = names.len();
-    names.retain(|name| name != C_APPLICATION);
-    let in_c = every || names.len() < all;
-    let chosen: Vec<_> = match names.as_slice() {
-        [] if every => Variant::of(board).collect(),
-        [] if in_c => Vec::new(),
-        [] => MAIN.map(|name| Variant::by_name(board, name)).into_iter().collect::<Outcome<_>>()?,
+    let words = args.rest();
+    let names = match words.as_slice() {
+        [] if every => all(board),
+        [] => MAIN.to_vec(),
         _ if every => return Err("--all and names do not go together.".into()),
-        names => names.iter().map(|name| Variant::by_name(board, name)).collect::<Outcome<_>>()?,
+        words => words.iter().map(String::as_str).collect(),
     };
+    // A name that there is not is refused before anything is installed.
+    names
+        .iter()
+        .filter(|name| **name != C_APPLICATION)
+        .try_for_each(|name| Variant::by_name(board, name).map(drop))?;
+    let in_c = names.contains(&C_APPLICATION);
     setup::prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
-    for variant in chosen {
-        let (name, product) = match &product {
-            Some(product) if variant.is_bootloader() => (variant.name_of(product)?, product.clone()),
-            _ => (variant.name.to_owned(), variant.product()?),
-        };
-        image(board, variant, &name, &product)?;
-    }
-    if in_c {
-        c_applications(board)?;
+    build(board, &names, product.as_ref())
+}
+
+/// The names of all images of a board, and that of the applications in C.
+fn all(board: &Layout) -> Vec<&'static str> {
+    Variant::of(board).map(|of| of.name).chain([C_APPLICATION]).collect()
+}
+
+/// Builds images of a board by their names, and prints their sizes; a bootloader as one of this product, if there is one.
+fn build(board: &Layout, names: &[&str], product: Option<&Product>) -> Outcome {
+    for name in names {
+        if *name == C_APPLICATION {
+            c_applications(board)?;
+            continue;
+        }
+        let variant = Variant::by_name(board, name)?;
+        match product {
+            Some(product) if variant.is_bootloader() => {
+                image(board, variant, &variant.name_of(product)?, product)?;
+            }
+            _ => renewed(board, variant)?,
+        }
     }
     Ok(())
 }
 
-/// Builds images of a board by their names, and prints their sizes; returns their folder. An image that was
-/// built after the last change of its sources is not built again: cargo keeps only the last product of a
-/// program, and would link all others once more.
+/// The same without another product; returns the folder of the images.
 pub fn images(board: &Layout, names: &[&str]) -> Outcome<PathBuf> {
-    let (folder, changed) = (workspace::firmware_dir(board), last_change()?);
-    for name in names {
-        let variant = Variant::by_name(board, name)?;
-        let (file, stamp) = (elf_of(board, name), folder.join(name).with_extension("built"));
-        if file.exists()
-            && fs::metadata(&stamp).and_then(|stamp| stamp.modified()).is_ok_and(|at| at > changed)
-        {
-            report(&file, &variant.regions(board))?;
-            continue;
-        }
-        let begun = SystemTime::now();
-        image(board, variant, name, &variant.product()?)?;
-        files::write(&stamp, "")?;
-        // A source that changed in the meantime is newer.
-        let dated = File::options().write(true).open(&stamp).and_then(|file| file.set_modified(begun));
-        dated.map_err(|error| format!("{}: {error}", stamp.display()))?;
-    }
-    Ok(folder)
+    build(board, names, None)?;
+    Ok(workspace::firmware_dir(board))
 }
 
 /// What the images are made of. The crates of others are in Cargo.lock.
-const SOURCES: [&str; 12] = [
-    ".cargo",
-    "Cargo.lock",
-    "Cargo.toml",
-    "app-template",
-    "bootloader",
-    "bsp",
-    "coboot-app",
-    "core",
-    "linker",
-    "rust-toolchain.toml",
-    "shared-abi",
-    "tests/apps",
-];
+const SOURCES: &str = ".cargo Cargo.lock Cargo.toml app-template bootloader bsp coboot-app core linker \
+                       rust-toolchain.toml shared-abi tests/apps";
 
-/// The time of the last change of the sources of the images, or of this program, which builds them.
-fn last_change() -> Outcome<SystemTime> {
-    fn newest(path: &Path) -> std::io::Result<SystemTime> {
-        // A folder changes when a file in it goes.
-        let mut last = fs::metadata(path)?.modified()?;
-        if path.is_dir() {
-            for entry in fs::read_dir(path)? {
-                last = last.max(newest(&entry?.path())?);
-            }
-        }
-        Ok(last)
-    }
+/// Builds an image of its own product, unless it was built after the last change of its sources and of this program:
+/// cargo keeps only the last product of a program, and would link all others once more.
+fn renewed(board: &Layout, variant: &Variant) -> Outcome {
+    let (elf, stamp) = (elf_of(board, variant.name), elf_of(board, variant.name).with_extension("built"));
     let program = std::env::current_exe().map_err(|error| format!("this program has no path: {error}"))?;
-    let mut last = SystemTime::UNIX_EPOCH;
-    for path in SOURCES.map(|path| workspace::root().join(path)).into_iter().chain([program]) {
-        last = last.max(newest(&path).map_err(|error| format!("{}: {error}", path.display()))?);
+    if elf.exists() && stamp.exists() {
+        // A folder changes when a file in it goes.
+        let mut find = Command::new("find");
+        find.current_dir(workspace::root()).args(SOURCES.split(' ')).arg(program);
+        if process::output(find.arg("-newer").arg(&stamp).args(["-print", "-quit"]))?.is_empty() {
+            return report(&elf, &variant.regions(board));
+        }
     }
-    Ok(last)
+    // A source that changes in the meantime is newer.
+    let begun = stamp.with_extension("begun");
+    files::write(&begun, "")?;
+    image(board, variant, variant.name, &variant.product()?)?;
+    fs::rename(&begun, &stamp).map_err(|error| format!("{}: {error}.", stamp.display()))
 }
 
 /// The file of an image.
@@ -271,24 +255,18 @@ fn elf_of(board: &Layout, name: &str) -> PathBuf {
     workspace::firmware_dir(board).join(format!("{name}.elf"))
 }
 
-/// Builds the images with these names for several boards, the applications in C if their name is the last, or
-/// everything where there are no names; several chips at once, since the last step of each image uses only one
-/// core.
+/// Builds the images with these names for several boards, or everything where there are no names; several chips at
+/// once, since the last step of each image uses only one core.
 pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
-    let build = |(board, names): (&Layout, &str)| {
-        let rust = names.strip_suffix(C_APPLICATION).unwrap_or(names);
-        let all = || Variant::of(board).map(|of| of.name).collect();
-        images(board, &if names.is_empty() { all() } else { rust.split_whitespace().collect::<Vec<_>>() })?;
-        if names.is_empty() || rust != names {
-            c_applications(board)?;
-        }
-        Outcome::Ok(())
+    let of_board = |(board, names): (&Layout, &str)| {
+        let names = if names.is_empty() { all(board) } else { names.split_whitespace().collect() };
+        build(board, &names, None)
     };
     let chips: BTreeSet<&str> = boards.iter().map(|(board, _)| board.chip.line.name()).collect();
     std::thread::scope(|scope| {
         let of_chip = |chip| boards.iter().copied().filter(move |(board, _)| board.chip.line.name() == chip);
         let builders: Vec<_> =
-            chips.into_iter().map(|chip| scope.spawn(move || of_chip(chip).try_for_each(build))).collect();
+            chips.into_iter().map(|chip| scope.spawn(move || of_chip(chip).try_for_each(of_board))).collect();
         // A builder that panics has printed the reason.
         builders
             .into_iter()
@@ -298,7 +276,7 @@ pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
 
 /// Builds the application in C for each program of a board, and the same with the tests' object
 /// 2100h. A board without a header in examples/c/boards has none.
-pub fn c_applications(board: &Layout) -> Outcome {
+fn c_applications(board: &Layout) -> Outcome {
     let (sources, dir) = (workspace::root().join("examples/c"), workspace::firmware_dir(board));
     let header = format!("boards/{}.h", board.board);
     if !sources.join(&header).exists() {
