@@ -124,20 +124,14 @@ mod tests {
         for (panel, drawn) in panels.iter().zip(titles) {
             for words in panel.lines().skip(1).map(|line| line.splitn(4, ' ').collect::<Vec<_>>()) {
                 match words[..] {
-                    ["frame", from, to, words] => {
+                    [kind @ ("frame" | "bar"), from, to, text] => {
                         let width = ((x(to) - x(from)) * 10.0).round() / 10.0;
-                        assert!(drawn.contains(&format!("<rect x=\"{}\" y", x(from))), "{words}");
-                        assert!(drawn.contains(&format!("width=\"{width}\" height=\"16\"")), "{words}");
-                        assert!(drawn.contains(&format!(">{words}</text>")), "{words}");
-                    }
-                    ["bar", from, to, lane] => {
-                        let width = ((x(to) - x(from)) * 10.0).round() / 10.0;
-                        let part = format!("width=\"{width}\" height=\"38\"");
-                        let is_bar = |line: &str| line.starts_with(&format!("<rect x=\"{}\"", x(from)));
-                        assert!(
-                            drawn.lines().any(|line| is_bar(line) && line.contains(&part)),
-                            "{lane} {from}"
-                        );
+                        let height = if kind == "frame" { 16 } else { 38 };
+                        let size = format!("width=\"{width}\" height=\"{height}\"");
+                        let begin = format!("<rect x=\"{}\" y", x(from));
+                        let is_drawn = |line: &str| line.starts_with(&begin) && line.contains(&size);
+                        assert!(drawn.lines().any(is_drawn), "{text} {from}");
+                        assert!(kind == "bar" || drawn.contains(&format!(">{text}</text>")), "{text}");
                     }
                     ["mark", at, ..] => assert!(drawn.contains(&format!("<line x1=\"{}\"", x(at))), "{at}"),
                     _ => break,

@@ -25,35 +25,21 @@ names the command; results of other commits and of changed sources do not count.
   --release   writes docs/evidence.md, too: the figures of a release, with date and commit
 ";
 
-/// A part of the page.
-struct Part {
-    /// The name of the record.
-    name: &'static str,
-    /// The member of the record that is its result in one number.
-    counts: &'static str,
-    /// The job that makes the record.
-    job: &'static str,
-    /// What it shows.
-    about: &'static str,
-}
-
-const fn part(name: &'static str, counts: &'static str, job: &'static str, about: &'static str) -> Part {
-    Part { name, counts, job, about }
-}
-
-const PARTS: [Part; 12] = [
-    part("tests", "passed", "test", "All host crates, and the built firmware in the emulator."),
-    part("powercut", "states", "powercut --full", "After a cut the device answers or runs a whole program."),
-    part("attacker", "frames", "attack", "A seeded attacker and a legal master on one bus."),
-    part("silicon", "chips", "attack --silicon 2000", "The main scenarios on chips that seeds draw."),
-    part("fuzz", "inputs", "fuzz", "Random inputs for what meets the bus or a file."),
-    part("cpu", "words", "opinion", "The same programs on QEMU's Cortex-M4 and on the emulator."),
-    part("coverage", "percent", "coverage", "Lines of the device's crates that tests reach."),
-    part("mutants", "tried", "mutants", "Changes of the code that the tests must notice."),
-    part("bench", "percent", "bench --json", "A download, in percent of what wire and flash allow."),
-    part("reproduce", "compared", "reproduce", "Two clones in two folders give the same firmware."),
-    part("sbom", "bills", "sbom", "The crates in bootloader and host tool, as CycloneDX."),
-    part("size", "bootloaders", "size", "The bootloader's flash on each board, against its budget."),
+/// The parts of the page: the name of the record, its member that is the result in one number, the job that makes the
+/// record, and what it shows.
+const PARTS: [[&str; 4]; 12] = [
+    ["tests", "passed", "test", "All host crates, and the built firmware in the emulator."],
+    ["powercut", "states", "powercut --full", "After a cut the device answers or runs a whole program."],
+    ["attacker", "frames", "attack", "A seeded attacker and a legal master on one bus."],
+    ["silicon", "chips", "attack --silicon 2000", "The main scenarios on chips that seeds draw."],
+    ["fuzz", "inputs", "fuzz", "Random inputs for what meets the bus or a file."],
+    ["cpu", "words", "opinion", "The same programs on QEMU's Cortex-M4 and on the emulator."],
+    ["coverage", "percent", "coverage", "Lines of the device's crates that tests reach."],
+    ["mutants", "tried", "mutants", "Changes of the code that the tests must notice."],
+    ["bench", "percent", "bench --json", "A download, in percent of what wire and flash allow."],
+    ["reproduce", "compared", "reproduce", "Two clones in two folders give the same firmware."],
+    ["sbom", "bills", "sbom", "The crates in bootloader and host tool, as CycloneDX."],
+    ["size", "bootloaders", "size", "The bootloader's flash on each board, against its budget."],
 ];
 
 /// What no run here can show.
@@ -76,8 +62,8 @@ pub fn run(mut args: Args) -> Outcome {
     if !clean {
         println!("The sources have changed since commit {commit}; the page is about that commit.");
     }
-    for (part, (verdict, _)) in PARTS.iter().zip(&results) {
-        println!("  {:<9} {verdict}", part.name);
+    for ([name, ..], (verdict, _)) in PARTS.iter().zip(&results) {
+        println!("  {name:<9} {verdict}");
     }
     let page = page(&commit, &results);
     if is_release {
@@ -138,19 +124,18 @@ type Known<'a> = (String, Vec<&'a Value>);
 
 /// What the records say of a commit, for each of [`PARTS`].
 fn results<'a>(commit: &str, records: &'a [(String, Value)]) -> Vec<Known<'a>> {
-    let known = |part: &Part| {
-        let is_of_part = |name: &str| {
-            name.strip_prefix(part.name).is_some_and(|rest| rest.is_empty() || rest.starts_with('-'))
-        };
+    let known = |[part, counted, ..]: &[&str; 4]| {
+        let is_of_part =
+            |name: &str| name.strip_prefix(part).is_some_and(|rest| rest.is_empty() || rest.starts_with('-'));
         let all: Vec<_> = records.iter().filter(|(name, _)| is_of_part(name)).collect();
         let is_ours = |record: &&Value| record["commit"] == *commit && record["clean"] == true;
         let ours: Vec<_> = all.iter().map(|(_, record)| record).filter(is_ours).collect();
-        (judge(part, &ours, all.len() > ours.len()), ours)
+        (judge(counted, &ours, all.len() > ours.len()), ours)
     };
     PARTS.iter().map(known).collect()
 }
 
-fn judge(part: &Part, ours: &[&Value], has_others: bool) -> String {
+fn judge(counted: &str, ours: &[&Value], has_others: bool) -> String {
     if ours.is_empty() {
         let others = if has_others { "; there are results of other sources" } else { "" };
         return format!("not run on this commit{others}");
@@ -160,16 +145,16 @@ fn judge(part: &Part, ours: &[&Value], has_others: bool) -> String {
     }
     let numbers =
         |name: &str| -> Vec<f64> { ours.iter().filter_map(|record| record[name].as_f64()).collect() };
-    let (counts, failed) = (numbers(part.counts), numbers("failed").iter().sum::<f64>());
+    let (counts, failed) = (numbers(counted), numbers("failed").iter().sum::<f64>());
     if counts.len() < ours.len() {
         return "**a run has counted nothing**".into();
     }
     // Counts are summed over the parts of a run; of percents the least counts.
-    let count = match part.counts {
+    let count = match counted {
         "percent" => counts.into_iter().fold(100.0, f64::min),
         _ => counts.iter().sum(),
     };
-    let verdict = format!("{count} {}, {failed} failed", part.counts);
+    let verdict = format!("{count} {counted}, {failed} failed");
     if failed > 0.0 {
         format!("**{verdict}**")
     } else {
@@ -181,13 +166,13 @@ fn page(commit: &str, results: &[Known]) -> String {
     let mut page =
         format!("# Evidence\n\nCommit `{commit}`. Every number comes from a run of its sources.\n\n");
     page += "| what | result | date | command |\n|---|---|---|---|\n";
-    for (Part { name, job, .. }, (verdict, records)) in PARTS.iter().zip(results) {
+    for ([name, _, job, _], (verdict, records)) in PARTS.iter().zip(results) {
         let dates = records.iter().filter_map(|record| record["date"].as_str()?.get(..10));
         let date = dates.max().unwrap_or("–");
         let _ = writeln!(page, "| {name} | {verdict} | {date} | `cargo xtask {job}` |");
     }
     let _ = writeln!(page, "\n{NOT_VERIFIED}");
-    for (Part { name, about, .. }, (_, records)) in PARTS.iter().zip(results) {
+    for ([name, .., about], (_, records)) in PARTS.iter().zip(results) {
         let _ = writeln!(page, "\n## {name}\n\n{about}");
         for record in records {
             let _ = writeln!(page, "\n```json\n{record:#}\n```");
@@ -211,7 +196,7 @@ mod tests {
     fn verdict(part: &str, records: &[(&str, Value)]) -> String {
         let records: Vec<_> =
             records.iter().map(|(name, record)| ((*name).to_owned(), record.clone())).collect();
-        let at = PARTS.iter().position(|other| other.name == part).unwrap();
+        let at = PARTS.iter().position(|[name, ..]| *name == part).unwrap();
         results(COMMIT, &records).swap_remove(at).0
     }
 
@@ -248,12 +233,8 @@ mod tests {
     fn the_page_has_each_part_with_its_records() {
         let records = [("tests".to_owned(), of_commit(json!({"jobs": [{"a": 5}], "passed": "<b>"})))];
         let page = page(COMMIT, &results(COMMIT, &records));
-        for part in &PARTS {
-            assert!(
-                page.contains(&format!("| {} |", part.name)) && page.contains(part.about),
-                "{}",
-                part.name
-            );
+        for [name, .., about] in PARTS {
+            assert!(page.contains(&format!("| {name} |")) && page.contains(about), "{name}");
         }
         assert!(page.contains("| tests | **a run has counted nothing** |"), "{page}");
         assert!(page.contains("      \"a\": 5\n"), "{page}");

@@ -26,9 +26,6 @@ impl Product {
 
     /// The product of a file in `bootloader/products`.
     pub fn named(name: &str) -> Outcome<Self> {
-        if name == DEFAULT {
-            return Ok(Self::default());
-        }
         let file = workspace::root().join(FOLDER).join(format!("{name}.rs"));
         if !is_name(name) || !file.exists() {
             return Err(format!("{FOLDER} has no {name}.rs: there is no product \"{name}\"."));

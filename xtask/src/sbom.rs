@@ -32,27 +32,15 @@ cargo-cyclonedx is installed into target/tools where it is missing, which takes 
 /// The version to install if there is none.
 const VERSION: &str = "0.5.7";
 
-/// A released program.
-struct Released {
-    package: &'static str,
-    /// The target, or `all`.
-    target: &'static str,
-    /// The arguments for cargo that choose its features.
-    features: Vec<String>,
+/// The options of cargo for the target and the features of a bootloader on a line of chips.
+fn bootloader(chip_feature: &str) -> [&str; 5] {
+    ["--target", workspace::TARGET, "--no-default-features", "--features", chip_feature]
 }
 
-impl Released {
-    fn bootloader(chip_feature: &str) -> Self {
-        let features = ["--no-default-features", "--features", chip_feature].map(str::to_owned).into();
-        Self { package: "bootloader", target: workspace::TARGET, features }
-    }
-
-    /// The crates that it is built from, according to cargo: itself and all its dependencies, build
-    /// dependencies too.
-    fn crates(&self) -> Outcome<BTreeSet<String>> {
-        let words = ["--package", self.package, "--edges", "normal,build", "--target", self.target];
-        process::tree(&words.into_iter().chain(self.features.iter().map(String::as_str)).collect::<Vec<_>>())
-    }
+/// The crates that a package is built from with these options, according to cargo: itself and all its dependencies,
+/// build dependencies too.
+fn crates(package: &str, options: &[&str]) -> Outcome<BTreeSet<String>> {
+    process::tree(&[&["--package", package, "--edges", "normal,build"], options].concat())
 }
 
 pub fn run(args: Args) -> Outcome {
@@ -60,44 +48,43 @@ pub fn run(args: Args) -> Outcome {
     setup::rust_target(workspace::TARGET)?;
     evidence::begin("sbom")?;
     let cyclonedx = setup::tool("cargo-cyclonedx", VERSION, &[])?;
-    let all = [
-        (DEFAULT.board, Released::bootloader(&build::chip_feature(DEFAULT))),
-        ("all-systems", Released { package: "coflash", target: "all", features: Vec::new() }),
-    ];
+    let chip_feature = build::chip_feature(DEFAULT);
     let mut rows = Vec::new();
-    for (name, released) in &all {
-        let text = tidy(&generate(released, &cyclonedx)?, &workspace::root().display().to_string());
+    for (package, name, options) in [
+        ("bootloader", DEFAULT.board, &bootloader(&chip_feature)[..]),
+        ("coflash", "all-systems", &["--target", "all"]),
+    ] {
+        let text = tidy(&generate(package, options, &cyclonedx)?, &workspace::root().display().to_string());
         let bill = process::json(&text)?;
-        let missing = missing(&bill, &released.crates()?);
+        let missing = missing(&bill, &crates(package, options)?);
         if !missing.is_empty() {
             return Err(format!(
-                "the bill of materials of {} does not list {}, which cargo builds it from.",
-                released.package,
+                "the bill of materials of {package} does not list {}, which cargo builds it from.",
                 missing.join(", ")
             ));
         }
-        let file = workspace::target_dir().join("sbom").join(format!("{}-{name}.cdx.json", released.package));
+        let file = workspace::target_dir().join("sbom").join(format!("{package}-{name}.cdx.json"));
         files::write(&file, &text)?;
         let hash: String = Sha512_256::digest(&text).iter().map(|byte| format!("{byte:02x}")).collect();
         println!("{}\n  SHA-512/256 {hash}", workspace::shown(&file));
-        let program = format!("{}, {name}", released.package);
+        let program = format!("{package}, {name}");
         let components = list(&bill, "components").count();
         rows.push(json!({"program": program, "components": components, "sha_512_256": hash}));
     }
     evidence::record("sbom", json!({"bills": rows.len(), "failed": 0, "of": rows}))
 }
 
-/// The output of cargo-cyclonedx for a package.
-fn generate(released: &Released, cyclonedx: &Path) -> Outcome<String> {
+/// The output of cargo-cyclonedx for a package, with these options of cargo.
+fn generate(package: &str, options: &[&str], cyclonedx: &Path) -> Outcome<String> {
     // The files are beside the manifests; the number keeps two runs apart.
     let name = format!("sbom-{}", std::process::id());
     let mut command = Command::new(cyclonedx);
     command.args(["cyclonedx", "--quiet", "--format", "json", "--spec-version", "1.5"]);
-    command.args(["--override-filename", &name, "--target", released.target]).args(&released.features);
+    command.args(["--override-filename", &name]).args(options);
     let metadata = process::metadata()?;
     let manifest = |package: &Value| Some(Path::new(package["manifest_path"].as_str()?).to_owned());
-    let own = list(&metadata, "packages").find(|package| package["name"] == released.package);
-    let own = own.and_then(manifest).ok_or_else(|| format!("there is no package {}.", released.package))?;
+    let own = list(&metadata, "packages").find(|own| own["name"] == package);
+    let own = own.and_then(manifest).ok_or_else(|| format!("there is no package {package}."))?;
     let made = process::run(command.arg("--manifest-path").arg(&own));
     let beside = |manifest: PathBuf| manifest.with_file_name(&name).with_extension("json");
     let text = files::text(&beside(own));
@@ -177,7 +164,7 @@ mod tests {
     /// without those of its tests or the emulator.
     #[test]
     fn cargo_tells_what_the_bootloader_is_built_from() {
-        let crates = Released::bootloader("bsp/chip-stm32f407").crates().unwrap();
+        let crates = crates("bootloader", &bootloader("bsp/chip-stm32f407")).unwrap();
         let has = |name: &&str| crates.iter().any(|krate| krate.split(' ').next() == Some(name));
         let linked = ["bootloader", "coboot-core", "coboot-canopen", "cortex-m-rt", "rtic", "bxcan", "syn"];
         assert!(linked.iter().all(has), "{crates:?}");

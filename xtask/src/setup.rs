@@ -63,15 +63,8 @@ pub fn may_use_sudo() {
 
 pub fn run(args: Args) -> Outcome {
     args.none_left()?;
-    prepare(&[
-        Part::Firmware,
-        Part::C,
-        Part::Examples,
-        Part::Emulator,
-        Part::Python,
-        Part::Gdb,
-        Part::Browser,
-    ])?;
+    use Part::{Browser, Emulator, Examples, Firmware, Gdb, Python, C};
+    prepare(&[Firmware, C, Examples, Emulator, Python, Gdb, Browser])?;
     println!("Everything is there.");
     Ok(())
 }

@@ -49,11 +49,8 @@ pub fn run(mut args: Args) -> Outcome {
     println!("board                    image                      at         bytes     of");
     let mut problems = Vec::new();
     let (mut images, mut count) = (Vec::new(), 0);
-    for board in BOARDS {
-        for name in ["bootloader", "bootloader-sealed"] {
-            if board.home.is_none() && name == "bootloader-sealed" {
-                continue;
-            }
+    for (board, names) in gated {
+        for name in names.split(' ') {
             count += 1;
             let used = build::size_of(board, name)
                 .map_err(|problem| format!("{}, {name}: {problem}", board.board))?;

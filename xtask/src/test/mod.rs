@@ -180,14 +180,7 @@ fn room() -> Outcome {
     }
 }
 
-/// What selects the test programs, those with firmware for the default board; and the programs that tests start, the
-/// host tool and the node, which cargo builds for their tests. The jobs of the repository are tested in
-/// .ci/run.
-fn ours() -> Vec<String> {
-    workspace::on_host()
-}
-
-/// Builds the programs that tests start, for tests that are chosen by words.
+/// Builds the programs that tests start. For the tests of their own packages cargo does it.
 fn programs_of_ours() -> Outcome {
     let mut cargo = process::cargo("build --bin=coflash --bin=coboot-node --bin=emulate");
     process::run(cargo.args(workspace::on_host()).current_dir(workspace::root()))
@@ -227,14 +220,14 @@ fn build_all(tier: Tier, programs: &[Vec<String>]) -> Outcome {
 
 /// The tests of the product on its default board.
 fn product(summary: &mut Summary) -> Outcome {
-    build_all(Tier::Product, &[ours()])?;
-    runner::run(&ours(), &Tier::Product.filter(), "", &variables(DEFAULT), summary)
+    build_all(Tier::Product, &[workspace::on_host()])?;
+    runner::run(&workspace::on_host(), &Tier::Product.filter(), "", &variables(DEFAULT), summary)
 }
 
 /// Tests of the default board that run from a tier on: ours, and those of more packages, which are built apart.
 fn later(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
     let more = more.iter().map(|package| format!("--package={package}"));
-    let programs = [ours(), more.collect()];
+    let programs = [workspace::on_host(), more.collect()];
     build_all(tier, &programs)?;
     programs.iter().try_for_each(|of| runner::run(of, &tier.filter(), "", &variables(DEFAULT), summary))
 }
@@ -245,7 +238,7 @@ fn ci(summary: &mut Summary) -> Outcome {
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
     let core = format!("{} & ({})", plan::of("coboot-core/it"), Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
-    runner::run(&ours(), &core, "[sealed] ", &takes_sealed, summary)?;
+    runner::run(&workspace::on_host(), &core, "[sealed] ", &takes_sealed, summary)?;
     let mut doc = process::cargo("test --doc --workspace --quiet");
     let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
     doc.current_dir(workspace::root()).args(without);
@@ -275,7 +268,6 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
     if tier == Tier::All {
         build::boards(&[(board, "")])?;
     }
-    // cargo builds the programs that tests start for those of their own packages alone.
     programs_of_ours()?;
     let programs: &[&str] = match tier {
         Tier::All => &["device", "update", "sealed", "foreign", "port"],
