@@ -4,16 +4,12 @@
 use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::{Mutex, PoisonError};
 
 use canopen::Address;
 use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use kit::folder::Folder;
-
-/// One browser at a time: several would only slow each other down.
-static BROWSER: Mutex<()> = Mutex::new(());
 
 /// A program that `cargo xtask test` has built or installed.
 fn given(name: &str) -> PathBuf {
@@ -55,7 +51,6 @@ fn check(scenario: &str, output: &Output) {
 /// Runs a scenario with nodes of its own.
 #[track_caller]
 fn with_nodes(scenario: &str) {
-    let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
     let (mut command, _folder) = script(scenario);
     let output = command.arg("--node").arg(given("COBOOT_NODE")).output().unwrap();
     check(scenario, &output);
@@ -118,7 +113,6 @@ fn a_service_station_is_readable_in_both_languages() {
 
 #[test]
 fn the_emulated_board_is_updated_by_dropping_an_elf() {
-    let _alone = BROWSER.lock().unwrap_or_else(PoisonError::into_inner);
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);

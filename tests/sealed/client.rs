@@ -3,7 +3,6 @@
 use std::env;
 use std::path::Path;
 use std::process::{Command, Output};
-use std::sync::{Mutex, PoisonError};
 
 use canopen::program::ProgramControl;
 use canopen::Address;
@@ -15,9 +14,6 @@ use coflash_core::file::sealed::Sealer;
 
 /// 100Ah, software version.
 const VERSION: Address = Address::new(0x100A, 0);
-
-/// One client at a time: a second one would only slow down both.
-static ALONE: Mutex<()> = Mutex::new(());
 
 /// How many times slower than real time the board runs for a client with its own time-out, and how many
 /// times longer that time-out is: their ratio stays, and a busy host has time enough.
@@ -34,7 +30,6 @@ fn started() -> Bench {
 /// uses the clock of a possibly busy machine.
 #[test]
 fn an_unmodified_python_canopen_writes_a_sealed_image() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut endpoint = Endpoint::new(started());
     let genuine = Sealer { compress: true, ..sealer(COUNTER) };
     let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
@@ -64,7 +59,6 @@ fn an_unmodified_python_canopen_writes_a_sealed_image() {
 /// The client with its defaults: its own SDO time-out of 0.3 s, its own block size.
 #[test]
 fn a_python_canopen_as_it_comes_writes_a_sealed_image_by_block_transfer() {
-    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut endpoint = Endpoint::slower(started(), SLOWER);
     let genuine = Sealer { encrypt_for: &*KEKS, compress: true, ..sealer(COUNTER) };
     let genuine = genuine.seal(&firmware::raw(firmware::APP_V1), &release()).unwrap();
