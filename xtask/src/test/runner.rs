@@ -105,8 +105,8 @@ pub fn run(
     const LINE: &str = "run --no-fail-fast --no-tests=pass --status-level=slow --final-status-level=fail \
                         --message-format=libtest-json";
     let mut nextest = nextest(LINE, arguments);
-    // One more than there are cores, since some tests mostly wait for other programs.
-    let threads = thread::available_parallelism().map_or(2, usize::from) + 1;
+    // Many tests mostly wait for other programs.
+    let threads = 3 * thread::available_parallelism().map_or(2, usize::from);
     nextest.args(["-E", filter, "--test-threads", &threads.to_string()]);
     nextest.envs(variables.iter().cloned()).env("NEXTEST_EXPERIMENTAL_LIBTEST_JSON", "1");
     // It shows the failed tests on its standard error, and reports all on its standard output.
