@@ -62,8 +62,9 @@ impl Summary {
     /// the name of a test.
     fn read(&mut self, message: &Value, place: &str) {
         match (message["type"].as_str(), message["event"].as_str()) {
-            // A test with `#[ignore]` is said to start and never to end.
+            // A test with `#[ignore]` is said to start, and sometimes to be ignored, but never to end.
             (Some("test"), Some("started")) => self.skipped += 1,
+            (Some("test"), Some("ignored")) => {}
             (Some("test"), Some(event)) => {
                 self.skipped = self.skipped.saturating_sub(1);
                 if event == "ok" {
@@ -137,6 +138,7 @@ mod tests {
             r#"{"type":"suite","event":"started","test_count":4}"#,
             r#"{"type":"test","event":"started","name":"coboot-tests::device$line::ignored"}"#,
             r#"{"type":"test","event":"started","name":"coboot-tests::device$line::silence"}"#,
+            r#"{"type":"test","event":"ignored","name":"coboot-tests::device$line::ignored"}"#,
             r#"{"type":"test","event":"started","name":"coboot-tests::device$line::noise"}"#,
             r#"{"type":"test","event":"ok","name":"coboot-tests::device$line::silence","exec_time":0.25}"#,
             r#"{"type":"test","event":"failed","name":"coboot-tests::device$line::noise","exec_time":0.5}"#,
