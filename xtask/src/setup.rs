@@ -226,22 +226,12 @@ fn renew_cmake(target: &Path) {
 
 /// Installs the libraries of a Rust target if they are missing.
 pub fn rust_target(target: &str) -> Outcome {
-    let is_there = || -> Outcome<bool> {
-        let sysroot = process::output(Command::new("rustc").args(["--print", "sysroot"]))?;
-        Ok(Path::new(sysroot.trim()).join("lib/rustlib").join(target).join("lib").is_dir())
-    };
-    if is_there()? {
-        return Ok(());
-    }
-    println!("Adding the Rust target {target} ...");
-    let added = process::run(Command::new("rustup").args(["target", "add", target]));
-    if added.is_ok() && is_there()? {
-        return Ok(());
-    }
-    Err(format!(
-        "the Rust target {target} is missing and could not be added. With rustup (https://rustup.rs) and a \
-         connection, this line does it:\n\n    rustup target add {target}"
-    ))
+    let added = process::output(Command::new("rustup").args(["target", "add", target]));
+    added.map(drop).map_err(|problem| {
+        format!(
+            "{problem}\nThe Rust target {target} needs rustup (https://rustup.rs), and a connection, once."
+        )
+    })
 }
 
 /// Provides a program that cargo installs, in exactly this version, in `target/tools`; returns its
