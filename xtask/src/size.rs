@@ -33,14 +33,9 @@ pub fn run(mut args: Args) -> Outcome {
     args.none_left()?;
     setup::prepare(&[Part::Firmware])?;
     if let Some(board) = chosen {
-        let names: Vec<_> = Variant::of(board).filter(|it| it.is_bootloader()).map(|it| it.name).collect();
-        build::images(board, &names)?;
-        println!("bootloader                      bytes");
-        for name in names {
-            let used: Vec<String> = build::size_of(board, name)?.iter().map(u32::to_string).collect();
-            println!("{name:<31} {}", used.join(" + "));
-        }
-        println!();
+        // It prints the sizes.
+        let all = Variant::of(board).filter(|variant| variant.is_bootloader()).map(|variant| variant.name);
+        build::images(board, &all.collect::<Vec<_>>())?;
     }
 
     let names = |board: &Layout| if board.home.is_some() { SPLIT_MAP } else { COMPACT_MAP };
