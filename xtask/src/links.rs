@@ -3,10 +3,12 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Component, Path, PathBuf};
 
-use crate::{files, outcome::Outcome, workspace};
+use crate::{files, outcome::Outcome, process, workspace};
 
-/// The pages outside `docs/` and `examples/`.
-pub const ELSEWHERE: [&str; 6] = [
+/// The pages, as git finds their files.
+const PAGES: [&str; 8] = [
+    "docs/*.md",
+    "examples/*.md",
     "README.md",
     "CHANGELOG.md",
     "CONTRIBUTING.md",
@@ -26,19 +28,10 @@ pub struct Link {
     pub heading: Option<String>,
 }
 
-/// Every page, as a path from the root of the repository: all in `docs/`, the README of each
-/// example, and those of [`ELSEWHERE`].
+/// Every page, as a path from the root of the repository: those that are no part of a commit yet, too.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
-    let root = workspace::root();
-    let mut pages = files::below(&root.join("docs"), &[])?;
-    pages.retain(|page| files::is(page, "md"));
-    let examples =
-        files::within(&root.join("examples"))?.into_iter().map(|example| example.join("README.md"));
-    pages.extend(examples.filter(|page| page.is_file()));
-    let from_the_root = pages.iter().map(|page| page.strip_prefix(root).unwrap_or(page).to_owned());
-    let mut pages: Vec<PathBuf> = from_the_root.chain(ELSEWHERE.map(PathBuf::from)).collect();
-    pages.sort();
-    Ok(pages)
+    let list = ["ls-files", "--cached", "--others", "--exclude-standard", "--"];
+    Ok(process::git(&[&list[..], &PAGES].concat())?.lines().map(PathBuf::from).collect())
 }
 
 /// All links of all pages that stay within the repository.
