@@ -36,33 +36,16 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
                   `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
 ";
 
-/// A stage of a run.
-struct Stage {
-    name: &'static str,
-    about: &'static str,
-    /// How long it takes, in minutes on two cores.
-    minutes: u32,
-    tier: Tier,
-    run: fn(&mut Summary) -> Outcome,
-}
-
-const fn stage(
-    name: &'static str,
-    about: &'static str,
-    minutes: u32,
-    tier: Tier,
-    run: fn(&mut Summary) -> Outcome,
-) -> Stage {
-    Stage { name, about, minutes, tier, run }
-}
+/// A stage of a run: its name, what it is about, the minutes that it takes on two cores, and the tier of its tests.
+type Stage = (&'static str, &'static str, u32, Tier, fn(&mut Summary) -> Outcome);
 
 /// All stages, in the order in which they run.
-const STAGES: &[Stage] = &[
-    stage("product", "the default board, device and tool", 12, Tier::Product, product),
-    stage("ci", "Chromium, tools of others, other chips, pages", 13, Tier::Ci, ci),
-    stage("slow", "tests that take minutes", 25, Tier::All, slow),
-    stage("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
-    stage("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
+const STAGES: [Stage; 5] = [
+    ("product", "the default board, device and tool", 12, Tier::Product, product),
+    ("ci", "Chromium, tools of others, other chips, pages", 13, Tier::Ci, ci),
+    ("slow", "tests that take minutes", 25, Tier::All, slow),
+    ("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
+    ("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
 ];
 
 /// What `--all` does not run, since it goes on for hours.
@@ -88,22 +71,22 @@ pub fn run(mut args: Args) -> Outcome {
         return Err("--part goes with --all.".into());
     }
     let chosen = part.as_deref().or((!all).then_some(if for_ci { "ci" } else { "product" }));
-    let is_chosen = |stage: &&Stage| chosen.is_none_or(|name| name == stage.name);
-    let stages: Vec<&Stage> = STAGES.iter().filter(is_chosen).collect();
+    let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| chosen == *name);
+    let stages: Vec<Stage> = STAGES.into_iter().filter(is_chosen).collect();
     if stages.is_empty() {
-        let names = STAGES.iter().map(|stage| stage.name).collect::<Vec<_>>();
+        let names = STAGES.map(|(name, ..)| name);
         return Err(format!("--part takes one of {}.", names.join(", ")));
     }
     if all {
-        for stage in STAGES {
+        for stage @ (name, about, minutes, ..) in STAGES {
             let word = if is_chosen(&stage) { "runs" } else { "in another part" };
-            println!("{:<8} {:>3} min  {:<54} {word}", stage.name, stage.minutes, stage.about);
+            println!("{name:<8} {minutes:>3} min  {about:<54} {word}");
         }
         println!("{NOT_RUN}\n");
     }
 
     // Before anything takes time: what is missing on this machine.
-    let tier = stages.iter().map(|stage| stage.tier).max().unwrap_or(Tier::Product);
+    let tier = stages.iter().map(|(_, _, _, tier, _)| *tier).max().unwrap_or(Tier::Product);
     room()?;
     setup::prepare(tier.needs())?;
     // No other run uses the build results of this clone.
@@ -135,11 +118,11 @@ pub fn run(mut args: Args) -> Outcome {
     if let Some(board) = chosen_board {
         on_board(board, Tier::All, &mut summary)?;
     } else {
-        for stage in &stages {
-            println!("== {}: {}", stage.name, stage.about);
-            if let Err(problem) = (stage.run)(&mut summary) {
+        for (name, about, _, _, run) in stages {
+            println!("== {name}: {about}");
+            if let Err(problem) = run(&mut summary) {
                 println!("{problem}");
-                summary.failed.push(format!("{}: something did not build or broke off", stage.name));
+                summary.failed.push(format!("{name}: something did not build or broke off"));
             }
         }
     }
@@ -207,34 +190,29 @@ fn variables(board: &Layout) -> Variables {
     ]
 }
 
-/// Builds the images of a tier, and the test programs that these arguments select beside them: the link of an image uses
-/// one core, and so does much of what cargo builds.
-fn build_all(tier: Tier, programs: &[Vec<String>]) -> Outcome {
+/// The tests of the product on its default board.
+fn product(summary: &mut Summary) -> Outcome {
+    of_default(Tier::Product, &[], summary)
+}
+
+/// Tests of the default board that run from a tier on: ours, and those of more packages, which are built apart.
+fn of_default(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
+    let more = more.iter().map(|package| format!("--package={package}")).collect();
+    let programs = [workspace::on_host(), more];
+    let programs: Vec<_> = programs.into_iter().filter(|programs| !programs.is_empty()).collect();
+    // The link of an image uses one core, and so does much of what cargo builds.
     std::thread::scope(|scope| {
         let images = scope.spawn(|| build_images(tier));
         let programs = programs.iter().try_for_each(|programs| runner::build(programs, &variables(DEFAULT)));
         images.join().map_err(|_| "a build broke off.".to_owned())??;
         programs
-    })
-}
-
-/// The tests of the product on its default board.
-fn product(summary: &mut Summary) -> Outcome {
-    build_all(Tier::Product, &[workspace::on_host()])?;
-    runner::run(&workspace::on_host(), &Tier::Product.filter(), "", &variables(DEFAULT), summary)
-}
-
-/// Tests of the default board that run from a tier on: ours, and those of more packages, which are built apart.
-fn later(tier: Tier, more: &[&str], summary: &mut Summary) -> Outcome {
-    let more = more.iter().map(|package| format!("--package={package}"));
-    let programs = [workspace::on_host(), more.collect()];
-    build_all(tier, &programs)?;
+    })?;
     programs.iter().try_for_each(|of| runner::run(of, &tier.filter(), "", &variables(DEFAULT), summary))
 }
 
 /// What `.ci/run` adds.
 fn ci(summary: &mut Summary) -> Outcome {
-    later(Tier::Ci, &["xtask"], summary)?;
+    of_default(Tier::Ci, &["xtask"], summary)?;
     // The product's tests once more, for a device that takes sealed images and has no keys yet.
     let core = format!("{} & ({})", plan::of("coboot-core/it"), Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
@@ -249,7 +227,7 @@ fn ci(summary: &mut Summary) -> Outcome {
 /// The tests that take minutes.
 fn slow(summary: &mut Summary) -> Outcome {
     examples::all()?;
-    later(Tier::All, &["xtask", "coboot-zencan"], summary)
+    of_default(Tier::All, &["xtask", "coboot-zencan"], summary)
 }
 
 /// Every test that runs firmware, for each other chip.
