@@ -35,8 +35,8 @@ const EXAMPLES: [(&str, Option<&str>); 5] = [
 ];
 /// The name for a new project of the template, which is in the folder no-stack.
 const TEMPLATE: &str = "template";
-/// What makes a project of a template, and its version.
-const GENERATE: (&str, &str) = ("cargo-generate", "0.23.7");
+/// The version of cargo-generate, which makes a project of a template.
+const GENERATE: &str = "0.23.7";
 
 pub fn run(args: Args) -> Outcome {
     let chosen = args.rest();
@@ -90,8 +90,7 @@ fn by_cargo(folder: &Path, work: &Path, program: &str, is_second: bool) -> Outco
 /// Makes a project of the template in `folder` and builds it; returns the program.
 fn template(folder: &Path, work: &Path) -> Outcome<PathBuf> {
     const NAME: &str = "from-template";
-    let (tool, version) = GENERATE;
-    let tool = setup::tool(tool, version, &[])?;
+    let tool = setup::tool("cargo-generate", GENERATE, &[])?;
     let project = work.join(NAME);
     files::remove(&project)?;
     files::make(work)?;

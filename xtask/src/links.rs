@@ -6,16 +6,8 @@ use std::path::{Component, Path, PathBuf};
 use crate::{files, outcome::Outcome, process, workspace};
 
 /// The pages, as git finds their files.
-const PAGES: [&str; 8] = [
-    "docs/*.md",
-    "examples/*.md",
-    "README.md",
-    "CHANGELOG.md",
-    "CONTRIBUTING.md",
-    "LICENSES.md",
-    "SECURITY.md",
-    "coflash/python/README.md",
-];
+const PAGES: &str = "docs/*.md examples/*.md README.md CHANGELOG.md CONTRIBUTING.md LICENSES.md SECURITY.md \
+                     coflash/python/README.md";
 
 /// A link within the repository.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -30,8 +22,8 @@ pub struct Link {
 
 /// Every page, as a path from the root of the repository: those that are no part of a commit yet, too.
 pub fn pages() -> Outcome<Vec<PathBuf>> {
-    let list = ["ls-files", "--cached", "--others", "--exclude-standard", "--"];
-    Ok(process::git(&[&list[..], &PAGES].concat())?.lines().map(PathBuf::from).collect())
+    let list = ["ls-files", "--cached", "--others", "--exclude-standard", "--"].into_iter();
+    Ok(process::git(&list.chain(PAGES.split(' ')).collect::<Vec<_>>())?.lines().map(PathBuf::from).collect())
 }
 
 /// All links of all pages that stay within the repository.

@@ -38,8 +38,9 @@ pub fn source(release: &Release, root: &Path) -> Outcome {
 pub fn linux(release: &Release, root: &Path) -> Outcome {
     files::unpack(&release.linux(), root)?;
     let folder = root.join(format!("coflash-{VERSION}"));
-    for file in ["LICENSE-MIT", "LICENSE-APACHE", "README.md", "THIRD-PARTY.txt", "udev/70-coflash.rules"] {
-        there(&folder.join(file))?;
+    let files = ["LICENSE-MIT", "LICENSE-APACHE", "README.md", "THIRD-PARTY.txt", "udev/70-coflash.rules"];
+    if let Some(file) = files.into_iter().find(|file| !folder.join(file).is_file()) {
+        return Err(format!("the archive has no {file}."));
     }
     works(&folder, "coflash")
 }
@@ -220,10 +221,6 @@ fn runs_on_windows(said: &str) -> Outcome {
         Some(foreign) => Err(format!("the program for Windows needs {foreign}, which no Windows has.")),
         None => Ok(()),
     }
-}
-
-fn there(file: &Path) -> Outcome {
-    file.is_file().then_some(()).ok_or_else(|| format!("the archive has no {}.", file.display()))
 }
 
 fn said_in(said: &str, expected: &str, who: &str) -> Outcome {
