@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 use std::process::ExitCode;
+use std::sync::atomic::Ordering;
 
 mod args;
 mod arrows;
@@ -127,6 +128,7 @@ fn main() -> ExitCode {
     // The programs that a job has started get the signal from the terminal, too. What they print of it comes
     // before the last line.
     let interrupted = ctrlc::set_handler(|| {
+        process::IS_ENDING.store(true, Ordering::Relaxed);
         std::thread::sleep(std::time::Duration::from_millis(300));
         eprintln!("\nxtask: interrupted. What is built so far is kept; the same command goes on from there.");
         std::process::exit(130);

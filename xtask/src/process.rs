@@ -5,12 +5,16 @@ use std::env;
 use std::ffi::OsStr;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use serde_json::Value;
 
 use crate::outcome::Outcome;
 use crate::workspace;
+
+/// Whether Ctrl-C ends this program, as soon as those that it has started have ended.
+pub static IS_ENDING: AtomicBool = AtomicBool::new(false);
 
 /// The cargo that started this program, on this workspace, in the caller's folder. `line` is the subcommand with
 /// its arguments, with blanks between them.

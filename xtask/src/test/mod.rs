@@ -5,6 +5,7 @@
 //! | `plan.rs` | which test runs when, and with which images |
 //! | `runner.rs` | builds and runs tests by cargo-nextest, and sums up |
 
+use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use shared_abi::layout::{Layout, BOARDS, DEFAULT};
@@ -125,6 +126,10 @@ pub fn run(mut args: Args) -> Outcome {
                 summary.failed.push(format!("{name}: something did not build or broke off"));
             }
         }
+    }
+    // What Ctrl-C has ended has not failed.
+    while process::IS_ENDING.load(Ordering::Relaxed) {
+        std::thread::park();
     }
     evidence::record(&name, summary.as_json())?;
     println!();
