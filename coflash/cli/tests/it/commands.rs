@@ -61,10 +61,6 @@ fn the_steps_of_an_update_one_by_one() {
     assert!(said.out.starts_with("node 5: program 1 is erased, in "), "{}", said.out);
     assert!(json["seconds"].is_number());
     assert_eq!(fake.writes(), ["command 80", "command 03"]);
-    // An erase without duration was postponed until the first block; a second command erases at
-    // once.
-    let (_, _, fake) = on(|| quick(BOOTLOADER), &["erase"]);
-    assert_eq!(fake.writes(), ["command 03"; 2]);
 
     let (said, _, fake) = on(|| quick(BOOTLOADER), &["release"]);
     assert_eq!(said.out, "node 5: program 1 is released for autostart\n");

@@ -14,7 +14,7 @@ use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::{raw, Firmware};
 use coflash_core::file::{Program, Target};
 use coflash_core::update::event::{Phase, RepeatReason, Retry, Warning};
-use coflash_core::update::{flash, DeviceState, Event, FlashOptions, Report};
+use coflash_core::update::{flash, steps, DeviceState, Event, FlashOptions, Report};
 use coflash_core::Error;
 use embedded_can::{Frame as _, StandardId};
 use kit::fake::{crc16, Blocks, Fake, Outcome, APPLICATION, BOOTLOADER, NODE};
@@ -590,6 +590,17 @@ fn every_status_of_the_manual_has_its_number_and_words() {
             assert!(error.to_string().starts_with("releasing the program for autostart failed: "), "{error}");
             assert_eq!(fake.count("command 01"), 1, "that of the trial");
         }
+    }
+}
+
+/// An erase without duration was postponed until the first block; a second command erases at once.
+#[test]
+fn an_erase_that_the_device_puts_off_is_asked_for_twice() {
+    for (millis, commands) in [(30, 2), (150, 1)] {
+        let mut fake = Fake::new(BOOTLOADER);
+        fake.erase_time = Duration::from_millis(millis);
+        steps::erase_at_once(&mut Session::new(&mut fake, node(), Timing::default()), 1).unwrap();
+        assert_eq!(fake.writes(), vec!["command 03"; commands], "{millis} ms");
     }
 }
 
