@@ -171,7 +171,8 @@ fn room() -> Outcome {
 /// Builds the programs that tests start. For the tests of their own packages cargo does it.
 fn programs_of_ours() -> Outcome {
     let mut cargo = process::cargo("build --bin=coflash --bin=coboot-node --bin=emulate");
-    process::run(cargo.args(workspace::on_host()).current_dir(workspace::root()))
+    // As for the default board: cargo builds what depends on the board again when the variable changes.
+    process::run(cargo.args(workspace::on_host()).envs(variables(DEFAULT)).current_dir(workspace::root()))
 }
 
 /// Builds the images of a tier, and of those before it.
@@ -250,8 +251,8 @@ fn other_chips() -> impl Iterator<Item = &'static Layout> {
 fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcome {
     if tier == Tier::All {
         build::boards(&[(board, "")])?;
+        programs_of_ours()?;
     }
-    programs_of_ours()?;
     let programs: &[&str] = match tier {
         Tier::All => &["device", "update", "sealed", "foreign", "port"],
         _ => &["device", "update"],
