@@ -5,7 +5,7 @@ use std::path::Path;
 use std::process::Command;
 
 use super::build;
-use super::release::{package_crates, Release, LINUX, SUMS, VERSION};
+use super::release::{Release, LINUX, SUMS, VERSION};
 use crate::{files, outcome::Outcome, process, setup, workspace};
 
 /// Checks the sums, with the program that users have for it.
@@ -125,7 +125,6 @@ finally:
 pub fn crates(release: &Release, root: &Path) -> Outcome {
     // One of the crates is the emulator.
     setup::prepare(&[setup::Part::Emulator])?;
-    process::run(package_crates(release)?.env("CARGO_PROFILE_DEV_DEBUG", "0"))?;
     tests_of_crates(release, &root.join("crates"))?;
     let mut install = process::bare_cargo();
     install.args(["install", "--locked", "--debug", "--quiet", "--no-track", "--path"]);
@@ -137,10 +136,12 @@ pub fn crates(release: &Release, root: &Path) -> Outcome {
     said_in(&said, VERSION, "coflash --version")
 }
 
-/// Runs the tests that the files for the registry have, in a folder without the repository. None of
-/// the crates is in the registry yet: a workspace has them find each other.
+/// Compiles what the files for the registry have, and runs its tests, in a folder without the repository. None of
+/// the crates is in the registry yet: a workspace has them find each other. (The check of `cargo package` keeps the
+/// sources of an earlier file of the same version.)
 fn tests_of_crates(release: &Release, folder: &Path) -> Outcome {
     files::make(folder)?;
+    let mut names = Vec::new();
     let mut manifest = "[workspace]\nmembers = [\"*\"]\nresolver = \"2\"\n\n[patch.crates-io]\n".to_owned();
     let packed = files::within(&release.build.join("package"))?;
     for file in packed.iter().filter(|file| files::is(file, "crate")) {
@@ -148,15 +149,18 @@ fn tests_of_crates(release: &Release, folder: &Path) -> Outcome {
         let place = file.file_stem().unwrap_or_default().to_string_lossy();
         let name = place.strip_suffix(VERSION).unwrap_or(&place).trim_end_matches('-');
         manifest += &format!("{name} = {{ path = \"{place}\" }}\n");
+        names.push(name.to_owned());
     }
     files::write(&folder.join("Cargo.toml"), manifest)?;
     files::copy(&workspace::root().join("Cargo.lock"), &folder.join("Cargo.lock"))?;
-    let mut tests = process::bare_cargo();
-    tests
-        .args(["test", "--workspace", "--quiet"])
-        .current_dir(folder)
-        .env("CARGO_TARGET_DIR", &release.build);
-    process::run(tests.env("CARGO_PROFILE_DEV_OPT_LEVEL", "1").env("CARGO_PROFILE_DEV_DEBUG", "0"))
+    let cargo = |words: &[&str]| {
+        let mut cargo = process::bare_cargo();
+        cargo.args(words).current_dir(folder).env("CARGO_TARGET_DIR", &release.build);
+        process::run(cargo.env("CARGO_PROFILE_DEV_OPT_LEVEL", "1").env("CARGO_PROFILE_DEV_DEBUG", "0"))
+    };
+    // Each by itself, without the features that another one asks for.
+    names.iter().try_for_each(|name| cargo(&["check", "--quiet", "--package", name]))?;
+    cargo(&["test", "--workspace", "--quiet"])
 }
 
 /// Runs the program in a folder without any other file of a system: with `root` as its root if the

@@ -10,7 +10,7 @@ mod release;
 use std::path::Path;
 use std::process::Command;
 
-use self::release::{package_crates, Release, SUMS, VERSION, WINDOWS};
+use self::release::{Release, SUMS, VERSION, WINDOWS};
 use crate::args::Args;
 use crate::{files, outcome::Outcome, process, sbom, setup, toolchain, workspace};
 
@@ -174,9 +174,16 @@ fn bills(release: &Release) -> Outcome {
     files::copy(&folder.join(format!("bootloader-{board}.cdx.json")), &bootloader)
 }
 
-/// The crates for the registry. [`check::crates`] checks their contents.
+/// The crates for the registry. [`check::crates`] checks their contents. One call packs all, since they depend on
+/// each other and none is in the registry yet.
 fn crates(release: &Release) -> Outcome {
-    process::run(package_crates(release)?.arg("--no-verify"))
+    let mut package = process::cargo("package --locked --no-verify --target-dir");
+    package.arg(&release.build).args(release.draft.then_some("--allow-dirty"));
+    // The packages without `publish = false`.
+    let metadata = process::metadata()?;
+    let published = process::list(&metadata, "packages").filter(|package| package["publish"].is_null());
+    package.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
+    process::run(&mut package)
 }
 
 /// Writes SHA256SUMS in the form for `sha256sum --check`.

@@ -1,10 +1,8 @@
 //! What a release is made of: its folders, its files and its crates.
 
 use std::path::PathBuf;
-use std::process::Command;
 
-use crate::process::list;
-use crate::{files, outcome::Outcome, process};
+use crate::{files, outcome::Outcome};
 
 /// Linux; the program does not need a C library of the system.
 pub const LINUX: &str = "x86_64-unknown-linux-musl";
@@ -58,16 +56,4 @@ impl Release {
         files::make(&folder)?;
         Ok(folder)
     }
-}
-
-/// `cargo package` of all crates that may be published. One call does all, since they depend on
-/// each other and none is in the registry yet.
-pub fn package_crates(release: &Release) -> Outcome<Command> {
-    let mut command = process::cargo("package --locked --target-dir");
-    command.arg(&release.build).args(release.draft.then_some("--allow-dirty"));
-    // The packages without `publish = false`.
-    let metadata = process::metadata()?;
-    let published = list(&metadata, "packages").filter(|package| package["publish"].is_null());
-    command.args(published.flat_map(|package| ["--package", package["name"].as_str().unwrap_or_default()]));
-    Ok(command)
 }
