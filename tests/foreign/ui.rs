@@ -1,6 +1,8 @@
 //! Tests of `coflash ui` in a real Chromium, which tests/python/ui_page.py controls: with nodes
 //! (`coboot-node`) that the script starts, and with the emulated board.
 
+mod machine;
+
 use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -895,6 +895,19 @@ def service_looks(bench):
 
 
 @scenario
+def service_machine(bench):
+    """Emulated boards, of which one is sealed and two have programs in C, get the programs of a package."""
+    _, url = bench.ui(bench.arguments.bus, "--service", bench.arguments.image, "--report-dir", bench.folder / "reports")
+    page = bench.page(url, locale="en-GB")
+    page.get_by_role("button", name="Search the devices").click()
+    stationed(page, "planned")
+    expect(page.locator("#others li")).to_have_count(1)
+    page.get_by_role("button", name="Update 8 devices").click()
+    stationed(page, "good")
+    assert len(list((bench.folder / "reports").glob("*.csv"))) == 8
+
+
+@scenario
 def emulated(bench):
     """The emulated board gets an application's ELF through the page."""
     _, url = bench.ui(bench.arguments.bus)
