@@ -29,6 +29,13 @@ pub fn cargo_on(folder: &Path, line: &str) -> Command {
 
 /// The same for a program that takes the words of cargo.
 pub fn on_workspace(mut command: Command, folder: &Path, line: &str) -> Command {
+    // Those of the package of this program, which cargo has set. The build script of the crate ring looks at them: it and
+    // all that depends on it were compiled again when another shell or job had none.
+    for (name, _) in env::vars_os() {
+        if ["CARGO_PKG_", "CARGO_MANIFEST_"].iter().any(|of| name.to_string_lossy().starts_with(of)) {
+            command.env_remove(name);
+        }
+    }
     let mut words = line.split_ascii_whitespace();
     command.args(words.next()).arg("--manifest-path").arg(folder.join("Cargo.toml")).args(words);
     if env::var_os("CARGO_TARGET_DIR").is_some() {
