@@ -320,6 +320,14 @@ impl Failure {
         Self { told: true, legacy, ..Self::new(exit, None, what, None) }
     }
 
+    /// Nothing on the bus is a device that a package is for.
+    pub(super) fn no_device_for(package: &Path) -> Self {
+        let what = format!("{}: no device on the bus is one that the package is for", package.display());
+        let advice =
+            "look at the bus with coflash scan: check the bit rate, and that the package is for this machine";
+        Self::new(Exit::NoAnswer, None, what, Some(advice.to_string()))
+    }
+
     /// A device that differs from a file in `count` properties; each one was shown.
     pub(super) fn differs(node: NodeId, count: usize) -> Self {
         let what = match count {

@@ -472,10 +472,13 @@ fn summary(
         "foreign": plan.foreign,
         "failed": failed,
     });
-    out.value(&document);
     if let Some(report) = report {
         write_report(report, &document)?;
     }
+    if all == 0 {
+        return Err(Failure::no_device_for(path));
+    }
+    out.value(&document);
     let Some(first) = failures.first() else { return Ok(()) };
     let is_cancelled = failures.iter().any(|failure| failure.exit == Exit::Cancelled);
     let exit = if is_cancelled { Exit::Cancelled } else { Exit::Some };

@@ -92,7 +92,11 @@ pub fn run(
             for step in device.steps.iter().filter(|step| step.entry == at) {
                 let (node, program) = (device.node, entry.name.clone());
                 match &step.todo {
-                    Todo::Has => ended.push((node, Ok(Good::Had))),
+                    // Another machine may be on the bus since then.
+                    Todo::Has => {
+                        let same = is_the_same(adapter, entry, device, options);
+                        ended.push((node, same.map(|_| Good::Had)));
+                    }
                     Todo::Leave(fault) => ended.push((node, Err(Bad::Left(fault.clone())))),
                     Todo::Update if failed.contains(&node) => {
                         ended.push((node, Err(Bad::Left(DeviceFault::EarlierFailed { node, program }))));

@@ -189,6 +189,24 @@ fn an_absent_node_and_one_of_another_type_are_said_and_the_others_go_on() {
     assert!(panel[0x2_0000..].iter().all(|byte| *byte == 0xFF), "nothing was written to the other device");
 }
 
+/// A wrong bus or bit rate is no success.
+#[test]
+fn a_bus_without_any_device_of_the_package_is_an_error() {
+    let folder = folder("machine-none");
+    let nodes = Nodes::start(&folder, STRANGER);
+    let recipe =
+        b"board = 'stm32f407g-disc1'\n[[program]]\nimage = 'drive.bin'\nvendor = 0x3F\nproduct = 1\n";
+    folder.write("line.toml", recipe);
+    let coflash = Coflash::new(&folder, &nodes);
+    coflash.done(&["package", "line.toml"]);
+    let done = coflash.run(&["flash", "line.cpk", "--yes"]);
+    assert_eq!(done.exit, 5, "{}{}", done.out, done.err);
+    assert!(done.err.contains("no device on the bus is one that the package is for"), "{}", done.err);
+    let json = coflash.run(&["flash", "line.cpk", "--yes", "--json"]);
+    let value: Value = serde_json::from_str(&json.out).unwrap();
+    assert_eq!((json.exit, &value["error"]["exit"]), (5, &5.into()));
+}
+
 /// Another tool, on this computer or on another one, is updating a node: the scan of a package does not begin, and
 /// breaks nothing.
 #[test]

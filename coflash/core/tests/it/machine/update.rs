@@ -225,6 +225,14 @@ fn a_device_that_was_exchanged_is_not_written() {
         assert!(fault.to_string().contains(what), "{fault}");
         assert!(is_untouched(&bus.0[0]), "{:?}", bus.0[0].writes());
     }
+    // Nor is it said of another device that it had the program.
+    let mut finished = Bus(vec![device(5, 1234), device(6, 1234)]);
+    finished.0.iter_mut().for_each(|fake| fake.crc_of_application = Some(CRC));
+    let had = planned(&mut finished, &package);
+    assert!(words(&carried_out(&mut finished, &package, &had)).iter().all(|its| its.2 == "had"));
+    finished.0[1].maker = Some(Box::new(Plate([63, 1234, 2, 4711])));
+    let outcomes = carried_out(&mut finished, &package, &had);
+    assert!(matches!(&outcomes[1].result, Err(Bad::Left(fault)) if fault.number() == 0x6000_040C));
     // Bootloader and application may report a part or not, and their revisions may differ.
     bus.0[0].maker = Some(Box::new(Plate([63, 1234, 3, 0])));
     assert_eq!(words(&carried_out(&mut bus, &package, &plan))[0].2, "updated");
