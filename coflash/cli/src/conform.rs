@@ -19,6 +19,7 @@ use serde_json::json;
 use super::context::Context;
 use super::device::cancelled;
 use super::file::{warn, Source};
+use super::keys;
 use super::output::Failure;
 use super::values::{milliseconds, node_id};
 
@@ -102,8 +103,7 @@ impl Conform {
         let means = Means { answer: self.answer_timeout, image, power: self.power() };
         let verdicts = run(&mut *adapter, self.node, &chosen, means, &cancelled()?, tell)?;
         if let Some(path) = &self.junit {
-            std::fs::write(path, junit(&verdicts))
-                .map_err(|error| Failure::system(format!("{}: {error}", path.display())))?;
+            keys::write(path, junit(&verdicts).as_bytes())?;
         }
         let count = |word: &str| verdicts.iter().filter(|v| words(&v.outcome).0 == word).count();
         let (passed, failed, skipped) = (count("passed"), count("FAILED"), count("skipped"));

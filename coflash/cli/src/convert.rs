@@ -185,12 +185,12 @@ impl Convert {
             (board, _) => judge(image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
         }
         if sealing.is_none() {
-            write(&output, &block_file::emit(program))?;
+            keys::write(&output, &block_file::emit(program))?;
         }
         if self.temp {
             let name = output.with_extension("tmp");
             let flash = PathBuf::from(name.file_name().unwrap_or_default());
-            write(&flash, &program.flash_image())?;
+            keys::write(&flash, &program.flash_image())?;
             context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
         }
         if let Some(sealing) = sealing {
@@ -307,9 +307,4 @@ impl Labels {
 fn same_file(one: &Path, other: &Path) -> bool {
     let canonical = |path: &Path| path.canonicalize().ok();
     one == other || canonical(one).is_some_and(|one| canonical(other) == Some(one))
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    std::fs::write(path, bytes)
-        .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", path.display())))
 }

@@ -13,6 +13,7 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::Device;
+use super::keys;
 use super::output::Failure;
 use super::values::{milliseconds, number};
 
@@ -235,9 +236,7 @@ impl Read {
         let bytes = debugger.read(self.address, self.len, &mut |_| {})?;
         let (address, len) = (self.address, bytes.len());
         if let Some(path) = &self.output {
-            std::fs::write(path, &bytes).map_err(|error| {
-                Failure::system(format!("{}: cannot be written: {error}", path.display()))
-            })?;
+            keys::write(path, &bytes)?;
             let words = format!("{len} bytes from {address:08X}h to {}", path.display());
             let value = json!({ "address": address, "size": len, "file": path.display().to_string() });
             return Ok(Done { words, value });

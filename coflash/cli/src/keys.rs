@@ -1,6 +1,6 @@
 //! `coflash key`: keys for sealed images, and certificates of signing keys.
 
-use std::io::{self, Write as _};
+use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
@@ -347,9 +347,28 @@ pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
     bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
 }
 
-/// Writes a file that everyone may read.
+/// Writes a file that everyone may read. It takes the place of another one, but of no private or secret key: nobody
+/// could make that again.
 pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
+    if is_secret_key(path) {
+        let what = format!("{} is a key, which would be lost", path.display());
+        return Err(Failure::usage(
+            what,
+            "name another file; if the key is no longer needed, delete it first",
+        ));
+    }
     std::fs::write(path, bytes).map_err(|error| unwritable(path, &error))
+}
+
+/// Whether a file has a private key or a key-encryption key in PEM.
+fn is_secret_key(path: &Path) -> bool {
+    let mut front = Vec::new();
+    // A pipe would wait for its other end.
+    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
+    let file = is_file.then(|| std::fs::File::open(path).ok()).flatten();
+    let is_read = file.is_some_and(|file| file.take(MAX).read_to_end(&mut front).is_ok());
+    let begins = |line: &str| line.starts_with("-----BEGIN ") && line.contains("KEY-----");
+    is_read && String::from_utf8_lossy(&front).lines().any(|line| begins(line) && !line.contains("PUBLIC"))
 }
 
 /// Writes a file that only its owner may read. Replaces an existing file only if `overwrite` is

@@ -187,6 +187,14 @@ impl Command {
         )
     }
 
+    /// What the command writes into an object, if that may be a password.
+    fn password(&self) -> Option<&str> {
+        match self {
+            Self::Write(write) => write.password(),
+            _ => None,
+        }
+    }
+
     fn run(&self, context: &Context) -> Result<(), Failure> {
         if let Some(bus) = context.bus.as_deref().filter(|_| self.takes_a_bus()) {
             coboot_can::check(bus)?;
@@ -267,7 +275,8 @@ fn main() -> ExitCode {
         }
     };
     let (log, reports) = (cli.log_file.as_deref(), cli.report_dir.as_deref());
-    let begun = record::begin(log, reports, &name, &words(), cli.bus.as_deref());
+    let password = cli.command.password();
+    let begun = record::begin(log, reports, &name, &words(), password, cli.bus.as_deref());
     let result = begun.map_err(Failure::system).and_then(|()| cli.command.run(&cli.context()));
     if let Err(failure) = &result {
         cli.output.failure(failure);

@@ -13,6 +13,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{json, Value};
 
 use super::events::Lines;
+use super::keys;
 use super::output::{Exit, Failure, Output};
 use super::progress::with_rate;
 use super::record;
@@ -172,8 +173,7 @@ pub(super) fn document(outcomes: &[Outcome]) -> Value {
 
 /// Writes the JSON document to a file.
 pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure> {
-    std::fs::write(path, format!("{document:#}\n"))
-        .map_err(|error| Failure::system(format!("{}: cannot be written: {error}", path.display())))
+    keys::write(path, format!("{document:#}\n").as_bytes())
 }
 
 fn outcome_value(outcome: &Outcome) -> Value {

@@ -11,6 +11,7 @@ use serde_json::{json, Value};
 use super::context::Context;
 use super::device::Device;
 use super::dialect::Access;
+use super::keys;
 use super::objects::{self, Names, Object};
 use super::output::{Exit, Failure};
 
@@ -125,9 +126,7 @@ impl Read {
         .map_err(|error| Failure::diagnosed(error, session))?;
         drop(waiting);
         if let Some(path) = &self.output {
-            std::fs::write(path, &bytes).map_err(|error| {
-                Failure::system(format!("{}: cannot be written: {error}", path.display()))
-            })?;
+            keys::write(path, &bytes)?;
         }
         let typed = || object.kind().filter(|_| self.kind == Kind::Auto)?.show(&bytes);
         let shown = match &self.output {

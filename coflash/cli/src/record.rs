@@ -81,6 +81,7 @@ pub(super) fn begin(
     reports: Option<&Path>,
     command: &str,
     words: &[OsString],
+    password: Option<&str>,
     bus: Option<&str>,
 ) -> Result<(), String> {
     let mut logs: Vec<Sink> = log.map(Sink::new).transpose()?.into_iter().collect();
@@ -93,7 +94,7 @@ pub(super) fn begin(
                 "coflash": env!("COFLASH_VERSION"),
                 "system": format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
                 "command": command,
-                "command_line": secrets::without(words),
+                "command_line": secrets::without(words, password),
                 "bus": bus,
                 "began": stamp(wall()),
                 "ended": null,
@@ -112,7 +113,7 @@ pub(super) fn begin(
     };
     if !logs.is_empty() {
         let record = RECORD.get_or_init(|| Record { logs, report });
-        let line: Vec<String> = secrets::without(words);
+        let line = secrets::without(words, password);
         record.note("command", &line.join(" "));
     }
     Ok(())

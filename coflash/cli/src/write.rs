@@ -4,6 +4,7 @@ use std::path::Path;
 
 use clap::builder::PossibleValuesParser;
 use clap::Args;
+use coboot_can::redact::is_password;
 use coflash_core::device::session::UPLOAD_MAX;
 use coflash_core::device::value::DataType;
 use coflash_core::device::Doing;
@@ -12,6 +13,8 @@ use super::context::Context;
 use super::device::Device;
 use super::objects::{bytes_of, Names, Object};
 use super::output::Failure;
+use super::secrets::HIDDEN;
+use super::values::address;
 
 /// The type with the name of a file as its value.
 const FROM_FILE: &str = "domain-from-file";
@@ -46,6 +49,11 @@ pub(super) struct Write {
 }
 
 impl Write {
+    /// The value, if it may be a password. What an object with a name is, only the sheet says.
+    pub(super) fn password(&self) -> Option<&str> {
+        address(&self.object).is_none_or(is_password).then_some(&self.value)
+    }
+
     pub(super) fn run(&self, context: &Context) -> Result<(), Failure> {
         let object = self.names.object(&self.object)?;
         let bytes = self.bytes(&object)?;
@@ -87,7 +95,11 @@ impl Write {
             let advice = "give --type u8, u16, u32, string and so on, or --eds FILE, which knows it";
             return Err(Failure::usage(format!("the type of {object} is unknown"), advice));
         };
-        let refused = |why: String| {
+        let refused = |mut why: String| {
+            // Messages go into records.
+            if is_password(object.at) && !self.value.is_empty() {
+                why = why.replace(&self.value, HIDDEN);
+            }
             Failure::usage(
                 format!("{object}: {why}"),
                 "nothing was sent; give a value that the object accepts",

@@ -148,6 +148,13 @@ fn the_command_makes_and_shows_a_package() {
         (&["package", recipe, "-o", recipe], 2, "replace its recipe"),
         (&["package", recipe, "-o", &aside], 2, "replace its recipe"),
         (&["package", recipe, "-o", &image], 2, "replace an image of its recipe"),
+        (
+            &["package", recipe, "--key", &release, "--cert", &cert, "-o", &release],
+            2,
+            "is a key, which would be lost",
+        ),
+        (&["package", recipe, "-o", &root], 2, "is a key, which would be lost"),
+        (&["convert", &data("plain-400.blk"), &root], 2, "is a key, which would be lost"),
         (&["package", recipe, "--key", &release, "--cert", &cert, "--cert", &cert], 2, "belong to one key"),
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),

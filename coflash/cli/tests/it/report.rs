@@ -144,6 +144,29 @@ fn a_bundle_has_no_secret_and_no_firmware() {
     assert_eq!(text(&members, "20000101T000000-flash-log.txt"), "");
 }
 
+/// Wherever the value stands among the words, with a sheet that names the object, and in the refusal of a value.
+#[test]
+fn a_password_that_write_sends_is_in_no_record() {
+    let folder = folder("written-password");
+    for words in [
+        &["6005/1", "PLANTED-value"][..],
+        &["6005/1", "--type", "string", "PLANTED-value"],
+        &["--type", "string", "0x6005/1", "PLANTED-value"],
+        &["Access code/Code", "PLANTED-value", "--eds", "none.eds"],
+        &["7F50/1", "--type", "u32", "PLANTED-value"],
+    ] {
+        let bus = ["--bus", "socketcand://127.0.0.1:1/can0", "-N", "5"];
+        let done = recorded(&folder, &[&["write"], &bus[..], words].concat(), &[]);
+        assert_ne!(done.exit, 0);
+        let run = runs(&folder).pop().unwrap();
+        let texts = fs::read_dir(&run).unwrap().map(|file| fs::read_to_string(file.unwrap().path()).unwrap());
+        let texts: Vec<_> = texts.collect();
+        assert!(texts.iter().any(|text| text.contains("***")), "{words:?}: {texts:?}");
+        assert!(!texts.iter().any(|text| text.contains("PLANTED")), "{words:?}: {texts:?}");
+        fs::remove_dir_all(run).unwrap();
+    }
+}
+
 /// `monitor` begins while another tool sends a password in segments: what names its object has passed before.
 #[test]
 fn a_record_that_begins_within_a_password_does_not_have_it() {
