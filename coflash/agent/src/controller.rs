@@ -11,7 +11,7 @@ use coflash_core::update::FailedUpdate;
 
 use super::backoff::Jitter;
 use super::config::Attempt;
-use super::ddi::{self, Artifact, Base, Cancel, Deployment, Execution, Finished, Handling};
+use super::ddi::{self, Artifact, Base, Cancel, Deployment, Execution, Finished, Handling, LINES_MOST};
 use super::record::{Finish, Record, RunningAction};
 
 /// What is to be done next. Each step but `Wait` has exactly one answer.
@@ -180,8 +180,8 @@ const FETCHES_MOST: u32 = 12;
 const WRONG_MOST: u32 = 2;
 /// How many messages of progress an action gets: hawkBit keeps 1000.
 const TOLD_MOST: u32 = 100;
-/// How many lines a message has: hawkBit keeps 50.
-const LINES_MOST: usize = 20;
+/// How many lines wait for a message: the longest plan of a machine has a line for each program of 127 devices.
+const PHASES_MOST: usize = 1000;
 /// The progress that is worth a message, in percent.
 const WORTH: u8 = 10;
 
@@ -406,12 +406,14 @@ impl Controller {
             }
             Work::Flashing { task, progress, .. } if progress.news => {
                 if now >= progress.at {
-                    progress.news = false;
+                    let rest = progress.phases.split_off(progress.phases.len().min(LINES_MOST));
+                    progress.news = !rest.is_empty();
                     progress.told = progress.percent;
                     progress.at = now + self.rules.tell;
                     progress.count += 1;
                     let percent = (progress.percent > 0).then_some(progress.percent);
-                    let (action, phases) = (task.action.clone(), std::mem::take(&mut progress.phases));
+                    let (action, phases) =
+                        (task.action.clone(), std::mem::replace(&mut progress.phases, rest));
                     let body =
                         ddi::feedback(&action, Execution::Proceeding, Finished::None, percent, &phases);
                     return self.ask(Ask::Tell { action, body });
@@ -788,7 +790,7 @@ impl Controller {
             }
             News::Phase(words) => {
                 progress.news = progress.count < TOLD_MOST;
-                if progress.phases.len() < LINES_MOST {
+                if progress.phases.len() < PHASES_MOST {
                     progress.phases.push(words.clone());
                 }
                 let words = format!("action {}: {words}", task.action);
@@ -814,8 +816,10 @@ impl Controller {
         let (task, first, tries) = (task.clone(), *first, *tries + 1);
         let phases = std::mem::take(&mut progress.phases);
         // An update without much to do ends before its plan was sent.
-        if progress.news && !phases.is_empty() {
-            self.tell(&task.action, Execution::Proceeding, &phases);
+        if progress.news {
+            for lines in phases.chunks(LINES_MOST) {
+                self.tell(&task.action, Execution::Proceeding, lines);
+            }
         }
         match flashed {
             Flashed::Done(details) => self.end(&task.action, true, details),
@@ -841,6 +845,7 @@ impl Controller {
         let words = details.join("; ");
         let kind = if ok { Kind::Updated } else { Kind::Failed };
         self.say(kind, format!("action {action}: {words}"));
+        let details = ddi::lines(&details);
         self.record.end(Finish { action: action.to_string(), ok, details, reported: false });
         self.unsaved = true;
         self.work = Work::Ended { action: action.to_string() };

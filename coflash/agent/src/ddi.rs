@@ -18,7 +18,7 @@ const NAME_MOST: usize = 255;
 /// The longest part of a wrong value that is shown, in characters.
 const SHOWN_MOST: usize = 40;
 /// The most lines of feedback: hawkBit keeps 50.
-const LINES_MOST: usize = 50;
+pub(super) const LINES_MOST: usize = 50;
 /// The longest line of feedback, in characters: hawkBit keeps 512.
 const LINE_MOST: usize = 500;
 /// The longest key and value of an attribute: hawkBit keeps 32 and 128.
@@ -246,6 +246,17 @@ pub(super) enum Finished {
     Failure,
 }
 
+/// The lines that feedback has of these: no more, and none longer, than the server keeps.
+pub(super) fn lines(details: &[String]) -> Vec<String> {
+    let mut shown: Vec<String> =
+        details.iter().take(LINES_MOST).map(|line| line.chars().take(LINE_MOST).collect()).collect();
+    if let Some(over) = details.len().checked_sub(LINES_MOST).filter(|over| *over > 0) {
+        shown.pop();
+        shown.push(format!("and {} more lines, which the agent's own output has", over + 1));
+    }
+    shown
+}
+
 /// The body of feedback on an action.
 pub(super) fn feedback(
     action: &str,
@@ -254,15 +265,9 @@ pub(super) fn feedback(
     percent: Option<u8>,
     details: &[String],
 ) -> serde_json::Value {
-    let mut shown: Vec<String> =
-        details.iter().take(LINES_MOST).map(|line| line.chars().take(LINE_MOST).collect()).collect();
-    if let Some(over) = details.len().checked_sub(LINES_MOST).filter(|over| *over > 0) {
-        shown.pop();
-        shown.push(format!("and {} more lines, which the agent's own output has", over + 1));
-    }
     let mut body = serde_json::json!({
         "id": action,
-        "status": { "execution": execution, "result": { "finished": finished }, "details": shown },
+        "status": { "execution": execution, "result": { "finished": finished }, "details": lines(details) },
     });
     if let Some(percent) = percent {
         body["status"]["result"]["progress"] = serde_json::json!({ "cnt": percent, "of": 100 });

@@ -13,8 +13,6 @@ use coflash_core::file::sealed::show::digits;
 
 /// The number of ended actions that are kept.
 const ENDED_MOST: usize = 16;
-/// The largest file.
-const SIZE_MOST: usize = 256 * 1024;
 
 /// What is known about the actions of a device.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -106,9 +104,8 @@ impl Store {
             )
         };
         let text = match coflash_core::file::limit::read_text(&path) {
-            Ok(text) if text.len() <= SIZE_MOST => text,
+            Ok(text) => text,
             Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Record::new(of)),
-            Ok(_) => return Err(damaged(&"it is too large for a state file")),
             Err(error) => return Err(damaged(&error)),
         };
         let record: Record = serde_json::from_str(&text)
@@ -174,8 +171,8 @@ mod tests {
         let strange = r#"{"of":"here","begun":{"action":"../../x","kept":false},"ended":[]}"#;
         fs::write(store.path("door", "json"), strange).unwrap();
         assert!(store.load("door", "here").unwrap_err().contains("impossible id"));
-        fs::write(store.path("door", "json"), "[".repeat(SIZE_MOST + 1)).unwrap();
-        assert!(store.load("door", "here").unwrap_err().contains("too large"));
+        fs::write(store.path("door", "json"), "[".repeat((1 << 20) + 1)).unwrap();
+        assert!(store.load("door", "here").unwrap_err().contains("more than 1048576 bytes"));
         fs::remove_file(store.path("door", "new")).unwrap();
         fs::create_dir(store.path("door", "new")).unwrap();
         let why = store.save("door", &record).unwrap_err();

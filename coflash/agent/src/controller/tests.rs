@@ -577,6 +577,31 @@ fn what_was_not_told_before_the_end_is_told_with_it() {
     assert_eq!(drive.feedback(), told("deploymentBase/8", "closed", "success"));
 }
 
+/// A plan has more lines than a message.
+#[test]
+fn a_long_plan_is_told_in_several_messages() {
+    let mut drive = Drive::new();
+    drive.go_to_flash();
+    let plan: Vec<String> = (1..=120).map(|node| format!("node {node}: drive: it has 1.0.0")).collect();
+    plan.iter().for_each(|line| drive.controller.news(News::Phase(line.clone())));
+    let mut told = Vec::new();
+    let mut message = |drive: &mut Drive| {
+        let Request::Post(_, body) = drive.asks() else { panic!("no feedback") };
+        let lines = body["status"]["details"].as_array().unwrap();
+        assert!(lines.len() <= 50, "hawkBit keeps 50");
+        told.extend(lines.iter().map(|line| line.as_str().unwrap().to_string()));
+        drive.answer(200, &json!({}));
+    };
+    message(&mut drive);
+    drive.controller.flashed(drive.now, Flashed::Done(vec!["drive: had it before".into(); 60]));
+    message(&mut drive);
+    message(&mut drive);
+    assert_eq!(told, plan);
+    assert_eq!(drive.feedback(), self::told("deploymentBase/8", "closed", "success"));
+    // A state file that was written can be read again.
+    assert_eq!(drive.disk.ended.last().unwrap().details.len(), 50);
+}
+
 #[test]
 fn a_bus_in_use_is_waited_for_and_the_update_may_be_cancelled_meanwhile() {
     let mut drive = Drive::new();
