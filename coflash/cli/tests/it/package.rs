@@ -47,6 +47,25 @@ fn the_documentations_example_is_a_recipe() {
     assert_eq!(counts, [(None, false), (Some(4), false), (None, true)]);
 }
 
+/// One image with two settings is two programs: the second has a name that no other image has.
+#[test]
+fn the_programs_of_a_job_have_names_of_their_own() {
+    let folder = folder("recipe-job");
+    for name in ["app.blk", "app (2).blk"] {
+        fs::copy(data("plain-400.blk"), folder.join(name)).unwrap();
+    }
+    let job = "[[device]]\nnode = 5\nimage = 'app.blk'\n[[device]]\nnode = 6\nimage = 'app (2).blk'\n\
+               [[device]]\nnode = 7\nimage = 'app.blk'\nverify = true\n";
+    let parts = Recipe::of_job(job, &folder).unwrap().parts;
+    let names: Vec<_> = parts.iter().map(|part| part.entry.name.as_str()).collect();
+    assert_eq!(names, ["app", "app (2)", "app (3)"]);
+    Package::parse(&make(None, None, &parts, &[]).unwrap()).unwrap();
+    fs::write(folder.join("a.bin"), binary()).unwrap();
+    let checked = "board = 'stm32f407g-disc1'\n[[device]]\nnode = 5\nimage = 'a.bin'\ncheck-target = true\n";
+    let fault = Recipe::of_job(checked, &folder).unwrap_err().to_string();
+    assert!(fault.contains("does not say for which device") && fault.contains("no check-target"), "{fault}");
+}
+
 /// A sealed image names its device; a plain program without a label does not.
 #[test]
 fn a_file_that_names_its_device_needs_no_other_name() {

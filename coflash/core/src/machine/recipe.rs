@@ -1,5 +1,6 @@
 //! The recipe of a package, `machine.toml`: which files become which programs of which devices.
 
+use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -122,11 +123,13 @@ impl Recipe {
             recipe.parts.push(part);
         }
         // Two images, or one image with two settings, may have one name.
-        for at in 1..recipe.parts.len() {
-            let (before, rest) = recipe.parts.split_at_mut(at);
-            let Some(Part { entry, .. }) = rest.first_mut() else { continue };
-            if before.iter().any(|part| part.entry.name == entry.name) {
-                entry.name = format!("{} ({})", entry.name, at + 1);
+        let mut taken: BTreeSet<String> = recipe.parts.iter().map(|part| part.entry.name.clone()).collect();
+        let mut met = BTreeSet::new();
+        for Part { entry, .. } in &mut recipe.parts {
+            if !met.insert(entry.name.clone()) {
+                let mut names = (2_u32..).map(|number| format!("{} ({number})", entry.name));
+                entry.name = names.find(|name| !taken.contains(name)).unwrap_or_default();
+                taken.insert(entry.name.clone());
             }
         }
         Ok(recipe)
@@ -169,9 +172,12 @@ impl Row {
         let identity = match (self.vendor, self.product) {
             (Some(vendor), Some(product)) => Some(Identity { vendor, product, revision: self.revision }),
             (None, None) if self.nodes.is_empty() || self.revision.is_some() || self.check_target => {
-                let target = target(&program).ok_or(
-                    "the file does not say for which device it is: give nodes, or vendor and product",
-                )?;
+                let advice = match self.nodes.as_slice() {
+                    [] => "give nodes, or vendor and product",
+                    _ => "it cannot be checked; give no revision without vendor and product, and no check-target",
+                };
+                let fault = || format!("the file does not say for which device it is: {advice}");
+                let target = target(&program).ok_or_else(fault)?;
                 Some(Identity { revision: self.revision, ..target })
             }
             (None, None) => None,
