@@ -847,7 +847,9 @@ def service_looks(bench):
     bench.nodes(port, *TWO)
     package = bench.package(
         (bench.image("drive", size=200 * 1024), f"nodes = [5]\nvendor = {VENDOR}\nproduct = {PRODUCT}"),
-        (bench.image("valve", vendor=0x63, product=2), "nodes = [9]\nvendor = 0x63\nproduct = 2"))
+        (bench.image("valve", vendor=0x63, product=2), "nodes = [9]\nvendor = 0x63\nproduct = 2"),
+        # A script could take these characters of a name for a pattern.
+        (bench.image("tap", vendor=0x63, product=3), "name = '$& {found} $$'\nvendor = 0x63\nproduct = 3\ncount = 2"))
     _, url = bench.ui(f"socketcand://127.0.0.1:{port}/can0", "--service", package, "--report-dir", bench.folder / "reports")
     kinds = [(width, scheme, locale) for width in (1280, 800, 390) for scheme in ("light", "dark") for locale in ("en-GB", "de-DE")]
 
@@ -859,6 +861,7 @@ def service_looks(bench):
             bench.picture(page, f"service-{step}-{width}-{scheme}-{locale[:2]}")
             readable(page, width, f"{step} {width} {scheme} {locale}")
             if step == "bad":
+                expect(page.locator("#rows")).to_contain_text("$& {found} $$: 2 ")
                 part = "Hersteller-ID" if locale == "de-DE" else "Vendor-ID"
                 expect(page.locator("#others li")).to_have_text(re.compile(rf"6: .+ · {part}.+: [0-9A-F]{{8}}h / [0-9A-F]{{8}}h / "))
             page.context.close()

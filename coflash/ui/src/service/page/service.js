@@ -31,7 +31,8 @@ let shown = "";
 
 /** The text with this key in the language of the user. */
 function t(key, values = {}) {
-  return Object.entries(values).reduce((all, [name, value]) => all.replaceAll(`{${name}}`, value), words[key][language]);
+  // A name may have any text: what is filled in is no pattern, and is not filled in again.
+  return words[key][language].replace(/\{(\w+)\}/g, (whole, name) => values[name] ?? whole);
 }
 
 const hex = (number) => number.toString(16).toUpperCase().padStart(8, "0") + "h";
