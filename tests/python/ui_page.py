@@ -608,6 +608,9 @@ def press(page, name):
     page.keyboard.press("Enter")
 
 
+# Counts the clicks of a page: a pressed key that presses a button is one, too.
+CLICKS = "() => { window.clicks = 0; document.addEventListener('click', () => (window.clicks += 1), true); }"
+
 # Counts the tones that a page plays.
 TONES = """() => {
   window.tones = 0;
@@ -654,6 +657,10 @@ def service(bench):
     page_words = page.locator("body").inner_text()
     for word in ["LSS", "Erase", "Löschen", "stm32", "Board"]:
         assert word not in page_words, word
+    page.evaluate(CLICKS)
+    reach(page, "Verbinden")
+    page.keyboard.type("4711\n\n")
+    assert page.evaluate("window.clicks") == 0, "there is no field for a barcode yet, and it presses no button"
     reach(page, "adapter-list")
     page.keyboard.press("End")
     reach(page, "address")
@@ -681,18 +688,25 @@ def service(bench):
     expect(page.locator('.device[data-node="5"]')).to_contain_text("drive: kein Programm → CRC ")
     # A number that is read again replaces the last one.
     reach(page, "2 Geräte aktualisieren")
-    page.keyboard.type("4712\n")
+    page.evaluate(CLICKS)
+    # A reader may send Enter twice (CR LF), or hold it.
+    page.keyboard.type("4712\n\n")
     expect(page.locator("#device-number")).to_have_value("4712")
-    # Enter leads to the button; it is pressed by a person.
-    assert page.evaluate("document.activeElement.id") == "update"
+    page.keyboard.down("Enter")
+    page.keyboard.down("Enter")
+    page.keyboard.up("Enter")
+    page.keyboard.type("4713\n\n")
+    expect(page.locator("#device-number")).to_have_value("4713")
+    # The button is pressed by a person.
+    assert page.evaluate("window.clicks") == 0, page.evaluate("window.clicks")
     assert not reports(bench), reports(bench)
     # The third press.
-    page.keyboard.press("Enter")
+    press(page, "2 Geräte aktualisieren")
     stationed(page, "working")
     expect(page.locator('.device[data-state="state-working"]').first).to_contain_text("%")
     expect(page.locator("#device-number")).to_have_value("")
     stationed(page, "good")
-    expect(page.locator("#number")).to_have_text("Gerätenummer: 4712")
+    expect(page.locator("#number")).to_have_text("Gerätenummer: 4713")
     expect(page.locator("#saved-count")).to_have_text("2 Berichte sind gespeichert:")
     assert page.evaluate("window.tones") == 2, page.evaluate("window.tones")
     saved = reports(bench)
@@ -700,14 +714,14 @@ def service(bench):
     for rows in saved.values():
         (row,) = rows
         assert (row["result"], row["program"], row["from"]) == ("updated", "drive", ""), row
-        assert (row["operator"], row["order"], row["device_number"]) == ("Jörg", "A-77", "4712"), row
+        assert (row["operator"], row["order"], row["device_number"]) == ("Jörg", "A-77", "4713"), row
         assert (row["package"], row["release"], row["file"]) == ("Press 4", "2026-11", "machine.cpk"), row
     # The report is that of a user with this language, and needs no script.
     html = next((bench.folder / "reports").glob("*.html"))
     report = page.context.new_page()
     report.goto(html.as_uri())
     expect(report.locator("h1")).to_have_text("Bericht über ein Update")
-    expect(report.locator("body")).to_contain_text("4712")
+    expect(report.locator("body")).to_contain_text("4713")
     bench.picture(report, "service-report")
     report.close()
     # What is done is not done again.
@@ -791,6 +805,8 @@ def service_full(bench):
     writing(page)
     page.get_by_role("button", name="Stop").click()
     assert page.evaluate("document.activeElement.textContent") == "Go on"
+    page.keyboard.type("4711\n")
+    expect(page.locator("#confirm")).to_be_visible()
     page.get_by_role("button", name="Stop the update").click()
     stationed(page, "bad")
     expect(page.locator('.device[data-node="6"]')).to_contain_text("It was stopped.")

@@ -246,7 +246,7 @@ function enter(field, value) {
   field.dispatchEvent(new Event("input"));
 }
 
-/** A barcode reader types its characters and Enter, whatever has the focus. */
+/** A barcode reader types its characters and Enter, some Enter twice, whatever has the focus. It presses no button. */
 function barcodes() {
   const fields = FIELDS.map($);
   const next = () => fields.find((field) => field.value === "");
@@ -254,12 +254,22 @@ function barcodes() {
     field.addEventListener("keydown", (event) => {
       if (event.key !== "Enter" || event.isComposing) return;
       event.preventDefault();
-      const button = $("update").hidden || $("update").disabled ? $("search") : $("update");
-      (next() ?? button).focus();
+      // The number that is read next replaces this one.
+      const field = next() ?? $("device-number");
+      field.focus();
+      field.select();
     });
   }
+  // Whether the last keys were characters, or characters and Enter: the next Enter is a reader's.
+  let isRead = false;
+  document.addEventListener("pointerdown", () => (isRead = false));
   document.addEventListener("keydown", (event) => {
+    if (event.key === "Enter") {
+      if ((isRead || event.repeat) && event.target.matches("button")) event.preventDefault();
+      return;
+    }
     const isCharacter = event.key.length === 1 && event.key !== " " && !event.ctrlKey && !event.altKey && !event.metaKey;
+    isRead = isCharacter;
     if (!isCharacter || $("report").hidden || $("confirm").open || event.target.matches("input[type=text], input[type=password], select")) return;
     event.preventDefault();
     // Of a station at work, the number is what changes from machine to machine.
