@@ -6,8 +6,10 @@ use std::path::{Path, PathBuf};
 
 /// The most reports with one name: those of one device in one second.
 const SAME: u32 = 100;
-/// More than the two files of one report have.
-const ROOM: usize = 32 * 1024;
+/// The files of one report.
+const FILES: usize = 2;
+/// More than one of them has, in bytes.
+const ROOM: usize = 16 * 1024;
 
 /// A folder that files can be written into, or could be at the start.
 #[derive(Clone, Debug)]
@@ -34,13 +36,22 @@ impl Folder {
     /// # Errors
     /// The error of the system.
     pub(super) fn check(&self, reports: usize) -> io::Result<()> {
-        let path = self.0.join(format!(".coflash-{}", std::process::id()));
-        let written = File::create(&path).and_then(|mut file| {
-            file.write_all(&vec![0; ROOM * reports])?;
-            file.sync_all()
-        });
-        let removed = fs::remove_file(&path);
+        let mut made = Vec::new();
+        let written = self.fill(FILES * reports, &mut made);
+        let removed = made.iter().map(fs::remove_file).fold(Ok(()), io::Result::and);
         written.and(removed)
+    }
+
+    /// Writes files of the size of a report's: a file system may have room in bytes, and for no more files.
+    fn fill(&self, files: usize, made: &mut Vec<PathBuf>) -> io::Result<()> {
+        for number in 0..files {
+            let path = self.0.join(format!(".coflash-{}-{number}", std::process::id()));
+            let mut file = File::create(&path)?;
+            made.push(path);
+            file.write_all(&[0; ROOM])?;
+            file.sync_all()?;
+        }
+        Ok(())
     }
 
     /// Saves contents as files of one name, each with its ending, and returns the name. No file is replaced; if one
@@ -98,6 +109,11 @@ mod tests {
         names.sort();
         assert_eq!(names, ["a.csv", "a.html", "a_2.csv", "a_2.html", "b.csv", "b_2.csv", "b_2.html"]);
         assert_eq!(fs::read_to_string(folder.path().join("b.csv")).unwrap(), "precious");
+        // Two reports need room for four files.
+        let mut made = Vec::new();
+        folder.fill(FILES * 2, &mut made).unwrap();
+        assert!(made.len() == 4 && made.iter().all(|path| path.exists()), "{made:?}");
+        assert!(folder.check(2).is_ok() && made.iter().all(|path| !path.exists()), "{made:?}");
         // A file where the folder was.
         fs::remove_dir_all(folder.path()).unwrap();
         fs::write(place.join("new"), "").unwrap();

@@ -115,8 +115,8 @@ impl Station {
         self.save();
     }
 
-    /// Saves the reports that are not saved yet. Returns whether all are.
-    pub(super) fn save(&self) -> bool {
+    /// Saves the reports that are not saved yet. Returns why some still are not.
+    pub(super) fn save(&self) -> Option<Message> {
         let mut unsaved = lock(&self.unsaved);
         let mut saved = Vec::new();
         let mut why = None;
@@ -133,9 +133,9 @@ impl Station {
         let left = unsaved.len();
         self.change(|state| {
             state.saved.extend(saved);
-            (state.unsaved, state.why) = (left, why);
+            (state.unsaved, state.why) = (left, why.clone());
         });
-        left == 0
+        why
     }
 
     /// The reports that are not saved, one a line; none if all are.

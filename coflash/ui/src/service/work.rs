@@ -142,8 +142,10 @@ impl Work for Update {
         let Link::Bus(adapter) = link else {
             return refused(station, shared, back(), Message::new("gateway"));
         };
-        // No device is changed whose outcome could not be kept.
-        station.save();
+        // No device is changed whose outcome could not be kept, and none while an earlier one is not.
+        if let Some(message) = station.save() {
+            return refused(station, shared, back(), message);
+        }
         if let Err(error) = service.folder.check(rows.len()) {
             return refused(station, shared, back(), unsaved(&error, service.folder.path()));
         }

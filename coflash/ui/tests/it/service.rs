@@ -330,6 +330,18 @@ fn what_cannot_be_saved_is_kept_and_nothing_more_is_begun() {
     assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
     let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
     assert_eq!(state["unsaved"], 1);
+    // The folder takes files again, but this report has no name there.
+    fs::remove_file(&reports).unwrap();
+    fs::rename(&away, &reports).unwrap();
+    let date = report.head.split("filename=\"").nth(1).unwrap().split("z_node").next().unwrap();
+    let name = format!("{date}Z_node-5_000003EDh");
+    let taken = (2..=100).map(|count| format!("{name}_{count}.html")).chain([format!("{name}.html")]);
+    let taken: Vec<PathBuf> = taken.map(|name| reports.join(name)).collect();
+    taken.iter().for_each(|path| fs::write(path, "").unwrap());
+    assert_eq!(confirm(&ui, &plan, &[6]).status, 200);
+    let state = ui.until("the refusal", |state| !state["message"].is_null() && state["busy"] == false);
+    assert_eq!((&state["message"]["key"], &state["unsaved"]), (&json!("not-saved"), &json!(1)));
+    assert_eq!(rows(&state), [(5, "state-due"), (6, "state-due")]);
     // The end of the server says what is lost with it.
     let words = ui.finish().expect("a report is not saved");
     assert!(
