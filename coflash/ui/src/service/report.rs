@@ -119,7 +119,7 @@ impl Report {
         rows.iter().map(|cells| cells.join("; ")).collect::<Vec<_>>().join("\n")
     }
 
-    /// The cells of a line for each program; of one without programs, for the device.
+    /// The cells of a line for each program; of a device that is missing, for the one that it should have.
     fn cells(&self) -> Vec<Vec<String>> {
         let Self { row, of } = self;
         let Of { date, entered, package, release, file, adapter, .. } = &**of;
@@ -150,8 +150,9 @@ impl Report {
             format!("coflash {}", env!("CARGO_PKG_VERSION")),
         ];
         let line = |program: [String; 4]| [&head[..], &program, &tail].concat();
-        if row.steps.is_empty() {
-            return vec![line(Default::default())];
+        if let Some(program) = &row.missing {
+            let (from, to) = (String::new(), String::new());
+            return vec![line([program.clone(), from, to, word(row.state).to_owned()])];
         }
         let of_step = |step: &Step| {
             let (from, to) = (step.from.clone().unwrap_or_default(), step.to.clone());
@@ -300,6 +301,7 @@ mod tests {
             identity: [Some(1), Some(2), Some(3), Some(0x100 + u32::from(node))],
             state: RowState::Updated,
             steps: vec![step],
+            missing: None,
             trouble: None,
             left: None,
             percent: None,

@@ -32,6 +32,9 @@ pub(super) struct Row {
     pub(super) identity: [Option<u32>; 4],
     pub(super) state: RowState,
     pub(super) steps: Vec<Step>,
+    /// The program of a device that is missing.
+    #[serde(skip)]
+    pub(super) missing: Option<String>,
     /// What went wrong.
     pub(super) trouble: Option<Message>,
     /// The key of what is in the device after that.
@@ -105,6 +108,7 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
             identity: device.identity,
             state: RowState::Has,
             steps: steps.collect(),
+            missing: None,
             trouble: device.steps.iter().find_map(|step| match &step.todo {
                 Todo::Leave(fault) => Some(trouble::of_device(fault)),
                 Todo::Has | Todo::Update => None,
@@ -121,7 +125,8 @@ pub(super) fn rows(plan: &Plan) -> Vec<Row> {
         identity: [None; 4],
         state: RowState::Failed,
         steps: Vec::new(),
-        trouble: Some(trouble::of_device(&missing.fault)),
+        missing: Some(missing.program.clone()),
+        trouble: Some(trouble::of_missing(missing)),
         left: None,
         percent: None,
     });

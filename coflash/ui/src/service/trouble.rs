@@ -1,7 +1,7 @@
 //! Which message an error has: what a person at the machine can do about it.
 
 use coflash_core::device::{Doing, Error};
-use coflash_core::machine::{Bad, DeviceFault, Outcome};
+use coflash_core::machine::{Bad, DeviceFault, Missing, Outcome};
 use coflash_core::update::DeviceState;
 
 use super::message::Message;
@@ -83,6 +83,16 @@ pub(super) fn of_device(fault: &DeviceFault) -> Message {
         _ => Message::new("trouble-other"),
     };
     message.detail(fault).number(fault.number())
+}
+
+/// The message of what is missing, with the node-ID and the program: a report has it without its row.
+pub(super) fn of_missing(missing: &Missing) -> Message {
+    let message = of_device(&missing.fault);
+    match missing.node {
+        Some(node) => message.value("node", node).value("program", &missing.program),
+        // Its message has the program.
+        None => message,
+    }
 }
 
 /// Whether a device was not updated because its password is missing or wrong.

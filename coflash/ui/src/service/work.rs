@@ -178,7 +178,7 @@ impl Work for Update {
             release: manifest.release.clone(),
             file: service.file.clone(),
             adapter: shared.look(|state| state.adapter.url.clone()),
-            missing: self.plan.missing.iter().map(|missing| trouble::of_device(&missing.fault)).collect(),
+            missing: self.plan.missing.iter().map(trouble::of_missing).collect(),
         };
         station.keep(reports(&rows, &Arc::new(of)));
         shared.change(|state| {

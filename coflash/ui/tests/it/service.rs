@@ -177,6 +177,7 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     assert_eq!(plan["rows"][0]["steps"][0]["from"], "CRC 12345678h");
     assert_eq!(plan["rows"][2]["trouble"]["key"], "trouble-absent");
     assert_eq!(plan["rows"][2]["trouble"]["number"], 0x6000_0013);
+    assert_eq!(plan["rows"][2]["trouble"]["values"], json!({ "node": "9", "program": "panel" }));
     assert_eq!((&plan["others"][0]["node"], &plan["others"][0]["identity"][1]), (&json!(20), &json!(99)));
     assert_eq!((plan["others"].as_array().unwrap().len(), &plan["others"][0]["trouble"]), (1, &Value::Null));
     for (nodes, status) in
@@ -215,10 +216,12 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
         "{}",
         reports[0].1
     );
-    assert!(reports[2].1.contains(",0x60000013,"), "{}", reports[2].1);
+    assert!(reports[2].1.contains(",panel,,,failed,0x60000013,"), "{}", reports[2].1);
     let pages = saved(&folder, "html");
     assert_eq!(pages.len(), 3);
     assert!(pages.iter().all(|(_, page)| page.contains("lang=\"de\"") && page.contains("4711")), "{pages:?}");
+    let missing = "Knoten 9 (panel): Das Gerät ist nicht am Bus.";
+    assert!(pages.iter().all(|(_, page)| page.contains(missing)), "{pages:?}");
     // The adapter is that of the next start.
     assert_eq!(fs::read_to_string(folder.join("bus")).unwrap(), bus);
     assert_eq!(ui.finish(), None);
