@@ -350,7 +350,8 @@ mod tests {
         assert!(html(&german).contains("lang=\"de\"") && html(&german).contains("Seriennummer"));
         assert!(html(&english).contains("lang=\"en\"") && html(&english).contains("Serial number"));
         // What the programs came from has its name in either language.
-        assert!(html(&german).contains("Auftragsdatei") && html(&english).contains("Job file"));
+        assert!(html(&german).contains("Job-Datei") && html(&english).contains("Job file"));
+        assert!(html(&german).contains("<th>Software</th>") && html(&english).contains("<th>Tool</th>"));
         assert_eq!(german.csv(), english.csv());
     }
 

@@ -36,6 +36,7 @@ pub(super) const KEYS: &[&str] = &[
     "hint-ready",
     "hint-planned",
     "hint-planned-bad",
+    "hint-incomplete",
     "hint-none",
     "hint-working",
     "hint-good",
@@ -194,7 +195,7 @@ impl Station {
             (Stage::Planned { .. }, Connection::Open) if rows.iter().all(is_good) => {
                 ("complete", Some("hint-good"))
             }
-            (Stage::Planned { .. }, Connection::Open) => ("bad", Some("hint-bad")),
+            (Stage::Planned { .. }, Connection::Open) => ("planned-bad", Some("hint-incomplete")),
         };
         let notice = shown.notice.as_ref().filter(|notice| !notice.ok);
         let message = match (&adapter.words, &own.message, notice) {

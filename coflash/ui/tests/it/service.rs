@@ -233,6 +233,20 @@ fn a_machine_is_updated_and_each_device_has_its_report() {
     assert_eq!(ui.until("the adapter", |state| state["open"] == true)["adapter"], json!(next));
 }
 
+/// One device has its program, the other one is missing: nothing was updated or was to be.
+#[test]
+fn a_search_alone_speaks_of_no_update() {
+    let folder = kit::folder!("service-incomplete");
+    let package = package(&folder, DRIVES);
+    let (mut has, _) = device(6, 1234);
+    has.crc_of_application = Some(package.programs().next().unwrap().1.crc());
+    let (bus, _server) = kit::fake::serve(Bus(vec![has]));
+    let ui = station(&folder, package, Some(bus));
+    let plan = planned(&ui);
+    assert_eq!(rows(&plan), [(6, "state-has"), (5, "state-failed")]);
+    assert_eq!((&plan["station"], &plan["hint"]), (&json!("planned-bad"), &json!("hint-incomplete")));
+}
+
 /// Somebody puts another device to the node while the plan is on the screen.
 #[test]
 fn a_device_that_is_exchanged_in_mid_plan_gets_nothing() {
