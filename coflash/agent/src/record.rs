@@ -160,6 +160,9 @@ mod tests {
         (0..40).for_each(|action| record.end(finish(action)));
         assert_eq!(record.begun, None, "20 has ended");
         assert_eq!((record.ended.len(), record.ended[0].action.as_str()), (16, "24"));
+        // Machines of many devices, of which each has failed.
+        let long = super::super::ddi::lines(&vec!["x".repeat(1000); 1000]);
+        (40..80).for_each(|action| record.end(Finish { details: long.clone(), ..finish(action) }));
         store.save("door", &record).unwrap();
         // A new file that was not finished when the power went does not count.
         fs::write(store.path("door", "new"), "{").unwrap();

@@ -347,17 +347,19 @@ pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
     bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
 }
 
-/// Writes a file that everyone may read. It takes the place of another one, but of no private or secret key: nobody
-/// could make that again.
+/// Writes a file that everyone may read. It takes the place of another one, but of [no key](spare).
 pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    if is_secret_key(path) {
-        let what = format!("{} is a key, which would be lost", path.display());
-        return Err(Failure::usage(
-            what,
-            "name another file; if the key is no longer needed, delete it first",
-        ));
-    }
+    spare(path)?;
     std::fs::write(path, bytes).map_err(|error| unwritable(path, &error))
+}
+
+/// Refuses to let an output take the place of a private key or a key-encryption key: nobody could make it again.
+pub(super) fn spare(path: &Path) -> Result<(), Failure> {
+    if !is_secret_key(path) {
+        return Ok(());
+    }
+    let what = format!("{} is a key, which would be lost", path.display());
+    Err(Failure::usage(what, "name another file; if the key is no longer needed, delete it first"))
 }
 
 /// Whether a file has a private key or a key-encryption key in PEM.

@@ -276,8 +276,10 @@ fn main() -> ExitCode {
     };
     let (log, reports) = (cli.log_file.as_deref(), cli.report_dir.as_deref());
     let password = cli.command.password();
-    let begun = record::begin(log, reports, &name, &words(), password, cli.bus.as_deref());
-    let result = begun.map_err(Failure::system).and_then(|()| cli.command.run(&cli.context()));
+    let begin = || record::begin(log, reports, &name, &words(), password, cli.bus.as_deref());
+    let spared = [log, cli.trace.as_deref()].into_iter().flatten().try_for_each(keys::spare);
+    let begun = spared.and_then(|()| begin().map_err(Failure::system));
+    let result = begun.and_then(|()| cli.command.run(&cli.context()));
     if let Err(failure) = &result {
         cli.output.failure(failure);
     }

@@ -598,7 +598,7 @@ fn a_long_plan_is_told_in_several_messages() {
     message(&mut drive);
     assert_eq!(told, plan);
     assert_eq!(drive.feedback(), self::told("deploymentBase/8", "closed", "success"));
-    // A state file that was written can be read again.
+    // The state file has the lines that the server gets.
     assert_eq!(drive.disk.ended.last().unwrap().details.len(), 50);
 }
 

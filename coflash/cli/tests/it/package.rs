@@ -174,6 +174,8 @@ fn the_command_makes_and_shows_a_package() {
         ),
         (&["package", recipe, "-o", &root], 2, "is a key, which would be lost"),
         (&["convert", &data("plain-400.blk"), &root], 2, "is a key, which would be lost"),
+        (&["inspect", package, "--log-file", &root], 2, "is a key, which would be lost"),
+        (&["scan", "--bus", "slcan:no-such-port", "--trace", &root], 2, "is a key, which would be lost"),
         (&["package", recipe, "--key", &release, "--cert", &cert, "--cert", &cert], 2, "belong to one key"),
         (&["package", package], 3, "line"),
         (&["flash", package, "--node", "5"], 2, "--node has no meaning beside a package"),

@@ -52,10 +52,14 @@ impl Language {
 
     /// A message in this language.
     pub(super) fn message(self, message: &Message) -> String {
-        let text = self.text(message.key).to_owned();
-        let fill =
-            |text: String, (name, value): (&&str, &String)| text.replace(&format!("{{{name}}}"), value);
-        message.values.iter().fold(text, fill)
+        let mut parts = self.text(message.key).split('{');
+        let mut filled = parts.next().unwrap_or_default().to_owned();
+        // What is filled in may have braces, and is not filled in again.
+        for (name, rest) in parts.filter_map(|part| part.split_once('}')) {
+            filled.push_str(message.values.get(name).map_or("", String::as_str));
+            filled.push_str(rest);
+        }
+        filled
     }
 }
 
@@ -90,6 +94,17 @@ mod tests {
         // A key that is there twice would hide a text.
         let lines: Vec<&str> = TABLE.lines().filter_map(|line| line.trim().strip_prefix('"')).collect();
         assert_eq!(lines.len(), TEXTS.len(), "one text a line, and no key twice");
+    }
+
+    /// A program may have the name of another value.
+    #[test]
+    fn what_is_filled_in_is_not_filled_in_again() {
+        let message = Message::new("trouble-too-few")
+            .value("program", "{found}")
+            .value("expected", 2)
+            .value("found", 0);
+        let said = Language::En.message(&message);
+        assert!(said.starts_with("{found}: 2 devices are expected, and 0 found."), "{said}");
     }
 
     /// A station works with a package or with a job file: one text names the package, and the others suit both.
