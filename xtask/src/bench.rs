@@ -1,6 +1,6 @@
 //! `cargo xtask bench`: measures how fast a program is downloaded, and the load on the host.
 
-use serde_json::json;
+use serde_json::{json, Value};
 
 use crate::args::Args;
 use crate::setup::{self, Part};
@@ -33,9 +33,12 @@ pub fn run(mut args: Args) -> Outcome {
         let mut facts = process::json(&process::output(bench.arg("--json"))?)?;
         facts["host"] = process::json(&process::output(cost()?.arg("--json"))?)?;
         println!("{facts:#}");
-        // The least share of what wire and flash allow.
+        // The least share of what wire and flash allow, and how many downloads have no measure or no limit.
         let percents = process::list(&facts, "downloads").filter_map(|row| row["percent"].as_u64());
-        facts["percent"] = json!(percents.min());
+        let numbers = ["percent", "measured_us", "wire_limit_us", "flash_limit_us"];
+        let is_whole = |row: &&Value| numbers.iter().all(|name| row[name].as_f64() > Some(0.0));
+        let failed = process::list(&facts, "downloads").filter(|row| !is_whole(row)).count();
+        (facts["percent"], facts["failed"]) = (json!(percents.min()), json!(failed));
         return evidence::record("bench", facts);
     }
     process::run(&mut bench)?;

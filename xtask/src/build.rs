@@ -43,8 +43,7 @@ pub struct Variant {
     pub least_programs: usize,
 }
 
-/// The rows as written, followed by one row for each feature with each product, on boards with two
-/// programs.
+/// The rows as written, followed by one row for each feature with each product, on boards with two programs.
 macro_rules! table {
     ($($row:expr,)+; $($feature:literal with $($product:literal),+;)+) => {
         &[$($row,)+ $($(Variant {
@@ -169,8 +168,7 @@ impl Variant {
     }
 }
 
-/// The flash regions of the bootloaders of a board: that of the resident part, and in the split map
-/// that of the RAM image.
+/// The flash regions of the bootloaders of a board: of the resident part, and in the split map of the RAM image.
 pub fn bootloader_flash(board: &Layout) -> Vec<Region> {
     [Some(board.resident()), board.home].into_iter().flatten().collect()
 }
@@ -188,10 +186,9 @@ pub fn run(mut args: Args) -> Outcome {
         words => words.iter().map(String::as_str).collect(),
     };
     // A name that there is not is refused before anything is installed.
-    names
-        .iter()
-        .filter(|name| **name != C_APPLICATION)
-        .try_for_each(|name| Variant::by_name(board, name).map(drop))?;
+    for name in names.iter().filter(|name| **name != C_APPLICATION) {
+        Variant::by_name(board, name)?;
+    }
     let in_c = names.contains(&C_APPLICATION);
     setup::prepare(if in_c { &[Part::Firmware, Part::C] } else { &[Part::Firmware] })?;
     build(board, &names, product.as_ref())
@@ -274,8 +271,8 @@ pub fn boards(boards: &[(&Layout, &str)]) -> Outcome {
     })
 }
 
-/// Builds the application in C for each program of a board, and the same with the tests' object
-/// 2100h. A board without a header in examples/c/boards has none.
+/// Builds the application in C for each program of a board, and the same with the tests' object 2100h. A board
+/// without a header in examples/c/boards has none.
 fn c_applications(board: &Layout) -> Outcome {
     let (sources, dir) = (workspace::root().join("examples/c"), workspace::firmware_dir(board));
     let header = format!("boards/{}.h", board.board);
@@ -399,8 +396,7 @@ fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
     files::bytes(&target_dir(board).join(TARGET).join(PROFILE).join(package))
 }
 
-/// Builds an image, puts it into the board's folder under a name, and prints its size. After the link a
-/// bootloader gets the CRC of its RAM image.
+/// Builds an image under a name, and prints its size. After the link a bootloader gets the CRC of its RAM image.
 fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Outcome {
     process::run(&mut cargo_for(variant.package, board, variant.features, product))?;
     let mut file = built(board, variant.package)?;

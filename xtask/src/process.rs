@@ -29,8 +29,7 @@ pub fn cargo_on(folder: &Path, line: &str) -> Command {
 
 /// The same for a program that takes the words of cargo.
 pub fn on_workspace(mut command: Command, folder: &Path, line: &str) -> Command {
-    // Those of the package of this program, which cargo has set. The build script of the crate ring looks at them: it and
-    // all that depends on it were compiled again when another shell or job had none.
+    // The crate ring is compiled again, with all that depends on it, when those of the package change that cargo runs.
     for (name, _) in env::vars_os() {
         if ["CARGO_PKG_", "CARGO_MANIFEST_"].iter().any(|of| name.to_string_lossy().starts_with(of)) {
             command.env_remove(name);

@@ -43,6 +43,9 @@ fn faults_of(folder: &Path, files: &[&str]) -> Outcome<Vec<String>> {
         grep.args(["-Pzois", "--with-filename"]).arg(format!(r"\b({words}){BETWEEN}({before})\b"));
         let found = grep.args(files).current_dir(folder).output();
         let found = found.map_err(|error| process::not_started(&grep, &error))?;
+        if !found.stderr.is_empty() {
+            return Err(format!("grep has not read all: {}", String::from_utf8_lossy(&found.stderr)));
+        }
         let found = String::from_utf8_lossy(&found.stdout).into_owned();
         faults.extend(found.split_terminator('\0').map(|phrase| format!("{phrase:?}: write {write}")));
     }
