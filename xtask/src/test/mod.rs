@@ -223,9 +223,8 @@ fn ci(summary: &mut Summary) -> Outcome {
     let core = format!("{} & ({})", plan::of("coboot-core/it"), Tier::Product.filter());
     let takes_sealed = [variables(DEFAULT), vec![("COBOOT_TAKES_SEALED", "1".into())]].concat();
     runner::run(&workspace::on_host(), &core, "[sealed] ", &takes_sealed, summary)?;
-    let mut doc = process::cargo("test --doc --workspace --quiet");
-    let without = workspace::NOT_ON_HOST.iter().flat_map(|package| ["--exclude", package]);
-    doc.current_dir(workspace::root()).args(without);
+    let mut doc = process::cargo("test --doc --quiet");
+    doc.current_dir(workspace::root()).args(workspace::on_host());
     summary.count("documentation", process::run(&mut doc));
     other_chips().try_for_each(|board| on_board(board, Tier::Ci, summary))
 }
