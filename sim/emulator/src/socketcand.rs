@@ -28,7 +28,7 @@ use std::time::Duration;
 
 use crate::frame::Frame;
 use crate::world::{Computer, PortId, World};
-use protocol::{frame_element, Effect, Session, Splitter, HELLO};
+use protocol::{frame_element, Effect, Reaction, Session, Splitter, HELLO};
 
 /// How long frames are held back after the answer to `rawmode`.
 pub const HOLD: Duration = Duration::from_millis(10);
@@ -49,10 +49,27 @@ type ClientId = u64;
 
 /// An event that the connections' threads report to the world's thread.
 enum Event {
-    Connected { id: ClientId, peer: SocketAddr, out: SyncSender<Out>, stream: TcpStream, credit: Arc<Credit> },
-    Frame { id: ClientId, frame: Frame },
-    Frames { id: ClientId, on: bool },
-    Gone { id: ClientId },
+    Connected {
+        id: ClientId,
+        peer: SocketAddr,
+        out: SyncSender<Out>,
+        stream: TcpStream,
+        credit: Arc<Credit>,
+    },
+    Frame {
+        id: ClientId,
+        frame: Frame,
+    },
+    /// Frames go to the client from now on, or no longer.
+    Frames {
+        id: ClientId,
+        on: bool,
+        answer: String,
+        done: SyncSender<()>,
+    },
+    Gone {
+        id: ClientId,
+    },
 }
 
 /// The channel from the connections' threads to the world's thread.
@@ -212,10 +229,17 @@ impl Server {
                 let ticket = world.send(port, frame);
                 self.owners.insert(ticket, id);
             }
-            Event::Frames { id, on } => {
+            Event::Frames { id, on, answer, done } => {
+                // A client that has read the answer misses no frame, and none comes before the answer.
+                let answers = [Some(Out::Text(answer)), on.then_some(Out::Hold)];
                 if let Some(client) = self.clients.get_mut(&id) {
                     client.frames = on;
+                    if answers.into_iter().flatten().any(|answer| client.out.try_send(answer).is_err()) {
+                        client.hang_up();
+                    }
                 }
+                // The connection may be over.
+                let _ = done.send(());
             }
             Event::Gone { id } => {
                 // What is in its queue still reaches it.
@@ -352,29 +376,29 @@ fn read(
             Err(_) => return,
         };
         for element in buffer[..len].iter().filter_map(|byte| splitter.push(*byte)) {
-            let reaction = session.handle(element.as_deref().map_err(|bad| *bad));
-            if let Some(answer) = reaction.answer {
-                // A full queue: it sends and does not read.
-                if out.try_send(Out::Text(answer)).is_err() {
+            let Reaction { answer, effect } = session.handle(element.as_deref().map_err(|bad| *bad));
+            if matches!(effect, Effect::StartFrames | Effect::StopFrames) {
+                let (done, is_done) = sync_channel(1);
+                let (on, answer) = (effect == Effect::StartFrames, answer.unwrap_or_default());
+                // The next answer comes after this one.
+                if !events.send(Event::Frames { id, on, answer, done }) || is_done.recv().is_err() {
                     return;
                 }
+                continue;
             }
-            let event = match reaction.effect {
-                Effect::None => continue,
-                Effect::Send(frame) if credit.take() => Event::Frame { id, frame },
-                Effect::Send(_) => return,
-                Effect::StartFrames => {
-                    if out.try_send(Out::Hold).is_err() {
+            // A full queue: it sends and does not read.
+            if answer.is_some_and(|answer| out.try_send(Out::Text(answer)).is_err()) {
+                return;
+            }
+            match effect {
+                Effect::Send(frame) => {
+                    if !credit.take() || !events.send(Event::Frame { id, frame }) {
                         return;
                     }
-                    Event::Frames { id, on: true }
                 }
-                Effect::StopFrames => Event::Frames { id, on: false },
                 // The writing thread ends the connection after the last text.
                 Effect::Close => return,
-            };
-            if !events.send(event) {
-                return;
+                Effect::None | Effect::StartFrames | Effect::StopFrames => {}
             }
         }
     }
