@@ -19,8 +19,8 @@ use serde_json::json;
 use super::context::Context;
 use super::device::cancelled;
 use super::file::{warn, Source};
-use super::keys;
 use super::output::Failure;
+use super::output_file;
 use super::values::{milliseconds, node_id};
 
 /// Checks whether a device conforms to CiA 301 and CiA 305, with a verdict for each check.
@@ -103,7 +103,7 @@ impl Conform {
         let means = Means { answer: self.answer_timeout, image, power: self.power() };
         let verdicts = run(&mut *adapter, self.node, &chosen, means, &cancelled()?, tell)?;
         if let Some(path) = &self.junit {
-            keys::write(path, junit(&verdicts).as_bytes())?;
+            output_file::write(path, junit(&verdicts).as_bytes())?;
         }
         let count = |word: &str| verdicts.iter().filter(|v| words(&v.outcome).0 == word).count();
         let (passed, failed, skipped) = (count("passed"), count("FAILED"), count("skipped"));

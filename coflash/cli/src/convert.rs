@@ -17,6 +17,7 @@ use super::context::Context;
 use super::file::{warn, Input, Source};
 use super::keys::{self, value_of_128_bits};
 use super::output::Failure;
+use super::output_file;
 use super::seal::{self, Form, ToSeal};
 use super::values::{number, program_number};
 
@@ -185,12 +186,12 @@ impl Convert {
             (board, _) => judge(image, start, board).map_err(|fault| Failure::no_program(input, fault))?,
         }
         if sealing.is_none() {
-            keys::write(&output, &block_file::emit(program))?;
+            output_file::write(&output, &block_file::emit(program))?;
         }
         if self.temp {
             let name = output.with_extension("tmp");
             let flash = PathBuf::from(name.file_name().unwrap_or_default());
-            keys::write(&flash, &program.flash_image())?;
+            output_file::write(&flash, &program.flash_image())?;
             context.out.say(format_args!("{}: the program as it lies in flash", flash.display()));
         }
         if let Some(sealing) = sealing {

@@ -13,8 +13,8 @@ use serde_json::{json, Value};
 
 use super::context::Context;
 use super::device::Device;
-use super::keys;
 use super::output::Failure;
+use super::output_file;
 use super::values::{milliseconds, number};
 
 /// Reads and writes memory, sets breakpoints and steps a device on the bench.
@@ -236,7 +236,7 @@ impl Read {
         let bytes = debugger.read(self.address, self.len, &mut |_| {})?;
         let (address, len) = (self.address, bytes.len());
         if let Some(path) = &self.output {
-            keys::write(path, &bytes)?;
+            output_file::write(path, &bytes)?;
             let words = format!("{len} bytes from {address:08X}h to {}", path.display());
             let value = json!({ "address": address, "size": len, "file": path.display().to_string() });
             return Ok(Done { words, value });

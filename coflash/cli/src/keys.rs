@@ -1,6 +1,5 @@
 //! `coflash key`: keys for sealed images, and certificates of signing keys.
 
-use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand, ValueEnum};
@@ -13,10 +12,8 @@ use serde_json::json;
 use super::context::Context;
 use super::objects::bytes_of;
 use super::output::Failure;
+use super::output_file::{exists, write, write_secret, LARGEST_KEY};
 use super::values::number;
-
-/// The most bytes that a file with a key may have.
-const MAX: u64 = 16 * 1024;
 
 /// Makes keys for sealed images, certifies them, and shows them.
 ///
@@ -264,7 +261,7 @@ impl Certify {
 impl Show {
     fn run(&self, context: &Context) -> Result<(), Failure> {
         let path = &self.file;
-        let bytes = bytes_of(path, MAX)?;
+        let bytes = bytes_of(path, LARGEST_KEY)?;
         if bytes.starts_with(&CERTIFICATE_MAGIC) {
             let bytes = certificate(path)?;
             let words = CertificateWords(wire::Certificate(&bytes));
@@ -315,7 +312,7 @@ pub(super) fn certificate_value(certificate: wire::Certificate<'_>) -> serde_jso
 }
 
 fn text(path: &Path) -> Result<String, Failure> {
-    Ok(String::from_utf8_lossy(&bytes_of(path, MAX)?).into_owned())
+    Ok(String::from_utf8_lossy(&bytes_of(path, LARGEST_KEY)?).into_owned())
 }
 
 /// The private key in a file.
@@ -341,64 +338,8 @@ pub(super) fn keks(paths: &[PathBuf]) -> Result<Vec<Kek>, Failure> {
 
 /// Reads a certificate. Its contents are checked where it is used.
 pub(super) fn certificate(path: &Path) -> Result<[u8; CERTIFICATE], Failure> {
-    let bytes = bytes_of(path, MAX)?;
+    let bytes = bytes_of(path, LARGEST_KEY)?;
     let bytes = Some(bytes).filter(|bytes| bytes.starts_with(&CERTIFICATE_MAGIC));
     let why = "is not a certificate: coflash key certify makes one";
     bytes.and_then(|bytes| bytes.try_into().ok()).ok_or_else(|| Failure::file(path, why))
-}
-
-/// Writes a file that everyone may read. It takes the place of another one, but of [no key](spare).
-pub(super) fn write(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
-    spare(path)?;
-    std::fs::write(path, bytes).map_err(|error| unwritable(path, &error))
-}
-
-/// Refuses to let an output take the place of a private key or a key-encryption key: nobody could make it again.
-pub(super) fn spare(path: &Path) -> Result<(), Failure> {
-    if !is_secret_key(path) {
-        return Ok(());
-    }
-    let what = format!("{} is a key, which would be lost", path.display());
-    Err(Failure::usage(what, "name another file; if the key is no longer needed, delete it first"))
-}
-
-/// Whether a file has a private key or a key-encryption key in PEM.
-fn is_secret_key(path: &Path) -> bool {
-    let mut front = Vec::new();
-    // A pipe would wait for its other end.
-    let is_file = std::fs::metadata(path).is_ok_and(|told| told.is_file());
-    let file = is_file.then(|| std::fs::File::open(path).ok()).flatten();
-    let is_read = file.is_some_and(|file| file.take(MAX).read_to_end(&mut front).is_ok());
-    let begins = |line: &str| line.starts_with("-----BEGIN ") && line.contains("KEY-----");
-    is_read && String::from_utf8_lossy(&front).lines().any(|line| begins(line) && !line.contains("PUBLIC"))
-}
-
-/// Writes a file that only its owner may read. Replaces an existing file only if `overwrite` is
-/// set.
-pub(super) fn write_secret(path: &Path, text: impl AsRef<[u8]>, overwrite: bool) -> Result<(), Failure> {
-    if overwrite {
-        // A new file gets the right mode; an existing one would keep its own mode.
-        match std::fs::remove_file(path) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(unwritable(path, &error)),
-            _ => {}
-        }
-    }
-    let mut options = std::fs::OpenOptions::new();
-    options.write(true).create_new(true);
-    #[cfg(unix)]
-    std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    let written = options.open(path).and_then(|mut file| file.write_all(text.as_ref()));
-    written.map_err(|error| match error.kind() {
-        io::ErrorKind::AlreadyExists => exists(path),
-        _ => unwritable(path, &error),
-    })
-}
-
-fn exists(path: &Path) -> Failure {
-    let what = format!("{} exists already", path.display());
-    Failure::usage(what, "name another file; --force replaces it, and the old key is gone then")
-}
-
-fn unwritable(path: &Path, error: &io::Error) -> Failure {
-    Failure::system(format!("{}: cannot be written: {error}", path.display()))
 }

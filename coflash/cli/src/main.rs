@@ -42,6 +42,7 @@ mod nameplate;
 mod nmt;
 mod objects;
 mod output;
+mod output_file;
 mod package;
 #[cfg(all(test, repository))]
 mod pages;
@@ -277,7 +278,7 @@ fn main() -> ExitCode {
     let (log, reports) = (cli.log_file.as_deref(), cli.report_dir.as_deref());
     let password = cli.command.password();
     let begin = || record::begin(log, reports, &name, &words(), password, cli.bus.as_deref());
-    let spared = [log, cli.trace.as_deref()].into_iter().flatten().try_for_each(keys::spare);
+    let spared = [log, cli.trace.as_deref()].into_iter().flatten().try_for_each(output_file::spare);
     let begun = spared.and_then(|()| begin().map_err(Failure::system));
     let result = begun.and_then(|()| cli.command.run(&cli.context()));
     if let Err(failure) = &result {

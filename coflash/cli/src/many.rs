@@ -13,8 +13,8 @@ use indicatif::{MultiProgress, ProgressBar, ProgressDrawTarget, ProgressStyle};
 use serde_json::{json, Value};
 
 use super::events::Lines;
-use super::keys;
 use super::output::{Exit, Failure, Output};
+use super::output_file;
 use super::progress::with_rate;
 use super::record;
 
@@ -173,7 +173,7 @@ pub(super) fn document(outcomes: &[Outcome]) -> Value {
 
 /// Writes the JSON document to a file.
 pub(super) fn write_report(path: &Path, document: &Value) -> Result<(), Failure> {
-    keys::write(path, format!("{document:#}\n").as_bytes())
+    output_file::write(path, format!("{document:#}\n").as_bytes())
 }
 
 fn outcome_value(outcome: &Outcome) -> Value {

@@ -9,8 +9,8 @@ use serde_json::json;
 use shared_abi::nameplate::Nameplate;
 
 use super::context::Context;
-use super::keys::write;
 use super::output::Failure;
+use super::output_file::write;
 use super::values::number;
 
 /// Makes a nameplate: the identity (1018h) of an OEM's device, for the one-time programmable bytes of its

@@ -25,6 +25,7 @@ use super::device::{cancelled, Patience};
 use super::keys::{self, public_key, signing_key};
 use super::many::{write_report, Board};
 use super::output::{Exit, Failure};
+use super::output_file;
 
 /// Makes a package for a machine: one file with the programs of several types of nodes.
 ///
@@ -87,7 +88,7 @@ impl MakePackage {
         if images.iter().any(|image| is_same(&output, image)) {
             return Err(Failure::usage("the package would replace an image of its recipe", advice));
         }
-        keys::write(&output, &bytes)?;
+        output_file::write(&output, &bytes)?;
         let package = Package::parse(&bytes).map_err(|fault| Failure::package(&output, &fault))?;
         show(context, "package", &output, &Checked { package, known: None });
         Ok(())

@@ -12,8 +12,9 @@ use serde_json::json;
 
 use super::context::Context;
 use super::file::{Input, MemoryMap};
-use super::keys::{write_secret, KeyBlock};
+use super::keys::KeyBlock;
 use super::output::Failure;
+use super::output_file::write_secret;
 
 /// Writes keys into a bootloader image, so that its devices accept only sealed programs.
 ///

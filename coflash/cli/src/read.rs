@@ -11,9 +11,9 @@ use serde_json::{json, Value};
 use super::context::Context;
 use super::device::Device;
 use super::dialect::Access;
-use super::keys;
 use super::objects::{self, Names, Object};
 use super::output::{Exit, Failure};
+use super::output_file;
 
 /// Reads objects, or a program if the device allows it (1F50/1).
 ///
@@ -126,7 +126,7 @@ impl Read {
         .map_err(|error| Failure::diagnosed(error, session))?;
         drop(waiting);
         if let Some(path) = &self.output {
-            keys::write(path, &bytes)?;
+            output_file::write(path, &bytes)?;
         }
         let typed = || object.kind().filter(|_| self.kind == Kind::Auto)?.show(&bytes);
         let shown = match &self.output {

@@ -20,8 +20,8 @@ use super::adapters;
 use super::context::Context;
 use super::device::Device;
 use super::info;
-use super::keys::write;
 use super::output::Failure;
+use super::output_file::write;
 use super::record::{self, FILES};
 use super::secrets::without_urls;
 

@@ -17,9 +17,10 @@ use shared_abi::layout::Layout;
 
 use super::context::Context;
 use super::file::{base, Input, Place};
-use super::keys::{self, write};
+use super::keys;
 use super::objects::bytes_of;
 use super::output::Failure;
+use super::output_file::write;
 use super::values::{number, program_number, unique_id};
 use super::verify::value;
 
