@@ -48,8 +48,13 @@ const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: fe
 const N: u8 = 2;
 const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
 static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
-const RENEWAL: Renewal =
-    Renewal { board: BOARD, features: feature::RENEWAL, identity: Some((7, 8)), ..Renewal::NONE };
+const RENEWAL: Renewal = Renewal {
+    board: BOARD,
+    features: feature::RENEWAL,
+    identity: Some((7, 8)),
+    revision: 3,
+    ..Renewal::NONE
+};
 static CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
@@ -381,7 +386,8 @@ impl<C: Choices> Node<'_, C> {
 
 #[test]
 fn an_image_is_staged_tried_confirmed_and_installed() {
-    let newer = Header { version: 0x0001_0003, ..SOUND };
+    // For the revision of the device alone.
+    let newer = Header { version: 0x0001_0003, revisions: 1 << 3, ..SOUND };
     let (old, new) = (image(0x200, 1), image_of(newer, 0x300, 2, true));
     let mut board = Board::new(&old);
     let program = board.flash.cells(PROGRAM)[..0x1000].to_vec();
@@ -513,7 +519,8 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
     for (header, status) in [
         (Header { vendor: 9, ..SOUND }, 0x80),
         (Header { product: 9, ..SOUND }, 0x82),
-        (Header { revisions: 2, ..SOUND }, 0x82),
+        // All revisions but the one of the device.
+        (Header { revisions: !(1 << 3), ..SOUND }, 0x82),
     ] {
         let mut node = board.start();
         let _ = node.send(N, &image_of(header, 0x280, 3, true));
@@ -707,16 +714,18 @@ fn a_program_that_reaches_into_staging_takes_it() {
     }
 }
 
-/// A small program leaves a spare alone.
+/// A small program leaves a spare alone, also one that ends where staging begins.
 #[test]
 fn a_program_that_ends_before_staging_leaves_it_alone() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut board = Board::new(&old);
-    board.renew(&new);
-    board.off();
-    board.install_program(0x1800);
-    let mut node = board.start();
-    assert_eq!((node.progress().state, node.has_staged(&new)), (State::Installed, true));
+    for size in [0x1800, STAGING.base - PROGRAM.base] {
+        let mut board = Board::new(&old);
+        board.renew(&new);
+        board.off();
+        board.install_program(size as usize);
+        let mut node = board.start();
+        assert_eq!((node.progress().state, node.has_staged(&new)), (State::Installed, true), "{size:#x}");
+    }
 }
 
 #[test]
