@@ -300,7 +300,7 @@ fn the_log_tells_the_last_events_the_latest_first() {
         assert_eq!(logged(host, 1), [2, code(status::SIGNATURE), 6, 12]);
         assert_eq!(host.update(1, &sealed(3, 4, 13), 7).1, status::ROLLBACK);
         assert_eq!(logged(host, 1), [3, code(status::ROLLBACK), 4, 13]);
-        // A refusal that the log has, also behind another one.
+        // A refusal that the log has, also after another one.
         assert_eq!(host.update(1, &forged(2, 6, 12), 7).1, status::SIGNATURE);
         assert_eq!(logged(host, 1), [3, code(status::ROLLBACK), 4, 13]);
         host.wait();

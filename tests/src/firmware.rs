@@ -184,11 +184,12 @@ pub fn with_label(mut image: Vec<u8>, label: &Label) -> Vec<u8> {
 /// If it was not built; the message gives the command.
 #[must_use]
 pub fn elf(name: &str) -> Vec<u8> {
-    let path = dir().join(name);
-    fs::read(&path).unwrap_or_else(|error| {
+    let folder = dir();
+    fs::read(folder.join(name)).unwrap_or_else(|error| {
+        let board = folder.file_name().unwrap_or_default().display();
         panic!(
-            "{}: {error}. Build the firmware first: `cargo xtask build --all`, or run `cargo xtask test`.",
-            path.display()
+            "{}: {error}. Build the firmware first: `cargo xtask build --all --board {board}`.",
+            folder.join(name).display()
         )
     })
 }

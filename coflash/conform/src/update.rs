@@ -40,7 +40,7 @@ pub(super) const CHECKS: &[Check] = &[
         running(b)?;
         b.with(steps::call_back).map(drop)
     }),
-    check("UPD-004", "the call is heard behind other requests", COMMANDS, |b| {
+    check("UPD-004", "the call is heard after other requests", COMMANDS, |b| {
         running(b)?;
         for _ in 0..LOAD {
             b.tell(request(0x40, 0x1000, 0, [0; 4]))?;

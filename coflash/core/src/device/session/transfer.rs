@@ -235,7 +235,7 @@ impl Session<'_> {
                                 deadline = self.now() + self.timing.command;
                             }
                         }
-                        // A host that was held up may find the answer behind other frames: it has
+                        // A host that was held up may find the answer after other frames: it has
                         // come in time, although the time is over.
                         arrived += 1;
                         let is_late = now.has_reached(until) && transfer.awaits_answer();
