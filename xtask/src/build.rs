@@ -332,8 +332,8 @@ fn lld() -> Outcome<PathBuf> {
 /// Builds a bootloader; returns what it takes of each of [`bootloader_flash`], in bytes.
 pub fn bootloader_size(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u32>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
-    process::run(cargo.env("CARGO_TERM_QUIET", "true"))?;
-    used(board, &ram_image::seal(built(board, "bootloader")?)?)
+    let built = built(board, "bootloader", cargo.env("CARGO_TERM_QUIET", "true"))?;
+    used(board, &ram_image::seal(built)?)
 }
 
 /// The same of a bootloader that was built under a name.
@@ -391,15 +391,19 @@ fn cargo_for(package: &str, board: &Layout, features: &str, product: &Product) -
     cargo
 }
 
-/// The ELF file of cargo's last build of a package.
-fn built(board: &Layout, package: &str) -> Outcome<Vec<u8>> {
+/// Runs cargo and returns the ELF file of the package. It has the same place for all products and features: no other
+/// job builds there until it is read.
+fn built(board: &Layout, package: &str, cargo: &mut Command) -> Outcome<Vec<u8>> {
+    let chip = board.chip.line.name();
+    let _alone = files::lock(chip, &format!("Another job builds for the {chip}."))?;
+    process::run(cargo)?;
     files::bytes(&target_dir(board).join(TARGET).join(PROFILE).join(package))
 }
 
 /// Builds an image under a name, and prints its size. After the link a bootloader gets the CRC of its RAM image.
 fn image(board: &Layout, variant: &Variant, name: &str, product: &Product) -> Outcome {
-    process::run(&mut cargo_for(variant.package, board, variant.features, product))?;
-    let mut file = built(board, variant.package)?;
+    let mut cargo = cargo_for(variant.package, board, variant.features, product);
+    let mut file = built(board, variant.package, &mut cargo)?;
     if variant.is_bootloader() {
         file = ram_image::seal(file).map_err(|problem| format!("{name} gets no CRC: {problem}"))?;
     }

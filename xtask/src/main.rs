@@ -172,11 +172,8 @@ fn main() -> ExitCode {
 }
 
 fn overview(jobs: &[Job]) -> String {
-    let mut text = String::from("usage: cargo xtask JOB [OPTIONS]    (cargo xtask JOB --help says more)\n\n");
-    for job in jobs {
-        text += &format!("  {:<9} {}\n", job.name, job.about);
-    }
-    text
+    let jobs: String = jobs.iter().map(|job| format!("  {:<9} {}\n", job.name, job.about)).collect();
+    format!("usage: cargo xtask JOB [OPTIONS]    (cargo xtask JOB --help says more)\n\n{jobs}")
 }
 
 #[cfg(test)]

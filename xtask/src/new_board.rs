@@ -33,7 +33,7 @@ pub fn run(mut args: Args) -> Outcome {
     };
     let mut words = args.rest().into_iter();
     let (Some(name), None) = (words.next(), words.next()) else {
-        return Err("one NAME is needed, and nothing else; --help tells more.".into());
+        return Err("one NAME is needed, and nothing else; --help says more.".into());
     };
     let root = workspace::root();
     let files = new_board::board(&name, &chip, &choices)?;

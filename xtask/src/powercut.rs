@@ -22,7 +22,7 @@ On the model of the flash it cuts every operation; of the real firmware it cuts 
   --full             every operation of an update and of a renewal with the real firmware, and a
                      twentieth of those of the other scenarios; with a twentieth on the board of each other chip, and on the
                      one with two programs
-  --reproduce POINT  tells one point in words, as update:37:torn:12:after
+  --reproduce POINT  says one point in words, as update:37:torn:12:after
   --scenario NAME    this scenario alone (docs/powercut.md)
   --board BOARD      this board alone (default: stm32f407g-disc1)
 ";

@@ -28,9 +28,9 @@ Sets the machine up, builds firmware and test programs and runs the tests of the
 board: device, host tool and a CANopen client of others. docs/testing.md says what runs where, and why.
 
   --ci            what .ci/run adds: Chromium, tools of others, the other chips, the pages
-  --all           everything: the two above, the tests that take minutes, and the jobs of the night
-                  that end by themselves
-  --part NAME     with --all: this part alone; --all lists the names at its beginning
+  --all           every test: the two above, those that take minutes, and jobs of the night; it says what it
+                  does not run
+  --part NAME     with --all: this part alone; --all lists the names at its beginning. K/N is the K-th of N
   --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
   WORDS           go to cargo test, for one kind of test:
@@ -42,16 +42,16 @@ type Stage = (&'static str, &'static str, u32, Tier, fn(&mut Summary) -> Outcome
 
 /// All stages, in the order in which they run.
 const STAGES: [Stage; 5] = [
-    ("product", "the default board, device and tool", 12, Tier::Product, product),
-    ("ci", "Chromium, tools of others, other chips, pages", 13, Tier::Ci, ci),
-    ("slow", "tests that take minutes", 25, Tier::All, slow),
-    ("boards", "every test with firmware, for each other chip", 25, Tier::All, boards),
+    ("product", "the default board, device and tool", 11, Tier::Product, product),
+    ("ci", "Chromium, tools of others, other chips, pages", 9, Tier::Ci, ci),
+    ("slow", "tests that take minutes", 30, Tier::All, slow),
+    ("boards", "every test with firmware, for each other chip", 30, Tier::All, boards),
     ("jobs", "power cuts, attacker, QEMU, replay, chips, two builds", 45, Tier::All, jobs),
 ];
 
-/// What `--all` does not run, since it goes on for hours.
-const NOT_RUN: &str =
-    "not run, for they take hours: cargo xtask mutants, cargo xtask fuzz, cargo xtask coverage";
+/// What `--all` does not run.
+const NOT_RUN: &str = "not run, for they take hours: cargo xtask mutants, fuzz, powercut --full, attack --silicon\n\
+    not run, jobs of their own: cargo xtask bench, coverage, package --check, examples template, and the gates of .ci/run";
 
 /// The least free space for a run from an empty folder, in KiB.
 const ROOM: u64 = 5 << 20;
@@ -72,11 +72,11 @@ pub fn run(mut args: Args) -> Outcome {
         return Err("--part goes with --all.".into());
     }
     let chosen = part.as_deref().or((!all).then_some(if for_ci { "ci" } else { "product" }));
-    let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| chosen == *name);
+    let is_chosen = |(name, ..): &Stage| chosen.is_none_or(|chosen| is_part(chosen, name));
     let stages: Vec<Stage> = STAGES.into_iter().filter(is_chosen).collect();
     if stages.is_empty() {
         let names = STAGES.map(|(name, ..)| name);
-        return Err(format!("--part takes one of {}.", names.join(", ")));
+        return Err(format!("--part takes one of {}; or K/N, such as 2/4.", names.join(", ")));
     }
     if all {
         for stage @ (name, about, minutes, ..) in STAGES {
@@ -108,7 +108,7 @@ pub fn run(mut args: Args) -> Outcome {
     let started = Instant::now();
     // Each part of a run has a record of its own; the page adds them up.
     let name = match (&part, chosen_board) {
-        (Some(part), _) => format!("tests-all-{part}"),
+        (Some(part), _) => format!("tests-all-{}", part.replace('/', "-of-")),
         (None, Some(board)) => format!("tests-{}", board.board),
         _ if all => "tests-all".into(),
         _ if for_ci => "tests-ci".into(),
@@ -144,8 +144,17 @@ pub fn run(mut args: Args) -> Outcome {
     match summary.failed.len() {
         0 if summary.is_empty() => Err("no test ran.".into()),
         0 => Ok(()),
-        failed => Err(format!("failed tests: {failed}; their output is above.")),
+        // The summary is the last line.
+        _ => std::process::exit(1),
     }
+}
+
+/// Whether a part has a stage: by its name, or as the K-th of N.
+fn is_part(part: &str, stage: &str) -> bool {
+    let k_of_n =
+        part.split_once('/').and_then(|(k, n)| Some((k.parse::<usize>().ok()?, n.parse::<usize>().ok()?)));
+    let index = STAGES.iter().position(|(name, ..)| *name == stage).unwrap_or_default();
+    part == stage || k_of_n.is_some_and(|(k, n)| index.checked_rem(n).is_some_and(|rest| rest + 1 == k))
 }
 
 /// Checks that the disk has room for a run from an empty folder, unless there are results already.
@@ -252,18 +261,12 @@ fn on_board(board: &'static Layout, tier: Tier, summary: &mut Summary) -> Outcom
         build::boards(&[(board, "")])?;
         programs_of_ours()?;
     }
-    let programs: &[&str] = match tier {
-        Tier::All => &["device", "update", "sealed", "foreign", "port"],
-        _ => &["device", "update"],
+    let (programs, tests) = match tier {
+        Tier::All => ("device update sealed foreign port", "all()".to_owned()),
+        _ => ("device update", format!("({}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter())),
     };
-    let arguments: Vec<_> = workspace::on_host()
-        .into_iter()
-        .chain(programs.iter().map(|name| format!("--test={name}")))
-        .collect();
-    let tests = match tier {
-        Tier::All => "all()".to_owned(),
-        _ => format!("({}) - ({})", plan::any_of(OF_EACH_CHIP), Tier::All.filter()),
-    };
+    let programs = programs.split(' ').map(|name| format!("--test={name}"));
+    let arguments: Vec<_> = workspace::on_host().into_iter().chain(programs).collect();
     let filter = format!("({tests}) - ({})", plan::any_of(plan::left_out(board)));
     runner::run(&arguments, &filter, &format!("[{}] ", board.board), &variables(board), summary)
 }

@@ -25,11 +25,7 @@ pub struct Summary {
 impl Summary {
     /// The last line of a run.
     pub fn line(&self) -> String {
-        let mut line = format!("{} passed, {} failed", self.passed, self.failed.len());
-        if self.skipped > 0 {
-            line += &format!(", {} skipped", self.skipped);
-        }
-        line
+        format!("{} passed, {} failed, {} skipped", self.passed, self.failed.len(), self.skipped)
     }
 
     /// Whether not a single test ran.
