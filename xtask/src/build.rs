@@ -332,8 +332,7 @@ fn lld() -> Outcome<PathBuf> {
 /// Builds a bootloader; returns what it takes of each of [`bootloader_flash`], in bytes.
 pub fn bootloader_size(board: &Layout, features: &str, product: &Product) -> Outcome<Vec<u32>> {
     let mut cargo = cargo_for("bootloader", board, features, product);
-    let built = built(board, "bootloader", cargo.env("CARGO_TERM_QUIET", "true"))?;
-    used(board, &ram_image::seal(built)?)
+    used(board, &ram_image::seal(built(board, "bootloader", cargo.env("CARGO_TERM_QUIET", "true"))?)?)
 }
 
 /// The same of a bootloader that was built under a name.

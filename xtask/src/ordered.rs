@@ -32,8 +32,6 @@ const CODE: [(&str, &str, &[&str]); 5] = [
     ),
     ("host test of the ABI", "tests/abi/main.rs", &["mod layout;", "mod header;", "mod reentry;"]),
 ];
-/// The test program of the ABI.
-const ABI_TESTS: &str = "abi";
 
 /// The parts of the repository that the orders are about.
 #[derive(Default)]
@@ -80,9 +78,8 @@ impl House {
         }
         for program in PROGRAMS {
             let sources = format!("{program}/src");
-            let receives = self.has(&sources, has_receiving_task);
             order(
-                receives,
+                self.has(&sources, has_receiving_task),
                 format!("{program}: no RTIC task is bound to the interrupt of received CAN frames"),
             );
             let has_timer = self.has(&sources, |text| text.contains("_monotonic!("));
@@ -95,8 +92,8 @@ impl House {
             let is_there = self.has(file, |text| pieces.iter().all(|piece| text.contains(piece)));
             order(is_there, format!("{file}: there is no {what} (`{}`)", pieces.join("`, `")));
         }
-        let is_abi = |(name, source): &(String, PathBuf)| name == ABI_TESTS && source.starts_with("tests");
-        order(self.tests.iter().any(is_abi), format!("tests: there is no test program `{ABI_TESTS}`"));
+        let is_abi = |(name, source): &(String, PathBuf)| name == "abi" && source.starts_with("tests");
+        order(self.tests.iter().any(is_abi), "tests: there is no test program `abi`".to_owned());
         broken
     }
 

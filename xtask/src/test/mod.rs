@@ -33,8 +33,7 @@ board: device, host tool and a CANopen client of others. docs/testing.md says wh
   --part NAME     with --all: this part alone; --all lists the names at its beginning. K/N is the K-th of N
   --list          the tests that wait for --ci or --all, and why
   --board BOARD   every test that runs firmware, with that of this board; or those that WORDS choose
-  WORDS           go to cargo test, for one kind of test:
-                  `cargo xtask test -p coboot-canopen sdo`, `cargo xtask test -p coboot-tests line::`
+  WORDS           go to cargo test, after the images are built: `cargo xtask test -p coboot-tests line::`
 ";
 
 /// A stage of a run: its name, what it is about, the minutes that it takes on two cores, and the tier of its tests.
@@ -144,17 +143,22 @@ pub fn run(mut args: Args) -> Outcome {
     match summary.failed.len() {
         0 if summary.is_empty() => Err("no test ran.".into()),
         0 => Ok(()),
-        // The summary is the last line.
-        _ => std::process::exit(1),
+        _ => std::process::exit(1), // The summary is the last line.
     }
 }
 
 /// Whether a part has a stage: by its name, or as the K-th of N.
 fn is_part(part: &str, stage: &str) -> bool {
-    let k_of_n =
-        part.split_once('/').and_then(|(k, n)| Some((k.parse::<usize>().ok()?, n.parse::<usize>().ok()?)));
-    let index = STAGES.iter().position(|(name, ..)| *name == stage).unwrap_or_default();
-    part == stage || k_of_n.is_some_and(|(k, n)| index.checked_rem(n).is_some_and(|rest| rest + 1 == k))
+    let at = STAGES.iter().position(|(name, ..)| *name == stage).unwrap_or_default();
+    let is_kth = |(k, n): (&str, &str)| Some(k.parse() == Ok(at.checked_rem(n.parse().ok()?)? + 1));
+    part == stage || part.split_once('/').and_then(is_kth) == Some(true)
+}
+
+#[test]
+fn a_part_is_a_stage_or_the_kth_of_n() {
+    let of = |part| STAGES.map(|(name, ..)| u8::from(is_part(part, name)));
+    assert_eq!(["slow", "1/4", "2/4"].map(of), [[0, 0, 1, 0, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 0]]);
+    assert_eq!(["0/4", "5/4", "1/0", "2/", "x"].map(of), [[0; 5]; 5]);
 }
 
 /// Checks that the disk has room for a run from an empty folder, unless there are results already.
