@@ -3,4 +3,4 @@
 use super::*;
 
 /// The choices of this product.
-pub const PRODUCT: Product = Product { profile: Profile::LIFT, ..Product::DEFAULT };
+pub const PRODUCT: Product = Product::of(Profile::LIFT);

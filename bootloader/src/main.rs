@@ -123,7 +123,9 @@ mod app {
         const EXTRAS: Extras = EXTRAS;
         const BLOCK_DOWNLOAD: bool = PRODUCT.block_download;
         const BLOCK_UPLOAD: bool = PRODUCT.block_upload;
+        const LSS: bool = PRODUCT.lss;
         const LSS_STORE: bool = PRODUCT.lss_store;
+        const DETECTS_BIT_RATE: bool = PRODUCT.auto_bit_rate;
         const NODE_IDS: RangeInclusive<u8> = PRODUCT.node_ids;
         const PROGRAM_START: ProgramStart = product::PROGRAM_START;
     }
@@ -194,8 +196,10 @@ mod app {
         let report = start::boot_report().unwrap_or(BootReport::NONE);
         let node = NodeParameters {
             id: NodeId::new(report.node_id),
-            // The boot stage reports only bit rates that the CAN controller can be set to.
-            bit_rate: BitRate::from_index(report.bit_rate).unwrap_or(BitRate::Auto),
+            // The boot stage reports only bit rates that the product supports.
+            bit_rate: BitRate::from_index(report.bit_rate)
+                .filter(|rate| product::supports(*rate))
+                .unwrap_or(product::BOARD_NODE.bit_rate),
         };
         let slave_config = slave::Config {
             node: node::Config {
@@ -210,10 +214,10 @@ mod app {
                     ..SdoConfig::DEFAULT
                 },
             },
-            lss: PRODUCT.lss.then_some(lss::Config {
+            lss: lss::Config {
                 start_in_configuration: PRODUCT.lss_start_in_configuration,
                 announce: PRODUCT.lss_announce,
-            }),
+            },
             is_silent: clock == Source::Internal && PRODUCT.crystal_failure == CrystalFailure::Silent,
         };
         let nameplate = product::nameplate();

@@ -15,7 +15,7 @@ pub use boot_core::crc::CrcKind;
 pub use boot_core::decision::Autostart;
 pub use boot_core::profile::Profile;
 
-use boot_core::bootloader::Extras;
+use boot_core::bootloader::{Extras, PasswordObject};
 use boot_core::canopen::program::ProgramStart;
 use boot_core::control::{Policy, Renewal};
 use boot_core::decision;
@@ -95,14 +95,16 @@ pub struct Product {
     /// Base of the COB-ID of SDO answers; the node-ID is added. At most 780h
     /// (`BLCOP_BASE_RESPONSE`).
     pub sdo_response_base: u16,
-    /// Whether the device may detect the bit rate by listening, if none is stored or set.
+    /// Whether the device may detect the bit rate by listening, if none is stored or set; on boards with the
+    /// split map alone.
     pub auto_bit_rate: bool,
     /// Whether an emergency follows each boot-up. It shows a master that the bootloader runs, and
     /// not the application.
     pub boot_up_emergency: bool,
     /// Period of the heartbeat (1017h, which is constant), in ms; 0 for none.
     pub heartbeat_ms: u16,
-    /// Whether the device supports layer setting services (LSS, CiA 305).
+    /// Whether the device supports layer setting services (LSS, CiA 305); on boards with the compact map
+    /// without a profile that has a password.
     pub lss: bool,
     /// Whether the device starts in LSS configuration state, for a bus with one device to
     /// configure.
@@ -133,6 +135,9 @@ pub struct Product {
     /// Whether date and time of the program can be read (1F52h), in the bootloader and in the program; on
     /// boards with the split map alone.
     pub program_date: bool,
+    /// Whether programs are taken as Intel HEX, too; on boards with the compact map in ESAcademy's profile
+    /// alone.
+    pub intel_hex: bool,
     /// Where vendor-ID, product code, revision and serial number (1018h) come from
     /// (`BLCOP_IDENTITY_VENDORID` to `BLCOP_IDENTITY_SERIALNR`).
     pub identity: IdentitySource,
@@ -208,7 +213,7 @@ impl Product {
         crystal_failure: CrystalFailure::Silent,
         sdo_request_base: 0x600,
         sdo_response_base: 0x580,
-        auto_bit_rate: true,
+        auto_bit_rate: LAYOUT.home.is_some(),
         boot_up_emergency: true,
         heartbeat_ms: 1000,
         lss: true,
@@ -223,6 +228,7 @@ impl Product {
         resume: LAYOUT.home.is_some(),
         read_back: LAYOUT.home.is_some(),
         program_date: LAYOUT.home.is_some(),
+        intel_hex: LAYOUT.home.is_some(),
         identity: IdentitySource::Board,
         identity_check: true,
         check: |_, _| Verdict::Standard,
@@ -243,6 +249,20 @@ impl Product {
         bootloader_counter: 0,
         bootloader_revisions: 0,
     };
+
+    /// A product whose only choice is its dialect. On the compact map a dialect has what its manual has:
+    /// ESAcademy's has Intel HEX; ESAcademy's nodes and lifts have a node-ID of their own, and no LSS.
+    pub const fn of(profile: Profile) -> Self {
+        let lss = LAYOUT.home.is_some() || !profile.download.locked;
+        Self {
+            lss,
+            // A silent device waits for LSS.
+            crystal_failure: if lss { CrystalFailure::Silent } else { CrystalFailure::RunFromHsi },
+            intel_hex: LAYOUT.home.is_some() || sends_hex(&profile),
+            profile,
+            ..Self::DEFAULT
+        }
+    }
 
     /// Returns the product if its choices are consistent; otherwise it fails the build with the
     /// message of the broken rule.
@@ -281,9 +301,10 @@ impl Product {
                     || self.second_server
                     || self.resume
                     || self.read_back
-                    || self.program_date),
-            "product: block_upload, second_server, resume, read_back and program_date need the split map: the \
-             compact one has no room for them"
+                    || self.program_date
+                    || self.auto_bit_rate),
+            "product: block_upload, second_server, resume, read_back, program_date and auto_bit_rate need the \
+             split map: the compact one has no room for them"
         );
         assert!(
             self.lss || matches!(self.crystal_failure, CrystalFailure::RunFromHsi),
@@ -362,6 +383,15 @@ impl Product {
         assert!(
             self.profile.download.locked != self.profile.password.is_empty(),
             "product: a profile that locks 1F50h needs a password, and only such a profile has one"
+        );
+        assert!(
+            LAYOUT.home.is_some() || !self.lss || !self.profile.download.locked,
+            "product: lss needs the split map in a profile with a password: the compact one has no room for \
+             both; Product::of(profile) has what fits"
+        );
+        assert!(
+            LAYOUT.home.is_some() || !self.intel_hex || sends_hex(&self.profile),
+            "product: intel_hex needs the split map, or ESAcademy's profile: the compact one has no room for it"
         );
         assert!(
             self.auto_bit_rate || BIT_RATE != 0,
@@ -443,6 +473,11 @@ impl Product {
             start_allowed: self.start_allowed,
         }
     }
+}
+
+/// Whether the dialect is ESAcademy's, whose tools send Intel HEX.
+const fn sends_hex(profile: &Profile) -> bool {
+    matches!(profile.extras.password, PasswordObject::EnableFlash)
 }
 
 /// The source of the device's identity.
@@ -577,7 +612,7 @@ pub fn parameters(flash: &impl Flash) -> Parameters {
 }
 
 /// Node-ID and bit rate of a device that has none stored.
-const BOARD_NODE: NodeParameters = NodeParameters {
+pub const BOARD_NODE: NodeParameters = NodeParameters {
     id: match NODE_ID {
         NO_NODE_ID => None,
         id => match NodeId::new(id) {

@@ -113,6 +113,7 @@ impl Parameters for Store {
     const RESUMES: bool = PRODUCT.resume;
     const RENEWS: bool = PRODUCT.renewal;
     const DATES: bool = PRODUCT.program_date;
+    const INTEL_HEX: bool = PRODUCT.intel_hex;
 
     fn services(&self) -> u32 {
         services().version

@@ -620,9 +620,17 @@ const MISTAKES: &[Mistake] = &[
         "product: second_server needs block_download, by which a group gets its data",
     ),
     product(
-        "Product { second_server: true, ..Product::DEFAULT }",
-        "product: block_upload, second_server, resume, read_back and program_date need the split map: the \
-         compact one has no room for them",
+        "Product { auto_bit_rate: true, ..Product::DEFAULT }",
+        "product: block_upload, second_server, resume, read_back, program_date and auto_bit_rate need the \
+         split map: the compact one has no room for them",
+    ),
+    product(
+        "Product { lss: true, ..Product::of(Profile::LIFT) }",
+        "product: lss needs the split map in a profile with a password",
+    ),
+    product(
+        "Product { intel_hex: true, ..Product::DEFAULT }",
+        "product: intel_hex needs the split map, or ESAcademy's profile",
     ),
     product(
         "Product { segments_per_sub_block: 128, ..Product::DEFAULT }",

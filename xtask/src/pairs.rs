@@ -6,7 +6,7 @@ use shared_abi::layout::{Layout, BOARDS};
 use crate::args::Args;
 use crate::product::Product;
 use crate::setup::{self, Part};
-use crate::size::{budgets, within};
+use crate::size::{budgets, spare, within};
 use crate::{build, files, outcome::Outcome, workspace};
 
 pub const HELP: &str = "\
@@ -14,15 +14,15 @@ usage: cargo xtask pairs [--spread]
 
 Builds bootloaders whose products differ from the default in many choices at once, so that any two
 values of any two choices are together in one of them (a covering array), sealed images included, and
-fails when one does not build or is over the budget of its flash. It prints the choices and the size
-of each.
+fails when one does not build, is over the budget of its flash, or leaves fewer than 512 bytes of it free on
+the compact map. It prints the choices and the size of each.
 
   --spread        each of them for one board, the next for the next; without, each for every board
 ";
 
 /// The fields of a product that are varied, and their values, as the product's file writes them; and
 /// the feature [`SEALED`]. The first value is the default (that of the split map).
-const FIELDS: [(&str, &[&str]); 48] = [
+const FIELDS: [(&str, &[&str]); 49] = [
     ("profile", &["Profile::STANDARD", "Profile::PAULUS", "Profile::ESACADEMY", "Profile::LIFT"]),
     ("autostart", &["Autostart::InOrder", "Autostart::List(&[])", "Autostart::Function(|| &[1])"]),
     ("rescue_window_ms", &["300", "0"]),
@@ -63,6 +63,7 @@ const FIELDS: [(&str, &[&str]); 48] = [
     ("resume", &["true", "false"]),
     ("read_back", &["true", "false"]),
     ("program_date", &["true", "false"]),
+    ("intel_hex", &["true", "false"]),
     ("renewal", &["LAYOUT.staging.is_some()", "false"]),
     ("renewal_s", &["60", "1"]),
     ("bootloader_counter", &["0", "3"]),
@@ -126,7 +127,8 @@ pub const PRODUCT: Product = Product {
     for ((name, values), value) in others {
         file += &format!("    {name}: {},\n", values[usize::from(*value)]);
     }
-    file + "    ..Product::DEFAULT\n};\n"
+    // The first field is the profile, by which the defaults of the compact map differ.
+    file + &format!("    ..Product::of({})\n}};\n", FIELDS[0].1[usize::from(row[0])])
 }
 
 /// The size in a board's flash of the bootloader of this product, in bytes; an error if it is over the
@@ -138,6 +140,9 @@ fn size(board: &Layout, row: &Row, product: &Product) -> Outcome<u32> {
     let used = build::bootloader_size(board, features, product).map_err(told)?;
     for (bytes, budget) in used.iter().zip(budgets(board)) {
         within(*bytes, budget).map_err(told)?;
+    }
+    if board.home.is_none() {
+        spare(used.iter().sum()).map_err(told)?;
     }
     Ok(used.iter().sum())
 }
@@ -218,12 +223,12 @@ fn pairs() -> Vec<(Choice, Choice)> {
 mod tests {
     use super::*;
 
-    /// Counted by hand: 4 for each pair of the 45 fields with two values, 6 with each of the two with three,
+    /// Counted by hand: 4 for each pair of the 46 fields with two values, 6 with each of the two with three,
     /// 8 with the one with four; 9 and twice 12 between these; seven are not permitted.
     #[test]
     fn every_pair_stands_in_a_row_and_no_row_contradicts_itself() {
         let rows = covering();
-        assert_eq!(pairs().len(), 45 * 44 / 2 * 4 + 45 * 6 * 2 + 45 * 8 + 9 + 12 * 2 - 7);
+        assert_eq!(pairs().len(), 46 * 45 / 2 * 4 + 46 * 6 * 2 + 46 * 8 + 9 + 12 * 2 - 7);
         for ((a, value_a), (b, value_b)) in pairs() {
             assert!(rows.iter().any(|row| row[a] == value_a && row[b] == value_b), "{a} {b}");
         }

@@ -21,6 +21,8 @@ arm-none-eabi-nm --demangle --size-sort target/firmware/BOARD/bootloader.elf
 /// The largest permitted sizes in bytes: of resident part, header and RAM image together in the
 /// compact map, and of the two in the split map (of 16 and 64 KiB).
 const COMPACT: u32 = 32_256;
+/// What the largest product leaves free of it, so that the next mistake can be mended.
+const SPARE: u32 = 512;
 const RESIDENT: u32 = 12 * 1024;
 const RAM_IMAGE: u32 = 56 * 1024;
 
@@ -87,6 +89,21 @@ pub fn within(used: u32, budget: &u32) -> Outcome {
     }
 }
 
+/// The gate of the compact map for the largest product: `used` bytes leave enough for a later mend.
+///
+/// # Errors
+/// When too few bytes are free.
+pub fn spare(used: u32) -> Outcome {
+    match COMPACT.saturating_sub(used) {
+        SPARE.. => Ok(()),
+        free => Err(format!(
+            "{free} of {COMPACT} bytes are free on the compact map, and {SPARE} have to be. Make the code smaller, or \
+             leave something out there by a named choice: a field of Product, its default for the compact map, and \
+             its rule in Product::checked (bootloader/src/product.rs, docs/product.md)."
+        )),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -95,5 +112,8 @@ mod tests {
     fn the_budget_itself_is_allowed_and_one_more_is_not() {
         assert_eq!(within(RESIDENT, &RESIDENT), Ok(()));
         assert!(within(RESIDENT + 1, &RESIDENT).unwrap_err().contains("1 bytes over its budget of 12 KiB"));
+        assert_eq!(spare(31_744), Ok(()));
+        assert!(spare(31_745).unwrap_err().starts_with("511 of 32256 bytes are free"));
+        assert!(spare(u32::MAX).unwrap_err().starts_with("0 of"));
     }
 }

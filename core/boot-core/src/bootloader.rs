@@ -164,10 +164,14 @@ pub trait Choices {
     const BLOCK_DOWNLOAD: bool = true;
     /// Whether objects can be read by SDO block upload.
     const BLOCK_UPLOAD: bool = true;
+    /// Whether it has layer setting services.
+    const LSS: bool = true;
     /// Whether layer setting services may store node-ID and bit rate.
     const LSS_STORE: bool = true;
     /// The node-IDs that the device takes: with another one no program starts.
     const NODE_IDS: RangeInclusive<u8> = 1..=127;
+    /// Whether it may detect the bit rate of its bus by listening.
+    const DETECTS_BIT_RATE: bool = true;
     /// 2007h/10.
     const PROGRAM_START: ProgramStart = ProgramStart::NONE;
 }
@@ -565,6 +569,14 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Objects
 impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
     for Bootloader<'_, F, P, PROGRAMS, C>
 {
+    fn has_lss() -> bool {
+        C::LSS
+    }
+
+    fn detects_bit_rate() -> bool {
+        C::DETECTS_BIT_RATE
+    }
+
     fn supports(&mut self, rate: BitRate) -> bool {
         (self.config.supports)(rate)
     }

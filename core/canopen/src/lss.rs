@@ -45,6 +45,23 @@ pub enum StoreError {
 
 /// The interface between LSS and the device.
 pub trait LssDevice {
+    /// Whether the device is a slave of these services. Without it, the compiler leaves out the code.
+    fn has_lss() -> bool
+    where
+        Self: Sized,
+    {
+        true
+    }
+
+    /// Whether the device may detect the bit rate of its bus by listening ([`BitRate::Auto`]).
+    /// Without it, the compiler leaves out the code.
+    fn detects_bit_rate() -> bool
+    where
+        Self: Sized,
+    {
+        true
+    }
+
     /// Whether the device supports this bit rate; for [`BitRate::Auto`], whether it may detect the
     /// bit rate by listening.
     fn supports(&mut self, rate: BitRate) -> bool;

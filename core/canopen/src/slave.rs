@@ -34,24 +34,17 @@ pub trait SlaveDevice: Objects + LssDevice {
     }
 }
 
-/// The configuration of a slave. [`LssDevice::supports`] for [`BitRate::Auto`] decides whether the
-/// slave may detect the bit rate by listening.
-#[derive(Clone, Copy, Debug)]
+/// The configuration of a slave.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Config {
     /// The configuration of the node.
     pub node: node::Config,
-    /// The configuration of the layer setting services; `None` for a slave without them.
-    pub lss: Option<lss::Config>,
+    /// The configuration of the layer setting services, for a device that [has](LssDevice::has_lss) them.
+    pub lss: lss::Config,
     /// Whether the slave only listens until a request of the layer setting services arrives: its clock may
-    /// be wrong, and a frame without an error shows that it is good enough.
+    /// be wrong, and a frame without an error shows that it is good enough. It has no effect on a slave
+    /// without these services.
     pub is_silent: bool,
-}
-
-impl Default for Config {
-    /// With layer setting services.
-    fn default() -> Self {
-        Self { node: node::Config::default(), lss: Some(lss::Config::default()), is_silent: false }
-    }
 }
 
 /// What the owner must do.
@@ -113,7 +106,7 @@ impl Slave {
             config,
             node: None,
             started: false,
-            lss: Lss::new(address, id, config.lss.unwrap_or_default()),
+            lss: Lss::new(address, id, config.lss),
             line: Line::Down(rate),
             losses: Losses::default(),
             second: CobId::NONE,
@@ -174,13 +167,15 @@ impl Slave {
                 // A frame that nobody acknowledges comes again and again.
                 let join_at = join_at.unwrap_or(now + JOIN_MS);
                 self.line = Line::Silent { rate, join_at: Some(join_at) };
-                self.lss.handle(frame, now, device);
+                if D::has_lss() {
+                    self.lss.handle(frame, now, device);
+                }
                 return false;
             }
             // A controller that only listens cannot send answers.
             _ => return false,
         }
-        if self.config.lss.is_some() {
+        if D::has_lss() {
             self.lss.handle(frame, now, device);
         }
         let Some(node) = &mut self.node else { return false };
@@ -203,14 +198,14 @@ impl Slave {
     }
 
     /// Processes the state of the controller.
-    pub fn observe(&mut self, status: Status, now: Instant, device: &mut impl SlaveDevice) {
+    pub fn observe<D: SlaveDevice>(&mut self, status: Status, now: Instant, device: &mut D) {
         if let Some(lost) = self.losses.observe(status.lost, now) {
             device.line_event(LineEvent::Lost(lost));
         }
         match &mut self.line {
             Line::Down(_) | Line::Silent { .. } => {}
             Line::Listening { detector, .. } => {
-                if detector.heard(status.heard, now, |rate| device.supports(rate)) {
+                if D::detects_bit_rate() && detector.heard(status.heard, now, |rate| device.supports(rate)) {
                     self.line = Line::Down(detector.rate());
                 }
             }
@@ -224,21 +219,21 @@ impl Slave {
 
     /// Returns the owner's next action; `None` if there is none. Frames are returned only while
     /// there is `room` for one in the mailboxes.
-    pub fn poll(&mut self, now: Instant, room: bool, device: &mut impl SlaveDevice) -> Option<Output> {
+    pub fn poll<D: SlaveDevice>(&mut self, now: Instant, room: bool, device: &mut D) -> Option<Output> {
         if !core::mem::replace(&mut self.started, true) {
             self.restart(self.lss.node_id(), device);
         }
         loop {
             if core::mem::take(&mut self.accept) {
-                return Some(Output::Accept(self.identifiers()));
+                return Some(Output::Accept(self.identifiers::<D>()));
             }
             match &mut self.line {
-                Line::Down(BitRate::Auto) => {
+                Line::Down(BitRate::Auto) if D::detects_bit_rate() => {
                     let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
                     self.line = Line::Listening { detector, set: None };
                     continue;
                 }
-                &mut Line::Down(rate) if self.config.is_silent => {
+                &mut Line::Down(rate) if D::has_lss() && self.config.is_silent => {
                     self.line = Line::Silent { rate, join_at: None };
                     return Some(Output::Listen(rate));
                 }
@@ -269,23 +264,25 @@ impl Slave {
                     }
                 }
             }
-            self.lss.follow_store(device);
+            if D::has_lss() {
+                self.lss.follow_store(device);
+            }
             if !room {
                 return None;
             }
-            match self.lss.poll(now) {
+            match D::has_lss().then(|| self.lss.poll(now)).flatten() {
                 Some(lss::Output::Send(frame)) => return Some(Output::Send(frame)),
                 Some(lss::Output::BitRate(rate)) => self.line = Line::Down(rate),
                 Some(lss::Output::NodeId(id)) => self.restart(Some(id), device),
-                None if self.lss.is_silent(now) => return None,
+                None if D::has_lss() && self.lss.is_silent(now) => return None,
                 None => return self.node.as_mut()?.poll(now, device).map(Output::Send),
             }
         }
     }
 
     /// The identifiers of the frames that it accepts.
-    fn identifiers(&self) -> [CobId; 4] {
-        let lss = if self.config.lss.is_some() { CobId::LSS_REQUEST } else { CobId::NMT };
+    fn identifiers<D: LssDevice>(&self) -> [CobId; 4] {
+        let lss = if D::has_lss() { CobId::LSS_REQUEST } else { CobId::NMT };
         let [nmt, request] = match &self.node {
             Some(node) => [CobId::NMT, self.config.node.sdo.request(node.id())],
             None => [lss; 2],

@@ -128,7 +128,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             findings: Findings::default(),
         };
         let outcome = match data {
-            Some(bytes) => intake.data(bytes, &mut to),
+            Some(bytes) => intake.data::<P>(bytes, &mut to),
             None => intake.end(&mut to),
         };
         let findings = to.findings;

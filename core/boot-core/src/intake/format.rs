@@ -5,6 +5,7 @@ use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
 use crate::resume::Partial;
+use crate::store::Parameters;
 
 /// At least the first two vectors: a program whose CRC does not cover them cannot start.
 pub(crate) const SMALLEST_PROGRAM: u32 = 8;
@@ -24,6 +25,11 @@ pub(crate) trait Format: Sized {
     /// Whether it carries a whole program in one transfer. Such a client is slowed down if the
     /// flash is slower than the bus, and an aborted transfer leaves an incomplete program.
     const IS_STREAM: bool;
+
+    /// Whether the device takes the format. Without it, the compiler leaves out the code.
+    fn is_taken<P: Parameters>() -> bool {
+        true
+    }
 
     /// Looks at the first bytes of a transfer, at most four.
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self>;

@@ -12,6 +12,7 @@ use super::stream::Stream;
 use crate::policy::Judge;
 use crate::queue::{Queue, PIECE_HEADER};
 use crate::refusal::Refusal;
+use crate::store::Parameters;
 
 /// A program in Intel HEX.
 pub(super) struct IntelHex {
@@ -21,6 +22,10 @@ pub(super) struct IntelHex {
 
 impl Format for IntelHex {
     const IS_STREAM: bool = true;
+
+    fn is_taken<P: Parameters>() -> bool {
+        P::INTEL_HEX
+    }
 
     fn recognise(first: &[u8], judge: &Judge<'_>) -> Recognition<Self> {
         if first.first() == Some(&b':') && !judge.is_data() {

@@ -24,6 +24,7 @@ use canopen::AbortCode;
 use crate::policy::Judge;
 use crate::queue::Queue;
 use crate::refusal::Refusal;
+use crate::store::Parameters;
 pub(crate) use format::{Destination, Findings, Format, Recognition};
 
 formats! {
@@ -58,25 +59,29 @@ impl Intake {
     }
 
     /// Takes the next bytes.
-    pub(crate) fn data(&mut self, mut bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+    pub(crate) fn data<P: Parameters>(
+        &mut self,
+        mut bytes: &[u8],
+        to: &mut Destination<'_, '_>,
+    ) -> Result<(), Refusal> {
         if let State::Unknown { bytes: first, len } = &mut self.state {
             let more = bytes.len().min(FIRST - *len);
             first[*len..*len + more].copy_from_slice(&bytes[..more]);
             *len += more;
             bytes = &bytes[more..];
             let (first, len) = (*first, *len);
-            let Some(mut known) = Known::recognise(&first[..len], &to.judge)? else { return Ok(()) };
+            let Some(mut known) = Known::recognise::<P>(&first[..len], &to.judge)? else { return Ok(()) };
             if to.judge.images.only_sealed().is_some()
                 && !matches!(known, Known::Sealed(_) | Known::BlockFile(_))
             {
                 return Err(Refusal::unfit(FlashError::NoAccess));
             }
             known.begin(self.size, &to.judge, to.queue)?;
-            known.data(&first[..len], to)?;
+            known.data::<P>(&first[..len], to)?;
             self.state = State::Known(known);
         }
         match &mut self.state {
-            State::Known(known) if !bytes.is_empty() => known.data(bytes, to),
+            State::Known(known) if !bytes.is_empty() => known.data::<P>(bytes, to),
             _ => Ok(()),
         }
     }
@@ -123,12 +128,12 @@ macro_rules! formats {
 
         impl Known {
             /// `None` if there are too few bytes to decide.
-            fn recognise(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
+            fn recognise<P: Parameters>(first: &[u8], judge: &Judge<'_>) -> Result<Option<Self>, Refusal> {
                 let mut more = false;
                 $(match <$format>::recognise(first, judge) {
-                    Recognition::Yes(format) => return Ok(Some(Self::$name(format))),
+                    Recognition::Yes(format) if <$format>::is_taken::<P>() => return Ok(Some(Self::$name(format))),
                     Recognition::More => more = true,
-                    Recognition::No => {}
+                    Recognition::Yes(_) | Recognition::No => {}
                 })*
                 if more { Ok(None) } else { Err(judge.unknown_format()) }
             }
@@ -150,9 +155,14 @@ macro_rules! formats {
                 }
             }
 
-            fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {
+            fn data<P: Parameters>(
+                &mut self,
+                bytes: &[u8],
+                to: &mut Destination<'_, '_>,
+            ) -> Result<(), Refusal> {
                 match self {
-                    $(Self::$name(format) => format.data(bytes, to)),*
+                    $(Self::$name(format) if <$format>::is_taken::<P>() => format.data(bytes, to),)*
+                    _ => Err(to.judge.unknown_format()),
                 }
             }
 

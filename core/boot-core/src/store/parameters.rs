@@ -80,6 +80,8 @@ pub trait Parameters {
     const RENEWS: bool = false;
     /// Whether the dates of programs are kept (1F52h). Without it, the compiler leaves out the code.
     const DATES: bool = true;
+    /// Whether programs are taken in Intel HEX. Without it, the compiler leaves out the code.
+    const INTEL_HEX: bool = true;
 
     /// The version of the services of the resident part, which owns the store. The flash must be idle.
     fn services(&self) -> u32 {

@@ -397,6 +397,14 @@ impl<D: Objects, M: Memory> Objects for Debugged<'_, D, M> {
 }
 
 impl<D: LssDevice, M> LssDevice for Debugged<'_, D, M> {
+    fn has_lss() -> bool {
+        D::has_lss()
+    }
+
+    fn detects_bit_rate() -> bool {
+        D::detects_bit_rate()
+    }
+
     fn supports(&mut self, rate: BitRate) -> bool {
         self.device.supports(rate)
     }

@@ -17,9 +17,9 @@ static ENTRIES: [Entry; 2] = [
     Entry::var(0x2000, "Domain", DataType::Domain, Access::Rw),
 ];
 
-/// A device with slow memory.
+/// A device with slow memory, with layer setting services or without.
 #[derive(Default)]
-struct Device {
+struct Device<const LSS: bool = true> {
     events: Vec<LineEvent>,
     ids: Vec<Option<u8>>,
     stored: Option<(Option<NodeId>, Option<BitRate>)>,
@@ -29,7 +29,7 @@ struct Device {
     cancelled: u32,
 }
 
-impl Objects for Device {
+impl<const LSS: bool> Objects for Device<LSS> {
     fn entries(&self) -> &'static [Entry] {
         &ENTRIES
     }
@@ -64,7 +64,11 @@ impl Objects for Device {
     }
 }
 
-impl LssDevice for Device {
+impl<const LSS: bool> LssDevice for Device<LSS> {
+    fn has_lss() -> bool {
+        LSS
+    }
+
     fn supports(&mut self, rate: BitRate) -> bool {
         rate != BitRate::K800
     }
@@ -79,7 +83,7 @@ impl LssDevice for Device {
     }
 }
 
-impl SlaveDevice for Device {
+impl<const LSS: bool> SlaveDevice for Device<LSS> {
     fn line_event(&mut self, event: LineEvent) {
         self.events.push(event);
     }
@@ -216,17 +220,21 @@ fn a_silent_slave_says_nothing_until_a_request_of_lss_arrives() {
 /// A product may disable layer setting services.
 #[test]
 fn a_slave_without_lss_neither_accepts_nor_answers_its_requests() {
-    let config = Config { lss: None, ..Config::default() };
-    let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K500, config);
-    let mut bench = Bench { slave, device: Device::default(), now: 0 };
+    // It cannot wait for them either.
+    let config = Config { is_silent: true, ..Config::default() };
+    let mut slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K500, config);
+    let mut device = Device::<false>::default();
+    let mut outputs = |asked: Option<[u8; 8]>| -> Vec<Output> {
+        let asked = asked.map(|request| Frame::full(CobId::LSS_REQUEST, request));
+        assert!(!asked.is_some_and(|frame| slave.handle(&frame, at(0), &mut device)));
+        core::iter::from_fn(|| slave.poll(at(0), true, &mut device)).collect()
+    };
     let ids = [CobId::NMT, CobId::NMT, CobId::sdo_request(NodeId::new(5).unwrap()), CobId::NMT];
     let boot_up = Output::Send(Frame::of(CobId::new(0x705).unwrap(), &[0]));
-    assert_eq!(bench.outputs(), [Output::Accept(ids), Output::Join(BitRate::K500), boot_up]);
+    assert_eq!(outputs(None), [Output::Accept(ids), Output::Join(BitRate::K500), boot_up]);
     // Switch state global to configuration, inquire node-ID.
     for request in [[0x04, 1, 0, 0, 0, 0, 0, 0], [0x5E, 0, 0, 0, 0, 0, 0, 0]] {
-        let frame = Frame::full(CobId::LSS_REQUEST, request);
-        assert!(!bench.slave.handle(&frame, at(bench.now), &mut bench.device));
-        assert_eq!(bench.outputs(), []);
+        assert_eq!(outputs(Some(request)), []);
     }
 }
 
@@ -261,7 +269,7 @@ fn reset_communication_ends_the_configuration_state() {
     bench.ask(0x000, &[0x82, 5]);
     assert_eq!(bench.ask(0x7E5, &inquire), [], "inquire node-ID is not served in LSS waiting");
     // A device that starts in configuration state (not in the standard) is in that state again.
-    let lss = Some(canopen::lss::Config { start_in_configuration: true, ..Default::default() });
+    let lss = canopen::lss::Config { start_in_configuration: true, ..Default::default() };
     let slave = Slave::new(ADDRESS, NodeId::new(5), BitRate::K125, Config { lss, ..Config::default() });
     let mut bench = Bench { slave, device: Device::default(), now: 0 };
     bench.outputs();
