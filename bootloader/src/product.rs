@@ -24,8 +24,8 @@ use boot_core::policy::SealPolicy;
 use boot_core::store::{Journal, NodeParameters};
 use bsp::line::TIMINGS;
 use bsp::{BIT_RATE, IDENTITY, LAYOUT, NODE_ID};
+use shared_abi::abilities::Abilities;
 use shared_abi::nameplate::Nameplate;
-use shared_abi::ram_image::feature;
 use shared_abi::renewal;
 use shared_abi::services::Facts;
 use shared_abi::warm_start::Cell;
@@ -38,9 +38,11 @@ include!(concat!(env!("OUT_DIR"), "/board_identity.rs"));
 pub const SEALED: bool = cfg!(feature = "sealed");
 
 /// The abilities of the resident part, which the RAM image needs.
-pub const FEATURES: u32 = if SEALED { feature::SEALED } else { 0 }
-    | if PRODUCT.renewal { feature::RENEWAL } else { 0 }
-    | if PRODUCT.rom_loader { feature::ROM_LOADER } else { 0 };
+pub const ABILITIES: Abilities = Abilities::NONE
+    .with(Abilities::SEALED, SEALED)
+    .with(Abilities::RENEWAL, PRODUCT.renewal)
+    .with(Abilities::ROM_LOADER, PRODUCT.rom_loader)
+    .with(Abilities::NAMEPLATE, HAS_NAMEPLATE);
 
 /// What a device does while its crystal fails. It then runs from HSI, which may be wrong by 4 % and more
 /// (DS8626 table 41), and CAN tolerates 0.3 to 1 %: such a node destroys the frames of the others.
@@ -551,7 +553,7 @@ pub const PRODUCT: Product = chosen::PRODUCT.checked();
 pub const fn renewal(device: &Nameplate) -> Renewal {
     Renewal {
         board: BOARD_IDENTITY,
-        features: FEATURES,
+        features: ABILITIES,
         identity: Some((device.vendor_id, device.product_code)),
         revision: device.revision,
         confirm_within_s: PRODUCT.renewal_s,
@@ -592,9 +594,7 @@ pub const FACTS: Facts = Facts {
     node_ids: *PRODUCT.node_ids.start() as u16 | (*PRODUCT.node_ids.end() as u16) << 8,
     bit_rates: ((2 << *PRODUCT.bit_rates.end()) - (1 << *PRODUCT.bit_rates.start()))
         | ((PRODUCT.auto_bit_rate as u16) << BitRate::Auto as u8),
-    abilities: if PRODUCT.renewal { Facts::RENEWS } else { 0 }
-        | if PRODUCT.rom_loader { Facts::ROM_LOADER } else { 0 }
-        | if HAS_NAMEPLATE { Facts::NAMEPLATE } else { 0 },
+    abilities: ABILITIES.0 as u16,
     sdo_request_base: PRODUCT.sdo_request_base,
     sdo_response_base: PRODUCT.sdo_response_base,
 };

@@ -2,13 +2,15 @@
 
 use core::arch::global_asm;
 
+use boot_core::crc::crc32;
 use bsp::{IDENTITY, LAYOUT};
+use shared_abi::abilities::Abilities;
 use shared_abi::boot_report::{BootReport, Words};
 use shared_abi::layout::{KNOWS_SEALED_IMAGES, MARK_OFFSET};
 use shared_abi::ram_image::{self, Header};
 use shared_abi::services::{self, Facts};
 
-use product::{BOARD_IDENTITY, FACTS, FEATURES, HAS_NAMEPLATE, PRODUCT, SEALED};
+use product::{ABILITIES, BOARD_IDENTITY, FACTS, HAS_NAMEPLATE, PRODUCT, SEALED};
 
 /// The bytes of the resident part: of the released one that the product names, or a fresh one.
 const BYTES: &[u8] = match PRODUCT.resident {
@@ -22,8 +24,7 @@ const _: () = {
         PRODUCT.resident.is_none() || LAYOUT.home.is_some(),
         "product: `resident` needs the split map: in the compact one the two parts are written together"
     );
-    let table = LAYOUT.callgate() + services::OFFSET;
-    let Some((version, facts)) = Facts::of_resident(BYTES, LAYOUT.bootloader.base, table) else {
+    let Some((version, facts)) = Facts::of_resident(BYTES, LAYOUT.bootloader.base, TABLE) else {
         panic!("product: `resident` is no resident part")
     };
     assert!(facts.board == FACTS.board, "product: `resident` is for another board");
@@ -39,11 +40,14 @@ const _: () = {
             && facts.sdo_response_base == FACTS.sdo_response_base,
         "product: `resident` has another sdo_request_base or sdo_response_base"
     );
-    let differs = facts.abilities ^ FACTS.abilities;
-    assert!(differs & Facts::ROM_LOADER == 0, "product: `resident` has another rom_loader");
-    assert!(differs & Facts::NAMEPLATE == 0, "product: `resident` has another identity");
-    assert!(differs == 0, "product: `resident` has another renewal");
+    let differs = Abilities(facts.abilities as u32 ^ ABILITIES.0);
+    assert!(!differs.has(Abilities::ROM_LOADER), "product: `resident` has another rom_loader");
+    assert!(!differs.has(Abilities::NAMEPLATE), "product: `resident` has another identity");
+    assert!(!differs.has(Abilities::RENEWAL), "product: `resident` has another renewal");
 };
+
+/// The address of the services of the resident part.
+const TABLE: u32 = LAYOUT.callgate() + services::OFFSET;
 
 #[repr(C, align(4))]
 struct Resident([u8; BYTES.len()]);
@@ -77,19 +81,20 @@ global_asm!(
     ".word {magic}, 0, {length}, __ram_image_size",
     ".word {ram_base}, {ram_end}, {services}, {features}",
     ".word {board}, {vendor}, {product}, {revisions}",
-    ".word {version}, {counter}, 0, 0",
+    ".word {version}, {counter}, {facts}, 0",
     magic = const ram_image::MAGIC,
     length = const Header::SIZE,
     ram_base = const LAYOUT.ram.base,
     ram_end = const LAYOUT.ram.end(),
     services = const ram_image::SERVICES_VERSION,
-    features = const FEATURES,
+    features = const ABILITIES.0,
     board = const BOARD_IDENTITY,
     vendor = const FOR.0,
     product = const FOR.1,
     revisions = const PRODUCT.bootloader_revisions,
     version = const product::VERSION,
     counter = const PRODUCT.bootloader_counter,
+    facts = const crc32(Facts::record(BYTES, LAYOUT.bootloader.base, TABLE).unwrap()),
 );
 
 /// The report of the resident part. Without one a debugger has started the image; it then stays, as

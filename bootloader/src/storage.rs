@@ -119,6 +119,11 @@ impl Parameters for Store {
         services().version
     }
 
+    fn facts(&self) -> u32 {
+        let Services { facts, crc32, .. } = services();
+        crc32(0, &raw const **facts as u32, facts.size.into())
+    }
+
     fn get<F: Flash>(&self, _flash: &F, key: Key) -> Option<Value> {
         let mut value = [0; 4];
         // SAFETY: the state comes from `open`.

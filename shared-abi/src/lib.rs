@@ -28,6 +28,7 @@
 //! with it.
 #![no_std]
 
+pub mod abilities;
 pub mod bit_timing;
 pub mod block_file;
 pub mod boot_report;

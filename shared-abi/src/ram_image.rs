@@ -7,6 +7,7 @@
 
 use core::fmt;
 
+use crate::abilities::Abilities;
 use crate::geometry::{Region, CORE_VECTORS_SIZE};
 use crate::layout::LEAST_STACK;
 use crate::vectors::VectorTable;
@@ -19,18 +20,6 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
 /// that is added to their table.
 pub const SERVICES_VERSION: u32 = 1;
 
-/// Abilities that a resident part may have and an image may need, a bit each.
-pub mod feature {
-    /// The device takes sealed images. A resident part that knows them loads only an image that needs
-    /// this: another one would take programs from anybody.
-    pub const SEALED: u32 = 1;
-    /// The bootloader can be renewed: an image that takes part in a trial ends by itself, and installs itself.
-    /// One without this runs from home alone.
-    pub const RENEWAL: u32 = 2;
-    /// The device leaves for the loader in the ROM of the chip on request.
-    pub const ROM_LOADER: u32 = 4;
-}
-
 /// What a device has for a RAM image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Host {
@@ -38,8 +27,10 @@ pub struct Host {
     pub board: u32,
     /// The [`SERVICES_VERSION`] of its resident part.
     pub services: u32,
-    /// The abilities of its resident part ([`feature`]).
-    pub features: u32,
+    /// The abilities of its resident part.
+    pub features: Abilities,
+    /// The CRC-32/ISO-HDLC of the [facts](crate::services::Facts) of its resident part.
+    pub facts: u32,
 }
 
 /// The header before the image: 64 bytes, little-endian. `cargo build` writes everything but the
@@ -62,8 +53,8 @@ pub struct Header {
     pub ram_end: u32,
     /// The image needs at least this [`SERVICES_VERSION`].
     pub services: u32,
-    /// The image needs these abilities ([`feature`]).
-    pub features: u32,
+    /// The image needs these abilities.
+    pub features: Abilities,
     /// The board: the CRC-32/ISO-HDLC of its layout as TOML ([`crate::layout::toml`]).
     pub board: u32,
     /// Vendor-ID, as in 1018h/1.
@@ -76,8 +67,10 @@ pub struct Header {
     pub version: u32,
     /// Security counter.
     pub counter: u32,
+    /// The facts of the resident part for which the image was built: as [`Host::facts`].
+    pub facts: u32,
     /// 0.
-    pub reserved: [u32; 2],
+    pub reserved: u32,
 }
 
 impl Header {
@@ -98,7 +91,7 @@ impl Header {
     #[must_use]
     pub const fn of_words(words: [u32; Self::SIZE as usize / 4]) -> Self {
         let [magic, crc, length, size, ram_base, ram_end, services, features, board, rest @ ..] = words;
-        let [vendor, product, revisions, version, counter, reserved @ ..] = rest;
+        let [vendor, product, revisions, version, counter, facts, reserved] = rest;
         Self {
             magic,
             crc,
@@ -107,13 +100,14 @@ impl Header {
             ram_base,
             ram_end,
             services,
-            features,
+            features: Abilities(features),
             board,
             vendor,
             product,
             revisions,
             version,
             counter,
+            facts,
             reserved,
         }
     }
@@ -130,6 +124,8 @@ impl Header {
     pub const CRC: u32 = core::mem::offset_of!(Self, crc) as u32;
     /// Offset of the abilities that the image needs.
     pub const FEATURES: u32 = core::mem::offset_of!(Self, features) as u32;
+    /// Offset of the facts of the resident part.
+    pub const FACTS: u32 = core::mem::offset_of!(Self, facts) as u32;
     /// The offset of the first byte that the CRC covers.
     pub const CRC_FROM: u32 = Self::CRC + 4;
 
@@ -137,7 +133,7 @@ impl Header {
     /// the images.
     ///
     /// # Errors
-    /// [`Damage::Header`], [`Damage::Board`] or [`Damage::Services`].
+    /// [`Damage::Header`], [`Damage::Board`], [`Damage::Services`] or [`Damage::Facts`].
     pub const fn check(&self, flash: u32, ram: Region, host: Host) -> Result<(), Damage> {
         if self.magic != MAGIC || self.length != Self::SIZE {
             return Err(Damage::Header);
@@ -153,14 +149,17 @@ impl Header {
             && self.ram_end <= ram.end()
             && self.ram_end > ram.base
             && self.ram_end - ram.base >= self.size;
-        if !fits || self.reserved[0] != 0 || self.reserved[1] != 0 {
+        if !fits || self.reserved != 0 {
             return Err(Damage::Header);
         }
         if self.services > host.services
-            || self.features & !(host.features | feature::RENEWAL) != 0
-            || host.features & !self.features & feature::SEALED != 0
+            || !host.features.has(self.features.without(Abilities::RENEWAL))
+            || host.features.has(Abilities::SEALED) && !self.features.has(Abilities::SEALED)
         {
             return Err(Damage::Services);
+        }
+        if self.facts != host.facts {
+            return Err(Damage::Facts);
         }
         Ok(())
     }
@@ -195,7 +194,9 @@ mod tests {
 
     const RAM: Region = Region::new(0x2000_0000, 0x1_FFC0);
     const BOARD: u32 = 0x1234_5678;
-    const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: 0 };
+    const FACTS: u32 = 0x0FAC_7500;
+    const HOST: Host =
+        Host { board: BOARD, services: SERVICES_VERSION, features: Abilities::NONE, facts: FACTS };
     const SOUND: Header = Header {
         magic: MAGIC,
         crc: 0,
@@ -204,14 +205,15 @@ mod tests {
         ram_base: 0x2000_0000,
         ram_end: 0x2001_FFC0,
         services: SERVICES_VERSION,
-        features: 0,
+        features: Abilities::NONE,
         board: BOARD,
         vendor: 1,
         product: 2,
         revisions: 3,
         version: 4,
         counter: 5,
-        reserved: [0; 2],
+        facts: FACTS,
+        reserved: 0,
     };
 
     #[test]
@@ -235,18 +237,21 @@ mod tests {
             (Header { ram_end: 0x2000_0000, ..SOUND }, Damage::Header),
             (Header { ram_end: 0x2000_3FFC, ..SOUND }, Damage::Header),
             (Header { ram_end: 0, ..SOUND }, Damage::Header),
-            (Header { reserved: [1, 0], ..SOUND }, Damage::Header),
-            (Header { reserved: [0, 1], ..SOUND }, Damage::Header),
+            (Header { reserved: 1, ..SOUND }, Damage::Header),
             (Header { board: !BOARD, ..SOUND }, Damage::Board),
             (Header { services: SERVICES_VERSION + 1, ..SOUND }, Damage::Services),
-            (Header { features: 1 << 31, ..SOUND }, Damage::Services),
+            (Header { features: Abilities::NAMEPLATE, ..SOUND }, Damage::Services),
+            (Header { features: Abilities(1 << 31), ..SOUND }, Damage::Services),
+            (Header { facts: FACTS ^ 1 << 31, ..SOUND }, Damage::Facts),
+            (Header { facts: 0, ..SOUND }, Damage::Facts),
         ] {
             assert_eq!(check(header), Err(damage), "{header:?}");
         }
         let large = Header { size: RAM.size - LEAST_STACK + 4, ..SOUND };
-        let sealed = Header { features: feature::SEALED, ..SOUND };
-        let check = |header: Header| header.check(0x4000, RAM, Host { features: feature::SEALED, ..HOST });
-        assert_eq!((check(SOUND), check(sealed)), (Err(Damage::Services), Ok(())));
+        let sealed = Header { features: Abilities::SEALED, ..SOUND };
+        let check =
+            |header: Header| header.check(0x4000, RAM, Host { features: Abilities(1 << 5 | 1), ..HOST });
+        assert_eq!((check(SOUND), check(sealed)), (Err(Damage::Services), Ok(())), "it may have more");
         assert_eq!(large.check(u32::MAX, RAM, HOST), Err(Damage::Header), "no room for the stack");
     }
 
@@ -275,6 +280,6 @@ mod tests {
     fn the_header_has_64_bytes() {
         assert_eq!(size_of::<Header>(), 64);
         assert_eq!(core::mem::offset_of!(Header, board), 32);
-        assert_eq!(core::mem::offset_of!(Header, reserved), 56);
+        assert_eq!(core::mem::offset_of!(Header, facts), 56);
     }
 }

@@ -45,8 +45,9 @@ pub struct Services {
 }
 
 /// Choices of the product that the resident part decides by, and that a RAM image has to share. The
-/// record only grows. (Whether the device takes sealed images is said by the
-/// [mark](crate::layout::MARK_OFFSET).)
+/// record only grows at its end. An image is for resident parts with one record: its header has the
+/// CRC-32/ISO-HDLC of all its bytes ([`Header::facts`](crate::ram_image::Header::facts)). Nothing of the
+/// single device is in it, neither serial number nor nameplate.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Facts {
@@ -64,8 +65,7 @@ pub struct Facts {
     /// The bit rates that the device can be set to, a bit for each index of CiA 305 table 1; bit 9:
     /// the device may find it out.
     pub bit_rates: u16,
-    /// Abilities that a RAM image has to share: [`RENEWS`](Self::RENEWS),
-    /// [`ROM_LOADER`](Self::ROM_LOADER) and [`NAMEPLATE`](Self::NAMEPLATE).
+    /// The lower half of [`Abilities`](crate::abilities::Abilities); the upper one is 0.
     pub abilities: u16,
     /// The bases of the COB-IDs of SDO requests, and of answers, which programs get with the handoff.
     pub sdo_request_base: u16,
@@ -74,33 +74,50 @@ pub struct Facts {
 }
 
 impl Facts {
-    /// In [`abilities`](Self::abilities): it loads a RAM image from staging, too ([`crate::renewal`]).
-    pub const RENEWS: u16 = 1;
-    /// In [`abilities`](Self::abilities): it leaves for the loader in the ROM of the chip on request.
-    pub const ROM_LOADER: u16 = 2;
-    /// In [`abilities`](Self::abilities): the identity of the device is that of its nameplate
-    /// ([`crate::nameplate`]), if it has one.
-    pub const NAMEPLATE: u16 = 4;
     /// Its size in bytes.
     pub const SIZE: u16 = size_of::<Self>() as u16;
 
-    /// Reads the facts from the bytes of a resident part for the chip: `base` is its address, `table`
-    /// that of its services. Returns them with the version of the services; `None` if this is no
-    /// resident part.
+    /// Its bytes.
     #[must_use]
-    pub const fn of_resident(bytes: &[u8], base: u32, table: u32) -> Option<(u32, Self)> {
+    pub const fn bytes(&self) -> [u8; Self::SIZE as usize] {
+        let mut bytes = [0; Self::SIZE as usize];
+        let Self { board, size, autostart, crc_bits, node_ids, bit_rates, abilities, .. } = *self;
+        let (low, high) = (board as u16, (board >> 16) as u16);
+        let bases = [self.sdo_request_base, self.sdo_response_base];
+        let halves =
+            [low, high, size, autostart, crc_bits, node_ids, bit_rates, abilities, bases[0], bases[1]];
+        let mut n = 0;
+        while n < halves.len() {
+            [bytes[2 * n], bytes[2 * n + 1]] = halves[n].to_le_bytes();
+            n += 1;
+        }
+        bytes
+    }
+
+    /// The bytes of the record in those of a resident part for the chip, as many as it says: `base` is the
+    /// address of the resident part, `table` that of its services. `None` if this is no resident part.
+    #[must_use]
+    pub const fn record(bytes: &[u8], base: u32, table: u32) -> Option<&[u8]> {
         /// The offset of the pointer to the facts: two words and seven pointers of four bytes.
         const FACTS: u32 = 9 * 4;
-        let Some(version) = word(bytes, table.wrapping_sub(base)) else { return None };
         let Some(at) = word(bytes, table.wrapping_sub(base).wrapping_add(FACTS)) else { return None };
         let at = at.wrapping_sub(base);
-        let (Some(board), Some(first), Some(second), Some(third), Some(fourth)) = (
-            word(bytes, at),
-            word(bytes, at.wrapping_add(4)),
-            word(bytes, at.wrapping_add(8)),
-            word(bytes, at.wrapping_add(12)),
-            word(bytes, at.wrapping_add(16)),
-        ) else {
+        let Some(size) = word(bytes, at.wrapping_add(4)) else { return None };
+        let Some((_, rest)) = bytes.split_at_checked(at as usize) else { return None };
+        match rest.split_at_checked(size as u16 as usize) {
+            Some((record, _)) if record.len() >= Self::SIZE as usize => Some(record),
+            _ => None,
+        }
+    }
+
+    /// Reads the facts in a [record](Self::record), and the version of the services before it.
+    #[must_use]
+    pub const fn of_resident(bytes: &[u8], base: u32, table: u32) -> Option<(u32, Self)> {
+        let Some(version) = word(bytes, table.wrapping_sub(base)) else { return None };
+        let Some(record) = Self::record(bytes, base, table) else { return None };
+        let (Some(board), Some(first), Some(second), Some(third), Some(fourth)) =
+            (word(record, 0), word(record, 4), word(record, 8), word(record, 12), word(record, 16))
+        else {
             return None;
         };
         let facts = Self {
@@ -114,9 +131,6 @@ impl Facts {
             sdo_request_base: fourth as u16,
             sdo_response_base: (fourth >> 16) as u16,
         };
-        if facts.size < Self::SIZE {
-            return None;
-        }
         Some((version, facts))
     }
 }
@@ -261,6 +275,7 @@ mod tests {
         }
         let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
         assert_eq!(read(&bytes), Some((3, facts)));
+        assert_eq!(Facts::record(&bytes, 0x0800_0000, 0x0800_0020), Some(&facts.bytes()[..]));
         for (at, word) in [(0x44, 0x0800_0070_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_0013)] {
             let mut wrong = bytes;
             wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());

@@ -24,6 +24,8 @@ pub enum Damage {
     Board = 4,
     /// Its stack pointer or its reset vector points out of its RAM.
     Vectors = 5,
+    /// The image was built for a resident part with other [facts](crate::services::Facts).
+    Facts = 6,
 }
 
 impl Damage {
@@ -36,6 +38,7 @@ impl Damage {
             3 => Self::Crc,
             4 => Self::Board,
             5 => Self::Vectors,
+            6 => Self::Facts,
             _ => return None,
         })
     }
@@ -314,10 +317,10 @@ mod tests {
 
     #[test]
     fn every_damage_has_a_number() {
-        for number in 1..=5 {
+        for number in 1..=6 {
             assert_eq!(Damage::from_number(number).map(|damage| damage as u8), Some(number));
         }
-        assert_eq!((Damage::from_number(0), Damage::from_number(6)), (None, None));
+        assert_eq!((Damage::from_number(0), Damage::from_number(7)), (None, None));
     }
 
     #[test]
@@ -445,7 +448,7 @@ mod tests {
             (7, 0x0001_00FF),
             (7, 0x0101_0001),
             (8, 0),
-            (8, 6),
+            (8, 7),
             (9, 0),
             (9, 0x0101),
             (10, 0),

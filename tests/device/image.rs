@@ -13,10 +13,12 @@ use emulator::machine::{ResetCause, Stop};
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, Object, ObjectSection, ObjectSymbol};
+use shared_abi::abilities::Abilities;
 use shared_abi::geometry::Region;
 use shared_abi::layout::toml::Toml;
-use shared_abi::ram_image::SERVICES_VERSION;
+use shared_abi::ram_image::{Header, Host, SERVICES_VERSION};
 use shared_abi::services::{Facts, OFFSET};
+use shared_abi::warm_start::Damage;
 
 /// The size of the header in bytes (shared_abi::ram_image, typed again).
 const HEADER: usize = 64;
@@ -69,6 +71,12 @@ impl Parts {
         crc32(&self.image[8..HEADER + self.get(SIZE) as usize])
     }
 
+    /// The facts of the resident part.
+    fn record(&self) -> &[u8] {
+        let board = firmware::board();
+        Facts::record(&self.resident, board.bootloader.base, board.callgate() + OFFSET).unwrap()
+    }
+
     /// Corrects the CRC.
     fn seal(&mut self) {
         self.set(CRC, self.right_crc());
@@ -98,7 +106,8 @@ const SERVICES: usize = 6;
 const FEATURES: usize = 7;
 const BOARD: usize = 8;
 const VERSION: usize = 12;
-const RESERVED: usize = 14;
+const FACTS: usize = 14;
+const RESERVED: usize = 15;
 const STACK: usize = 16;
 const RESET: usize = 17;
 
@@ -118,7 +127,7 @@ fn the_header_says_what_was_linked() {
             [SERVICES_VERSION, if renews { 2 } else { 0 }]
         );
         assert_eq!(parts.get(BOARD), crc32(Toml(board).to_string().as_bytes()));
-        assert_eq!([parts.get(RESERVED), parts.get(RESERVED + 1)], [0, 0]);
+        assert_eq!([parts.get(FACTS), parts.get(RESERVED)], [crc32(parts.record()), 0]);
         match board.home {
             Some(home) => assert_eq!(parts.home, home.base),
             None => assert_eq!(parts.home, board.bootloader.base + parts.resident.len() as u32),
@@ -269,6 +278,7 @@ const BY_SERVICES: u32 = 2;
 const BY_CRC: u32 = 3;
 const BY_BOARD: u32 = 4;
 const BY_VECTORS: u32 = 5;
+const BY_FACTS: u32 = 6;
 
 /// Ways to damage an image, and the boot stage's report.
 fn damages() -> Vec<(&'static str, Parts, u32)> {
@@ -310,9 +320,10 @@ fn damages() -> Vec<(&'static str, Parts, u32)> {
         ("RAM that ends before it begins", sealed(&[(RAM_END, 0)]), BY_HEADER),
         ("RAM that is shorter than the image", sealed(&[(RAM_END, board.ram.base + size - 4)]), BY_HEADER),
         ("a reserved word", sealed(&[(RESERVED, 1)]), BY_HEADER),
-        ("the other reserved word", sealed(&[(RESERVED + 1, 1 << 31)]), BY_HEADER),
         ("newer services", sealed(&[(SERVICES, SERVICES_VERSION + 1)]), BY_SERVICES),
-        ("an unknown ability", sealed(&[(FEATURES, 1)]), BY_SERVICES),
+        ("an ability that the resident part has not", sealed(&[(FEATURES, 1)]), BY_SERVICES),
+        ("an unknown ability", sealed(&[(FEATURES, 1 << 31)]), BY_SERVICES),
+        ("another resident part", sealed(&[(FACTS, !good.get(FACTS))]), BY_FACTS),
         ("another board", sealed(&[(BOARD, !good.get(BOARD))]), BY_BOARD),
         ("a bit of the CRC", bit(5), BY_CRC),
         ("a bit of the version", bit(VERSION * 4), BY_CRC),
@@ -462,15 +473,64 @@ fn an_image_without_a_crc_runs() {
     assert!(bench.is_bootloader(NODE));
 }
 
-/// The resident part stays in the field while RAM images come and go: an image of another product,
-/// in which every address differs, runs on it, and calls its services.
+/// The products of the tests by what their resident parts decide by (bootloader/products): those of a row have the
+/// same facts.
+const BY_FACTS_OF: [&[&str]; 7] = [
+    &[
+        firmware::BOOTLOADER,
+        firmware::BOOTLOADER_PAULUS,
+        firmware::BOOTLOADER_ESACADEMY,
+        firmware::BOOTLOADER_LIFT,
+        firmware::BOOTLOADER_WATCHDOG,
+        firmware::BOOTLOADER_LOG_RTT,
+        firmware::BOOTLOADER_LOG_DEFMT,
+        firmware::BOOTLOADER_LOG_UART,
+        firmware::BOOTLOADER_DEBUGGER,
+        firmware::BOOTLOADER_VIRTUAL_CAN,
+    ],
+    // CRC-16.
+    &[firmware::BOOTLOADER_CRC_16],
+    // No autostart, no renewal, fixed bit rate.
+    &[firmware::BOOTLOADER_LEAST],
+    // Node-IDs, bit rates, COB-IDs, nameplates.
+    &[firmware::BOOTLOADER_SWITCHES],
+    // The loader in the ROM.
+    &[firmware::BOOTLOADER_WAYS_IN],
+    // Sealed images, with renewal or without.
+    &[firmware::BOOTLOADER_SEALED, firmware::BOOTLOADER_SEALED_LOG_RTT, firmware::BOOTLOADER_SEALED_DEBUGGER],
+    &[firmware::BOOTLOADER_SEALED_WRITES_FLASH],
+];
+
+/// Each image on each resident part, as the running bootloader and the resident part judge its header.
+#[test]
+fn an_image_is_for_the_resident_parts_with_its_facts_alone() {
+    let board = firmware::board();
+    let all =
+        BY_FACTS_OF.iter().enumerate().flat_map(|(row, names)| names.iter().map(move |name| (row, *name)));
+    let all: Vec<_> = all.map(|(row, name)| (row, name, Parts::of(name))).collect();
+    for (row, resident, parts) in &all {
+        let base = board.bootloader.base;
+        let (services, facts) = Facts::of_resident(&parts.resident, base, board.callgate() + OFFSET).unwrap();
+        let features = Abilities(facts.abilities.into());
+        let host = Host { board: facts.board, services, features, facts: crc32(parts.record()) };
+        for (other, image, Parts { image: bytes, .. }) in &all {
+            let judged = Header::of_bytes(bytes.first_chunk().unwrap()).check(u32::MAX, board.ram, host);
+            let is_refused = matches!(judged, Err(Damage::Facts | Damage::Services));
+            let expected = if row == other { judged == Ok(()) } else { is_refused };
+            assert!(expected, "{image} on {resident}: {judged:?}");
+        }
+    }
+}
+
+/// The resident part stays in the field while RAM images come and go: an image in which every address differs
+/// runs on it, and calls its services.
 #[test]
 fn a_ram_image_runs_on_the_resident_part_of_another_bootloader() {
     if firmware::board().home.is_none() {
         // In the compact map the two are one, written together.
         return;
     }
-    let names = [firmware::BOOTLOADER, firmware::BOOTLOADER_LEAST, firmware::BOOTLOADER_LOG_RTT];
+    let names = [firmware::BOOTLOADER, firmware::BOOTLOADER_DEBUGGER, firmware::BOOTLOADER_LOG_RTT];
     let entries = names.map(|name| Parts::of(name).get(RESET));
     let addresses = |name| {
         let elf = firmware::elf(name);

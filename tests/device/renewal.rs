@@ -2,8 +2,8 @@
 //! on trial, and is installed at home after its confirmation (docs/renewal.md).
 
 use canopen::program::{
-    FlashError, ProgramControl, ProgramStart, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID, PROGRAM_VERSION,
-    STATE_BOOTLOADER, STATE_PROGRAM_START, STATE_RENEWAL,
+    FlashError, FlashStatus, ProgramControl, ProgramStart, DEVICE_STATE, PROGRAM_DATA, PROGRAM_ID,
+    PROGRAM_VERSION, STATE_BOOTLOADER, STATE_PROGRAM_START, STATE_RENEWAL,
 };
 use canopen::Address;
 use coboot_tests::bench::{Bench, NODE};
@@ -22,6 +22,7 @@ use shared_abi::geometry::Region;
 use shared_abi::handoff::ResetCause;
 use shared_abi::ram_image::Header;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
+use shared_abi::warm_start::Damage;
 
 /// An image for this board with code of its own: all its vectors lead there.
 fn made_of(code: &[u16]) -> Vec<u8> {
@@ -254,10 +255,16 @@ fn an_image_that_does_not_work_ends_by_itself() {
         ("hangs", made_of(&HANGS), TrialEnd::Reset(ResetCause::IndependentWatchdog)),
         ("locks up", made_of(&FAULTS), TrialEnd::Reset(ResetCause::IndependentWatchdog)),
         ("resets", made_of(&RESETS), TrialEnd::Reset(ResetCause::Software)),
+        ("of another resident part", made_of(&HANGS), TrialEnd::Damaged(Damage::Facts)),
     ] {
         let mut bench = board();
         let old = crc_of(&image_of(firmware::BOOTLOADER));
         stage(&mut bench, &image);
+        if end == TrialEnd::Damaged(Damage::Facts) {
+            // An older bootloader would have let it in.
+            let facts = firmware::board().staging.unwrap().base + Header::FACTS;
+            bench.machine().load_bin(facts, &[0; 4]).unwrap();
+        }
         start(&mut bench);
         let over = Progress { state: State::Staged, origin: Origin::Home, trial_end: end };
         assert_eq!((progress(&mut bench), identification(&mut bench)), (over, old), "{case}");
@@ -388,13 +395,23 @@ fn a_wrong_image_is_refused_before_an_erase() {
     bench_image[4..8].fill(0);
     let mut other_board = bench_image.clone();
     other_board[32] ^= 1;
-    // It would never end its trial.
-    let without_renewal = image_of(firmware::BOOTLOADER_LEAST);
-    for wrong in [bench_image, with_crc(other_board), without_renewal] {
+    let other_facts = Damage::Facts as u16;
+    for (wrong, detail) in [
+        (bench_image, 0),
+        (with_crc(other_board), 0),
+        // It would never end its trial.
+        (image_of(firmware::BOOTLOADER_LEAST), other_facts),
+        // Programs that it installs would not start: the resident part computes CRC-32.
+        (image_of(firmware::BOOTLOADER_CRC_16), other_facts),
+        // They need more than the resident part has: the loader in the ROM, nameplates.
+        (image_of(firmware::BOOTLOADER_WAYS_IN), 0),
+        (image_of(firmware::BOOTLOADER_SWITCHES), 0),
+    ] {
         let at = Address::new(PROGRAM_DATA, number());
         bench.session().command(number(), ProgramControl::Clear).unwrap();
         let _ = bench.session().write(at, &wrong, Doing::Write(at), &mut |_| {});
-        assert_eq!(status(&mut bench).error, Some(FlashError::Format));
+        let FlashStatus { error, detail: found, .. } = status(&mut bench);
+        assert_eq!((error, found), (Some(FlashError::Format), detail));
         assert_eq!(progress(&mut bench).state, State::Staged);
         assert_eq!(cells(&mut bench, staging), spare);
     }

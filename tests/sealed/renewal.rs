@@ -216,6 +216,11 @@ fn an_image_that_knows_no_sealed_programs_is_refused() {
     });
     let file = bootloader_sealer(1).seal(&open, &signer()).unwrap();
     assert_eq!(send(&mut bench, &file), status::WRONG_PRODUCT);
+    // Nor one for another resident part; its header says so: FORMAT with 6.
+    let mut other = image(1, 2);
+    other[56] ^= 1;
+    let file = bootloader_sealer(1).seal(&with_crc(other), &signer()).unwrap();
+    assert_eq!(send(&mut bench, &file), 6 << 16 | 0x04);
     assert_eq!(progress(&mut bench).state, State::None);
 }
 

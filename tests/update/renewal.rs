@@ -6,7 +6,7 @@ use canopen::program::FlashError;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coboot_tests::renewal::{number, plain, running, version};
+use coboot_tests::renewal::{image_of, number, plain, running, version};
 use coboot_tests::sealed_board;
 use coflash_core::device::{info, Doing};
 use coflash_core::file::read::{read, Format};
@@ -160,6 +160,23 @@ fn a_program_that_reaches_into_staging_is_named() {
     };
     assert!(error.to_string().contains("program 1 reaches into the flash where a new bootloader waits"));
     assert!(error.advice().to_string().contains("coflash erase --program 1"));
+}
+
+/// Each program that it installs would have another CRC than the resident part computes.
+#[test]
+fn a_bootloader_for_another_resident_part_is_refused_and_named() {
+    let mut bench = board();
+    call_back(&mut bench);
+    bench.machine().keep_flash_log();
+    let (result, _) = renewed(&mut bench, &plain(&image_of(firmware::BOOTLOADER_CRC_16)));
+    let error = result.unwrap_err();
+    assert!(
+        error.to_string().contains("was built for a resident part that decides by other choices"),
+        "{error}"
+    );
+    assert!(error.advice().to_string().contains("built for its resident part"), "{}", error.advice());
+    assert_eq!(bench.machine().take_flash_log(), []);
+    install(&mut bench, firmware::APP_V2);
 }
 
 /// A sealed device takes a sealed one alone.

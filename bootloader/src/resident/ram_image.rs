@@ -1,5 +1,6 @@
 //! Loads the rest of the bootloader from flash to RAM, if it is undamaged and for this device.
 
+use boot_core::crc::crc32;
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
@@ -8,10 +9,15 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
 use crate::flash::ResidentFlash;
-use product::{BOARD_IDENTITY, FEATURES, SEALED};
+use product::{ABILITIES, BOARD_IDENTITY, FACTS, SEALED};
 
 /// What this resident part has for an image.
-pub const HOST: Host = Host { board: BOARD_IDENTITY, services: SERVICES_VERSION, features: FEATURES };
+pub const HOST: Host = Host {
+    board: BOARD_IDENTITY,
+    services: SERVICES_VERSION,
+    features: ABILITIES,
+    facts: crc32(&FACTS.bytes()),
+};
 
 extern "C" {
     /// The image's header: the linker script of the resident part has its address.

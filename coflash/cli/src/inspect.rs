@@ -106,6 +106,7 @@ fn value(inspection: &Inspection) -> Value {
         "bootloader": inspection.bootloader.as_ref().map(|(header, _)| json!({
             "version": header.version, "size": header.total(), "crc": header.crc, "vendor_id": header.vendor,
             "product_code": header.product, "board": header.board, "services": header.services,
+            "facts": header.facts,
         })),
         "fault": match inspection.bootloader {
             Some((_, judgement)) => judgement.err().map(|fault| fault.to_string()),

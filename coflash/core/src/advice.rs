@@ -148,7 +148,8 @@ advice! {
     } => "clear that program first, and install it again afterwards: coflash erase --program {program}",
     /// For a bootloader that does not fit the device.
     OtherBootloader => "the file is a bootloader for another board, for a newer resident part, or not the one of this \
-                        product: coflash info shows what the device has",
+                        product: coflash info shows what the device has; give the bootloader of its product that was \
+                        built for its resident part (`resident`)",
     /// For a supply that is too low.
     Supply => "check the supply of the device under load, from its source to the chip (coflash info says whether it is \
                good), and run the command again",

@@ -38,8 +38,8 @@ impl CrcKind {
 
 /// The CRC-32 of these bytes.
 #[must_use]
-pub fn crc32(bytes: &[u8]) -> u32 {
-    resume(0, bytes)
+pub const fn crc32(bytes: &[u8]) -> u32 {
+    CRC32.checksum(bytes)
 }
 
 /// The CRC-32 of earlier bytes followed by `bytes`; `crc` is the CRC of the earlier bytes, 0 if

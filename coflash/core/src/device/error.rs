@@ -8,6 +8,7 @@ use canopen::AbortCode;
 use canopen::{Address, NodeId};
 use shared_abi::handoff::ResetCause;
 use shared_abi::renewal::TrialEnd;
+use shared_abi::warm_start::Damage;
 
 use super::device_type::DeviceType;
 use super::dialect::Dialect;
@@ -631,6 +632,11 @@ pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
         (FlashError::NotCleared, 1..) => {
             format!("program {detail} reaches into the flash where a new bootloader waits")
         }
+        (FlashError::Format, OTHER_FACTS) => {
+            "the bootloader was built for a resident part that decides by other \
+             choices: programs that it installs would not start"
+                .to_string()
+        }
         (FlashError::NoAccess, LOW_SUPPLY) => {
             "the supply of the device is too low to write its flash".to_string()
         }
@@ -641,11 +647,15 @@ pub(crate) fn failure_words(error: FlashError, detail: u16) -> String {
 /// The detail of [`FlashError::NoAccess`] for a supply that is too low.
 pub(crate) const LOW_SUPPLY: u16 = SUPPLY_DETAIL as u16;
 
+/// The detail of [`FlashError::Format`] for a bootloader that does not fit the resident part.
+const OTHER_FACTS: u16 = Damage::Facts as u16;
+
 /// The detail of an error of 1F57h as a number, unless it is 0 or [`failure_words`] have it.
 pub(crate) fn detail_words(error: Option<FlashError>, detail: u16) -> String {
     match (error, detail) {
         (_, 0)
         | (Some(FlashError::Secured | FlashError::NotCleared), _)
+        | (Some(FlashError::Format), OTHER_FACTS)
         | (Some(FlashError::NoAccess), LOW_SUPPLY) => String::new(),
         _ => format!(", detail {detail:04X}h"),
     }

@@ -112,6 +112,7 @@ const fn damage_words(damage: Damage) -> &'static str {
         Damage::Crc => "its CRC is wrong",
         Damage::Board => "it is for another board",
         Damage::Vectors => "its stack or its entry is outside its RAM",
+        Damage::Facts => "it was built for a resident part that decides by other choices",
     }
 }
 

@@ -242,10 +242,10 @@ impl fmt::Display for Inspection {
             writeln!(f, "  label        {}", Words(label))?;
         }
         if let Some((header, _)) = &self.bootloader {
-            let Header { version, vendor, product, board, services, crc, .. } = *header;
+            let Header { version, vendor, product, board, services, facts, crc, .. } = *header;
             let (version, size) = (Version(version), header.total());
             writeln!(f, "  bootloader   version {version}, {size} bytes, CRC {crc:08X}h")?;
-            writeln!(f, "  for          vendor-ID {vendor:08X}h, product code {product:08X}h, board {board:08X}h, services {services}")?;
+            writeln!(f, "  for          vendor-ID {vendor:08X}h, product code {product:08X}h, board {board:08X}h, services {services}, facts {facts:08X}h")?;
         }
         match (&self.bootloader, &self.judgement) {
             (Some((_, Ok(()))), _) => {

@@ -11,6 +11,7 @@ use shared_abi::warm_start::{BootRequest, TrialStep};
 
 use super::{find, Downloader, Failure, Program};
 use crate::flash::Flash;
+use crate::policy::Renewal;
 use crate::program::Expected;
 use crate::programmer::Renewing;
 use crate::refusal::Refusal;
@@ -20,7 +21,7 @@ use crate::session::Session;
 use crate::store::{Parameters, RenewalRecord};
 
 /// Of a device without renewal.
-const NO_HOST: Host = Host { board: 0, services: 0, features: 0 };
+const NO_HOST: Host = Renewal::NONE.host(0, 0);
 
 impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     fn known(&self) -> Known {
@@ -71,7 +72,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         self.show_image(identification, header.version);
         let services = self.parameters.services();
-        self.programmer.renewing = Some(Renewing { layout: self.layout, policy, services, record: None });
+        let facts = self.parameters.facts();
+        self.programmer.renewing =
+            Some(Renewing { layout: self.layout, policy, services, facts, record: None });
         let record = self.image_record(flash);
         self.set_record(record);
         let Some(record) = record else { return };

@@ -158,8 +158,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     fn proceed(&mut self, program: u8, is_stream: bool, findings: Findings) {
         let staging = self.staging_of(program);
         let has = P::RENEWS.then(|| {
-            let Host { board, services, features } = self.host();
-            Requirements { board, services, features }
+            let Host { board, services, features, .. } = self.host();
+            Requirements { board, services, features: features.0 }
         });
         let Some(state) = find::<P>(&mut self.programs, program) else { return };
         if let Some(begin) = findings.begins {

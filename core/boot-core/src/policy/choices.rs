@@ -1,6 +1,7 @@
 //! The product's choices about downloads.
 
 use canopen::program::FlashError;
+use shared_abi::abilities::Abilities;
 use shared_abi::block_file::Control;
 use shared_abi::ram_image::Host;
 
@@ -110,8 +111,8 @@ pub struct Policy {
 pub struct Renewal {
     /// The identity of the board, as in the header of a RAM image.
     pub board: u32,
-    /// The abilities of the resident part (`shared_abi::ram_image::feature`).
-    pub features: u32,
+    /// The abilities of the resident part.
+    pub features: Abilities,
     /// Vendor-ID and product code of the device, which an image must have; `None` for any.
     pub identity: Option<(u32, u32)>,
     /// The revision number of the device (1018h/3); the five lowest bits are the hardware revision.
@@ -121,13 +122,14 @@ pub struct Renewal {
 }
 
 impl Renewal {
-    /// What the device has for a RAM image, with this version of the services.
-    pub(crate) const fn host(&self, services: u32) -> Host {
-        Host { board: self.board, services, features: self.features }
+    /// What the device has for a RAM image, with this version of the services and these facts.
+    pub(crate) const fn host(&self, services: u32, facts: u32) -> Host {
+        Host { board: self.board, services, features: self.features, facts }
     }
 
     /// Values of no device.
-    pub const NONE: Self = Self { board: 0, features: 0, identity: None, revision: 0, confirm_within_s: 60 };
+    pub const NONE: Self =
+        Self { board: 0, features: Abilities::NONE, identity: None, revision: 0, confirm_within_s: 60 };
 }
 
 /// The values with which a sealed image is checked, besides the keys in the device.

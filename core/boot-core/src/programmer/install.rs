@@ -3,11 +3,13 @@
 //! RAM (docs/renewal.md).
 
 use canopen::program::FlashError;
+use shared_abi::abilities::Abilities;
 use shared_abi::block_file::{fits, Difference};
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::{feature, Header, Host};
+use shared_abi::ram_image::{Header, Host};
 use shared_abi::renewal::State;
+use shared_abi::warm_start::Damage;
 
 use crate::crc::CrcKind;
 use crate::flash::{Flash, FlashFault, Next};
@@ -25,6 +27,8 @@ pub(crate) struct Renewing {
     pub policy: &'static Renewal,
     /// The version of the services of the resident part.
     pub services: u32,
+    /// The CRC-32 of its facts.
+    pub facts: u32,
     /// The stored record of the image in staging; a copy, because the flash cannot be read while it is busy.
     /// It must be removed before a program changes that flash.
     pub record: Option<RenewalRecord>,
@@ -38,32 +42,39 @@ impl Renewing {
 
     /// What the device has for a RAM image.
     pub(crate) const fn host(&self) -> Host {
-        self.policy.host(self.services)
+        self.policy.host(self.services, self.facts)
     }
 
     /// Whether an image with this header may become the bootloader. `counter`: that of its manifest, if it
     /// is sealed.
+    ///
+    /// # Errors
+    /// The status, with the detail [`Damage::Facts`] or 0.
     pub(super) fn judge(
         &self,
         bytes: &[u8; Header::SIZE as usize],
         counter: Option<u32>,
-    ) -> Result<(), FlashError> {
+    ) -> Result<(), (FlashError, u8)> {
         let header = Header::of_bytes(bytes);
         let Renewal { identity, revision, .. } = *self.policy;
         let room = self.places().staging.size.saturating_sub(Header::SIZE);
-        if header.check(room, self.layout.ram, self.host()).is_err()
+        let checked = header.check(room, self.layout.ram, self.host());
+        if checked == Err(Damage::Facts) {
+            return Err((FlashError::Format, Damage::Facts as u8));
+        }
+        if checked.is_err()
             || header.crc == 0
-            || header.features & feature::RENEWAL == 0
+            || !header.features.has(Abilities::RENEWAL)
             || counter.is_some_and(|counter| counter != header.counter)
         {
-            return Err(FlashError::Format);
+            return Err((FlashError::Format, 0));
         }
         if header.revisions != 0 && header.revisions >> (revision & 31) & 1 == 0 {
-            return Err(FlashError::WrongProductId);
+            return Err((FlashError::WrongProductId, 0));
         }
         match identity.map(|device| fits((header.vendor, header.product), device)) {
-            Some(Err(Difference::VendorId)) => Err(FlashError::WrongVendorId),
-            Some(Err(Difference::ProductCode)) => Err(FlashError::WrongProductId),
+            Some(Err(Difference::VendorId)) => Err((FlashError::WrongVendorId, 0)),
+            Some(Err(Difference::ProductCode)) => Err((FlashError::WrongProductId, 0)),
             Some(Ok(())) | None => Ok(()),
         }
     }

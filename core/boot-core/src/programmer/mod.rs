@@ -305,8 +305,8 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         self.target.as_ref().is_none_or(|target| target.half_erased)
     }
 
-    /// More about the error that ended the last work, once: the number of the protected sector, or
-    /// [`SUPPLY_DETAIL`]; 0 for other errors.
+    /// More about the error that ended the last work, once: the number of the protected sector,
+    /// [`SUPPLY_DETAIL`], or that of a damage of a new RAM image; 0 for other errors.
     pub(crate) fn take_detail(&mut self) -> u8 {
         core::mem::take(&mut self.detail)
     }
@@ -627,7 +627,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         let Some(ahead) = target.untouched else { return Ok(()) };
         if P::RENEWS && target.program == BOOTLOADER {
             // Nothing was lost: the download ends.
-            judge_image(self.renewing.as_ref(), &self.source, piece)?;
+            judge_image(self.renewing.as_ref(), &self.source, piece).map_err(|(error, detail)| {
+                self.detail = detail;
+                error
+            })?;
         }
         let Some(target) = &mut self.target else { return Ok(()) };
         // Nothing is lost for a program that the flash does not take.
@@ -819,10 +822,10 @@ fn judge_image(
     renewing: Option<&Renewing>,
     source: &Source<'_>,
     piece: Option<Piece>,
-) -> Result<(), FlashError> {
-    let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err(FlashError::Format) };
+) -> Result<(), (FlashError, u8)> {
+    let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err((FlashError::Format, 0)) };
     if piece.address != renewing.places().staging.base || piece.size < Header::SIZE {
-        return Err(FlashError::Format);
+        return Err((FlashError::Format, 0));
     }
     let mut header = [0; Header::SIZE as usize];
     for (at, byte) in header.iter_mut().enumerate() {

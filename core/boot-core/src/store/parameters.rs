@@ -88,6 +88,11 @@ pub trait Parameters {
         SERVICES_VERSION
     }
 
+    /// The CRC-32 of the facts of the resident part, as in the header of an image for it. The flash must be idle.
+    fn facts(&self) -> u32 {
+        0
+    }
+
     /// The value of a key, `None` if it was never stored.
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 

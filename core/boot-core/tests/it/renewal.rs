@@ -18,10 +18,11 @@ use kit::boot::{leaked, Boot};
 use kit::ihex;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 use kit::random::Random;
+use shared_abi::abilities::Abilities;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
-use shared_abi::ram_image::{feature, Header, Host, MAGIC, SERVICES_VERSION};
+use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
 use shared_abi::renewal::{word, Origin, Progress, State, TrialEnd};
 use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
 
@@ -44,13 +45,13 @@ const PLACES: Places = match Places::of(&LAYOUT) {
 
 const BOARD: u32 = 0x1234_5678;
 /// What the resident part has.
-const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: feature::RENEWAL };
+const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: Abilities::RENEWAL, facts: 0 };
 const N: u8 = 2;
 const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
 static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
 const RENEWAL: Renewal = Renewal {
     board: BOARD,
-    features: feature::RENEWAL,
+    features: Abilities::RENEWAL,
     identity: Some((7, 8)),
     revision: 3,
     ..Renewal::NONE
@@ -92,22 +93,23 @@ const SOUND: Header = Header {
     ram_base: LAYOUT.ram.base,
     ram_end: LAYOUT.ram.base + LAYOUT.ram.size,
     services: SERVICES_VERSION,
-    features: feature::RENEWAL,
+    features: Abilities::RENEWAL,
     board: BOARD,
     vendor: 7,
     product: 8,
     revisions: 0,
     version: 0x0001_0002,
     counter: 0,
-    reserved: [0; 2],
+    facts: 0,
+    reserved: 0,
 };
 
 fn words(header: &Header) -> Vec<u8> {
     let Header { magic, crc, length, size, ram_base, ram_end, services, features, .. } = *header;
-    let Header { board, vendor, product, revisions, version, counter, reserved: [a, b], .. } = *header;
+    let Header { board, vendor, product, revisions, version, counter, facts, reserved, .. } = *header;
     [
-        magic, crc, length, size, ram_base, ram_end, services, features, board, vendor, product, revisions,
-        version, counter, a, b,
+        magic, crc, length, size, ram_base, ram_end, services, features.0, board, vendor, product, revisions,
+        version, counter, facts, reserved,
     ]
     .into_iter()
     .flat_map(u32::to_le_bytes)
@@ -493,9 +495,9 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
         ("for the bench", SOUND, false),
         ("for another board", Header { board: !BOARD, ..SOUND }, true),
         ("for newer services", Header { services: SERVICES_VERSION + 1, ..SOUND }, true),
-        ("with an unknown ability", Header { features: feature::RENEWAL | 1 << 7, ..SOUND }, true),
-        ("without renewal", Header { features: 0, ..SOUND }, true),
-        ("with a reserved word", Header { reserved: [0, 1], ..SOUND }, true),
+        ("with an unknown ability", Header { features: Abilities(2 | 1 << 7), ..SOUND }, true),
+        ("without renewal", Header { features: Abilities::NONE, ..SOUND }, true),
+        ("with a reserved word", Header { reserved: 1, ..SOUND }, true),
         ("for another place in RAM", Header { ram_base: 0x2000_0200, ..SOUND }, true),
         ("of another format", Header { length: 64 | 1 << 16, ..SOUND }, true),
     ] {
@@ -515,8 +517,9 @@ fn what_cannot_become_the_bootloader_is_refused_before_an_erase() {
             board.leave(None);
         }
     }
-    // Of another vendor, another product.
+    // Of another vendor, another product; for another resident part, with the detail that says so.
     for (header, status) in [
+        (Header { facts: 1, ..SOUND }, 6 << 16 | FORMAT),
         (Header { vendor: 9, ..SOUND }, 0x80),
         (Header { product: 9, ..SOUND }, 0x82),
         // All revisions but the one of the device.

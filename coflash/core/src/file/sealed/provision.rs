@@ -1,9 +1,12 @@
 //! Makes the bootloader image of a sealed device: the bootloader with the key block.
 
 use seal::key_block::SIZE;
+use shared_abi::abilities::Abilities;
 use shared_abi::layout::{Layout, KNOWS_SEALED_IMAGES, MARK_OFFSET};
-use shared_abi::ram_image::{feature, Header, MAGIC};
+use shared_abi::ram_image::{Header, MAGIC};
+use shared_abi::services::{Facts, OFFSET};
 
+use crate::file::checksum::CRC;
 use crate::file::fault::Place;
 use crate::file::image::{Image, Pieces};
 use crate::file::range::AddressRange;
@@ -30,6 +33,9 @@ pub enum ProvisionFault {
     /// There is no RAM image, or one without a CRC.
     #[error("it has no RAM image with a CRC at {0:#010x}: give what `cargo xtask build` has made")]
     NoRamImage(u32),
+    /// The two parts are of two builds that contradict each other.
+    #[error("its RAM image was built for a resident part that decides by other choices: give the two parts of one build")]
+    OtherResident,
     /// The image does not begin at the CPU's start address.
     #[error(
         "it begins at {found:#010x} and not at {start:#010x}, where the CPU starts after a reset: it is not a bootloader"
@@ -79,6 +85,13 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
     {
         return Err(ProvisionFault::NoRamImage(home.first));
     }
+    let facts = bootloader.segments().next().and_then(|(base, bytes)| {
+        Facts::record(&bytes, base, layout.callgate() + OFFSET)
+            .map(|record| CRC.checksum(record).to_le_bytes())
+    });
+    if facts.is_some() && bootloader.bytes(home.first + Header::FACTS) != facts {
+        return Err(ProvisionFault::OtherResident);
+    }
     let own = AddressRange { first: resident.first, last: place.first - 1 };
     let mut pieces = Pieces::default();
     for part in [own, home] {
@@ -95,7 +108,8 @@ pub fn provision(bootloader: &Image, layout: &Layout, block: &[u8; SIZE]) -> Res
 #[must_use]
 pub fn protected_sectors(bootloader: &Image, layout: &Layout) -> u32 {
     let features = layout.home.and_then(|home| bootloader.bytes(home.base + Header::FEATURES));
-    layout.protected_sectors(features.is_some_and(|word| u32::from_le_bytes(word) & feature::RENEWAL != 0))
+    let has = |word| Abilities(u32::from_le_bytes(word)).has(Abilities::RENEWAL);
+    layout.protected_sectors(features.is_some_and(has))
 }
 
 #[cfg(test)]
@@ -132,6 +146,12 @@ mod tests {
             assert_eq!(provision(&resident(none, 0x400)), Err(ProvisionFault::Open));
         }
         assert_eq!(provision(&resident(b"CBS1", 0x400)[..0x1F]), Err(ProvisionFault::Open), "cut off");
+        // Its services have facts of 20 bytes, and the header of the RAM image is not for them.
+        let mut facts = resident(b"CBS1", 0x400);
+        let pointer = (LAYOUT.callgate() + OFFSET - BASE) as usize + 36;
+        facts[pointer..pointer + 4].copy_from_slice(&(BASE + 0x200).to_le_bytes());
+        facts[0x204..0x206].copy_from_slice(&[20, 0]);
+        assert_eq!(provision(&facts), Err(ProvisionFault::OtherResident));
     }
 
     /// The word at offset 28 of the header has a bit for renewal, which writes the home of the RAM image.

@@ -369,7 +369,7 @@ impl Sealer<'_> {
     /// What the device of a bootloader's RAM image must have: what its header says.
     fn requirements(&self, image: &[u8]) -> Option<Requirements> {
         let header = bootloader_header(image).filter(|_| self.program == BOOTLOADER)?;
-        Some(Requirements { board: header.board, services: header.services, features: header.features })
+        Some(Requirements { board: header.board, services: header.services, features: header.features.0 })
     }
 
     fn records_size(&self) -> usize {
