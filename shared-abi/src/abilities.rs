@@ -34,15 +34,9 @@ impl Abilities {
         Self(self.0 | if chosen { others.0 } else { 0 })
     }
 
-    /// Those that are not among the others.
-    #[must_use]
-    pub const fn without(self, others: Self) -> Self {
-        Self(self.0 & !others.0)
-    }
-
     /// Whether all of the others are among them.
     #[must_use]
     pub const fn has(self, others: Self) -> bool {
-        others.without(self).0 == 0
+        others.0 & !self.0 == 0
     }
 }

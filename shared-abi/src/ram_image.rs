@@ -153,7 +153,7 @@ impl Header {
             return Err(Damage::Header);
         }
         if self.services > host.services
-            || !host.features.has(self.features.without(Abilities::RENEWAL))
+            || !host.features.with(Abilities::RENEWAL, true).has(self.features)
             || host.features.has(Abilities::SEALED) && !self.features.has(Abilities::SEALED)
         {
             return Err(Damage::Services);

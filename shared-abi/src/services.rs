@@ -77,23 +77,6 @@ impl Facts {
     /// Its size in bytes.
     pub const SIZE: u16 = size_of::<Self>() as u16;
 
-    /// Its bytes.
-    #[must_use]
-    pub const fn bytes(&self) -> [u8; Self::SIZE as usize] {
-        let mut bytes = [0; Self::SIZE as usize];
-        let Self { board, size, autostart, crc_bits, node_ids, bit_rates, abilities, .. } = *self;
-        let (low, high) = (board as u16, (board >> 16) as u16);
-        let bases = [self.sdo_request_base, self.sdo_response_base];
-        let halves =
-            [low, high, size, autostart, crc_bits, node_ids, bit_rates, abilities, bases[0], bases[1]];
-        let mut n = 0;
-        while n < halves.len() {
-            [bytes[2 * n], bytes[2 * n + 1]] = halves[n].to_le_bytes();
-            n += 1;
-        }
-        bytes
-    }
-
     /// The bytes of the record in those of a resident part for the chip, as many as it says: `base` is the
     /// address of the resident part, `table` that of its services. `None` if this is no resident part.
     #[must_use]
@@ -275,7 +258,7 @@ mod tests {
         }
         let read = |bytes: &[u8]| Facts::of_resident(bytes, 0x0800_0000, 0x0800_0020);
         assert_eq!(read(&bytes), Some((3, facts)));
-        assert_eq!(Facts::record(&bytes, 0x0800_0000, 0x0800_0020), Some(&facts.bytes()[..]));
+        assert_eq!(Facts::record(&bytes, 0x0800_0000, 0x0800_0020), Some(&bytes[0x60..0x74]));
         for (at, word) in [(0x44, 0x0800_0070_u32), (0x44, 0x0000_0060), (0x44, !0), (0x64, 0x0002_0013)] {
             let mut wrong = bytes;
             wrong[at..at + 4].copy_from_slice(&word.to_le_bytes());

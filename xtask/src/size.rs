@@ -89,19 +89,16 @@ pub fn within(used: u32, budget: &u32) -> Outcome {
     }
 }
 
-/// The gate of the compact map for the largest product: `used` bytes leave enough for a later mend.
+/// The gate of the compact map: `used` bytes leave [`SPARE`].
 ///
 /// # Errors
-/// When too few bytes are free.
+/// When they do not.
 pub fn spare(used: u32) -> Outcome {
-    match COMPACT.saturating_sub(used) {
-        SPARE.. => Ok(()),
-        free => Err(format!(
-            "{free} of {COMPACT} bytes are free on the compact map, and {SPARE} have to be. Make the code smaller, or \
-             leave something out there by a named choice: a field of Product, its default for the compact map, and \
-             its rule in Product::checked (bootloader/src/product.rs, docs/product.md)."
-        )),
-    }
+    let free = COMPACT.saturating_sub(used);
+    (free >= SPARE).then_some(()).ok_or_else(|| format!(
+        "{free} of {COMPACT} bytes are free on the compact map, and {SPARE} have to be. Make the code smaller, or leave \
+         something out there by name: a field of Product, its default, and its rule in `checked` (docs/product.md)."
+    ))
 }
 
 #[cfg(test)]

@@ -1,10 +1,13 @@
 //! Loads the rest of the bootloader from flash to RAM, if it is undamaged and for this device.
 
+use core::mem::transmute;
+
 use boot_core::crc::crc32;
 use boot_core::flash::Flash;
 use bsp::LAYOUT;
 use shared_abi::geometry::Region;
 use shared_abi::ram_image::{Header, Host, SERVICES_VERSION};
+use shared_abi::services::Facts;
 use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::Damage;
 
@@ -16,7 +19,8 @@ pub const HOST: Host = Host {
     board: BOARD_IDENTITY,
     services: SERVICES_VERSION,
     features: ABILITIES,
-    facts: crc32(&FACTS.bytes()),
+    // SAFETY: it has integers alone, and no gap between them: its size is their sum (shared_abi::services).
+    facts: crc32(&unsafe { transmute::<Facts, [u8; Facts::SIZE as usize]>(FACTS) }),
 };
 
 extern "C" {

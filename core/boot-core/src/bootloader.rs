@@ -573,12 +573,8 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> LssDevice
         C::LSS
     }
 
-    fn detects_bit_rate() -> bool {
-        C::DETECTS_BIT_RATE
-    }
-
     fn supports(&mut self, rate: BitRate) -> bool {
-        (self.config.supports)(rate)
+        (C::DETECTS_BIT_RATE || rate != BitRate::Auto) && (self.config.supports)(rate)
     }
 
     fn takes(&mut self, id: NodeId) -> bool {

@@ -53,15 +53,6 @@ pub trait LssDevice {
         true
     }
 
-    /// Whether the device may detect the bit rate of its bus by listening ([`BitRate::Auto`]).
-    /// Without it, the compiler leaves out the code.
-    fn detects_bit_rate() -> bool
-    where
-        Self: Sized,
-    {
-        true
-    }
-
     /// Whether the device supports this bit rate; for [`BitRate::Auto`], whether it may detect the
     /// bit rate by listening.
     fn supports(&mut self, rate: BitRate) -> bool;

@@ -34,7 +34,8 @@ pub trait SlaveDevice: Objects + LssDevice {
     }
 }
 
-/// The configuration of a slave.
+/// The configuration of a slave. [`LssDevice::supports`] for [`BitRate::Auto`] decides whether the
+/// slave may detect the bit rate by listening.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Config {
     /// The configuration of the node.
@@ -205,7 +206,9 @@ impl Slave {
         match &mut self.line {
             Line::Down(_) | Line::Silent { .. } => {}
             Line::Listening { detector, .. } => {
-                if D::detects_bit_rate() && detector.heard(status.heard, now, |rate| device.supports(rate)) {
+                if device.supports(BitRate::Auto)
+                    && detector.heard(status.heard, now, |rate| device.supports(rate))
+                {
                     self.line = Line::Down(detector.rate());
                 }
             }
@@ -228,7 +231,7 @@ impl Slave {
                 return Some(Output::Accept(self.identifiers::<D>()));
             }
             match &mut self.line {
-                Line::Down(BitRate::Auto) if D::detects_bit_rate() => {
+                Line::Down(BitRate::Auto) if device.supports(BitRate::Auto) => {
                     let detector = Detector::new(BitRate::K125, now, |rate| device.supports(rate));
                     self.line = Line::Listening { detector, set: None };
                     continue;

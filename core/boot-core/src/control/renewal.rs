@@ -55,7 +55,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
 
     /// What the device has for a RAM image.
     pub(super) fn host(&self) -> Host {
-        self.programmer.renewing.as_ref().map_or(NO_HOST, Renewing::host)
+        self.programmer.renewing.map_or(NO_HOST, |renewing| renewing.host)
     }
 
     /// Starts with the report of the resident part. What a cut has interrupted goes on.
@@ -71,10 +71,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.region = places.home;
         }
         self.show_image(identification, header.version);
-        let services = self.parameters.services();
-        let facts = self.parameters.facts();
-        self.programmer.renewing =
-            Some(Renewing { layout: self.layout, policy, services, facts, record: None });
+        let host = policy.host(self.parameters.services(), self.parameters.facts());
+        self.programmer.renewing = Some(Renewing { layout: self.layout, policy, host, record: None });
         let record = self.image_record(flash);
         self.set_record(record);
         let Some(record) = record else { return };

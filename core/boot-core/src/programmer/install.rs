@@ -25,10 +25,8 @@ use crate::store::{RenewalRecord, Value};
 pub(crate) struct Renewing {
     pub layout: &'static Layout,
     pub policy: &'static Renewal,
-    /// The version of the services of the resident part.
-    pub services: u32,
-    /// The CRC-32 of its facts.
-    pub facts: u32,
+    /// What the device has for a RAM image.
+    pub host: Host,
     /// The stored record of the image in staging; a copy, because the flash cannot be read while it is busy.
     /// It must be removed before a program changes that flash.
     pub record: Option<RenewalRecord>,
@@ -40,41 +38,34 @@ impl Renewing {
         Places::of(self.layout).unwrap_or(Places::NONE)
     }
 
-    /// What the device has for a RAM image.
-    pub(crate) const fn host(&self) -> Host {
-        self.policy.host(self.services, self.facts)
-    }
-
     /// Whether an image with this header may become the bootloader. `counter`: that of its manifest, if it
-    /// is sealed.
-    ///
-    /// # Errors
-    /// The status, with the detail [`Damage::Facts`] or 0.
+    /// is sealed. `detail` says more about the error.
     pub(super) fn judge(
         &self,
         bytes: &[u8; Header::SIZE as usize],
         counter: Option<u32>,
-    ) -> Result<(), (FlashError, u8)> {
+        detail: &mut u8,
+    ) -> Result<(), FlashError> {
         let header = Header::of_bytes(bytes);
         let Renewal { identity, revision, .. } = *self.policy;
         let room = self.places().staging.size.saturating_sub(Header::SIZE);
-        let checked = header.check(room, self.layout.ram, self.host());
+        let checked = header.check(room, self.layout.ram, self.host);
         if checked == Err(Damage::Facts) {
-            return Err((FlashError::Format, Damage::Facts as u8));
+            *detail = Damage::Facts as u8;
         }
         if checked.is_err()
             || header.crc == 0
             || !header.features.has(Abilities::RENEWAL)
             || counter.is_some_and(|counter| counter != header.counter)
         {
-            return Err((FlashError::Format, 0));
+            return Err(FlashError::Format);
         }
         if header.revisions != 0 && header.revisions >> (revision & 31) & 1 == 0 {
-            return Err((FlashError::WrongProductId, 0));
+            return Err(FlashError::WrongProductId);
         }
         match identity.map(|device| fits((header.vendor, header.product), device)) {
-            Some(Err(Difference::VendorId)) => Err((FlashError::WrongVendorId, 0)),
-            Some(Err(Difference::ProductCode)) => Err((FlashError::WrongProductId, 0)),
+            Some(Err(Difference::VendorId)) => Err(FlashError::WrongVendorId),
+            Some(Err(Difference::ProductCode)) => Err(FlashError::WrongProductId),
             Some(Ok(())) | None => Ok(()),
         }
     }

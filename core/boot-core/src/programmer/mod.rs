@@ -627,10 +627,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         let Some(ahead) = target.untouched else { return Ok(()) };
         if P::RENEWS && target.program == BOOTLOADER {
             // Nothing was lost: the download ends.
-            judge_image(self.renewing.as_ref(), &self.source, piece).map_err(|(error, detail)| {
-                self.detail = detail;
-                error
-            })?;
+            judge_image(self.renewing.as_ref(), &self.source, piece, &mut self.detail)?;
         }
         let Some(target) = &mut self.target else { return Ok(()) };
         // Nothing is lost for a program that the flash does not take.
@@ -693,7 +690,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// The header of the image in staging, if the whole image is still that of the record.
     fn staged<F: Flash>(&self, flash: &F, record: &RenewalRecord) -> Option<Header> {
         let renewing = self.renewing.as_ref()?;
-        let image = check(flash, renewing.places().staging, renewing.layout, renewing.host());
+        let image = check(flash, renewing.places().staging, renewing.layout, renewing.host);
         image.ok().filter(|image| image.crc == record.crc)
     }
 
@@ -822,17 +819,18 @@ fn judge_image(
     renewing: Option<&Renewing>,
     source: &Source<'_>,
     piece: Option<Piece>,
-) -> Result<(), (FlashError, u8)> {
-    let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err((FlashError::Format, 0)) };
+    detail: &mut u8,
+) -> Result<(), FlashError> {
+    let (Some(renewing), Some(piece)) = (renewing, piece) else { return Err(FlashError::Format) };
     if piece.address != renewing.places().staging.base || piece.size < Header::SIZE {
-        return Err((FlashError::Format, 0));
+        return Err(FlashError::Format);
     }
     let mut header = [0; Header::SIZE as usize];
     for (at, byte) in header.iter_mut().enumerate() {
         *byte = source.byte(at);
     }
     let unsealer = &source.unsealer;
-    renewing.judge(&header, unsealer.is_active().then(|| unsealer.edition().counter))
+    renewing.judge(&header, unsealer.is_active().then(|| unsealer.edition().counter), detail)
 }
 
 /// The program of a bit in `voids`: [`bit`] has 31 for the bootloader.

@@ -401,10 +401,6 @@ impl<D: LssDevice, M> LssDevice for Debugged<'_, D, M> {
         D::has_lss()
     }
 
-    fn detects_bit_rate() -> bool {
-        D::detects_bit_rate()
-    }
-
     fn supports(&mut self, rate: BitRate) -> bool {
         self.device.supports(rate)
     }

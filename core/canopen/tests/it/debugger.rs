@@ -350,10 +350,6 @@ impl LssDevice for Noted {
         false
     }
 
-    fn detects_bit_rate() -> bool {
-        false
-    }
-
     fn supports(&mut self, rate: BitRate) -> bool {
         rate == BitRate::K125
     }
@@ -384,7 +380,7 @@ fn what_is_not_of_the_interface_is_the_devices() {
     let mut noted = Noted::default();
     let mut both = debugger.attach(&mut noted);
     let other = Address::new(0x1F50, 1);
-    assert!(!Both::has_second_server() && !Both::has_lss() && !Both::detects_bit_rate());
+    assert!(!Both::has_second_server() && !Both::has_lss());
     assert_eq!(both.download_space(other, false), 7);
     assert_eq!(both.download_space(DATA, false), usize::MAX);
     assert!(both.supports(BitRate::K125) && !both.supports(BitRate::K250));
