@@ -29,7 +29,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let keeps = P::RENEWS && command == Clear && self.keeps_staging(program);
         let state = find::<P>(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
-            // No program runs, but the bootloader: the requested state already exists.
+            // No program runs, but the bootloader: the requested state already exists. Many masters send
+            // no CLEAR after STOP.
+            state.stopped |= command == Stop;
             return Ok(());
         }
         // A host that sends a program in one transfer uses 2 as in CiA 302-3: reset the program,
@@ -45,6 +47,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.start_when_verified = true;
             return Ok(());
         }
+        // A second CLEAR in a row; one that is refused ends the row.
+        let again = match &mut state.session {
+            Session::Cleared { just } if command == Clear => core::mem::take(just),
+            _ => false,
+        };
         // A new download does not wait for the end of the old one.
         let own = self.programmer.program().is_none_or(|of| of == program);
         let restarts = command == Clear && own && self.programmer.is_abortable();
@@ -59,7 +66,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         let changes = matches!(command, Clear | SetSignature | ClrSignature);
-        let again = matches!(state.session, Session::Cleared { just: true });
         let erases = again || (self.policy.erase)(program) == Erase::AtOnce;
         let withdrawn = state.record.is_some_and(|record| record.withdrawn);
         if !self.rights.permits(right_of(command, erases, withdrawn)) {
@@ -78,9 +84,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 // failed.
                 state.session = Session::Cleared { just: true };
                 self.download_cancel();
-                self.programmer.abort();
-                if erases {
-                    self.programmer.erase_all(program, region);
+                if !self.programmer.has_cleared(program) {
+                    self.programmer.abort();
+                    if erases {
+                        self.programmer.erase_all(program, region);
+                    }
                 }
             }
             (Start, Some(_)) if fresh => self.boot_request = Some(BootRequest::Fresh(program)),

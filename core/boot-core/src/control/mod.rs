@@ -74,6 +74,8 @@ struct Program {
     start_when_verified: bool,
     /// The client has not sent the password.
     locked: bool,
+    /// STOP was written since the last download began.
+    stopped: bool,
 }
 
 /// Why a block or a command failed.
@@ -154,6 +156,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 streamed: false,
                 start_when_verified: false,
                 locked: policy.locked,
+                stopped: false,
             }
         });
         Self {
@@ -254,7 +257,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     #[must_use]
     pub fn partial(&self, program: u8) -> [u8; 8] {
         let Some(state) = self.program(program) else { return [0; 8] };
-        let [id, stored] = state.partial.words();
+        let [id, stored] = state.resumable().words();
         let (id, end) = match state.session {
             Session::Idle => (id, stored),
             Session::Open { .. } => (id, self.programmer.source().queue.last.end()),
@@ -479,6 +482,7 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             region,
             session: state.session,
             installed: false,
+            stopped: false,
             images: Images::Plain,
             partial: Partial::NONE,
         };
@@ -500,6 +504,8 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         let start = core::mem::take(&mut state.start_when_verified);
         state.failure = outcome.err().map(|error| Failure { error, detail: self.programmer.take_detail() });
         if outcome.is_err() {
+            // Nothing goes on with a program that was refused as a whole.
+            self.programmer.disown(program);
             state.streamed = false;
             if !matches!(state.session, Session::Idle) {
                 state.session = Session::Failed;
@@ -564,6 +570,14 @@ fn place<P: Parameters>(count: usize, number: u8) -> usize {
 }
 
 impl Program {
+    /// The download that can go on: none after a refusal, until a block is accepted.
+    const fn resumable(&self) -> Partial {
+        match self.failure {
+            None => self.partial,
+            Some(_) => Partial::NONE,
+        }
+    }
+
     /// Records the reason of a refusal. The error that ended a session stays visible.
     fn refuse(&mut self, Refusal(error, abort): Refusal) -> AbortCode {
         if !matches!(self.session, Session::Failed) || self.failure.is_none() {

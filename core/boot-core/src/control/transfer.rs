@@ -33,6 +33,11 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         let room = self.has_room();
         let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
+        // A second CLEAR erases everything, but not after a download, taken or refused: then it may come
+        // from a host that repeats the same wrong file.
+        if let Session::Cleared { just } = &mut state.session {
+            *just = false;
+        }
         if PROGRAMS > 1
             && matches!(state.session, Session::Open { .. })
             && self.programmer.program() != Some(program)
@@ -42,7 +47,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.session = Session::Failed;
         }
         let others = self.programmer.is_busy() && self.programmer.program().is_some_and(|of| of != program);
-        let refusal = if self.boot_request.is_some() || others || !self.programmer.is_abortable() || !room {
+        // The data wait where CLEAR still erases.
+        let takes = self.programmer.is_abortable() || self.programmer.has_cleared(program);
+        let refusal = if self.boot_request.is_some() || others || !takes || !room {
             Some(Refusal::untimely(FlashError::Busy))
         } else if state.locked {
             Some(Refusal::untimely(FlashError::NoAccess))
@@ -53,11 +60,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         };
         if let Some(refusal) = refusal {
             return Err(state.refuse(refusal));
-        }
-        // A second CLEAR erases everything, but not after a block: then it may come from a host
-        // that repeats the same wrong file.
-        if let Session::Cleared { just } = &mut state.session {
-            *just = false;
         }
         state.streamed = false;
         self.transfer = Some(Transfer { program, intake: Intake::new(size) });
@@ -119,8 +121,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             region: state.region,
             session: state.session,
             installed: state.record.is_some(),
+            stopped: state.stopped,
             images: self.rights.images(),
-            partial: state.partial,
+            partial: state.resumable(),
         };
         let mut to = Destination {
             judge,
@@ -140,6 +143,10 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 Ok(program)
             }
             Err(refusal) => {
+                // What is stored of the data before it does not go on after a cut.
+                if matches!(judge.session, Session::Open { next } if next != 1) {
+                    self.programmer.disown(program);
+                }
                 if findings.begins.is_some() && !matches!(judge.session, Session::Open { .. }) {
                     // Its pieces belong to a download that does not start.
                     self.programmer.source_mut().queue.clear();
@@ -168,7 +175,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 (state.version, state.told_date) = (begin.version, begin.date);
             }
             let mut next = 1;
-            let goes_on = P::RESUMES && state.partial.is_same(begin.partial);
+            let goes_on = P::RESUMES && state.resumable().is_same(begin.partial);
             // A sequence of blocks that begins again continues over the existing pieces.
             if matches!(state.session, Session::Open { .. }) {
                 if goes_on {
@@ -176,7 +183,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 }
                 if P::RESUMES && !goes_on {
                     state.partial = Partial::NONE;
-                    self.programmer.disown();
+                    self.programmer.disown(program);
                 }
             } else {
                 let mut partial = if P::RESUMES { begin.partial } else { begin.partial.disowned() };
@@ -185,7 +192,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                     next = ANY;
                 }
                 self.programmer.source_mut().queue.last = LastBlock::none(partial.start());
-                let mut erases = next == ANY || self.policy.erases(state.session);
+                let counts_as_clear = core::mem::take(&mut state.stopped) && is_stream;
+                let mut erases = next == ANY || counts_as_clear || self.policy.erases(state.session);
                 if let Some(staging) = staging {
                     // It is erased in any case, and begins anew after a cut.
                     (erases, partial) = (true, Partial::begin(0, staging.base));
@@ -194,7 +202,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
                 self.programmer.open(program, region, erases, begin.size, partial);
                 if findings.sealed.is_some() {
                     // What was found authentic is not known any more after a cut.
-                    self.programmer.disown();
+                    self.programmer.disown(program);
                     self.programmer.source_mut().unsealer.begin(Place {
                         layout: self.layout,
                         policy: &self.policy.seal,

@@ -110,7 +110,6 @@ impl Format for BlockFile {
                 to.queue.discard();
                 return Ok(());
             }
-            to.queue.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
         let mut fields = [0; LAST_SIZE_2008];
         let fields = fields.get_mut(..header.size as usize).map(|fields| {
@@ -148,8 +147,11 @@ impl Format for BlockFile {
                 to.findings.complete = Some(Expected { size: 0, crc: None });
             }
             _ if to.judge.images.only_sealed().is_some() => {
-                if header.number == 1 && to.queue.open_word() != u32::from_le_bytes(MAGIC) {
-                    return Err(Refusal::unfit(FlashError::NoAccess));
+                if header.number == 1 {
+                    to.judge.is_allowed()?;
+                    if to.queue.open_word() != u32::from_le_bytes(MAGIC) {
+                        return Err(Refusal::unfit(FlashError::NoAccess));
+                    }
                 }
                 to.queue.commit_bytes();
                 to.findings.block = true;
@@ -171,6 +173,10 @@ impl Format for BlockFile {
                 to.queue.commit();
                 to.findings.block = true;
             }
+        }
+        if to.findings.block {
+            // A refused block has not come.
+            to.queue.last.replace(header.number, self.crc, header.flash_address + header.size);
         }
         Ok(())
     }
@@ -232,7 +238,7 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
     match (header.number, to.judge.session) {
         // The sequence begins again over the existing pieces.
         (NUMBER_CONTROL, Session::Open { .. }) => return Ok(()),
-        (NUMBER_CONTROL, _) => return to.judge.may_begin(),
+        (NUMBER_CONTROL, _) => return to.judge.may_begin(false),
         (NUMBER_LAST, Session::Open { next }) if next != 1 => return Ok(()),
         (number, Session::Open { next }) if to.queue.last.may_follow(next, number, header.flash_address) => {}
         _ => return Err(Refusal::untimely(FlashError::Sequence)),
@@ -240,5 +246,11 @@ fn judge_header(header: Header, to: &Destination<'_, '_>) -> Result<(), Refusal>
     if header.size == 0 {
         return Err(Refusal::unfit(FlashError::Format));
     }
-    to.judge.check_place(Region::new(header.flash_address, header.size))
+    to.judge.check_place(Region::new(header.flash_address, header.size))?;
+    // The first data are the start of the program, which shows whether it can run here.
+    let (base, is_sealed) = (to.judge.region.base, to.judge.images.only_sealed().is_some());
+    if to.queue.last.end() == base && header.flash_address != base && !is_sealed {
+        return Err(Refusal::unfit(FlashError::Address));
+    }
+    Ok(())
 }

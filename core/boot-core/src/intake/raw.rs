@@ -37,13 +37,13 @@ impl Format for Raw {
     fn begin(&mut self, size: Option<u32>, judge: &Judge<'_>, _queue: &Queue<'_>) -> Result<(), Refusal> {
         let size = size.unwrap_or(0);
         if judge.has_begun() {
-            return judge.may_begin();
+            return judge.may_begin(true);
         }
         if size > judge.region.size {
             return Err(Refusal(FlashError::Address, AbortCode::LENGTH_TOO_HIGH));
         }
         self.0.set_size(size);
-        judge.may_begin()
+        judge.may_begin(true)
     }
 
     fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {

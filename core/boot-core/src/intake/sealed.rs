@@ -28,7 +28,7 @@ impl Format for SealedImage {
     }
 
     fn begin(&mut self, _size: Option<u32>, judge: &Judge<'_>, _queue: &Queue<'_>) -> Result<(), Refusal> {
-        judge.may_begin()
+        judge.may_begin(true)
     }
 
     fn data(&mut self, bytes: &[u8], to: &mut Destination<'_, '_>) -> Result<(), Refusal> {

@@ -112,9 +112,13 @@ impl Stream {
 /// the piece holds them. A HEX file may begin anywhere, and a small block may end before the label;
 /// vectors and label are checked again when everything is in flash.
 pub(super) fn judge_start(to: &Destination<'_, '_>) -> Result<(), Refusal> {
+    if to.queue.open_address() != to.judge.region.base {
+        return Ok(());
+    }
+    // It may have changed since the download began, and so far nothing is lost.
+    to.judge.is_allowed()?;
     // The header of a new RAM image is judged before anything is written.
-    let has_vectors = !to.judge.is_data() && !to.judge.is_bootloader();
-    if !has_vectors || to.queue.open_address() != to.judge.region.base {
+    if to.judge.is_data() || to.judge.is_bootloader() {
         return Ok(());
     }
     let mut vectors = [0; 8];

@@ -29,6 +29,8 @@ pub(crate) struct Judge<'a> {
     pub session: Session,
     /// Whether a program is installed.
     pub installed: bool,
+    /// Whether STOP was written since the last download began.
+    pub stopped: bool,
     /// The images that the device takes.
     pub images: Images,
     /// The download that can go on, or is going on.
@@ -51,15 +53,24 @@ impl Judge<'_> {
         matches!(self.session, Session::Open { .. })
     }
 
-    /// Whether a download may begin.
-    pub(crate) fn may_begin(&self) -> Result<(), Refusal> {
-        let replaces = self.policy.replaces;
+    /// Whether a download may begin; `is_stream`: it is a whole program in one transfer, for which STOP
+    /// counts as CLEAR.
+    pub(crate) fn may_begin(&self, is_stream: bool) -> Result<(), Refusal> {
+        let replaces = self.policy.replaces || is_stream && self.stopped;
         match self.session {
             Session::Idle if self.installed && !replaces => Err(Refusal::untimely(FlashError::NotCleared)),
             Session::Failed if !replaces => Err(Refusal::untimely(FlashError::Sequence)),
             Session::Open { .. } => Err(Refusal::untimely(FlashError::Sequence)),
-            _ if (self.policy.allowed)() => Ok(()),
-            _ => Err(Refusal::untimely(FlashError::NoAccess)),
+            _ => self.is_allowed(),
+        }
+    }
+
+    /// Whether programs may be changed now.
+    pub(crate) fn is_allowed(&self) -> Result<(), Refusal> {
+        if (self.policy.allowed)() {
+            Ok(())
+        } else {
+            Err(Refusal::untimely(FlashError::NoAccess))
         }
     }
 

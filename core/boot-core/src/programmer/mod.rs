@@ -78,6 +78,8 @@ struct Target {
     untouched: Option<u32>,
     /// All of it is being erased for a command.
     clearing: bool,
+    /// A download has begun, perhaps while `clearing`.
+    opened: bool,
     /// See [`ProgramRecord::half_erased`]; not including the present work, which begins with the
     /// removal of the record.
     half_erased: bool,
@@ -109,6 +111,8 @@ enum Change {
     Void,
     /// The record of a program is replaced.
     Record,
+    /// The same at the end of CLEAR: a download may begin before it.
+    Clear,
     /// The same as `Record`, but no host waits for it.
     Confirm,
     /// Node-ID and bit rate.
@@ -182,7 +186,8 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Prepares for pieces of this program, and of no other. The first piece removes its record.
     /// With `erase`, its sectors are erased, those of the first `size` bytes before data arrive;
-    /// otherwise each piece must find its place erased.
+    /// otherwise each piece must find its place erased. CLEAR that is still at work goes on beside the
+    /// pieces.
     /// `partial` is the progress to begin with: a download that goes on begins after its region's
     /// start.
     pub(crate) fn open(&mut self, program: u8, region: Region, erase: bool, size: u32, partial: Partial) {
@@ -191,20 +196,34 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         } else {
             (region.end(), region.end())
         };
-        let (untouched, clearing, half_erased) = (Some(ahead), false, true);
+        let (untouched, clearing, opened, half_erased) = (Some(ahead), false, true, true);
         let ahead = erased;
         self.source.rest();
-        self.target =
-            Some(Target { program, region, erased, ahead, untouched, clearing, half_erased, partial });
+        if let Some(target) =
+            self.target.as_mut().filter(|target| target.program == program && target.clearing)
+        {
+            (target.opened, target.partial) = (true, partial);
+            return;
+        }
+        self.target = Some(Target {
+            program,
+            region,
+            erased,
+            ahead,
+            untouched,
+            clearing,
+            opened,
+            half_erased,
+            partial,
+        });
     }
 
-    /// The pieces of the [opened](Self::open) program are of another file from here on: after a
-    /// cut, neither of them can go on.
-    pub(crate) fn disown(&mut self) {
-        let Some(target) = &mut self.target else { return };
+    /// The download of this program does not go on after a cut: a part of it was refused, or its pieces
+    /// are of another file from here on.
+    pub(crate) fn disown(&mut self, program: u8) {
+        let Some(target) = self.target.as_mut().filter(|target| target.program == program) else { return };
         // The first piece removes the record in any case.
-        if target.partial.disown() && target.untouched.is_none() {
-            let program = target.program;
+        if P::RESUMES && target.partial.disown() && target.untouched.is_none() {
             self.void(program);
         }
     }
@@ -213,7 +232,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     pub(crate) fn erase_all(&mut self, program: u8, region: Region) {
         self.open(program, region, true, region.size, Partial::begin(0, region.base));
         if let Some(target) = &mut self.target {
-            target.clearing = true;
+            (target.clearing, target.opened) = (true, false);
         }
     }
 
@@ -341,7 +360,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     pub(crate) fn is_busy_with(&self, program: u8) -> bool {
         let current = self.program() == Some(program);
         let ending = match self.job {
-            Some(Job::Store(Change::Record, of)) => of == program,
+            Some(Job::Store(Change::Record | Change::Clear, of)) => of == program,
             Some(Job::Verify { .. }) => current,
             _ => false,
         };
@@ -365,8 +384,14 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Whether [`abort`](Self::abort) undoes nothing that a host believes to be done.
     pub(crate) fn is_abortable(&self) -> bool {
-        let clearing = self.target.as_ref().is_some_and(|target| target.clearing);
+        let clearing = self.target.as_ref().is_some_and(|target| target.clearing && !target.opened);
         !clearing && !self.is_installing() && self.finishing().is_none() && !self.is_storing_node()
+    }
+
+    /// Whether all of this program was erased for a command, or is being erased, and no download has begun
+    /// since.
+    pub(crate) fn has_cleared(&self, program: u8) -> bool {
+        self.target.as_ref().is_some_and(|target| target.program == program && !target.opened)
     }
 
     /// Whether node-ID and bit rate are being stored.
@@ -505,7 +530,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                     self.source.stored(result);
                 }
                 match result {
-                    Ok(()) => Some(Event::Stored { program, ends: change == Change::Record }),
+                    Ok(()) => {
+                        let ends = matches!(change, Change::Record | Change::Clear);
+                        Some(Event::Stored { program, ends })
+                    }
                     // The consequence is only another rescue window.
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
@@ -789,7 +817,11 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 impl Target {
     /// Erases the flash for the piece, or ahead of it.
     fn erase<F: Flash>(&self, flash: &F, piece: Option<Piece>) -> Result<Option<Job>, FlashError> {
-        let needed = piece.map_or(self.ahead, |piece| piece.address + piece.size);
+        let mut needed = piece.map_or(self.ahead, |piece| piece.address + piece.size);
+        if self.clearing {
+            // What is not blank in a sector may come after the data.
+            needed = flash.sector_at(needed - 1).ok_or(FlashError::Address)?.region.end();
+        }
         if self.erased >= needed {
             return Ok(None);
         }
@@ -801,10 +833,15 @@ impl Target {
         Ok(Some(Job::Erase { sector: Some(sector), until: sector.region.end() }))
     }
 
-    /// All of it is erased for a command: stores that no erase is unfinished.
+    /// All of it is erased for a command: stores that no erase is unfinished, unless a download has begun
+    /// meanwhile.
     fn end_clear(&mut self, parameters: &mut impl Parameters) -> Option<Job> {
+        if !self.clearing || self.erased < self.region.end() {
+            return None;
+        }
+        (self.clearing, self.half_erased) = (false, false);
         let value = ProgramRecord::none(false, Partial::NONE);
-        core::mem::take(&mut self.clearing).then(|| store(parameters, Change::Record, self.program, value))
+        (!self.opened).then(|| store(parameters, Change::Clear, self.program, value))
     }
 
     /// Writes the piece.

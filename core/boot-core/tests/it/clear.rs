@@ -74,6 +74,7 @@ fn a_second_clear_erases_what_was_written_since_the_last_one() {
     assert_eq!(clear(&mut rig, 1), NONE);
     // A debugger has written something to the last sector.
     rig.chip.model().poke(0x0800_43FC, &[0x7F]);
+    rig.reset();
     assert_eq!(clear(&mut rig, 1), [0x0800_3C00]);
     // An aborted download may have left more than the contents show, also after a program that was
     // installed since.
@@ -113,6 +114,70 @@ fn every_clear_that_erases_does_so() {
     rig.command(1, CLEAR).unwrap();
     rig.settle();
     assert_eq!(erased(&rig, 1), NONE);
+}
+
+/// Lely's master and others send data right after the acknowledgement of CLEAR, without a look at 1F57h: they
+/// are taken, whatever CLEAR has to do. It erases everything beside them, and what is blank costs nothing.
+#[test]
+fn data_right_after_clear_are_taken() {
+    for setup in [&STANDARD_1, &STANDARD_2, &AT_ONCE_2] {
+        let number = setup.programs();
+        let image = raw(setup, number, 1200);
+        let text = kit::rig::hex(setup.region(number).base, &image);
+        let mut blocks = vec![kit::rig::block(0, 0, &kit::rig::words(&[1200, 0, 0]))];
+        blocks.push(kit::rig::block(1, setup.region(number).base, &image));
+        blocks.push(kit::rig::block(u32::MAX, 0, &kit::rig::words(&[1200, kit::rig::crc32(&image)])));
+        for file in [vec![image.clone()], vec![text], blocks] {
+            for (was, clears, steps) in
+                [(0, 3, 0), (0, 3, 4), (0, 5, 0), (3000, 2, 0), (3000, 2, 60), (3000, 2, 4000), (1500, 1, 3)]
+            {
+                let what = format!("{}: {was} bytes, {clears} times CLEAR, {steps} steps", setup.name);
+                let mut rig = Rig::new(setup, 4096);
+                if was > 0 {
+                    rig.install(number, &raw(setup, number, was));
+                    rig.reset();
+                }
+                for again in 1..=clears {
+                    rig.command(number, CLEAR).unwrap();
+                    if again < clears {
+                        rig.settle();
+                    }
+                }
+                if clears > 2 {
+                    assert_eq!(rig.status(number), 0, "{what}: it is done");
+                }
+                rig.steps(steps);
+                for (part, bytes) in file.iter().enumerate() {
+                    assert_eq!(rig.send(number, bytes), Ok(()), "{what}");
+                    // The queue has room for one block of data.
+                    if part > 0 {
+                        rig.settle();
+                    }
+                }
+                rig.settle();
+                assert_eq!(rig.status(number), 0, "{what}");
+                let cells = rig.cells(number);
+                assert_eq!(cells[..image.len()], image, "{what}");
+                if clears > 1 {
+                    assert!(cells[image.len()..].iter().all(|byte| *byte == 0xFF), "{what}");
+                }
+                rig.assert_installed(number, &image, &what);
+            }
+        }
+    }
+}
+
+/// The refusal of a download or of a CLEAR ends the row of CLEARs.
+#[test]
+fn a_refusal_ends_the_row_of_clears() {
+    let mut rig = Rig::new(&STANDARD_1, 1024);
+    rig.install(1, &raw(&STANDARD_1, 1, 1500));
+    for _ in 0..3 {
+        rig.command(1, CLEAR).unwrap();
+        rig.settle();
+        assert!(rig.send(1, &[0; 8]).is_err());
+        assert_eq!(rig.state(1), 0, "the program stays");
+    }
 }
 
 /// The task that answers the bus waits for a step.

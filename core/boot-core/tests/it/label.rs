@@ -236,7 +236,14 @@ fn a_products_own_check_sees_the_label() {
         let image = labelled(NEW, &Label::dated(DEVICE.0, DEVICE.1, version, TODAY));
         assert_eq!(bench.command(CLEAR), 0);
         bench.good(&block(0, 0, &[0; 8]));
-        assert_eq!(bench.block(&block_file(&image, 512)[1]), outcome);
+        let file = block_file(&image, 512);
+        assert_eq!(bench.block(&file[1]), outcome);
+        // Nothing goes on after a refusal.
+        if outcome.0.is_err() {
+            bench.good(&block(0, 0, &[0; 8]));
+            assert!(bench.transfer(&file[2]).is_err());
+            assert_eq!(bench.node.flash().touched, []);
+        }
     }
 }
 

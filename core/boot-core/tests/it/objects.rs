@@ -866,6 +866,22 @@ fn a_program_is_replaced_without_clear_where_the_profile_says_so() {
     }
 }
 
+/// STOP counts as CLEAR for the program of its sub-index, and for no other.
+#[test]
+fn stop_of_a_program_leaves_the_other_one_alone() {
+    let mut rig = Rig::new(&STANDARD_2, 4096);
+    for number in [1, 2] {
+        rig.install(number, &raw(&STANDARD_2, number, 600));
+    }
+    rig.reset();
+    rig.command(2, 0x00).unwrap();
+    assert_eq!(rig.send(1, &raw(&STANDARD_2, 1, 700)), Err(MAN_BUSY));
+    assert_eq!(rig.status(1), 0x08, "NOTCLEARED");
+    rig.send(2, &raw(&STANDARD_2, 2, 700)).unwrap();
+    rig.settle();
+    assert_eq!(rig.stored().records.map(|record| record.map(|record| record.0)), [Some(600), Some(700)]);
+}
+
 /// Programming may be forbidden after CLEAR: then no block is taken, and nothing is lost.
 #[test]
 fn a_block_is_refused_while_programming_is_not_allowed() {
@@ -879,9 +895,18 @@ fn a_block_is_refused_while_programming_is_not_allowed() {
     ALLOWED.store(false, Ordering::Relaxed);
     bench.node.flash().touched.clear();
     assert_eq!(bench.block(&kit::bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
+    // Also after block 0, as long as nothing is lost; and in one transfer.
+    let image = kit::bench::program(300, 0x22);
+    ALLOWED.store(true, Ordering::Relaxed);
+    bench.good(&kit::bench::block(0, 0, &[0; 8]));
+    ALLOWED.store(false, Ordering::Relaxed);
+    for _ in 0..2 {
+        assert_eq!(bench.block(&kit::bench::block_file(&image, 96)[1]), (Err(MAN_BUSY), 0x84));
+    }
+    assert_eq!(bench.stream(&image, None, 7), (Err(MAN_BUSY), 0x88));
     assert_eq!(bench.node.flash().touched, []);
     ALLOWED.store(true, Ordering::Relaxed);
-    bench.install(&kit::bench::program(300, 0x22));
+    bench.install(&image);
 }
 
 /// SYS TEC manual, table 3: SECURED for what belongs to the bootloader, ADDRESS for all else.

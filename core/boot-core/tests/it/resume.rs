@@ -10,6 +10,7 @@ use canopen::AbortCode;
 use kit::bench::{self, block, block_file, last, program, Bench, CLEAR, CONFIG, DATA, LAYOUT, PROGRAM};
 use kit::boot::{leaked, Boot, Store};
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
+use kit::rig::{self, Rig, Setup, LIFT_1, LIFT_2, PAULUS_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 
@@ -343,6 +344,118 @@ fn clear_ends_what_could_go_on() {
     assert_eq!(bench.command(CLEAR), 0);
     assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0));
     assert!(flash.cells(PROGRAM).iter().all(|byte| *byte == 0xFF));
+}
+
+/// The files that a device refuses, before any good data, and 1F57h for them.
+fn refused(setup: &Setup, number: u8) -> Vec<(&'static str, Vec<Vec<u8>>, u32)> {
+    let base = setup.region(number).base;
+    let good = rig::program(setup.region(number), rig::PRODUCT_CODE, 1300, 0x66);
+    let file = |control: [u32; 3], first: (u32, u32, &[u8])| {
+        let (at, address, data) = first;
+        let control = rig::block(0, 0, &rig::words(&control));
+        let crc = rig::words(&[1300, rig::crc32(&good)]);
+        let rest = rig::block(2, base + 600, &good[600..]);
+        vec![control, rig::block(at, address, data), rest, rig::block(u32::MAX, 0, &crc)]
+    };
+    let ours = [1300, rig::VENDOR_ID, rig::PRODUCT_CODE];
+    let first = |product, vectors: u32| {
+        let mut bytes = rig::program(setup.region(number), product, 600, 0x66);
+        bytes[4..8].copy_from_slice(&vectors.to_le_bytes());
+        bytes
+    };
+    let (right, other) = (base + 0x101, rig::PRODUCT_CODE ^ 1);
+    let mut damaged = file(ours, (1, base, &good[..600]));
+    damaged[1][100] ^= 1;
+    let mut short = file(ours, (1, base, &good[..600]));
+    short[1].pop();
+    let foreign = first(rig::PRODUCT_CODE, 0x0800_0101);
+    vec![
+        ("vectors", file(ours, (1, base, &foreign)), 0x04),
+        ("label", file(ours, (1, base, &first(other, right))), 0x82),
+        ("block 0", file([1300, rig::VENDOR_ID, other], (1, base, &good[..600])), 0x82),
+        ("vendor", file([1300, 5, rig::PRODUCT_CODE], (1, base, &good[..600])), 0x80),
+        ("place", file(ours, (1, base + 0x400, &good[..600])), 0x0C),
+        ("bootloader", file(ours, (1, setup.layout.bootloader.base, &good[..600])), 0x0E),
+        ("CRC", damaged, 0x06),
+        ("length", short, 0x04),
+        ("order", file(ours, (3, base, &good[..600])), 0x88),
+        ("raw", vec![foreign.clone()], 0x04),
+        ("HEX", vec![rig::hex(base, &foreign)], 0x04),
+        ("no program", vec![vec![0x3C; 600]], 0x04),
+    ]
+}
+
+/// What is refused may come again, from a host that goes on where the device says, and that sends the rest
+/// after a refusal, as a group of devices gets it; before and after a power-off; all files in a row. The old
+/// program starts, and the next good one is taken.
+#[test]
+fn a_refused_program_costs_nothing_however_often_it_comes() {
+    for setup in [&STANDARD_1, &STANDARD_2, &PAULUS_2, &LIFT_1, &LIFT_2] {
+        let number = if setup.is_data(2) { 1 } else { setup.programs() };
+        let old = rig::program(setup.region(number), rig::PRODUCT_CODE, 900, 1);
+        let mut rig = Rig::new(setup, 4096);
+        rig.install(number, &old);
+        rig.reset();
+        for (kind, file, status) in refused(setup, number) {
+            for attempt in 0..4 {
+                let what = format!("{}, {kind}, attempt {attempt}", setup.name);
+                rig.unlock(number).unwrap();
+                let mut told = [0; 8];
+                rig.node.read(Address::new(0x2006, number), &mut told).unwrap();
+                assert_eq!(told[..4], [0; 4], "{what}: 2006h");
+                // After an odd number of attempts a host that sends no CLEAR again.
+                if attempt % 2 == 0 {
+                    rig.command(number, CLEAR).unwrap();
+                }
+                let outcomes: Vec<_> =
+                    file.iter().map(|part| (rig.send(number, part), rig.status(number))).collect();
+                assert!(outcomes.iter().any(|(_, of)| *of == status), "{what}: {outcomes:02X?}");
+                rig.settle();
+                assert_eq!(rig.cells(number)[..old.len()], old, "{what}");
+                if attempt == 1 {
+                    rig.assert_installed(number, &old, &what);
+                }
+            }
+        }
+        let new = rig::program(setup.region(number), rig::PRODUCT_CODE, 1000, 2);
+        rig.unlock(number).unwrap();
+        rig.install(number, &new);
+        rig.assert_installed(number, &new, setup.name);
+    }
+}
+
+/// A refusal ends what can go on until a block is taken again, and after a power-off in any case. 2006h counts
+/// the blocks that were taken.
+#[test]
+fn a_refusal_ends_what_could_go_on() {
+    let image = program(0xC00, 0x33);
+    let file = named(&image);
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::new(&mut flash);
+    for block in &file[..=20] {
+        bench.good(block);
+    }
+    let wrong = block(21, 0x2000_0000, &[0; CHUNK]);
+    let mut damaged = file[21].clone();
+    damaged[20] ^= 1;
+    for wrong in [&wrong, &damaged, &file[23]] {
+        assert!(bench.transfer(wrong).is_err());
+        assert_eq!(partial(&mut bench).0, 0);
+    }
+    bench.good(&file[21]);
+    assert_eq!(partial(&mut bench), (crc_of(&file[0]), PROGRAM.base + 21 * CHUNK as u32));
+    assert_eq!(partial(&mut Bench::new(&mut flash)).0, 0, "after a power-off");
+    send(&mut flash, &file);
+    assert!(is_installed(&flash, &image));
+    // A program that is refused as a whole.
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.command(CLEAR), 0);
+    for block in &file[..file.len() - 1] {
+        bench.good(block);
+    }
+    assert_eq!(bench.block(&last(&program(0xC00, 0x34))).1, 0x02, "NOVALPROG");
+    assert_eq!(partial(&mut bench).0, 0);
+    assert_eq!(partial(&mut Bench::new(&mut flash)).0, 0);
 }
 
 /// For a group of devices, a block comes again until all of them have it.

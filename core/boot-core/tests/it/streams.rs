@@ -320,6 +320,61 @@ fn a_client_that_breaks_off_leaves_no_program() {
     assert_eq!(bench.stream(&image, None, 7), (Ok(()), 0));
 }
 
+/// Most public scripts send STOP, data and START. STOP counts as CLEAR for one download in one transfer, until
+/// the next reset; the block file keeps the order of the manual.
+#[test]
+fn stop_counts_as_clear_for_one_download_in_one_transfer() {
+    const STOP: u8 = 0x00;
+    const NOT_CLEARED: (Result<(), AbortCode>, u32) = (Err(STATE), 0x08);
+    let image = program(1500, 0xB3);
+    let text = hex(&image, 16, "\n");
+    let mut flash = ModelFlash::new(&CHIP);
+    cleared(&mut flash).install(&program(600, 0x11));
+    for _ in 0..2 {
+        for data in [&image[..], text.as_bytes()] {
+            let mut bench = Bench::new(&mut flash);
+            assert_eq!(bench.stream(data, None, 7), NOT_CLEARED);
+            assert_eq!(bench.command(STOP), 0x08);
+            assert_eq!(bench.block(&block(0, 0, &[0; 8])), NOT_CLEARED);
+            assert_eq!(bench.stream(b"no program", None, 7), (Err(STORE), 0x04));
+            assert_eq!(bench.stream(data, None, 7), (Ok(()), 0));
+            assert_eq!(bench.stream(data, None, 7), NOT_CLEARED, "once");
+            // A download that broke off; then there is no program, and the flash is not blank.
+            for resets in [false, true] {
+                assert_eq!(bench.command(STOP), 0x08);
+                bench.begin(&data[..1400]);
+                bench.node.download_cancel(DATA);
+                bench.settle();
+                if resets {
+                    bench = Bench::new(&mut flash);
+                    assert_eq!(bench.command(STOP), 0);
+                } else {
+                    assert_eq!(bench.stream(data, None, 7).0, Err(STATE), "CLEAR or STOP comes first");
+                    bench.command(STOP);
+                }
+                assert_eq!(bench.stream(data, None, 7), (Ok(()), 0));
+                assert_eq!(bench.stream(data, None, 7), NOT_CLEARED);
+            }
+            // A reset ends it.
+            assert_eq!(bench.command(STOP), 0x08);
+        }
+    }
+    let mut bench = Bench::new(&mut flash);
+    assert_eq!(bench.stream(&image, None, 7), NOT_CLEARED);
+    assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (0, block_crc(&image)));
+}
+
+/// Data of the application, which are any bytes, come in one transfer.
+#[test]
+fn stop_counts_as_clear_for_data() {
+    let mut flash = ModelFlash::new(&CHIP);
+    let mut bench = Bench::with(&mut flash, Policy { data: Some(1), ..Policy::DEFAULT });
+    assert_eq!(bench.stream(b"first", None, 7), (Ok(()), 0));
+    assert_eq!(bench.stream(b"second", None, 7), (Err(STATE), 0x08));
+    assert_eq!(bench.command(0x00), 0x08);
+    assert_eq!(bench.stream(b"second", None, 7), (Ok(()), 0));
+}
+
 /// The formats do not mix within a session.
 #[test]
 fn two_formats_in_one_session_are_refused() {

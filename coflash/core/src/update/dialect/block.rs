@@ -182,8 +182,8 @@ impl PartialDownload {
     }
 }
 
-/// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off; if the
-/// device's part of it proves to be wrong, everything is sent.
+/// Steps 4 to 9, and the comparison of the program's CRC. Goes on with a download that was cut off, unless
+/// the device has refused something since; if the device's part of it proves to be wrong, everything is sent.
 fn send_verified(
     session: &mut Session<'_>,
     file: Cut<'_>,
@@ -194,7 +194,11 @@ fn send_verified(
 ) -> Result<(u32, Duration), Error> {
     let number = options.program;
     let partial = if options.from_start { None } else { partial_download(session, number)? };
-    let partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
+    let mut partial = partial.filter(|partial| partial.checksum_of(file.own).is_some());
+    // Some bootloaders count the block that they refused last: what follows it would cost the old program.
+    if partial.is_some() && session.status(number)?.error.is_some() {
+        partial = None;
+    }
     let mut all = |from, update: &mut RunningUpdate<'_>| {
         let sent = send(session, file, from, in_group, options, update)?;
         steps::verify(session, number, crcs, &mut |event| update.tell(event))?;

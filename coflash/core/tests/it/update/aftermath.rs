@@ -190,17 +190,24 @@ fn without_an_answer_a_postponed_erase_is_not_called_done() {
     }
 }
 
-/// A device with a begun download (2006h) of the file that has no data yet.
-struct Begun;
+/// A device with a begun download (2006h) of the file that has no data yet; and 1F57h until CLEAR.
+struct Begun(u32);
 
 impl Maker for Begun {
     fn value(&mut self, at: (u16, u8), _: u32) -> Option<Result<Vec<u8>, u32>> {
         // The CRC of block 0, which has 12 bytes of data after its 12 of header, and the start of the program.
         let crc = &data!("identity-110.blk")[24..28];
-        (at == (0x2006, 1)).then(|| Ok([crc, &0x0801_0000_u32.to_le_bytes()].concat()))
+        match at {
+            (0x2006, 1) => Some(Ok([crc, &0x0801_0000_u32.to_le_bytes()].concat())),
+            (0x1F57, 1) if self.0 != 0 => Some(Ok(self.0.to_le_bytes().into())),
+            _ => None,
+        }
     }
 
-    fn write(&mut self, _: (u16, u8), _: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+    fn write(&mut self, at: (u16, u8), data: &[u8], _: u32) -> Option<Result<Deed, u32>> {
+        if (at, data) == ((0x1F51, 1), &[CLEAR]) {
+            self.0 = 0;
+        }
         None
     }
 
@@ -214,7 +221,7 @@ impl Maker for Begun {
 fn a_begun_download_without_data_may_have_left_the_old_program() {
     for (crc, state) in [(0x0BAD_CAFE, DeviceState::Postponed), (0, DeviceState::Erased)] {
         let begun = |fake: &mut Fake| {
-            fake.maker = Some(Box::new(Begun));
+            fake.maker = Some(Box::new(Begun(0)));
             fake.crc = Some(crc);
         };
         let mut whole = Fake::new(BOOTLOADER);
@@ -233,6 +240,16 @@ fn a_begun_download_without_data_may_have_left_the_old_program() {
         );
         assert_eq!(cut.state, state, "{crc:08X}");
     }
+}
+
+/// What the device has refused last, here with FORMAT, is not gone on with: it may count the refused block.
+#[test]
+fn a_begun_download_that_was_refused_begins_again() {
+    let mut fake = Fake::new(BOOTLOADER);
+    fake.maker = Some(Box::new(Begun(0x04)));
+    let (result, events) = run(&mut fake, &FlashOptions::default());
+    result.unwrap();
+    assert!(!events.iter().any(|event| matches!(event, Event::Phase(Phase::GoingOn { .. }))), "{events:?}");
 }
 
 #[test]
