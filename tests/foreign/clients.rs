@@ -5,11 +5,12 @@ use std::env;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use canopen::Address;
-use coboot_tests::bench::Bench;
+use canopen::{Address, BitRate};
+use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coflash_core::file::block_file::emit;
+use coflash_core::update::{flash, FlashOptions};
 
 const VERSION: Address = Address::new(0x100A, 0);
 
@@ -98,6 +99,39 @@ fn canopen_asyncio_updates_the_device_by_raw_images() {
         assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version);
     }
     endpoint.bench.assert_nothing_unmodelled();
+}
+
+/// Each public script with its own time-outs, on a board that runs so much slower than real time. From the running
+/// program, twice in a row.
+#[test]
+fn public_scripts_update_the_device_twice_in_a_row() {
+    const SLOWER: u32 = 2;
+    let folder = kit::folder!("clients");
+    for order in ["ixxat", "mcuboot", "ulc", "emotas", "ddt", "issue28"] {
+        let mut bench = Bench::new();
+        let board = bench.boards()[0];
+        bench.commission(board, NODE, BitRate::K500);
+        bench.set_host_bit_rate(500_000);
+        bench.power_on();
+        bench.await_boot_up(100);
+        flash(
+            &mut bench.session(),
+            &firmware::blocks(firmware::APP_V1),
+            &FlashOptions::default(),
+            &mut |_| {},
+        )
+        .unwrap();
+        let mut endpoint = Endpoint::slower(bench, SLOWER);
+        for (image, version) in [(firmware::APP_V2, "2.0.0"), (firmware::APP_V1, "1.0.0")] {
+            let path = folder.write(format!("{image}.bin"), firmware::raw(image));
+            let mut python = python();
+            python.arg(script("script_client.py")).arg(endpoint.address()).arg(path).arg(order);
+            let output = endpoint.run(python.args(["--slower", &SLOWER.to_string()]));
+            assert!(output.status.success(), "{order}: {}", text(&output));
+            assert_eq!(endpoint.bench.session().read_text(VERSION).unwrap(), version, "{order}");
+        }
+        endpoint.bench.assert_nothing_unmodelled();
+    }
 }
 
 /// The command line built by `cargo xtask test`.

@@ -331,6 +331,18 @@ fn an_installed_program_stays_without_clear() {
         assert_eq!((abort, status), (Err(AbortCode::DEVICE_STATE), NOT_CLEARED));
         assert_eq!(device.take_touched(), []);
         is_installed(host, 1, &image);
+        // STOP counts as CLEAR for one image; it needs no right, and what is not genuine costs nothing.
+        let newer = program(900, 2);
+        let genuine = of_counter(6, 1, &newer);
+        let mut forged = genuine.clone();
+        forged[100] ^= 1;
+        for (file, is_good) in [(&forged, false), (&forged, false), (&genuine, true)] {
+            host.wait();
+            host.command(1, 0x00).unwrap();
+            assert_eq!(host.send(1, file, 7).1 == 0, is_good);
+            is_installed(host, 1, if is_good { &newer } else { &image });
+        }
+        assert_eq!(host.send(1, &of_counter(7, 1, &image), 7).1, NOT_CLEARED);
     });
 }
 

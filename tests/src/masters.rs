@@ -222,6 +222,35 @@ pub fn confirm(bus: &mut dyn Adapter, node: u8, program: u8) -> Result<(), Strin
     idle(&mut master, program)
 }
 
+/// STOP if a program runs, CLEAR or not, one download and START, each request once: the order of docs/masters.md,
+/// as `sdo.c` of CANopenTerm sends it with its time-out of 100 ms; and that of the public scripts without CLEAR.
+///
+/// # Errors
+/// The first step that fails.
+pub fn simple(
+    bus: &mut dyn Adapter,
+    node: u8,
+    (timeout, clears): (Duration, bool),
+    image: &[u8],
+    transfers: Transfers,
+) -> Result<(), String> {
+    let mut master = Master::new(bus, node, timeout);
+    if master.number(0x1F51, 1)? == 1 {
+        master.control(1, STOP)?;
+    }
+    if clears {
+        master.control(1, CLEAR)?;
+    }
+    master.download(1, image, transfers)?;
+    idle(&mut master, 1)?;
+    master.control(1, START)?;
+    master.pause(Duration::from_millis(300));
+    match master.number(0x1F51, 1)? {
+        1 => Ok(()),
+        state => Err(format!("1F51h reads {state}")),
+    }
+}
+
 /// How many times Lely's master repeats a request that may meet a restarting device.
 const LELY_RETRY: u32 = 3;
 /// Its pause before it reads 1F57h and 1F51h.

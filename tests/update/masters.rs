@@ -4,15 +4,17 @@
 
 use std::time::Duration;
 
-use canopen::BitRate;
+use canopen::{Address, BitRate};
 use coboot_node::device::Event;
 use coboot_tests::bench::{Bench, NODE};
 use coboot_tests::firmware;
-use coboot_tests::masters::{confirm, lely, systec, zephyr, Master};
+use coboot_tests::masters::{confirm, lely, simple, systec, zephyr, Master};
 use coboot_tests::node::NodeBus;
 use coboot_tests::renewal::{crc_of, identification, number, progress, running, version};
+use coflash_core::device::Transfers;
 use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
+use coflash_core::update::steps::{call_back, erase_at_once};
 use coflash_core::update::{flash, FlashOptions};
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
@@ -69,16 +71,43 @@ fn zephyrs_runner_updates_and_confirms_a_running_device() {
     }
 }
 
-/// The step "check and update software version" at 500 kbit/s.
+/// An update by a master; no request was repeated.
+type Update = fn(&mut Bench, &[u8]) -> Result<(), String>;
+
+/// Lely's step "check and update software version" with its defaults; CANopenTerm with its 100 ms; and scripts that
+/// send no CLEAR, with the 300 ms of python-canopen. At 500 kbit/s, each of them twice in a row, and once more
+/// after `coflash erase`.
 #[test]
-fn lelys_master_updates_a_running_device() {
-    let raw = firmware::raw(firmware::APP_V2);
-    for image in APPLICATIONS {
-        let mut bench = board_at(BitRate::K500, 500_000, image);
-        let done =
-            lely(&mut bench, NODE, &raw, crc32(&raw)).unwrap_or_else(|error| panic!("{image}: {error}"));
-        assert_eq!((done.repeated, done.stop_answered), (0, true), "{image}");
-        assert!(!bench.is_bootloader(NODE), "{image}");
+fn each_master_updates_a_running_device_again_and_again() {
+    const TERM: (Duration, bool) = (Duration::from_millis(100), true);
+    const SCRIPT: (Duration, bool) = (Duration::from_millis(300), false);
+    let masters: [(&str, Update); 5] = [
+        ("Lely", |bench, image| {
+            let done = lely(bench, NODE, image, crc32(image))?;
+            assert_eq!((done.repeated, done.stop_answered), (0, true));
+            Ok(())
+        }),
+        ("CANopenTerm", |bench, image| simple(bench, NODE, TERM, image, Transfers::Segments)),
+        ("CANopenTerm, block", |bench, image| simple(bench, NODE, TERM, image, Transfers::Blocks)),
+        ("a script", |bench, image| simple(bench, NODE, SCRIPT, image, Transfers::Segments)),
+        ("a script, block", |bench, image| simple(bench, NODE, SCRIPT, image, Transfers::Blocks)),
+    ];
+    for (number, (master, update)) in masters.into_iter().enumerate() {
+        let mut bench = board_at(BitRate::K500, 500_000, APPLICATIONS[number % 2]);
+        for (time, image) in [firmware::APP_V2, firmware::APP_V1, firmware::APP_V2].iter().enumerate() {
+            if time == 2 {
+                call_back(&mut bench.session()).unwrap();
+                // Twice: there is nothing to erase the second time.
+                for _ in 0..2 {
+                    erase_at_once(&mut bench.session(), 1).unwrap();
+                }
+            }
+            let raw = firmware::raw(image);
+            update(&mut bench, &raw).unwrap_or_else(|error| panic!("{master}, {time}: {error}"));
+            assert!(!bench.is_bootloader(NODE), "{master}, {time}");
+            let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
+            assert_eq!(crc, crc32(&raw), "{master}, {time}");
+        }
         bench.assert_nothing_unmodelled();
     }
 }
@@ -167,7 +196,7 @@ const NEW: u32 = 0x0009_0001;
 /// A device that runs a program, and whose master has called its bootloader (1F51h/1 = 80h).
 fn called_back() -> Bench {
     let mut bench = board_at(BitRate::K125, 125_000, firmware::APP_V1);
-    coflash_core::update::steps::call_back(&mut bench.session()).unwrap();
+    call_back(&mut bench.session()).unwrap();
     bench
 }
 

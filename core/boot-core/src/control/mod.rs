@@ -181,6 +181,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         if P::RENEWS {
             self.begin_renewal(flash, report);
         }
+        // A program may have answered STOP itself before it has left; it then leaves no node-ID.
+        if let (Some(state), 0) = (find::<P>(&mut self.programs, report.owed.program), report.owed.value) {
+            state.stopped = true;
+        }
         let Some(state) = find::<P>(&mut self.programs, report.refused) else { return };
         state.failure = Some(Failure::of(FlashError::NoValidProgram));
         if report.reason == Reason::Damaged as u8 || report.reason == Reason::Vectors as u8 {

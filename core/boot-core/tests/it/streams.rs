@@ -7,10 +7,12 @@ use boot_core::profile::Profile;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, Instant};
 use kit::bench::*;
+use kit::boot::{leaked, Boot};
 use kit::ihex::{record, END_OF_FILE as EOF};
 use kit::model::{ModelFlash, CHIP};
 use proptest::prelude::*;
-use shared_abi::warm_start::BootRequest;
+use shared_abi::boot_report::BootReport;
+use shared_abi::warm_start::{BootRequest, Owed};
 
 const STORE: AbortCode = AbortCode(0x0800_0020);
 const STATE: AbortCode = AbortCode(0x0800_0022);
@@ -362,6 +364,15 @@ fn stop_counts_as_clear_for_one_download_in_one_transfer() {
     let mut bench = Bench::new(&mut flash);
     assert_eq!(bench.stream(&image, None, 7), NOT_CLEARED);
     assert_eq!((bench.read_state(), bench.word(IDENTIFICATION)), (0, block_crc(&image)));
+    // A program that has answered STOP itself leaves it without a node-ID.
+    for (owed, is_taken) in [((1, 0, 0), true), ((1, 3, 0), false), ((2, 0, 0), false), ((0, 0, 0), false)] {
+        let (program, value, node_id) = owed;
+        let owed = Owed { program, value, node_id };
+        let boot = Boot { report: BootReport { owed, ..BootReport::NONE }, ..Boot::new(&CONFIG, node()) };
+        let (buffer, sealed) = leaked(256);
+        let mut bench = Bench { node: boot.on(&mut flash, buffer, sealed) };
+        assert_eq!(bench.stream(&image, None, 7).0.is_ok(), is_taken, "{owed:?}");
+    }
 }
 
 /// Data of the application, which are any bytes, come in one transfer.

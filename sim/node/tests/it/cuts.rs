@@ -8,7 +8,7 @@ use boot_core::canopen::NodeId;
 use boot_core::crc::CrcKind;
 use boot_core::program::verify;
 use boot_core::store::Journal;
-use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::device::{Dialect, Session, Timing, Transfers};
 use coflash_core::file::block_file;
 use coflash_core::update::event::{Phase, Warning};
 use coflash_core::update::{flash, Event, FlashOptions, Report};
@@ -177,6 +177,56 @@ fn an_update_that_is_cut_anywhere_goes_on() {
     for (name, count) in &counts {
         println!("{name}: {count:?}");
         assert!(count.updates > 250 && count.updates > 2 * (count.before_data + count.after_data));
+    }
+}
+
+/// Thirteen files that the device refuses, each flashed twice with `--force`, before and after a power-off, and the
+/// file of the old program: it stays and is complete.
+#[test]
+fn a_refused_file_costs_nothing_however_often_it_is_flashed() {
+    let (mut flash, _) = old_and_new();
+    let old = program(0x2A00, 0x11);
+    let file = |at: usize, word: u32, base: u32| {
+        let mut image = program(0x2000, 0x22);
+        image[at..at + 4].copy_from_slice(&word.to_le_bytes());
+        let words: Vec<u8> = [0x2000_u32, 0, 0].into_iter().flat_map(u32::to_le_bytes).collect();
+        let data = (1..).zip(image.chunks(CHUNK));
+        let data = data.map(|(n, data)| block(n, base + (n - 1) * CHUNK as u32, data));
+        [block(0, 0, &words)]
+            .into_iter()
+            .chain(data)
+            .chain([bench::last(&image)])
+            .collect::<Vec<_>>()
+            .concat()
+    };
+    // A reset vector elsewhere and without the Thumb bit, and a stack outside the RAM.
+    let wrong = [(4, 0x0800_0101), (4, PROGRAM.base + 0x200), (0, 0x3000_0000)];
+    let dialects = [Dialect::Block, Dialect::Raw, Dialect::Hex];
+    let vectors = wrong.iter().flat_map(|(at, word)| dialects.map(|of| (of, file(*at, *word, PROGRAM.base))));
+    // In the middle of the program, over the bootloader, and outside the flash.
+    let places = [PROGRAM.base + 0x400, 0x0800_0000, 0x0900_0000];
+    let places = places.map(|base| (Dialect::Block, file(4, base + 0x201, base)));
+    let secured = (Dialect::Hex, file(4, 0x0800_0201, 0x0800_0000));
+    for (kind, (dialect, file)) in vectors.chain(places).chain([secured]).enumerate() {
+        let refused = options().force(true).dialect(Some(dialect));
+        for attempt in 0..2 {
+            let mut bus = CutBus::new(flash, None);
+            for _ in 0..2 {
+                let ended = update(&mut bus, &file, Transfers::Blocks, &refused);
+                assert!(ended.result.is_err(), "{kind}, {attempt}: {:?}", ended.events);
+                assert!(
+                    is_installed(&mut bus.flash().clone(), &old),
+                    "{kind}, {attempt}: {:?}",
+                    ended.events
+                );
+            }
+            if attempt == 1 && kind % 4 == 0 {
+                let ended = update(&mut bus, &named(&old), Transfers::Blocks, &options());
+                ended.result.unwrap_or_else(|error| panic!("{kind}: {error}"));
+            }
+            flash = bus.flash().clone();
+        }
+        assert!(is_installed(&mut flash, &old), "{kind}");
     }
 }
 
