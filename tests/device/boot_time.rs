@@ -98,13 +98,7 @@ fn start_times(silicon: Silicon) {
     let mut bench = Bench::with(ChipOptions { silicon, ..ChipOptions::default() });
     bench.power_on();
     let power_on = bench.await_boot_up(100) - Time(0);
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V1);
     println!("boot-up of the bootloader: {} us after power-on", micros(power_on));
     assert!(power_on <= Span::from_micros(4500), "{} us", micros(power_on));
     // The application looks at its deadlines by a clock of its own: the request meets it in any phase.

@@ -12,6 +12,7 @@ use coflash_core::update::{flash, Event, FlashOptions};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
 use emulator::time::{Span, Time};
+use kit::rig::{block, crc32};
 
 const DATA: Address = Address::new(0x1F50, 1);
 const STATUS: Address = Address::new(0x1F57, 1);
@@ -298,25 +299,6 @@ fn crc16(bytes: &[u8]) -> u16 {
             |crc, _| if crc >> 15 == 1 { crc << 1 ^ 0x1021 } else { crc << 1 },
         )
     })
-}
-
-/// CRC of a block: CRC-32/ISO-HDLC. "123456789" gives CBF43926h there.
-fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(
-            crc ^ u32::from(*byte),
-            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
-        )
-    })
-}
-
-/// A block of the block file.
-fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
-    let header = [number, address, data.len() as u32];
-    let mut bytes: Vec<u8> = header.iter().flat_map(|word| word.to_le_bytes()).collect();
-    bytes.extend(data);
-    bytes.extend(crc32(&bytes).to_le_bytes());
-    bytes
 }
 
 #[test]

@@ -13,6 +13,7 @@ use coflash_core::file::convert::{self, program_of, Options};
 use coflash_core::file::read::read;
 use coflash_core::update::{flash, FlashOptions, Report};
 use coflash_core::Error;
+use kit::rig::crc32;
 use shared_abi::callgate;
 use shared_abi::geometry::Region;
 use shared_abi::layout::stm32f407g_disc1_two;
@@ -136,13 +137,6 @@ fn size_of_arguments(selector: u32) -> u32 {
         READ_NODE | STORE_NODE => 8,
         _ => 20,
     }
-}
-
-/// CRC-32/ISO-HDLC, bit by bit.
-fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xEDB8_8320 * (crc & 1)))
-    })
 }
 
 #[test]

@@ -10,7 +10,6 @@ use coboot_can::Adapter;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::firmware;
 use coflash_core::device::{Doing, Transfers};
-use coflash_core::update::{flash, FlashOptions};
 use emulator::time::{Span, Time};
 
 /// The segments of a sub-block at 125 kbit/s: as many as fit into 80 ms, with 135 bits each.
@@ -38,13 +37,7 @@ fn board(rate: BitRate) -> Bench {
 /// A board that runs the application template.
 fn running_board() -> Bench {
     let mut bench = board(BitRate::K125);
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .expect("a good program");
+    bench.install(firmware::APP_V1);
     bench
 }
 

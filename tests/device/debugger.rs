@@ -315,13 +315,7 @@ fn without_the_feature_there_is_no_interface() {
     bench.power_on();
     bench.await_boot_up(100);
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V1);
     assert_eq!(command(&mut bench, 0, 0x2000_0000, 4), Some(0x0602_0000));
 }
 

@@ -11,6 +11,7 @@ use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::{Span, Time};
+use kit::rig::block;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
@@ -50,23 +51,6 @@ fn program_flash(bench: &mut Bench) -> Vec<u8> {
 /// The address of program 1.
 fn program_start() -> u32 {
     firmware::board().programs[0].base
-}
-
-fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(
-            crc ^ u32::from(*byte),
-            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
-        )
-    })
-}
-
-fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
-    let mut bytes: Vec<u8> =
-        [number, address, data.len() as u32].iter().flat_map(|w| w.to_le_bytes()).collect();
-    bytes.extend(data);
-    bytes.extend(crc32(&bytes).to_le_bytes());
-    bytes
 }
 
 /// Sends a block; returns the abort code and the status after all work.

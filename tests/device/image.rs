@@ -243,13 +243,7 @@ fn board_with_a_program() -> Bench {
     let mut bench = Bench::new();
     bench.power_on();
     bench.await_boot_up(100);
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V1);
     bench.confirm_program();
     bench.power_off();
     bench

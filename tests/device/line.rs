@@ -225,13 +225,7 @@ fn finds_the_bit_rate_of_a_bus_where_it_is_alone_with_the_master() {
 #[test]
 fn an_application_finds_the_bit_rate_too() {
     let mut bench = empty_board();
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V1);
     bench.session().command(1, canopen::program::ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     store(&mut bench, NODE, BitRate::Auto);

@@ -174,13 +174,7 @@ fn the_uart_speaks_while_the_flash_erases() {
     let mut bench = Bench::of_image(firmware::BOOTLOADER_LOG_UART);
     bench.power_on();
     bench.await_boot_up(100);
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V1);
     bench.session().command(1, ProgramControl::StartBootloader).unwrap();
     bench.await_boot_up(1000);
     bench.soil_programs();

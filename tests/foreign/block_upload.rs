@@ -9,7 +9,6 @@ use canopen::Address;
 use coboot_tests::bench::{Bench, NODE, REQUEST, RESPONSE};
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
-use coflash_core::update::{flash, FlashOptions};
 
 fn bootloader() -> Bench {
     let mut bench = Bench::new();
@@ -21,13 +20,7 @@ fn bootloader() -> Bench {
 
 fn application() -> Bench {
     let mut bench = bootloader();
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V1),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .expect("a good program");
+    bench.install(firmware::APP_V1);
     bench
 }
 

@@ -6,11 +6,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use canopen::{Address, BitRate};
-use coboot_tests::bench::{Bench, NODE};
+use coboot_tests::bench::Bench;
 use coboot_tests::endpoint::Endpoint;
 use coboot_tests::firmware;
 use coflash_core::file::block_file::emit;
-use coflash_core::update::{flash, FlashOptions};
 
 const VERSION: Address = Address::new(0x100A, 0);
 
@@ -108,20 +107,7 @@ fn public_scripts_update_the_device_twice_in_a_row() {
     const SLOWER: u32 = 2;
     let folder = kit::folder!("clients");
     for order in ["ixxat", "mcuboot", "ulc", "emotas", "ddt", "issue28"] {
-        let mut bench = Bench::new();
-        let board = bench.boards()[0];
-        bench.commission(board, NODE, BitRate::K500);
-        bench.set_host_bit_rate(500_000);
-        bench.power_on();
-        bench.await_boot_up(100);
-        flash(
-            &mut bench.session(),
-            &firmware::blocks(firmware::APP_V1),
-            &FlashOptions::default(),
-            &mut |_| {},
-        )
-        .unwrap();
-        let mut endpoint = Endpoint::slower(bench, SLOWER);
+        let mut endpoint = Endpoint::slower(Bench::running(BitRate::K500, firmware::APP_V1), SLOWER);
         for (image, version) in [(firmware::APP_V2, "2.0.0"), (firmware::APP_V1, "1.0.0")] {
             let path = folder.write(format!("{image}.bin"), firmware::raw(image));
             let mut python = python();

@@ -9,6 +9,7 @@ use canopen::program::ProgramControl;
 use canopen::{Address, BitRate, NodeId};
 use coboot_can::{Adapter, AdapterError};
 use coflash_core::device::{Session, Timing};
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::{Outcome, Record};
 use emulator::frame::Frame;
 use emulator::machine::{Machine, Options, Stop, Usart};
@@ -392,6 +393,33 @@ impl Bench {
                 return Some(frame.data().to_vec());
             }
         }
+    }
+
+    /// A board at this bit rate that runs this application.
+    ///
+    /// # Panics
+    /// If it cannot be installed.
+    #[must_use]
+    pub fn running(rate: BitRate, image: &str) -> Self {
+        let mut bench = Self::new();
+        bench.commission(bench.device, NODE, rate);
+        bench.set_host_bit_rate(rate.bits_per_second().expect("a rate that can be set"));
+        bench.power_on();
+        bench.await_boot_up(1000);
+        bench.install(image);
+        bench.run_ms(100);
+        bench.events();
+        bench
+    }
+
+    /// Installs an application of the board, without a trial run, and starts it.
+    ///
+    /// # Panics
+    /// If the board does not take it.
+    pub fn install(&mut self, image: &str) {
+        let options = FlashOptions::default().trial_run(false);
+        let installed = flash(&mut self.session(), &firmware::blocks(image), &options, &mut |_| {});
+        installed.expect("it is installed");
     }
 
     /// Configures a board as in the factory: sets its node-ID (255 for none) and bit rate by layer

@@ -3,12 +3,10 @@
 use bsp::can::BitTiming;
 use canopen::program::ProgramControl;
 use canopen::BitRate;
-use coflash_core::update::{flash, FlashOptions};
 use emulator::machine::{ResetCause, Stop};
 use emulator::time::Span;
 
 use crate::bench::{Bench, NODE};
-use crate::firmware;
 
 /// The bit rates of CiA 301, in bit/s.
 const RATES: [(BitRate, u32); 8] = [
@@ -32,20 +30,11 @@ const PAUSE: Span = Span::from_millis(10);
 /// # Panics
 /// If the board does not do this.
 pub fn at_every_bit_rate(image: &str, mut then: impl FnMut(BitRate, Bench)) {
-    let blocks = firmware::blocks(image);
     for (rate, bits) in RATES {
         if BitTiming::new(bsp::CAN_CLOCK, bits).is_none() {
             continue;
         }
-        let mut bench = Bench::new();
-        let board = bench.device;
-        bench.commission(board, NODE, rate);
-        bench.set_host_bit_rate(bits);
-        bench.power_on();
-        bench.await_boot_up(1000);
-        flash(&mut bench.session(), &blocks, &FlashOptions::default().trial_run(false), &mut |_| {})
-            .expect("it is installed");
-        bench.events();
+        let mut bench = Bench::running(rate, image);
         let from = bench.time();
         bench.session().command(1, ProgramControl::StartBootloader).expect("it is answered");
         bench.await_boot_up(2000);

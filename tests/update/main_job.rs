@@ -45,13 +45,7 @@ fn the_main_job() {
     );
     assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "running");
 
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(firmware::APP_V2),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
+    bench.install(firmware::APP_V2);
     assert_eq!(bench.session().read_text(Address::new(0x100A, 0)).unwrap(), "2.0.0");
 
     bench.power_off();

@@ -15,47 +15,18 @@ use coflash_core::device::Transfers;
 use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::read::{read, Format};
 use coflash_core::update::steps::{call_back, erase_at_once};
-use coflash_core::update::{flash, FlashOptions};
+use kit::rig::crc32;
 use shared_abi::renewal::{Origin, Progress, State, TrialEnd};
 
 /// The applications that run on the device.
 const APPLICATIONS: [&str; 2] = [firmware::APP_V1, firmware::APP_C];
-
-/// The index of the bench's bit rate.
-fn board_at(rate: BitRate, bits: u32, image: &str) -> Bench {
-    let mut bench = Bench::new();
-    if rate != BitRate::K125 {
-        let board = bench.device;
-        bench.commission(board, NODE, rate);
-        bench.set_host_bit_rate(bits);
-    }
-    bench.power_on();
-    bench.await_boot_up(1000);
-    flash(
-        &mut bench.session(),
-        &firmware::blocks(image),
-        &FlashOptions::default().trial_run(false),
-        &mut |_| {},
-    )
-    .unwrap();
-    bench.run_ms(100);
-    bench.events();
-    bench
-}
-
-/// CRC-32/ISO-HDLC, bit by bit.
-fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xEDB8_8320 * (crc & 1)))
-    })
-}
 
 /// The whole procedure, from one application to the next, confirmed at the end: the device runs the
 /// new program, and starts it by itself.
 #[test]
 fn zephyrs_runner_updates_and_confirms_a_running_device() {
     for image in APPLICATIONS {
-        let mut bench = board_at(BitRate::K125, 125_000, image);
+        let mut bench = Bench::running(BitRate::K125, image);
         let done = zephyr(&mut bench, NODE, 1, &firmware::raw(firmware::APP_V2));
         let [stop, clear] = done.unwrap_or_else(|error| panic!("{image}: {error}")).answers;
         println!("{image}: STOP answered in {stop:?}, CLEAR in {clear:?}");
@@ -93,7 +64,7 @@ fn each_master_updates_a_running_device_again_and_again() {
         ("a script, block", |bench, image| simple(bench, NODE, SCRIPT, image, Transfers::Blocks)),
     ];
     for (number, (master, update)) in masters.into_iter().enumerate() {
-        let mut bench = board_at(BitRate::K500, 500_000, APPLICATIONS[number % 2]);
+        let mut bench = Bench::running(BitRate::K500, APPLICATIONS[number % 2]);
         for (time, image) in [firmware::APP_V2, firmware::APP_V1, firmware::APP_V2].iter().enumerate() {
             if time == 2 {
                 call_back(&mut bench.session()).unwrap();
@@ -143,7 +114,7 @@ fn both_masters_update_a_node_without_a_chip() {
 fn stop_and_clear_are_answered_by_the_bootloader_within_25_ms() {
     for image in APPLICATIONS {
         for command in [0, 3] {
-            let mut bench = board_at(BitRate::K125, 125_000, image);
+            let mut bench = Bench::running(BitRate::K125, image);
             let from = bench.time();
             let took = Master::new(&mut bench, NODE, Duration::from_millis(100)).control(1, command);
             let took = took.unwrap_or_else(|error| panic!("{image}: {error}"));
@@ -179,7 +150,7 @@ fn stop_is_answered_as_soon_as_the_wire_allows_at_every_bit_rate() {
     let rates = [BitRate::K10, BitRate::K20, BitRate::K50, BitRate::K250, BitRate::K500, BitRate::K1000];
     for rate in rates {
         let bits = rate.bits_per_second().unwrap();
-        let mut bench = board_at(rate, bits, firmware::APP_V1);
+        let mut bench = Bench::running(rate, firmware::APP_V1);
         let took = Master::new(&mut bench, NODE, Duration::from_millis(100)).control(1, 0).unwrap();
         println!("{}: {bits} bit/s: {took:?}", firmware::board().board);
         let limit = DEVICE + Duration::from_secs(1) * BITS / bits;
@@ -195,7 +166,7 @@ const NEW: u32 = 0x0009_0001;
 
 /// A device that runs a program, and whose master has called its bootloader (1F51h/1 = 80h).
 fn called_back() -> Bench {
-    let mut bench = board_at(BitRate::K125, 125_000, firmware::APP_V1);
+    let mut bench = Bench::running(BitRate::K125, firmware::APP_V1);
     call_back(&mut bench.session()).unwrap();
     bench
 }

@@ -14,6 +14,7 @@ use shared_abi::layout::Layout;
 
 use crate::boot::{leaked, Boot};
 use crate::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+pub use crate::rig::{block, crc32};
 
 pub const LAYOUT: Layout = ONE_PROGRAM;
 pub static LAYOUT_REF: &Layout = &LAYOUT;
@@ -180,16 +181,6 @@ impl<'f> Bench<'f> {
     }
 }
 
-pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    for word in [number, address, data.len() as u32] {
-        bytes.extend(word.to_le_bytes());
-    }
-    bytes.extend(data);
-    bytes.extend(block_crc(&bytes).to_le_bytes());
-    bytes
-}
-
 /// The CRC-32 of blocks and programs.
 pub fn block_crc(bytes: &[u8]) -> u32 {
     crc32(bytes)
@@ -201,16 +192,6 @@ pub fn crc16(bytes: &[u8]) -> u32 {
         (0..8).fold(crc ^ u32::from(*byte) << 8, |crc, _| {
             (if crc & 0x8000 != 0 { crc << 1 ^ 0x1021 } else { crc << 1 }) & 0xFFFF
         })
-    })
-}
-
-/// CRC-32/ISO-HDLC from its definition (reflected polynomial EDB88320h), bit by bit.
-pub fn crc32(bytes: &[u8]) -> u32 {
-    !bytes.iter().fold(u32::MAX, |crc, byte| {
-        (0..8).fold(
-            crc ^ u32::from(*byte),
-            |crc, _| if crc & 1 == 1 { crc >> 1 ^ 0xEDB8_8320 } else { crc >> 1 },
-        )
     })
 }
 

@@ -235,31 +235,17 @@ fn a_products_own_check_sees_the_label() {
     for (version, outcome) in [(7, (Err(UNFIT), 0x7E)), (8, (Ok(()), 0))] {
         let image = labelled(NEW, &Label::dated(DEVICE.0, DEVICE.1, version, TODAY));
         assert_eq!(bench.command(CLEAR), 0);
-        bench.good(&block(0, 0, &[0; 8]));
+        let control = block(0, 0, &[700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat());
+        bench.good(&control);
         let file = block_file(&image, 512);
         assert_eq!(bench.block(&file[1]), outcome);
         // Nothing goes on after a refusal.
         if outcome.0.is_err() {
-            bench.good(&block(0, 0, &[0; 8]));
+            bench.good(&control);
             assert!(bench.transfer(&file[2]).is_err());
             assert_eq!(bench.node.flash().touched, []);
         }
     }
-}
-
-/// Block 0 alone loses nothing, whatever it contains: after a reset the old program is found.
-#[test]
-fn a_control_block_alone_loses_nothing() {
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = updated(&mut flash);
-    assert_eq!(bench.command(CLEAR), 0);
-    bench.good(&block(0, 0, &[700, DEVICE.0, DEVICE.1].map(u32::to_le_bytes).concat()));
-    assert_eq!(bench.node.flash().touched, []);
-    // Aborted and begun again, it still loses nothing.
-    assert_eq!(bench.command(CLEAR), 0);
-    bench.good(&block(0, 0, &[0; 8]));
-    assert_eq!(bench.node.flash().touched, []);
-    assert_eq!(autostart(&flash), Ok(OLD));
 }
 
 /// An update to the program of another product in small blocks, cut at every operation: the old

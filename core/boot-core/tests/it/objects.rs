@@ -882,72 +882,6 @@ fn stop_of_a_program_leaves_the_other_one_alone() {
     assert_eq!(rig.stored().records.map(|record| record.map(|record| record.0)), [Some(600), Some(700)]);
 }
 
-/// Programming may be forbidden after CLEAR: then no block is taken, and nothing is lost.
-#[test]
-fn a_block_is_refused_while_programming_is_not_allowed() {
-    use std::sync::atomic::{AtomicBool, Ordering};
-    static ALLOWED: AtomicBool = AtomicBool::new(true);
-    let policy = Policy { allowed: || ALLOWED.load(Ordering::Relaxed), ..Policy::DEFAULT };
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::with(&mut flash, policy);
-    bench.install(&kit::bench::program(200, 0x11));
-    assert_eq!(bench.command(CLEAR), 0);
-    ALLOWED.store(false, Ordering::Relaxed);
-    bench.node.flash().touched.clear();
-    assert_eq!(bench.block(&kit::bench::block(0, 0, &[0; 8])), (Err(MAN_BUSY), 0x84), "NO_ACCESS");
-    // Also after block 0, as long as nothing is lost; and in one transfer.
-    let image = kit::bench::program(300, 0x22);
-    ALLOWED.store(true, Ordering::Relaxed);
-    bench.good(&kit::bench::block(0, 0, &[0; 8]));
-    ALLOWED.store(false, Ordering::Relaxed);
-    for _ in 0..2 {
-        assert_eq!(bench.block(&kit::bench::block_file(&image, 96)[1]), (Err(MAN_BUSY), 0x84));
-    }
-    assert_eq!(bench.stream(&image, None, 7), (Err(MAN_BUSY), 0x88));
-    assert_eq!(bench.node.flash().touched, []);
-    ALLOWED.store(true, Ordering::Relaxed);
-    bench.install(&image);
-}
-
-/// SYS TEC manual, table 3: SECURED for what belongs to the bootloader, ADDRESS for all else.
-#[test]
-fn a_block_outside_the_program_is_refused_with_the_reason() {
-    let layout = STANDARD_1.layout;
-    let (boot, own) = (layout.bootloader, STANDARD_1.region(1));
-    let parameters = layout.parameters;
-    assert_eq!(parameters[1].end(), own.base, "the program follows the parameters");
-    const SECURED: u32 = 0x0E;
-    const ADDRESS: u32 = 0x0C;
-    for (base, size, status) in [
-        (boot.base, 4, SECURED),
-        (boot.end() - 1, 1, SECURED),
-        (boot.base - 4, 4, ADDRESS),
-        (boot.base - 4, 5, SECURED),
-        (boot.base - 4, 12, SECURED),
-        (parameters[0].base, 16, SECURED),
-        (parameters[1].end() - 1, 1, SECURED),
-        (own.base - 1, 2, SECURED),
-        (own.base - 1, 64, SECURED),
-        (own.base, own.size as usize + 1, ADDRESS),
-        (own.end(), 1, ADDRESS),
-        (own.end() - 1, 2, ADDRESS),
-        (0, 4, ADDRESS),
-        (u32::MAX - 3, 4, ADDRESS),
-        (u32::MAX, 1, ADDRESS),
-    ] {
-        let mut rig = Rig::new(&STANDARD_1, 32 * 1024);
-        rig.command(1, CLEAR).unwrap();
-        rig.settle();
-        rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
-        rig.settle();
-        rig.chip.model().touched.clear();
-        assert!(rig.send(1, &kit::rig::block(1, base, &vec![0; size])).is_err(), "{base:#x}, {size}");
-        rig.settle();
-        assert_eq!(rig.status(1), status, "{base:#x}, {size}");
-        assert_eq!(rig.chip.model().touched, [], "{base:#x}, {size}");
-    }
-}
-
 // --- the limits of a block, and what is seen of work by another client
 
 /// SYS TEC manual, table 3, shifted by the bit for busy: FORMAT, ADDRESS and SEQUENCE.
@@ -956,7 +890,6 @@ const ADDRESS: u32 = 0x0C;
 const SEQUENCE: u32 = 0x88;
 const LENGTH: AbortCode = AbortCode(0x0607_0010);
 const LENGTH_TOO_HIGH: AbortCode = AbortCode(0x0607_0012);
-const LENGTH_TOO_LOW: AbortCode = AbortCode(0x0607_0013);
 
 /// A device after CLEAR and a control block, with this buffer.
 fn open(setup: &'static Setup, buffer: usize) -> Rig {
@@ -966,28 +899,6 @@ fn open(setup: &'static Setup, buffer: usize) -> Rig {
     rig.send(1, &kit::rig::block(0, 0, &[0; 8])).unwrap();
     rig.settle();
     rig
-}
-
-/// A block is 12 bytes in front of its data and 4 after them (SYS TEC manual, figure 5).
-#[test]
-fn a_block_that_is_no_block_is_told_how() {
-    let base = STANDARD_1.region(1).base;
-    let whole = kit::rig::block(1, base, &raw(&STANDARD_1, 1, 64));
-    for (len, abort) in [
-        (4, LENGTH_TOO_LOW),
-        (11, LENGTH_TOO_LOW),
-        (12, LENGTH),
-        (15, LENGTH),
-        (whole.len() - 1, LENGTH),
-        (whole.len() + 1, LENGTH),
-    ] {
-        let mut rig = open(&STANDARD_1, 1024);
-        let mut bytes = whole.clone();
-        bytes.resize(len, 0);
-        rig.begin(1, None, &bytes).unwrap();
-        assert_eq!(rig.node.download_end(Address::new(0x1F50, 1)), Err(abort), "{len}");
-        assert_eq!(rig.status(1), FORMAT, "{len}");
-    }
 }
 
 /// The buffer is the limit: for the size that is announced, for the size in the header, and for what

@@ -10,7 +10,7 @@ use canopen::AbortCode;
 use kit::bench::{self, block, block_file, last, program, Bench, CLEAR, CONFIG, DATA, LAYOUT, PROGRAM};
 use kit::boot::{leaked, Boot, Store};
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
-use kit::rig::{self, Rig, Setup, LIFT_1, LIFT_2, PAULUS_2, STANDARD_1, STANDARD_2};
+use kit::rig::{self, Rig, LIFT_1, LIFT_2, PAULUS_2, STANDARD_1, STANDARD_2};
 use shared_abi::geometry::{Geometry, Region, SectorRun};
 use shared_abi::layout::Layout;
 
@@ -328,88 +328,68 @@ fn the_progress_of_a_large_program_is_stored_sixteen_times() {
     assert_eq!(words, (1 + 16) * 7);
 }
 
-/// CLEAR gives up what was there; a command of another kind does not.
-#[test]
-fn clear_ends_what_could_go_on() {
-    let image = program(0xC00, 0x33);
-    let file = named(&image);
-    let mut flash = ModelFlash::new(&CHIP);
-    let mut bench = Bench::new(&mut flash);
-    for block in &file[..30] {
-        bench.good(block);
-    }
-    assert_eq!(bench.command(CLEAR), 0);
-    assert_eq!(partial(&mut bench), (0, 0));
-    // The second CLEAR in a row erases at once.
-    assert_eq!(bench.command(CLEAR), 0);
-    assert_eq!(partial(&mut Bench::new(&mut flash)), (0, 0));
-    assert!(flash.cells(PROGRAM).iter().all(|byte| *byte == 0xFF));
-}
-
-/// The files that a device refuses, before any good data, and 1F57h for them.
-fn refused(setup: &Setup, number: u8) -> Vec<(&'static str, Vec<Vec<u8>>, u32)> {
-    let base = setup.region(number).base;
-    let good = rig::program(setup.region(number), rig::PRODUCT_CODE, 1300, 0x66);
-    let file = |control: [u32; 3], first: (u32, u32, &[u8])| {
-        let (at, address, data) = first;
-        let control = rig::block(0, 0, &rig::words(&control));
-        let crc = rig::words(&[1300, rig::crc32(&good)]);
-        let rest = rig::block(2, base + 600, &good[600..]);
-        vec![control, rig::block(at, address, data), rest, rig::block(u32::MAX, 0, &crc)]
+/// Files that a device refuses before any good data, and 1F57h for them.
+fn refused(region: Region, bootloader: Region) -> Vec<(Vec<Vec<u8>>, u32)> {
+    let (base, vendor, product) = (region.base, rig::VENDOR_ID, rig::PRODUCT_CODE);
+    let image = |product| rig::program(region, product, 1300, 0x66);
+    let good = image(product);
+    let with = |at: usize, word: u32| {
+        let mut image = good.clone();
+        image[at..at + 4].copy_from_slice(&word.to_le_bytes());
+        image
     };
-    let ours = [1300, rig::VENDOR_ID, rig::PRODUCT_CODE];
-    let first = |product, vectors: u32| {
-        let mut bytes = rig::program(setup.region(number), product, 600, 0x66);
-        bytes[4..8].copy_from_slice(&vectors.to_le_bytes());
-        bytes
+    let file = |vendor, product, first| {
+        let control = block(0, 0, &rig::words(&[1300, vendor, product]));
+        vec![control, first, block(2, base + 600, &good[600..]), last(&good)]
     };
-    let (right, other) = (base + 0x101, rig::PRODUCT_CODE ^ 1);
-    let mut damaged = file(ours, (1, base, &good[..600]));
-    damaged[1][100] ^= 1;
-    let mut short = file(ours, (1, base, &good[..600]));
-    short[1].pop();
-    let foreign = first(rig::PRODUCT_CODE, 0x0800_0101);
+    let ours = |first| file(vendor, product, first);
+    let first = |image: &[u8]| block(1, base, &image[..600]);
+    let (mut damaged, mut short) = (first(&good), first(&good));
+    damaged[100] ^= 1;
+    short.pop();
     vec![
-        ("vectors", file(ours, (1, base, &foreign)), 0x04),
-        ("label", file(ours, (1, base, &first(other, right))), 0x82),
-        ("block 0", file([1300, rig::VENDOR_ID, other], (1, base, &good[..600])), 0x82),
-        ("vendor", file([1300, 5, rig::PRODUCT_CODE], (1, base, &good[..600])), 0x80),
-        ("place", file(ours, (1, base + 0x400, &good[..600])), 0x0C),
-        ("bootloader", file(ours, (1, setup.layout.bootloader.base, &good[..600])), 0x0E),
-        ("CRC", damaged, 0x06),
-        ("length", short, 0x04),
-        ("order", file(ours, (3, base, &good[..600])), 0x88),
-        ("raw", vec![foreign.clone()], 0x04),
-        ("HEX", vec![rig::hex(base, &foreign)], 0x04),
-        ("no program", vec![vec![0x3C; 600]], 0x04),
+        // No stack pointer, no reset vector, one without the Thumb bit; the label.
+        (ours(first(&with(0, 0x3000_0000))), 0x04),
+        (ours(first(&with(4, 0x0800_0101))), 0x04),
+        (ours(first(&with(4, base + 0x100))), 0x04),
+        (ours(first(&image(product ^ 1))), 0x82),
+        (file(vendor, product ^ 1, first(&good)), 0x82),
+        (file(vendor ^ 1, product, first(&good)), 0x80),
+        (ours(block(1, base + 0x400, &good[..600])), 0x0C),
+        (ours(block(1, bootloader.base, &good[..600])), 0x0E),
+        (ours(block(3, base, &good[..600])), 0x88),
+        (ours(damaged), 0x06),
+        (ours(short), 0x04),
+        (vec![with(4, 0x0800_0101)], 0x04),
+        (vec![rig::hex(base, &with(4, 0x0800_0101))], 0x04),
+        (vec![vec![0x3C; 600]], 0x04),
     ]
 }
 
-/// What is refused may come again, from a host that goes on where the device says, and that sends the rest
-/// after a refusal, as a group of devices gets it; before and after a power-off; all files in a row. The old
-/// program starts, and the next good one is taken.
+/// What is refused may come again: after CLEAR or without it, after a power-off, and with the rest of the file, as
+/// a device of a group gets it; all files in a row. The old program starts, and the next good one is taken.
 #[test]
 fn a_refused_program_costs_nothing_however_often_it_comes() {
     for setup in [&STANDARD_1, &STANDARD_2, &PAULUS_2, &LIFT_1, &LIFT_2] {
         let number = if setup.is_data(2) { 1 } else { setup.programs() };
-        let old = rig::program(setup.region(number), rig::PRODUCT_CODE, 900, 1);
+        let region = setup.region(number);
+        let old = rig::program(region, rig::PRODUCT_CODE, 900, 1);
         let mut rig = Rig::new(setup, 4096);
         rig.install(number, &old);
         rig.reset();
-        for (kind, file, status) in refused(setup, number) {
+        for (kind, (file, status)) in refused(region, setup.layout.bootloader).iter().enumerate() {
             for attempt in 0..4 {
-                let what = format!("{}, {kind}, attempt {attempt}", setup.name);
+                let what = format!("{}, file {kind}, attempt {attempt}", setup.name);
                 rig.unlock(number).unwrap();
                 let mut told = [0; 8];
                 rig.node.read(Address::new(0x2006, number), &mut told).unwrap();
                 assert_eq!(told[..4], [0; 4], "{what}: 2006h");
-                // After an odd number of attempts a host that sends no CLEAR again.
                 if attempt % 2 == 0 {
                     rig.command(number, CLEAR).unwrap();
                 }
-                let outcomes: Vec<_> =
+                let sent: Vec<_> =
                     file.iter().map(|part| (rig.send(number, part), rig.status(number))).collect();
-                assert!(outcomes.iter().any(|(_, of)| *of == status), "{what}: {outcomes:02X?}");
+                assert!(sent.iter().any(|(_, found)| found == status), "{what}: {sent:02X?}");
                 rig.settle();
                 assert_eq!(rig.cells(number)[..old.len()], old, "{what}");
                 if attempt == 1 {
@@ -417,7 +397,7 @@ fn a_refused_program_costs_nothing_however_often_it_comes() {
                 }
             }
         }
-        let new = rig::program(setup.region(number), rig::PRODUCT_CODE, 1000, 2);
+        let new = rig::program(region, rig::PRODUCT_CODE, 1000, 2);
         rig.unlock(number).unwrap();
         rig.install(number, &new);
         rig.assert_installed(number, &new, setup.name);
@@ -447,9 +427,12 @@ fn a_refusal_ends_what_could_go_on() {
     assert_eq!(partial(&mut Bench::new(&mut flash)).0, 0, "after a power-off");
     send(&mut flash, &file);
     assert!(is_installed(&flash, &image));
-    // A program that is refused as a whole.
+    // A program that is refused as a whole; CLEAR does the same.
     let mut bench = Bench::new(&mut flash);
     assert_eq!(bench.command(CLEAR), 0);
+    bench.good(&file[0]);
+    assert_eq!((partial(&mut bench).0 == 0, bench.command(CLEAR)), (false, 0));
+    assert_eq!(partial(&mut bench), (0, 0));
     for block in &file[..file.len() - 1] {
         bench.good(block);
     }
