@@ -285,7 +285,15 @@ impl ProgramControl {
         match react(command, sub == self.program, standing)? {
             Reaction::Nothing => {}
             Reaction::Confirm => self.confirm(now, services)?,
-            Reaction::CallBack => self.promise(BootRequest::Stay, now)?,
+            Reaction::CallBack => {
+                let request = match (self.promised, command) {
+                    (Some(before @ BootRequest::Owed(_)), _) => before,
+                    // The answer comes from here, so the bootloader owes none to a node; it counts STOP.
+                    (None, Command::Stop) => BootRequest::Owed(Owed { program: sub, value, node_id: 0 }),
+                    _ => BootRequest::Stay,
+                };
+                self.promise(request, now)?;
+            }
             _ if matches!(self.promised, Some(BootRequest::Confirm(_))) => return Err(Abort::DEVICE_STATE),
             Reaction::Restart => self.leave(BootRequest::Start(sub), now),
             Reaction::HandOver => {
@@ -519,7 +527,8 @@ mod tests {
         let mut in_segments = control(false);
         assert_eq!(in_segments.write_answered(1, &[3], 0, &mut { STORES }), Err(STATE));
         assert_eq!(in_segments.write_answered(1, &[0], 0, &mut { STORES }), Ok(()));
-        assert_eq!(request_behind(&mut in_segments), Next::Leave(BootRequest::Stay));
+        let stopped = BootRequest::Owed(Owed { program: 1, value: 0, node_id: 0 });
+        assert_eq!(request_behind(&mut in_segments), Next::Leave(stopped));
         let mut changed = control(false);
         changed.node_id_changed(Some(33));
         let mut stored = control(false);
@@ -527,7 +536,8 @@ mod tests {
         for mut control in [changed.clone(), stored, control(false).answering_itself()] {
             assert_eq!(control.write(1, &[3], 0, &mut { STORES }), Err(STATE));
             assert_eq!(control.write(1, &[0], 0, &mut { STORES }), Ok(Answer::Send));
-            assert_eq!(request_behind(&mut control), Next::Leave(BootRequest::Stay));
+            assert_eq!(control.write(1, &[0x80], 0, &mut { STORES }), Ok(Answer::Send), "it leaves");
+            assert_eq!(request_behind(&mut control), Next::Leave(stopped));
         }
         // Stored, the new node-ID is the bootloader's as well.
         changed.node_stored(Some(33), true);

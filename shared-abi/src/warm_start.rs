@@ -153,7 +153,8 @@ pub struct Owed {
     pub program: u8,
     /// The written value: 0 STOP or 3 CLEAR.
     pub value: u8,
-    /// The addressed node, 1 to 127. A bootloader with another node-ID does not send the answer.
+    /// The addressed node, 1 to 127. A bootloader with another node-ID does not send the answer. 0: the
+    /// program has answered STOP itself, which the bootloader then counts as its own.
     pub node_id: u8,
 }
 
