@@ -817,15 +817,14 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 impl Target {
     /// Erases the flash for the piece, or ahead of it.
     fn erase<F: Flash>(&self, flash: &F, piece: Option<Piece>) -> Result<Option<Job>, FlashError> {
-        let mut needed = piece.map_or(self.ahead, |piece| piece.address + piece.size);
-        if self.clearing {
-            // What is not blank in a sector may come after the data.
-            needed = flash.sector_at(needed - 1).ok_or(FlashError::Address)?.region.end();
-        }
-        if self.erased >= needed {
+        let needed = piece.map_or(self.ahead, |piece| piece.address + piece.size);
+        let sector = flash.sector_at(self.erased);
+        // A sector that was looked at in part may still have to be erased, and data with it.
+        let is_within = sector.is_some_and(|sector| sector.region.base != self.erased);
+        if self.erased >= needed && !(self.clearing && is_within) {
             return Ok(None);
         }
-        let sector = flash.sector_at(self.erased).ok_or(FlashError::Address)?;
+        let sector = sector.ok_or(FlashError::Address)?;
         let place = Region::new(self.erased, BLANK_STEP);
         if self.clearing && !self.half_erased && flash.is_blank(place) {
             return Ok(Some(Job::Erase { sector: None, until: place.end() }));
