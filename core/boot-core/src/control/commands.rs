@@ -26,7 +26,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         if P::RENEWS && program == BOOTLOADER {
             return self.command_bootloader(command);
         }
-        let keeps = P::RENEWS && command == Clear && self.keeps_staging(program);
+        let keeps = command == Clear && self.programmer.may_take(program).is_err();
         let state = find::<P>(&mut self.programs, program).ok_or(AbortCode::NO_SUB_INDEX)?;
         if matches!(command, Stop | StartBootloader) {
             // No program runs, but the bootloader: the requested state already exists. Many masters send
@@ -166,8 +166,13 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
     /// # Errors
     /// The device is busy with other work.
     pub fn unlock(&mut self, program: u8, at_once: bool) -> Result<(), AbortCode> {
+        // A password crosses the bus in plain text: in a sealed device it must not make a program
+        // invalid.
+        let is_program = !(P::RENEWS && program == BOOTLOADER);
+        let at_once = at_once && is_program && self.rights.permits(right::ERASE);
+        let keeps = at_once && self.programmer.may_take(program).is_err();
         let Some(state) = find::<P>(&mut self.programs, program) else { return Err(AbortCode::NO_SUB_INDEX) };
-        if self.boot_request.is_some() || !self.programmer.is_abortable() {
+        if self.boot_request.is_some() || !self.programmer.is_abortable() || keeps {
             return Err(state.refuse(Refusal::untimely(FlashError::Busy)));
         }
         self.download_cancel();
@@ -178,10 +183,6 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
             state.streamed = false;
             state.session = Session::Cleared { just: false };
         }
-        // A password crosses the bus in plain text: in a sealed device it must not make a program
-        // invalid.
-        let is_program = !(P::RENEWS && program == BOOTLOADER);
-        let at_once = at_once && is_program && self.rights.permits(right::ERASE);
         if let (true, Some(region)) = (at_once, self.program(program).map(|state| state.region)) {
             self.programmer.void_if_writable(program, region);
         }

@@ -294,10 +294,10 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 
     /// Whether a complete program or an acknowledged command is not yet carried out: a reset now
-    /// would undo it.
+    /// would undo it. So it would begin an installation at home anew, with the erase.
     #[must_use]
     pub fn is_finishing(&self) -> bool {
-        self.programmer.finishing().is_some() || self.programmer.is_storing()
+        self.programmer.finishing().is_some() || self.programmer.is_storing() || self.is_installing()
     }
 
     /// Whether a RAM image is being installed at home, or home is being repaired.
@@ -375,16 +375,18 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                 if ends {
                     self.end(BOOTLOADER, Ok(()));
                 } else if self.programmer.program() == Some(BOOTLOADER) {
-                    self.drop_partial();
+                    self.drop_partial(flash);
                 }
             }
             Some(Event::Written { program: BOOTLOADER, expected, crc }) if P::RENEWS => {
                 if let Some(state) = find::<P>(&mut self.programs, BOOTLOADER) {
                     state.session = Session::Idle;
                 }
-                match self.check_image(flash, &expected, crc) {
-                    Ok(record) => self.programmer.record_image(&mut self.parameters, record),
-                    Err(error) => self.end(BOOTLOADER, Err(error)),
+                let record = self.check_image(flash, &expected, crc);
+                let stores =
+                    record.and_then(|record| self.programmer.record_image(&mut self.parameters, record));
+                if let Err(error) = stores {
+                    self.end(BOOTLOADER, Err(error));
                 }
             }
             Some(Event::Stored { program, ends }) => {
@@ -402,6 +404,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     if ends && open && is_same {
                         state.session = Session::Idle;
                     }
+                }
+                if P::RENEWS {
+                    self.note_occupied();
                 }
                 if ends {
                     self.end(program, Ok(()));
@@ -498,7 +503,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
 
     /// Ends a piece of work on a program.
     fn end(&mut self, program: u8, outcome: Result<(), FlashError>) {
-        let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program);
+        // Without a target the received data were discarded, also those of another program.
+        let is_gone = P::RENEWS && self.programmer.program().is_none();
+        let current = self.transfer.as_ref().is_some_and(|transfer| transfer.program == program || is_gone);
         if outcome.is_err() && current {
             self.transfer = None;
             self.programmer.source_mut().queue.clear();

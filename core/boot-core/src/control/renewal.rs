@@ -9,7 +9,7 @@ use shared_abi::ram_image::Host;
 use shared_abi::renewal::{of_word, Origin, Progress, State, BOOTLOADER};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use super::{find, Downloader, Failure, Program};
+use super::{find, load, Downloader, Failure, Program};
 use crate::flash::Flash;
 use crate::policy::Renewal;
 use crate::program::Expected;
@@ -72,7 +72,9 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         }
         self.show_image(identification, header.version);
         let host = policy.host(self.parameters.services(), self.parameters.facts());
-        self.programmer.renewing = Some(Renewing { layout: self.layout, policy, host, record: None });
+        let layout = self.layout;
+        self.programmer.renewing = Some(Renewing { layout, policy, host, record: None, is_occupied: false });
+        self.note_occupied();
         let record = self.image_record(flash);
         self.set_record(record);
         let Some(record) = record else { return };
@@ -211,52 +213,38 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Ok(RenewalRecord { state: State::Staged, size: image.total(), crc: image.crc, home })
     }
 
-    /// Whether a download of a new image, or of the last program, may begin now.
+    /// Whether a transfer of this program may begin now, which begins a download or goes on with one.
     pub(super) fn may_renew<F: Flash>(&mut self, flash: &F, program: u8) -> Result<(), AbortCode> {
-        let is_last = usize::from(program) == self.layout.programs.len();
         let Some(places) = Places::of(self.layout) else { return Ok(()) };
         let is_open =
             self.program(program).is_some_and(|state| matches!(state.session, Session::Open { .. }));
-        if is_open || program != BOOTLOADER && !is_last {
-            return Ok(());
-        }
-        let mut detail = 0;
         // An image on trial takes no other one, also when it is installed: it does not run from home.
         let on_trial = self.known().origin == Origin::Trial && program == BOOTLOADER;
-        let error = if self.renewal_state() == State::Confirmed || on_trial {
-            Some(FlashError::Busy)
-        } else if program != BOOTLOADER || self.programmer.is_busy() {
-            None
-        } else {
-            let last = self.layout.programs.len() as u8;
-            let (installed, _) = self.installed(last);
-            if installed.end() > places.staging.base {
-                detail = last;
-                Some(FlashError::NotCleared)
-            } else {
-                let writable = self.programmer.check_writable(flash, places.staging);
-                let writable = writable.and_then(|()| self.programmer.check_writable(flash, places.home));
-                detail = self.programmer.take_detail();
-                writable.err()
-            }
-        };
-        let Some(error) = error else { return Ok(()) };
+        let mut may = if on_trial { Err(FlashError::Busy) } else { self.programmer.may_take(program) };
+        if may.is_ok() && program == BOOTLOADER && !is_open && !self.programmer.is_busy() {
+            may = self.programmer.check_writable(flash, places.staging);
+            may = may.and_then(|()| self.programmer.check_writable(flash, places.home));
+        }
+        let Err(error) = may else { return Ok(()) };
+        let detail = self.programmer.take_detail();
         let Some(state) = find::<P>(&mut self.programs, program) else { return Ok(()) };
         let abort = state.refuse(Refusal::untimely(error));
         state.failure = Some(Failure { error, detail });
         Err(abort)
     }
 
+    /// Takes note whether the last program lies in staging: its record has changed.
+    pub(super) fn note_occupied(&mut self) {
+        let (program, _) = self.installed(self.layout.programs.len() as u8);
+        if let Some(renewing) = &mut self.programmer.renewing {
+            renewing.is_occupied = program.end() > renewing.places().staging.base;
+        }
+    }
+
     /// The flash for a new image of the bootloader; `None` for any other program.
     pub(super) fn staging_of(&self, program: u8) -> Option<Region> {
         let places = if P::RENEWS && program == BOOTLOADER { Places::of(self.layout) } else { None };
         places.map(|places| places.staging)
-    }
-
-    /// Whether a program has to leave staging alone, because its image is confirmed and not installed yet.
-    pub(super) fn keeps_staging(&self, program: u8) -> bool {
-        let is_last = usize::from(program) == self.layout.programs.len();
-        is_last && self.renewal_state() == State::Confirmed
     }
 
     /// Whether the running image is on trial, and not confirmed.
@@ -267,14 +255,16 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         known.origin == Origin::Trial && !is_confirmed
     }
 
-    /// The flash of staging is about to be erased for a new image: a download of the last program that has
-    /// reached it does not go on afterwards.
-    pub(super) fn drop_partial(&mut self) {
+    /// The flash of staging is about to be erased for a new image: a download of the last program whose stored
+    /// progress has passed its start does not go on afterwards.
+    pub(super) fn drop_partial<F: Flash>(&mut self, flash: &F) {
         let Some(Places { staging, .. }) = Places::of(self.layout) else { return };
         let last = self.layout.programs.len() as u8;
-        let Some(state) = find::<P>(&mut self.programs, last) else { return };
-        if state.partial.start() > staging.base || matches!(state.session, Session::Open { .. }) {
-            state.partial = Partial::NONE;
+        let (_, stored) = load(&self.parameters, flash, last, &self.rights);
+        if stored.start() > staging.base {
+            if let Some(state) = find::<P>(&mut self.programs, last) {
+                state.partial = Partial::NONE;
+            }
             self.programmer.void(last);
         }
     }

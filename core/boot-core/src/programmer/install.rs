@@ -30,12 +30,25 @@ pub(crate) struct Renewing {
     /// The stored record of the image in staging; a copy, because the flash cannot be read while it is busy.
     /// It must be removed before a program changes that flash.
     pub record: Option<RenewalRecord>,
+    /// Whether the last program has a record and reaches into staging; a copy, too.
+    pub is_occupied: bool,
 }
 
 impl Renewing {
     /// The two places of a RAM image.
-    pub(super) fn places(&self) -> Places {
+    pub(crate) fn places(&self) -> Places {
         Places::of(self.layout).unwrap_or(Places::NONE)
+    }
+
+    /// The number of the last program, whose flash ends with staging.
+    pub(crate) fn last_program(&self) -> u8 {
+        self.layout.programs.len() as u8
+    }
+
+    /// Whether the image in staging is confirmed and not installed: home may be half erased, and this image
+    /// the only bootloader.
+    pub(super) fn is_confirmed(&self) -> bool {
+        self.record.is_some_and(|record| record.state == State::Confirmed)
     }
 
     /// Whether an image with this header may become the bootloader. `counter`: that of its manifest, if it
@@ -79,9 +92,7 @@ impl Renewing {
 
     /// Whether the last program's flash up to `end` is a part of staging, and has a record.
     pub(super) fn is_reached(&self, program: u8, end: u32) -> bool {
-        self.record.is_some()
-            && usize::from(program) == self.layout.programs.len()
-            && end > self.places().staging.base
+        self.record.is_some() && program == self.last_program() && end > self.places().staging.base
     }
 }
 

@@ -10,6 +10,9 @@
 //! [`Programmer::void`] only note that a record must be removed, and until it is removed, nothing
 //! is erased or written. The record of an opened program is removed with the first piece and not
 //! before: a refusal or an abort until then has no effect on the old program.
+//!
+//! Staging is the end of the last program's flash and the place of a new RAM image, so there two
+//! records can stand in the way. [`Programmer::may_take`] is the rule for it.
 
 mod install;
 mod write;
@@ -273,8 +276,17 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Replaces the record of the RAM image in staging.
-    pub(crate) fn record_image(&mut self, parameters: &mut impl Parameters, record: RenewalRecord) {
+    ///
+    /// # Errors
+    /// [`may_replace`](Self::may_replace).
+    pub(crate) fn record_image(
+        &mut self,
+        parameters: &mut impl Parameters,
+        record: RenewalRecord,
+    ) -> Result<(), FlashError> {
+        self.may_replace(BOOTLOADER)?;
         self.job = Some(store(parameters, Change::Record, BOOTLOADER, record.value()));
+        Ok(())
     }
 
     /// Installs the confirmed RAM image.
@@ -285,6 +297,50 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     /// The stored record of the RAM image in staging.
     pub(crate) fn image(&self) -> Option<RenewalRecord> {
         self.renewing.as_ref().and_then(|renewing| renewing.record)
+    }
+
+    /// **The rule of staging**: whether a download of this program, or a command that erases it, may go on now.
+    ///
+    /// - Nothing removes the record of a *confirmed* image but its installation. Until then neither the last
+    ///   program nor another image takes its flash.
+    /// - Data are not changed while a record for them is valid: an image waits until a program that reaches
+    ///   into staging was cleared.
+    ///
+    /// The answer may change while a download is open: another download, or an installation that failed, comes
+    /// in between. So it is asked at the begin of each transfer and each command, by `control`, and once more
+    /// before anything is lost for the first data. [`may_replace`](Self::may_replace) is the last line behind it.
+    ///
+    /// # Errors
+    /// [`FlashError::Busy`] for a confirmed image; [`FlashError::NotCleared`], with the program as the
+    /// [detail](Self::take_detail).
+    pub(crate) fn may_take(&mut self, program: u8) -> Result<(), FlashError> {
+        let Some(renewing) = self.renewing.as_ref().filter(|_| P::RENEWS) else { return Ok(()) };
+        let last = renewing.last_program();
+        if program != BOOTLOADER && program != last {
+            return Ok(());
+        }
+        if renewing.is_confirmed() {
+            return Err(FlashError::Busy);
+        }
+        if program == BOOTLOADER && renewing.is_occupied {
+            self.detail = last;
+            return Err(FlashError::NotCleared);
+        }
+        Ok(())
+    }
+
+    /// Whether the record of a program may be replaced or removed now. That of a confirmed image is changed by its
+    /// installation alone, which does not ask; each other [`store`] of a record that may be the image's does.
+    fn may_replace(&self, program: u8) -> Result<(), FlashError> {
+        let is_kept = P::RENEWS
+            && program == BOOTLOADER
+            && !self.is_installing()
+            && self.renewing.as_ref().is_some_and(Renewing::is_confirmed);
+        if is_kept {
+            Err(FlashError::Busy)
+        } else {
+            Ok(())
+        }
     }
 
     /// The two places of a RAM image.
@@ -537,7 +593,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                     // The consequence is only another rescue window.
                     Err(_) if change == Change::Confirm => None,
                     Err(error) => {
-                        self.stop_installing();
+                        // A value of something else, which cannot be stored, does not end an installation.
+                        if program == BOOTLOADER {
+                            self.stop_installing();
+                        }
                         // If the record cannot be removed, its data must not be changed.
                         let mut program = program;
                         if let Some(of) = self.program().filter(|of| change == Change::Void || *of == program)
@@ -612,7 +671,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         if let Some(region) = self.unwritten.take() {
             self.check_writable(flash, region).inspect_err(|_| self.voids = 0)?;
         }
-        if let Some(job) = self.remove_record(parameters, flash) {
+        if let Some(job) = self.remove_record(parameters, flash)? {
             return Ok(Some(job));
         }
         let Some(target) = &mut self.target else { return Ok(None) };
@@ -653,9 +712,13 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             return Ok(());
         }
         let Some(ahead) = target.untouched else { return Ok(()) };
-        if P::RENEWS && target.program == BOOTLOADER {
+        if P::RENEWS {
             // Nothing was lost: the download ends.
-            judge_image(self.renewing.as_ref(), &self.source, piece, &mut self.detail)?;
+            let program = target.program;
+            self.may_take(program)?;
+            if program == BOOTLOADER {
+                judge_image(self.renewing.as_ref(), &self.source, piece, &mut self.detail)?;
+            }
         }
         let Some(target) = &mut self.target else { return Ok(()) };
         // Nothing is lost for a program that the flash does not take.
@@ -686,17 +749,14 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         parameters: &mut impl Parameters,
         flash: &F,
     ) -> Result<Option<Job>, FlashError> {
-        let Some(record) = self.image() else {
-            self.install = None;
-            return Ok(None);
-        };
+        let Some(record) = self.image() else { return Err(FlashError::NoValidProgram) };
         let Some(install) = &self.install else { return Ok(None) };
         let (change, state) = match install {
             Phase::Counter => {
                 // It was good when it was loaded. Home is not given up for one that has decayed since.
+                // Its record goes, and the installation ends without one.
                 let Some(Header { counter, .. }) = self.staged(flash, &record) else {
-                    self.void(BOOTLOADER);
-                    return Err(FlashError::NoValidProgram);
+                    return Ok(Some(store(parameters, Change::Void, BOOTLOADER, RenewalRecord::NONE)));
                 };
                 let raised = self.raised_counter(parameters, flash, counter);
                 self.install = Some(Phase::Permit);
@@ -740,13 +800,12 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// A program that reaches into staging takes its flash: the record of the image there is removed first.
     fn give_up_staging(&mut self, piece: Option<Piece>) {
-        let (Some(target), Some(renewing)) = (&self.target, &mut self.renewing) else { return };
+        let (Some(target), Some(renewing)) = (&self.target, &self.renewing) else { return };
         if target.untouched.is_some() {
             return;
         }
         let end = piece.map_or(target.ahead, |piece| target.ahead.max(piece.address + piece.size));
         if renewing.is_reached(target.program, end) {
-            renewing.record = None;
             self.void(BOOTLOADER);
         }
     }
@@ -769,15 +828,17 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Removes the record of a program, or writes the progress of its download into it.
-    fn remove_record<F: Flash>(&mut self, parameters: &mut P, flash: &F) -> Option<Job> {
+    fn remove_record<F: Flash>(&mut self, parameters: &mut P, flash: &F) -> Result<Option<Job>, FlashError> {
         if self.voids == 0 {
-            return None;
+            return Ok(None);
         }
         let program = of_bit::<P>(self.voids.trailing_zeros() as u8);
+        // A record that stays is not asked for again.
+        self.may_replace(program).inspect_err(|_| self.voids = 0)?;
         // The counter that a program has proved must survive its record.
         if let Some(counter) = self.source.proved(flash, parameters, program) {
             if !core::mem::replace(&mut self.kept, true) {
-                return Some(store_counter(parameters, program, counter));
+                return Ok(Some(store_counter(parameters, program, counter)));
             }
         }
         let mut half_erased = ProgramRecord::load_half_erased(parameters, flash, program);
@@ -788,7 +849,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             partial = target.partial;
         }
         let value = ProgramRecord::none(half_erased, partial);
-        Some(store(parameters, Change::Void, program, value))
+        Ok(Some(store(parameters, Change::Void, program, value)))
     }
 
     /// All pieces are written: continues as the source demands.
@@ -805,7 +866,10 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             Demand::Wait => None,
             Demand::Process => Some(Job::Process),
             Demand::Counter(counter) => Some(store_counter(parameters, program, counter)),
-            Demand::Keep(record) => Some(store(parameters, Change::Record, program, record)),
+            Demand::Keep(record) => {
+                self.may_replace(program)?;
+                Some(store(parameters, Change::Record, program, record))
+            }
             Demand::Verify(expected) => {
                 let crc = FlashCrc::new(Region::new(target.region.base, expected.size));
                 Some(Job::Verify { expected, crc })
