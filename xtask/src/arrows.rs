@@ -59,6 +59,7 @@ const RULES: &[(&str, &str)] = &[
         "coboot-tests",
         "app-template boot-core bsp canopen coboot-app coboot-can coboot-node coflash-conform coflash-core emulator product seal shared-abi kit",
     ),
+    ("attack", "boot-core canopen coflash-core shared-abi kit"),
     ("coboot-fuzz", "boot-core canopen coboot-can coflash-conform coflash-core coflash-ui seal shared-abi kit"),
     ("coboot-zencan", "bsp canopen coboot-can coboot-tests coflash-core emulator"),
     ("new-board", "shared-abi"),
@@ -68,12 +69,12 @@ const RULES: &[(&str, &str)] = &[
 /// What the tests share: in no package, and so a dev-dependency, of crates that have tests with it.
 const KIT: &str = "kit";
 /// The crates that consist of tests, and may use the kit like any other crate.
-const TESTS: [&str; 2] = ["coboot-tests", "coboot-fuzz"];
+const TESTS: [&str; 3] = ["coboot-tests", "coboot-fuzz", "attack"];
 
 /// The crates that need no `unsafe` and forbid it to the compiler.
 const PURE: &str =
     "canopen seal boot-core coboot-linker coboot-can coflash-core coflash-conform coflash-agent \
-                    coflash-ui coflash coboot-node kit new-board xtask";
+                    coflash-ui coflash coboot-node kit attack new-board xtask";
 /// The attribute that forbids it.
 const FORBID: &str = "#![forbid(unsafe_code)]";
 

@@ -15,6 +15,7 @@
 //! | `boot` | feature `boot`: the one way to make a bootloader |
 //! | `driver` | feature `boot`: the demonstration that proves a flash driver |
 //! | `bench` | feature `boot`: a bootloader on that flash, and the actions of a host |
+//! | `renewal` | feature `boot`: RAM images, and the part of the resident part that loads one |
 //! | `rig` | feature `boot`: a bootloader of any profile, driven by its objects alone |
 
 #![allow(clippy::new_without_default, reason = "a device that has booted is no default value")]
@@ -46,6 +47,9 @@ pub mod memory;
 pub mod model;
 pub mod pages;
 pub mod random;
+#[cfg(feature = "boot")]
+#[allow(missing_docs, reason = "names say it")]
+pub mod renewal;
 #[cfg(feature = "boot")]
 #[allow(missing_docs, reason = "names say it")]
 pub mod rig;

@@ -3,23 +3,31 @@
 //! Tests with this rig do not depend on the construction of the bootloader. That knowledge is in
 //! [`boot`](crate::boot) and [`Rig::stored`].
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Everything, PasswordObject};
-use boot_core::control::{Erase, Policy, Step};
+use boot_core::bootloader::{
+    entries, entry_count, Bootloader, Choices, Config, Everything, Extras, PasswordObject,
+};
+use boot_core::control::{Erase, Policy, Renewal, SealedMemory, Step};
 use boot_core::flash::Flash;
+use boot_core::policy::SealPolicy;
 use boot_core::profile::Profile;
 use boot_core::store::{Journal, NodeParameters, Parameters, ProgramRecord};
 use canopen::device::Device;
 use canopen::lss::LssDevice;
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, BitRate, Instant, NodeId};
+use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
 use shared_abi::label::{self, Label};
 use shared_abi::layout::Layout;
+use shared_abi::abilities::Abilities;
+use shared_abi::ram_image::Host;
+use shared_abi::renewal::word;
 use shared_abi::warm_start::BootRequest;
 
-use crate::boot::{leaked, Boot};
+use crate::boot::{leaked, Boot, Store};
 use crate::ihex::{record, END_OF_FILE};
 use crate::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use crate::renewal::{self, loads};
 
 // --- setups
 
@@ -28,6 +36,8 @@ pub struct Setup {
     pub name: &'static str,
     pub profile: Profile,
     pub layout: &'static Layout,
+    /// Whether it takes sealed images: with the keys in its flash, these alone.
+    pub takes_sealed: bool,
     config: Config,
 }
 
@@ -39,7 +49,10 @@ static TWO: Layout = TWO_PROGRAMS;
 
 /// The setup of a profile, with its own object dictionary.
 macro_rules! setup {
-    ($name:literal, $programs:literal, $layout:ident, $profile:expr) => {{
+    ($name:literal, $programs:literal, $layout:expr, $profile:expr) => {
+        setup!($name, $programs, $layout, $profile, false)
+    };
+    ($name:literal, $programs:literal, $layout:expr, $profile:expr, $sealed:literal) => {{
         const PROFILE: Profile = $profile;
         static ENTRIES: [Entry; entry_count($programs, PROFILE.extras)] =
             entries($programs, PROFILE.extras).entries();
@@ -47,12 +60,18 @@ macro_rules! setup {
             name: $name,
             profile: PROFILE,
             layout: &$layout,
-            config: config(&PROFILE, &$layout, &ENTRIES),
+            takes_sealed: $sealed,
+            config: config(&PROFILE, &$layout, &ENTRIES, $sealed),
         }
     }};
 }
 
-const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [Entry]) -> Config {
+const fn config(
+    profile: &Profile,
+    layout: &'static Layout,
+    entries: &'static [Entry],
+    takes_sealed: bool,
+) -> Config {
     Config {
         entries,
         device: Device {
@@ -70,9 +89,41 @@ const fn config(profile: &Profile, layout: &'static Layout, entries: &'static [E
         layout,
         supports: |_| true,
         boot_up_emergency: false,
-        download: Policy { identity: Some((VENDOR_ID, PRODUCT_CODE)), ..profile.download },
+        download: Policy {
+            identity: Some((VENDOR_ID, PRODUCT_CODE)),
+            renewal: if profile.extras.bootloader.is_none() {
+                None
+            } else if takes_sealed {
+                Some(&SEALED_RENEWAL)
+            } else {
+                Some(&RENEWAL)
+            },
+            seal: SealPolicy {
+                vendor_id: VENDOR_ID,
+                product_code: PRODUCT_CODE,
+                data: profile.download.data,
+                ..SealPolicy::NONE
+            },
+            ..profile.download
+        },
         password: profile.password,
     }
+}
+
+/// A renewal of the bootloader by an image of any vendor.
+const RENEWAL: Renewal = Renewal { identity: None, ..renewal::RENEWAL };
+const SEALED_RENEWAL: Renewal = Renewal { features: Abilities::RENEWAL.with(Abilities::SEALED, true), ..RENEWAL };
+
+/// A profile with the renewal of the bootloader, which has this program number.
+const fn renews(profile: Profile, number: u8) -> Profile {
+    Profile { extras: Extras { bootloader: Some(number), ..profile.extras }, ..profile }
+}
+
+/// The choices of a device whose bootloader has this program number.
+struct Renews<const NUMBER: u8>;
+
+impl<const NUMBER: u8> Choices for Renews<NUMBER> {
+    const EXTRAS: Extras = Extras { bootloader: Some(NUMBER), ..Everything::EXTRAS };
 }
 
 /// The standard profile with a CLEAR that erases at once.
@@ -91,7 +142,27 @@ pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY
 pub static LIFT_1: Setup = setup!("LIFT_1", 1, ONE, Profile::LIFT);
 pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT);
 
+/// Devices that can be renewed. Data of a lift are a program, too, and the bootloader follows them.
+pub static RENEWALS: [Setup; 10] = [
+    setup!("STANDARD_1", 1, renewal::LAYOUT, renews(Profile::STANDARD, 2)),
+    setup!("STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3)),
+    setup!("AT_ONCE_2", 2, renewal::TWO, renews(AT_ONCE, 3)),
+    setup!("PAULUS_1", 1, renewal::LAYOUT, renews(Profile::PAULUS, 2)),
+    setup!("ESACADEMY_1", 1, renewal::LAYOUT, renews(Profile::ESACADEMY, 2)),
+    setup!("ESACADEMY_2", 2, renewal::TWO, renews(Profile::ESACADEMY, 3)),
+    setup!("LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3)),
+    setup!("LIFT_2", 2, renewal::TWO, renews(Profile::LIFT, 3)),
+    setup!("SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), true),
+    setup!("SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), true),
+];
+
 impl Setup {
+    /// What its resident part has for a RAM image.
+    pub fn host(&self) -> Host {
+        let features = self.config.download.renewal.map_or(Abilities::NONE, |renewal| renewal.features);
+        Host { features, ..renewal::HOST }
+    }
+
     pub fn programs(&self) -> u8 {
         self.layout.programs.len() as u8
     }
@@ -108,6 +179,11 @@ impl Setup {
     /// Whether a program number is for data of the application.
     pub fn is_data(&self, program: u8) -> bool {
         self.profile.download.data == Some(program)
+    }
+
+    /// Whether the password of a program makes it invalid, as CLEAR does.
+    pub fn password_clears(&self) -> bool {
+        matches!(self.profile.extras.password, PasswordObject::EnableFlash)
     }
 
     /// The object for a program's password, and the password.
@@ -132,7 +208,7 @@ pub trait Node: Objects + LssDevice {
     fn set_time(&mut self, now: Instant);
 }
 
-impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, P, PROGRAMS> {
+impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Node for Bootloader<'_, F, P, PROGRAMS, C> {
     fn is_idle_after_step(&mut self) -> bool {
         self.step() == Step::Idle
     }
@@ -177,19 +253,37 @@ impl Rig {
     /// A device with this flash.
     pub fn on(setup: &'static Setup, buffer: usize, flash: ModelFlash) -> Self {
         let chip = Chip::new(flash);
-        let node = Self::boot(setup, &chip, buffer);
+        let node = Self::boot(setup, &chip, buffer, None);
         Self { setup, chip, node, buffer }
     }
 
-    fn boot(setup: &'static Setup, chip: &Chip, buffer: usize) -> Box<dyn Node> {
+    fn boot(
+        setup: &'static Setup,
+        chip: &Chip,
+        buffer: usize,
+        request: Option<BootRequest>,
+    ) -> Box<dyn Node> {
         let flash = chip.clone();
-        let (buffer, sealed) = leaked(buffer);
+        let (buffer, mut sealed) = leaked(buffer);
+        if setup.takes_sealed {
+            sealed = Box::leak(Box::<SealedMemory>::default()).sealed();
+        }
         let parameters = Journal::open(&flash, setup.layout.parameters);
         let node = NodeParameters::load(&parameters, &flash, BOARD_NODE, |_| true);
-        let boot = Boot::new(&setup.config, node);
-        match setup.programs() {
-            1 => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, buffer, sealed)),
-            2 => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, buffer, sealed)),
+        let mut boot = Boot::new(&setup.config, node);
+        let number = setup.profile.extras.bootloader;
+        if number.is_some() {
+            let loaded = loads(&flash, setup.layout, setup.host(), request);
+            let (_, origin, trial_end) = loaded.expect("a bootloader can be loaded");
+            boot.report = BootReport { renewal: word(origin, trial_end), ..boot.report };
+        }
+        let renewed = Store::<true, true>(Journal::open(&flash, setup.layout.parameters));
+        match (setup.programs(), number) {
+            (1, None) => Box::new(boot.with::<_, _, 1, Everything>(parameters, flash, buffer, sealed)),
+            (2, None) => Box::new(boot.with::<_, _, 2, Everything>(parameters, flash, buffer, sealed)),
+            (1, Some(2)) => Box::new(boot.with::<_, _, 2, Renews<2>>(renewed, flash, buffer, sealed)),
+            (1, Some(3)) => Box::new(boot.with::<_, _, 2, Renews<3>>(renewed, flash, buffer, sealed)),
+            (2, Some(3)) => Box::new(boot.with::<_, _, 3, Renews<3>>(renewed, flash, buffer, sealed)),
             _ => unreachable!(),
         }
     }
@@ -215,8 +309,13 @@ impl Rig {
 
     /// A reset: a running flash operation ends there.
     pub fn reset(&mut self) {
+        self.reset_for(None);
+    }
+
+    /// The same with a request to the resident part.
+    pub fn reset_for(&mut self, request: Option<BootRequest>) {
         self.chip.model().power_on();
-        self.node = Self::boot(self.setup, &self.chip, self.buffer);
+        self.node = Self::boot(self.setup, &self.chip, self.buffer, request);
     }
 
     /// Runs until there is no work.
@@ -285,10 +384,14 @@ impl Rig {
         Ok(())
     }
 
+    pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {
+        self.node.download_end(Address::new(0x1F50, program))
+    }
+
     /// A whole download, without waiting for the remaining work.
     pub fn send(&mut self, program: u8, data: &[u8]) -> Result<(), AbortCode> {
         self.begin(program, Some(data.len() as u32), data)?;
-        self.node.download_end(Address::new(0x1F50, program))
+        self.end(program)
     }
 
     pub fn cancel(&mut self, program: u8) {

@@ -1,61 +1,31 @@
 //! The renewal of the bootloader, on the model of the flash, with the power cut at every operation.
 
-use std::collections::BTreeMap;
-
 use boot_core::bootloader::{entries, entry_count, Bootloader, Choices, Config, Extras};
-use boot_core::control::{Policy, Renewal, Step};
+use boot_core::control::{Policy, Step};
 use boot_core::crc::CrcKind;
-use boot_core::crc32;
-use boot_core::flash::{Flash, FlashFault};
+use boot_core::flash::FlashFault;
 use boot_core::program::verify;
-use boot_core::renewal::{header, Places};
 use boot_core::store::{Journal, RenewalRecord};
-use canopen::lss::LssDevice as _;
 use canopen::od::{Address, Entry, Objects};
-use canopen::{AbortCode, BitRate, Instant, NodeId};
+use canopen::{AbortCode, Instant};
 use kit::bench::{self, block_file, node, program, DEVICE};
 use kit::boot::{leaked, Boot};
 use kit::ihex;
-use kit::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
+use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
 use kit::random::Random;
+use kit::renewal::{
+    crc_of, image, image_of, loads, BOARD, HOME, HOST, LAYOUT, PROGRAM, RENEWAL, SOUND, STAGING,
+};
 use shared_abi::abilities::Abilities;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
-use shared_abi::layout::Layout;
-use shared_abi::ram_image::{Header, Host, MAGIC, SERVICES_VERSION};
+use shared_abi::ram_image::{Header, SERVICES_VERSION};
 use shared_abi::renewal::{word, Origin, Progress, State, TrialEnd};
-use shared_abi::warm_start::{BootRequest, Damage, TrialStep};
+use shared_abi::warm_start::{BootRequest, TrialStep};
 
-const HOME: Region = Region::new(0x0800_0800, 0x400);
-const STAGING: Region = Region::new(0x0800_3C00, 0x800);
-const PROGRAM: Region = Region::new(0x0800_0C00, 0x3800);
-static LAYOUT: Layout = Layout {
-    bootloader: Region::new(0x0800_0000, 0x200),
-    parameters: [Region::new(0x0800_0200, 0x200), Region::new(0x0800_0400, 0x200)],
-    home: Some(HOME),
-    programs: &[PROGRAM],
-    staging: Some(STAGING),
-    ..ONE_PROGRAM
-}
-.checked();
-const PLACES: Places = match Places::of(&LAYOUT) {
-    Some(places) => places,
-    None => panic!("the layout has staging"),
-};
-
-const BOARD: u32 = 0x1234_5678;
-/// What the resident part has.
-const HOST: Host = Host { board: BOARD, services: SERVICES_VERSION, features: Abilities::RENEWAL, facts: 0 };
 const N: u8 = 2;
 const EXTRAS: Extras = Extras { bootloader: Some(N), ..Extras::STANDARD };
 static ENTRIES: [Entry; entry_count(1, EXTRAS)] = entries(1, EXTRAS).entries();
-const RENEWAL: Renewal = Renewal {
-    board: BOARD,
-    features: Abilities::RENEWAL,
-    identity: Some((7, 8)),
-    revision: 3,
-    ..Renewal::NONE
-};
 static CONFIG: Config = Config {
     entries: &ENTRIES,
     device: DEVICE,
@@ -85,70 +55,10 @@ const NO_VALID_PROGRAM: u32 = 0x02;
 const WRITE: u32 = 0x0A;
 const SECURED: u32 = 0x0E;
 
-const SOUND: Header = Header {
-    magic: MAGIC,
-    crc: 0,
-    length: Header::SIZE,
-    size: 0,
-    ram_base: LAYOUT.ram.base,
-    ram_end: LAYOUT.ram.base + LAYOUT.ram.size,
-    services: SERVICES_VERSION,
-    features: Abilities::RENEWAL,
-    board: BOARD,
-    vendor: 7,
-    product: 8,
-    revisions: 0,
-    version: 0x0001_0002,
-    counter: 0,
-    facts: 0,
-    reserved: 0,
-};
-
-fn words(header: &Header) -> Vec<u8> {
-    let Header { magic, crc, length, size, ram_base, ram_end, services, features, .. } = *header;
-    let Header { board, vendor, product, revisions, version, counter, facts, reserved, .. } = *header;
-    [
-        magic, crc, length, size, ram_base, ram_end, services, features.0, board, vendor, product, revisions,
-        version, counter, facts, reserved,
-    ]
-    .into_iter()
-    .flat_map(u32::to_le_bytes)
-    .collect()
-}
-
-/// An image with this header; the CRC is written unless the header has the CRC `bench`.
-fn image_of(header: Header, size: usize, fill: u8, has_crc: bool) -> Vec<u8> {
-    let mut image = words(&Header { size: size as u32, ..header });
-    image.extend([header.ram_end, header.ram_base + 0x41].into_iter().flat_map(u32::to_le_bytes));
-    image.extend((8..size).map(|at| fill ^ at as u8));
-    if has_crc {
-        let crc = crc32(&image[8..]).to_le_bytes();
-        image[4..8].copy_from_slice(&crc);
-    }
-    image
-}
-
-fn image(size: usize, fill: u8) -> Vec<u8> {
-    image_of(SOUND, size, fill, true)
-}
-
 /// What remains of a device when its power is off: the flash. And what a warm reset keeps.
 struct Board {
     flash: ModelFlash,
     request: Option<BootRequest>,
-    /// The origin of the image that ran before the reset.
-    ran: Option<Origin>,
-}
-
-/// The checks of the resident part before it loads an image (bootloader/src/resident/ram_image.rs).
-fn load(flash: &ModelFlash, place: Region) -> Result<Header, Damage> {
-    let header = header(flash, place);
-    header.check(place.size - Header::SIZE, LAYOUT.ram, HOST)?;
-    let covered = Region::new(place.base + Header::CRC_FROM, header.total() - Header::CRC_FROM);
-    if header.crc != 0 && flash.crc32(0, covered) != header.crc {
-        return Err(Damage::Crc);
-    }
-    Ok(header)
 }
 
 impl Board {
@@ -156,7 +66,7 @@ impl Board {
     fn new(first: &[u8]) -> Self {
         let mut flash = ModelFlash::new(&CHIP);
         flash.poke(HOME.base, first);
-        let mut board = Self { flash, request: None, ran: None };
+        let mut board = Self { flash, request: None };
         board.install_program(0x1000);
         board.off();
         board
@@ -189,7 +99,7 @@ impl Board {
 
     fn off(&mut self) {
         self.flash.power_on();
-        (self.request, self.ran) = (None, None);
+        self.request = None;
     }
 
     /// A warm reset with this request.
@@ -199,22 +109,7 @@ impl Board {
 
     /// The image that the resident part loads.
     fn loads(&self) -> (Header, Origin, TrialEnd) {
-        let journal = Journal::open(&self.flash, LAYOUT.parameters);
-        let record = RenewalRecord::load(&journal, &self.flash);
-        let mut trial_end = match (self.request, self.ran) {
-            (Some(BootRequest::Renewal(TrialStep::Late)), _) => TrialEnd::Late,
-            (Some(BootRequest::Renewal(TrialStep::GivenUp)), _) => TrialEnd::GivenUp,
-            _ => TrialEnd::None,
-        };
-        let tries = self.request == Some(BootRequest::Renewal(TrialStep::Try));
-        for (place, origin) in PLACES.order(&self.flash, record, tries).into_iter().flatten() {
-            match load(&self.flash, place) {
-                Ok(header) => return (header, origin, trial_end),
-                Err(damage) if origin == Origin::Trial => trial_end = TrialEnd::Damaged(damage),
-                Err(_) => {}
-            }
-        }
-        panic!("no bootloader can be loaded, with the record {record:?}");
+        loads(&self.flash, &LAYOUT, HOST, self.request).expect("no bootloader can be loaded")
     }
 
     fn start(&mut self) -> Node<'_> {
@@ -227,7 +122,6 @@ impl Board {
     fn wake(&mut self) -> Node<'_> {
         let (_, origin, trial_end) = self.loads();
         self.request = None;
-        self.ran = Some(origin);
         let report = BootReport { renewal: word(origin, trial_end), ..BootReport::NONE };
         let journal = kit::boot::Store(Journal::open(&self.flash, LAYOUT.parameters));
         let (buffer, sealed) = leaked(512);
@@ -283,10 +177,6 @@ fn program_of(size: usize) -> Vec<u8> {
     image
 }
 
-fn crc_of(image: &[u8]) -> u32 {
-    u32::from_le_bytes(image[4..8].try_into().unwrap())
-}
-
 /// A block file for another address than that of the model's program.
 fn block_file_at(image: &[u8], base: u32, chunk: usize) -> Vec<Vec<u8>> {
     let mut file = block_file(image, chunk);
@@ -312,16 +202,6 @@ impl<C: Choices> Node<'_, C> {
             }
         }
         panic!("the work does not end");
-    }
-
-    /// Until the work is done, or for a part of it.
-    fn wait(&mut self, random: &mut Random) {
-        if random.chance(70) {
-            return self.settle();
-        }
-        for _ in 0..random.below(60) {
-            self.0.step();
-        }
     }
 
     fn read<const LEN: usize>(&mut self, index: u16, sub: u8) -> [u8; LEN] {
@@ -942,7 +822,7 @@ fn no_cut_leaves_a_device_without_a_bootloader() {
     let (old, new) = (image(0x200, 1), image(0x300, 2));
     let fresh = Board::new(&old);
     let operations = {
-        let mut board = Board { flash: fresh.flash.clone(), request: None, ran: None };
+        let mut board = Board { flash: fresh.flash.clone(), request: None };
         board.renew(&new);
         board.flash.operations
     };
@@ -950,7 +830,7 @@ fn no_cut_leaves_a_device_without_a_bootloader() {
     let mut starts = 0;
     for operation in 1..=operations {
         for cut in [Cut::Before, Cut::After, Cut::Torn(3), Cut::Torn(4), Cut::Unstable(5), Cut::Unstable(6)] {
-            let mut board = Board { flash: fresh.flash.clone(), request: None, ran: None };
+            let mut board = Board { flash: fresh.flash.clone(), request: None };
             board.flash.cut = Some((operation, cut));
             assert!(until_power_cut(|| board.renew(&new)));
             board.off();
@@ -971,167 +851,6 @@ fn no_cut_leaves_a_device_without_a_bootloader() {
         }
     }
     assert!(starts > 1_000, "{starts}");
-}
-
-/// What a hostile master sends: whole files and parts of them, of images that may run here and of others.
-struct Files {
-    /// In the order of [`files`]: those of the first two may run here.
-    images: [Vec<Vec<u8>>; 4],
-    /// A program that leaves staging alone, and one that reaches into it.
-    programs: [Vec<Vec<u8>>; 2],
-}
-
-fn files(images: [&[u8]; 4]) -> Files {
-    Files {
-        images: images.map(|image| block_file_at(image, HOME.base, 200)),
-        programs: [0x800, 0x3400].map(|size| block_file_at(&program_of(size), PROGRAM.base, 200)),
-    }
-}
-
-/// One life of a device with a master that knows everything and wants the worst, until a reset; the request
-/// that is left for the next one.
-fn hostile_life(board: &mut Board, files: &Files, random: &mut Random) -> Option<BootRequest> {
-    let mut node = board.wake();
-    let mut now = 0;
-    for _ in 0..random.below(40) {
-        let sub = 1 + random.below(3) as u8;
-        match random.below(16) {
-            0..=4 => {
-                let commands =
-                    [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, WITHDRAW, random.next() as u8];
-                let _ = node.try_command(sub, random.pick(&commands));
-            }
-            5 | 6 => {
-                let file = random.pick(&[0, 0, 1, 1, 2, 3]);
-                // All of it, or a few blocks that nobody has announced.
-                let blocks = &files.images[file];
-                let from = if random.chance(80) { 0 } else { random.below(blocks.len()) };
-                for block in &blocks[from..] {
-                    if node.push(N, block).is_err() || random.chance(3) {
-                        break;
-                    }
-                    node.wait(random);
-                }
-            }
-            7 => {
-                for block in &files.programs[random.below(2)] {
-                    if node.push(1, block).is_err() || random.chance(3) {
-                        break;
-                    }
-                    node.wait(random);
-                }
-            }
-            8 => {
-                // A download that is never ended, of one of two masters.
-                let block = &files.images[random.below(4)][random.below(2)];
-                let at = Address::new(0x1F50, sub);
-                if node.0.download_start(at, Some(block.len() as u32)).is_ok() {
-                    let _ = node.0.download_data(at, &block[..random.below(block.len()).min(100)]);
-                    if random.chance(50) {
-                        node.0.download_cancel(at);
-                    }
-                }
-            }
-            9 => {
-                now += random.below(40_000) as u32;
-                node.0.set_time(Instant::from_millis(now));
-            }
-            10 => {
-                let id = NodeId::new(1 + random.below(127) as u8);
-                let _ = node.0.store(id, Some(BitRate::K250));
-            }
-            11 => node.settle(),
-            // An operation that the flash refuses.
-            12 => {
-                let flash = node.0.flash();
-                flash.fail = Some((flash.operations + 1 + random.below(20) as u32, FlashFault::Failed));
-            }
-            // A tool that knows what comes next.
-            _ if node.progress().origin == Origin::Trial => drop(node.try_command(N, CONFIRM)),
-            _ if node.progress().state == State::Staged => drop(node.try_command(N, START)),
-            _ => {
-                let _ = node.try_command(N, CLEAR);
-                let blocks = &files.images[random.below(2)];
-                let _ = blocks.iter().try_for_each(|block| node.send(N, block));
-            }
-        }
-        node.wait(random);
-        if let Some(request) = node.0.take_boot_request() {
-            node.settle();
-            return Some(request);
-        }
-    }
-    node.settle();
-    None
-}
-
-/// Whoever writes whatever, in whatever order, with cuts of the power and bits that rot: there is a
-/// bootloader, it is one of those that may run here, and a tool gets through afterwards.
-#[test]
-fn a_hostile_master_never_takes_the_last_bootloader() {
-    let (old, a, b) = (image(0x200, 1), image(0x300, 2), image(0x280, 3));
-    let mut damaged = image(0x300, 4);
-    damaged[0x100] ^= 1;
-    let foreign = image_of(Header { board: BOARD ^ 1, ..SOUND }, 0x300, 5, true);
-    let files = files([&a, &b, &damaged, &foreign]);
-    let may_run = [&old, &a, &b].map(|image| crc_of(image));
-    let mut states = BTreeMap::new();
-    for seed in 0..400 {
-        let random = &mut Random(seed);
-        let mut board = Board::new(&old);
-        for life in 0..20 {
-            if random.chance(40) {
-                let kinds = [Cut::Before, Cut::After, Cut::Torn(seed), Cut::Unstable(seed)];
-                let operation = board.flash.operations + 1 + random.below(300) as u32;
-                board.flash.cut = Some((operation, random.pick(&kinds)));
-            }
-            let mut request = None;
-            let is_cut = until_power_cut(|| request = hostile_life(&mut board, &files, random));
-            board.flash.fail = None;
-            if is_cut || random.chance(20) {
-                board.off();
-            } else {
-                board.flash.cut = None;
-                board.leave(request);
-            }
-            let journal = Journal::open(&board.flash, LAYOUT.parameters);
-            let state =
-                RenewalRecord::load(&journal, &board.flash).map_or(State::None, |record| record.state);
-            let (header, origin, _) = board.loads();
-            assert!(may_run.contains(&header.crc), "seed {seed}, life {life}: an image of nobody");
-            *states.entry((state as u8, origin as u8)).or_insert(0) += 1;
-            // One bit rots where another image is certain.
-            let place = match (state, origin) {
-                (State::Installed, Origin::Home) if load(&board.flash, STAGING).is_ok() => HOME,
-                (State::Staged, Origin::Home | Origin::Trial) | (State::Installed, Origin::Home) => STAGING,
-                _ => continue,
-            };
-            if random.chance(10) {
-                let mut cells = board.flash.cells(place).to_vec();
-                let at = random.below(cells.len());
-                cells[at] &= random.next() as u8;
-                board.flash.poke(place.base, &cells);
-                *states.entry((state as u8, board.loads().1 as u8)).or_insert(0) += 1;
-            }
-        }
-        board.off();
-        // A tool that always gets through: it clears the program, which may lie in staging.
-        let mut node = board.start();
-        if node.progress().state != State::Confirmed {
-            for _ in 0..2 {
-                assert_eq!(node.command(1, CLEAR), 0, "seed {seed}");
-            }
-        }
-        board.off();
-        board.renew(&a);
-        board.off();
-        assert_eq!(board.loads().0.crc, crc_of(&a), "seed {seed}");
-    }
-    // Each state of the record, and each place that an image can come from, was met.
-    let met: Vec<_> = states.keys().collect();
-    for wanted in [(0, 0), (1, 0), (1, 1), (2, 2), (3, 0), (3, 3)] {
-        assert!(states.contains_key(&wanted), "{wanted:?} was not met, only {met:?}");
-    }
 }
 
 /// While an image is confirmed and not installed, nothing else touches its flash.

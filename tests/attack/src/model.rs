@@ -1,0 +1,215 @@
+//! The bootloader on the strict model of a flash, with the resident part's decision after each reset.
+
+use boot_core::canopen::program::Supply;
+use boot_core::flash::Flash;
+use boot_core::renewal::check;
+use boot_core::store::{Journal, ProgramRecord, RenewalRecord};
+use canopen::{BitRate, Instant, NodeId};
+use kit::model::{caught, ModelFlash, PowerCut, CHIP};
+use kit::renewal::{load, loads, HOME, PLACES, STAGING};
+use kit::rig::{crc32, words, Rig, Setup};
+use shared_abi::geometry::Region;
+use shared_abi::renewal::{Origin, Progress, State};
+use shared_abi::warm_start::{BootRequest, TrialStep};
+
+use crate::device::{Action, Answer, Device, Seen, Stored};
+use crate::files::{file, keys, plain, Content};
+
+/// More steps than any work takes.
+const ENDLESS: usize = 1_000_000;
+
+/// The device.
+pub struct Model {
+    rig: Rig,
+    /// The time since the last reset, in ms.
+    now: u32,
+    starts: u32,
+    /// The sub-index of the last transfer.
+    sub: u8,
+}
+
+impl Model {
+    /// A new device with a bootloader, and no program.
+    #[must_use]
+    pub fn new(setup: &'static Setup) -> Self {
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(HOME.base, &plain(setup, Content::OLD));
+        if setup.takes_sealed {
+            flash.poke(setup.layout.key_block().base, &keys());
+        }
+        Self { rig: Rig::on(setup, 2048, flash), now: 0, starts: 0, sub: 1 }
+    }
+
+    fn reset(&mut self, request: Option<BootRequest>) {
+        let is_low = self.rig.chip.supply() == Supply::Low;
+        self.rig.reset_for(request);
+        self.rig.chip.model().low_from = is_low.then_some(0);
+        (self.now, self.starts) = (0, self.starts + 1);
+    }
+
+    fn power_off(&mut self) {
+        {
+            let mut flash = self.rig.chip.model();
+            (flash.cut, flash.fail, flash.weak, flash.low_from) = (None, None, None, None);
+        }
+        self.reset(None);
+    }
+
+    /// A reset that somebody has requested waits for what a host believes to be done.
+    fn finish(&mut self) {
+        for _ in 0..ENDLESS {
+            if !self.rig.node.is_finishing() {
+                return;
+            }
+            if self.rig.node.is_idle_after_step() {
+                self.pass(100);
+            }
+        }
+        panic!("a reset waits for ever");
+    }
+
+    fn pass(&mut self, ms: u32) {
+        self.now += ms;
+        self.rig.node.set_time(Instant::from_millis(self.now));
+    }
+
+    fn progress(&mut self) -> Progress {
+        let bytes = words(&[self.rig.word(0x2007, 9)]);
+        Progress::from_bytes(bytes.try_into().expect("four bytes")).expect("known numbers")
+    }
+
+    fn perform(&mut self, action: &Action) -> Answer {
+        let rig = &mut self.rig;
+        let at = |after: &u32| rig.chip.model().operations + after;
+        let taken = match action {
+            Action::Command { sub, value } => rig.command(*sub, *value),
+            Action::Password { sub } => rig.unlock(*sub),
+            Action::Send { sub, content, block, bytes } => {
+                let file = file(rig.setup, *content);
+                let all = block.map_or(&file.whole, |block| &file.blocks[block % file.blocks.len()]);
+                let part = &all[..bytes.unwrap_or(all.len()).min(all.len())];
+                self.sub = *sub;
+                let begun = rig.begin(*sub, Some(all.len() as u32), part);
+                begun.and_then(|()| if bytes.is_none() { rig.end(*sub) } else { Ok(()) })
+            }
+            _ => {
+                match action {
+                    Action::Cancel => rig.cancel(self.sub),
+                    Action::Store(id) => drop(rig.node.store(NodeId::new(*id), Some(BitRate::K250))),
+                    Action::Run(steps) => rig.steps(*steps),
+                    Action::Settle => rig.settle(),
+                    Action::Wait(ms) => self.pass(*ms),
+                    Action::ResetNode => {
+                        self.finish();
+                        self.reset(None);
+                    }
+                    Action::PowerOff => self.power_off(),
+                    Action::Cut(after, cut) => {
+                        let at = at(after);
+                        rig.chip.model().cut = Some((at, *cut));
+                    }
+                    Action::Dip(after) => {
+                        let at = at(after);
+                        rig.chip.model().low_from = Some(at);
+                    }
+                    Action::Supply => rig.chip.model().low_from = None,
+                    Action::Fail(after, fault) => {
+                        let at = at(after);
+                        rig.chip.model().fail = Some((at, *fault));
+                    }
+                    Action::Weak(after, seed) => {
+                        let at = at(after);
+                        rig.chip.model().weak = Some((at, *seed));
+                    }
+                    Action::Rot(at, bits) => self.rot(*at, *bits),
+                    _ => unreachable!("{action:?} is several"),
+                }
+                return self.leave(Answer::Nothing);
+            }
+        };
+        let answer = if taken.is_ok() { Answer::Acknowledged } else { Answer::Refused };
+        self.leave(answer)
+    }
+
+    /// Carries out a request to leave the bootloader. A program that starts comes back.
+    fn leave(&mut self, answer: Answer) -> Answer {
+        if let Some(request) = self.rig.node.take_boot_request() {
+            if request != BootRequest::Renewal(TrialStep::Late) {
+                self.finish();
+            }
+            self.reset(Some(request));
+        }
+        answer
+    }
+
+    /// One place rots where another image is certain.
+    fn rot(&mut self, at: usize, bits: u8) {
+        let Seen { record, origin, is_certain, is_staged, .. } = self.look();
+        let place = match (record.map(|record| record.state), origin) {
+            (Some(State::Installed), Origin::Home) if is_staged && at % 2 == 0 => HOME,
+            (Some(State::Staged), Origin::Home | Origin::Trial) | (Some(State::Installed), Origin::Home) => {
+                STAGING
+            }
+            _ => return,
+        };
+        if is_certain && !self.rig.node.is_finishing() {
+            let at = place.base + (at / 2) as u32 % place.size;
+            {
+                let mut flash = self.rig.chip.model();
+                let cell = flash.cells(Region::new(at, 1))[0];
+                flash.poke(at, &[cell & bits]);
+            }
+            self.power_off();
+        }
+    }
+}
+
+impl Device for Model {
+    fn setup(&self) -> &'static Setup {
+        self.rig.setup
+    }
+
+    fn act(&mut self, action: &Action) -> Answer {
+        match caught(|| self.perform(action)) {
+            Ok(answer) => answer,
+            Err(cause) if cause.is::<PowerCut>() => {
+                self.power_off();
+                Answer::Nothing
+            }
+            Err(cause) => std::panic::resume_unwind(cause),
+        }
+    }
+
+    fn look(&mut self) -> Seen {
+        let setup = self.rig.setup;
+        let origin = self.progress().origin;
+        self.rig.chip.model().touched.clear();
+        let mut flash = self.rig.chip.model().clone();
+        flash.power_on();
+        let (layout, host) = (setup.layout, setup.host());
+        let journal = Journal::open(&flash, layout.parameters);
+        let record = RenewalRecord::load(&journal, &flash);
+        let programs = (1..=setup.programs()).map(|number| {
+            let Some(record) = ProgramRecord::load(&journal, &flash, number) else { return Stored::None };
+            let region = setup.region(number);
+            let place = Region::new(region.base, record.size.min(region.size));
+            let is_true = crc32(flash.cells(place)) == record.crc && flash.is_stable(place);
+            if is_true {
+                Stored::Good(record.crc)
+            } else {
+                Stored::Damaged
+            }
+        });
+        let staged = check(&flash, PLACES.staging, layout, host);
+        Seen {
+            starts: self.starts,
+            origin,
+            loads: loads(&flash, layout, host, None).map(|(header, ..)| header.crc),
+            home: load(&flash, PLACES.home, host).ok().map(|header| header.crc),
+            record,
+            is_staged: record.is_some_and(|record| staged.is_ok_and(|image| image.crc == record.crc)),
+            programs: programs.collect(),
+            is_certain: layout.parameters.iter().all(|region| flash.is_stable(*region)),
+        }
+    }
+}

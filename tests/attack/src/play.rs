@@ -1,0 +1,128 @@
+//! Carries out the actions of a seed, and shortens those that break a rule.
+
+use std::fmt;
+
+use kit::model::caught;
+use shared_abi::renewal::{Origin, State};
+
+use crate::device::{Action, Device};
+use crate::files::{self, Content};
+use crate::rules::{History, RULES};
+use crate::script;
+
+/// A broken rule, and what was found.
+#[derive(Clone, Debug)]
+pub struct Broken(pub &'static str, pub String);
+
+/// What an attack has met: the states of a renewal with the origin of the bootloader, and the starts.
+#[derive(Default)]
+pub struct Met {
+    /// In the order of [`State`] and [`Origin`].
+    pub states: std::collections::BTreeSet<(u8, u8)>,
+    /// The lives of the device.
+    pub starts: u64,
+}
+
+struct Attack<'a, D> {
+    device: D,
+    history: History,
+    met: &'a mut Met,
+}
+
+impl<D: Device> Attack<'_, D> {
+    /// Carries out an action, and checks all rules.
+    fn act(&mut self, action: &Action) -> Result<(), Broken> {
+        if let Action::Renew(image) = action {
+            return script::renewal(&self.history.seen, self.device.setup(), *image)
+                .iter()
+                .try_for_each(|action| self.act(action));
+        }
+        let (answer, seen) = caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
+            let text = cause.downcast_ref::<String>().map(String::as_str);
+            let text = text.or(cause.downcast_ref::<&str>().copied());
+            Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
+        })?;
+        self.history.permit(self.device.setup(), action, answer);
+        for rule in RULES {
+            (rule.check)(&self.history, &seen).map_err(|what| Broken(rule.name, what))?;
+        }
+        self.met.starts += u64::from(seen.starts - self.history.seen.starts);
+        let state = seen.record.map_or(State::None, |record| record.state);
+        self.met.states.insert((state as u8, seen.origin as u8));
+        self.history.update(seen);
+        Ok(())
+    }
+
+    /// Whatever was done: a tool that knows what it wants gets the newest image installed.
+    fn repair(&mut self) -> Result<(), Broken> {
+        let setup = self.device.setup();
+        self.act(&Action::PowerOff)?;
+        script::make_room(setup).iter().try_for_each(|action| self.act(action))?;
+        for _ in 0..8 {
+            self.act(&Action::Settle)?;
+            self.act(&Action::Password { sub: script::bootloader(setup) })?;
+            self.act(&Action::Renew(Content::NEWEST))?;
+        }
+        let seen = &self.history.seen;
+        if seen.home == files::crc(setup, Content::NEWEST) && seen.origin == Origin::Home {
+            return Ok(());
+        }
+        Err(Broken("a tool gets a new bootloader installed afterwards", format!("{seen:?}")))
+    }
+}
+
+/// Carries out actions on a new device, and installs the newest bootloader at the end.
+///
+/// # Errors
+/// The number of the action that broke a rule, or of all if the tool failed at the end; with the rule.
+pub fn play<D: Device>(mut device: D, actions: &[Action], met: &mut Met) -> Result<(), (usize, Broken)> {
+    let history = History::new(device.look());
+    let mut attack = Attack { device, history, met };
+    for (n, action) in actions.iter().enumerate() {
+        attack.act(action).map_err(|broken| (n, broken))?;
+    }
+    attack.repair().map_err(|broken| (actions.len(), broken))
+}
+
+/// An attack that has broken a rule.
+pub struct Failure {
+    seed: u64,
+    actions: Vec<Action>,
+    /// The rule.
+    pub broken: Broken,
+}
+
+impl fmt::Display for Failure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Broken(rule, what) = &self.broken;
+        writeln!(f, "seed {}: not true that {rule}: {what}; the actions, shortened:", self.seed)?;
+        self.actions.iter().enumerate().try_for_each(|(n, action)| writeln!(f, "  {n:>3} {action:?}"))
+    }
+}
+
+/// The attack of a seed on a new device.
+///
+/// # Errors
+/// The rule that it has broken, with the actions that are needed for it.
+pub fn attack<D: Device>(new: impl Fn() -> D, seed: u64, met: &mut Met) -> Result<(), Box<Failure>> {
+    let mut actions = script::of(new().setup(), seed);
+    let Err((n, mut broken)) = play(new(), &actions, met) else { return Ok(()) };
+    actions.truncate(n + 1);
+    let mut size = actions.len().next_power_of_two();
+    while size > 0 {
+        let mut from = 0;
+        while from < actions.len() {
+            let mut fewer = actions.clone();
+            fewer.drain(from..(from + size).min(actions.len()));
+            match play(new(), &fewer, &mut Met::default()) {
+                Err((n, found)) if found.0 == broken.0 => {
+                    fewer.truncate(n + 1);
+                    (actions, broken) = (fewer, found);
+                }
+                _ => from += size,
+            }
+        }
+        size /= 2;
+    }
+    Err(Box::new(Failure { seed, actions, broken }))
+}
