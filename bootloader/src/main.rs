@@ -310,7 +310,7 @@ mod app {
             return;
         }
         let status = can.lock(line::status);
-        let (finishing, installing) = bootloader.lock(|bootloader| {
+        let finishing = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             debugger.with(bootloader, |device| {
                 slave.observe(status, now, device);
@@ -344,11 +344,11 @@ mod app {
                 let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);
                 *pending_reset = PendingReset { wanted: true, request, at: ends.then_some(now) };
             }
-            (bootloader.is_finishing(), bootloader.is_installing())
+            bootloader.is_finishing()
         });
         if let Some((program, window_ms)) = *held {
             // An installation that a cut has left is completed first.
-            if now.has_reached(Instant::from_millis(window_ms.into())) && !installing {
+            if now.has_reached(Instant::from_millis(window_ms.into())) && !finishing {
                 // The program starts even if no other node acknowledges the boot-up.
                 *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };

@@ -14,7 +14,7 @@ use coboot_tests::renewal::{
 };
 use coflash_core::device::Doing;
 use coflash_core::update::{flash, FlashOptions};
-use emulator::machine::{Cut, FlashCut, Options, Stop};
+use emulator::machine::{Cut, FlashCut, Operation, Options, Stop};
 use emulator::silicon::{Silicon, WORST};
 use emulator::time::Span;
 use kit::random::Random;
@@ -163,6 +163,28 @@ fn a_reset_after_the_confirmation_starts_the_program() {
     call_back(&mut bench);
     let installed = Progress { state: State::Installed, ..Progress::default() };
     assert_eq!((progress(&mut bench), identification(&mut bench)), (installed, crc_of(&new)));
+}
+
+/// Anybody can write NMT, and each reset would erase home once more.
+#[test]
+fn an_nmt_reset_waits_for_an_installation() {
+    let new = version(firmware::BOOTLOADER, NEW);
+    let mut bench = board();
+    stage(&mut bench, &new);
+    start(&mut bench);
+    bench.events();
+    bench.machine().keep_flash_log();
+    bench.session().command(number(), ProgramControl::SetSignature).unwrap();
+    for _ in 0..50 {
+        bench.post(0x000, &[0x81, NODE]);
+        bench.run_ms(100);
+    }
+    assert_eq!(cells(&mut bench, home(new.len())), new);
+    let sector = firmware::board().chip.sector_at(home(1).base).unwrap();
+    let log = bench.machine().take_flash_log();
+    let erases = |operation: &&Operation| matches!(operation, Operation::Erase { sectors } if sectors.contains(&sector));
+    assert_eq!(log.iter().filter(erases).count(), 1);
+    assert!(!bench.events().is_empty(), "the reset came in the end");
 }
 
 /// A bootloader with a visible change: another product for this board, whose code is at other addresses.

@@ -376,12 +376,6 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
         self.download.confirm(program);
     }
 
-    /// Whether a RAM image is being installed at home. The power may fail meanwhile, but a reset would begin it anew.
-    #[must_use]
-    pub fn is_installing(&self) -> bool {
-        self.download.is_installing()
-    }
-
     /// Whether a reset now would undo work that a host believes to be done or in progress.
     #[must_use]
     pub fn is_finishing(&mut self) -> bool {

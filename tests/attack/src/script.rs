@@ -25,7 +25,8 @@ pub fn of(setup: &'static Setup, seed: u64) -> Vec<Action> {
     // Each product has its own attacks.
     let mut random = Random(seed ^ u64::from(kit::rig::crc32(setup.name.as_bytes())) << 32);
     // Some kinds of actions alone, each time others: what one kind needs, another one always undoes.
-    let kinds: Vec<usize> = (0..KINDS).filter(|_| random.chance(40)).chain([KINDS - 1]).collect();
+    let kinds: Vec<usize> =
+        (0..KINDS).filter(|_| random.chance(40)).chain([KINDS - 2, KINDS - 1, KINDS - 1]).collect();
     let mut script = Script { setup, random, actions: Vec::new(), is_locked: true };
     for _ in 0..script.random.below(60) {
         let kind = script.random.pick(&kinds);
@@ -67,7 +68,7 @@ impl Script {
         let of_program = Content::Program { number: program, extent: random.pick(&EXTENTS) };
         let any = 1 + random.below(4) as u8;
         let sub = random.pick(&[program, program, own, own, any]);
-        let far = random.pick(&[25, 300]);
+        let far = random.pick(&[25, 80, 300]);
         let after = 1 + random.below(far) as u32;
         let seed = random.next();
         match kind {
@@ -109,9 +110,13 @@ impl Script {
             16 => self.reset(Action::Rot(seed as usize, (seed >> 32) as u8)),
             17 | 18 => self.go_on(),
             _ => {
-                let image = random.pick(&Content::SENT);
+                let image = if seed % 4 == 0 { random.pick(&Content::SENT) } else { Content::Image(1) };
+                let disturbance = random.pick(&[Action::Dip(after), Action::Fail(after, FlashFault::Failed)]);
                 if self.is_locked {
                     self.add(Action::Password { sub: own });
+                }
+                if self.random.chance(40) {
+                    self.add(disturbance);
                 }
                 self.reset(Action::Renew(image));
             }
@@ -137,7 +142,7 @@ impl Script {
         }
         let blocks = file(self.setup, content).blocks.len();
         let from = if self.random.chance(80) { 0 } else { self.random.below(blocks) };
-        let ends = self.random.pick(&[1, 30]);
+        let ends = self.random.pick(&[1, 30, 50]);
         for block in from..blocks {
             self.add(Action::Send { sub, content, block: Some(block), bytes: None });
             self.run();
@@ -161,9 +166,12 @@ impl Script {
             .collect();
         begun.dedup_by_key(|(sub, content, _)| (*sub, *content));
         let Some(last) = begun.len().checked_sub(1) else { return };
-        let (sub, content, block) = begun[self.random.below(last + 1)];
+        let (sub, mut content, block) = begun[self.random.below(last + 1)];
+        if let Content::Program { extent, .. } = &mut content {
+            *extent = self.random.pick(&[*extent, Extent::Large]);
+        }
         let from = self.random.pick(&[0, 0, block + 1]);
-        for block in from..from + 1 + self.random.below(4) {
+        for block in from..from + 1 + self.random.pick(&[1, 2, 14]) {
             self.add(Action::Send { sub, content, block: Some(block), bytes: None });
             self.run();
         }

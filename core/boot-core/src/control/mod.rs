@@ -294,16 +294,11 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
     }
 
     /// Whether a complete program or an acknowledged command is not yet carried out: a reset now
-    /// would undo it. So it would begin an installation at home anew, with the erase.
+    /// would undo it, and begin an installation at home anew, with the erase.
     #[must_use]
     pub fn is_finishing(&self) -> bool {
-        self.programmer.finishing().is_some() || self.programmer.is_storing() || self.is_installing()
-    }
-
-    /// Whether a RAM image is being installed at home, or home is being repaired.
-    #[must_use]
-    pub fn is_installing(&self) -> bool {
-        self.programmer.is_installing()
+        let programmer = &self.programmer;
+        programmer.finishing().is_some() || programmer.is_storing() || programmer.is_installing()
     }
 
     /// Stores node-ID and bit rate in the background.
