@@ -4,36 +4,20 @@ use boot_core::flash::FlashFault;
 use boot_core::store::RenewalRecord;
 use kit::model::Cut;
 use kit::rig::Setup;
-use shared_abi::renewal::Origin;
+use shared_abi::renewal::{Origin, State};
 
 use crate::files::Content;
 
-/// What is done to a device. Numbers of operations count from the present one.
+/// What is done to a device.
 #[derive(Clone, Copy, Debug)]
 pub enum Action {
     /// 1F51h.
-    Command {
-        /// The sub-index.
-        sub: u8,
-        /// The command.
-        value: u8,
-    },
+    Command { sub: u8, value: u8 },
     /// The right password of this sub-index, if the device has one.
-    Password {
-        /// The sub-index.
-        sub: u8,
-    },
-    /// A transfer to 1F50h.
-    Send {
-        /// The sub-index.
-        sub: u8,
-        /// What is sent.
-        content: Content,
-        /// One block of its block file; `None` for all of it in one transfer.
-        block: Option<usize>,
-        /// Only so many bytes: the transfer stays open.
-        bytes: Option<usize>,
-    },
+    Password { sub: u8 },
+    /// A transfer to 1F50h: one block of a block file, or all of it as a stream; with `bytes` so many alone, and the
+    /// transfer stays open.
+    Send { sub: u8, content: Content, block: Option<usize>, bytes: Option<usize> },
     /// The open transfer is aborted.
     Cancel,
     /// LSS: this node-ID is stored.
@@ -48,31 +32,27 @@ pub enum Action {
     ResetNode,
     /// The power goes, and returns.
     PowerOff,
-    /// The power goes in a flash operation.
-    Cut(u32, Cut),
-    /// The supply is too low from a flash operation on.
-    Dip(u32),
+    /// So many flash operations later there is trouble.
+    Flash(u32, Trouble),
     /// The supply is good again.
     Supply,
-    /// A flash operation fails.
-    Fail(u32, FlashFault),
-    /// A flash operation does a part, and says nothing.
-    Weak(u32, u64),
     /// Bits of a byte of an image decay without power, where another image is certain.
     Rot(usize, u8),
     /// What a tool does next so that this image becomes the bootloader: data, START or 83h.
     Renew(Content),
 }
 
-/// How a device has answered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Answer {
-    /// It has acknowledged the request.
-    Acknowledged,
-    /// It has refused it.
-    Refused,
-    /// There was nothing to answer, or the power went.
-    Nothing,
+/// What happens in a flash operation.
+#[derive(Clone, Copy, Debug)]
+pub enum Trouble {
+    /// The power goes, and returns.
+    Cut(Cut),
+    /// The supply is too low from this one on.
+    Dip,
+    /// It fails.
+    Fail(FlashFault),
+    /// It does a part, drawn by this seed, and says nothing.
+    Weak(u64),
 }
 
 /// A program as a debug probe finds it.
@@ -80,9 +60,9 @@ pub enum Answer {
 pub enum Stored {
     /// It has no record.
     None,
-    /// It has a record, and this CRC as the record says.
+    /// It has this CRC, as its record says.
     Good(u32),
-    /// It has a record that is not true.
+    /// Its record is not true.
     Damaged,
 }
 
@@ -93,7 +73,7 @@ pub struct Seen {
     pub starts: u32,
     /// Where the running bootloader was loaded from.
     pub origin: Origin,
-    /// The CRC of the bootloader that is loaded after a reset; `None` if none can be loaded.
+    /// The CRC of the bootloader that is loaded after a reset, if one can be loaded.
     pub loads: Option<u32>,
     /// The CRC of a good image at home.
     pub home: Option<u32>,
@@ -107,12 +87,19 @@ pub struct Seen {
     pub is_certain: bool,
 }
 
+impl Seen {
+    pub fn state(&self) -> State {
+        self.record.map_or(State::None, |record| record.state)
+    }
+}
+
 /// A device that is attacked.
 pub trait Device {
     /// Its product.
     fn setup(&self) -> &'static Setup;
-    /// Carries out an action; the resets that it leads to as well. (Not [`Action::Renew`].)
-    fn act(&mut self, action: &Action) -> Answer;
+    /// Carries out an action, and the resets that it leads to; whether the device has acknowledged it. (Not
+    /// [`Action::Renew`], which is several.)
+    fn act(&mut self, action: &Action) -> bool;
     /// As a probe finds it. It changes nothing.
     fn look(&mut self) -> Seen;
 }

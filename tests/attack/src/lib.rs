@@ -3,9 +3,9 @@
 //! | module | what it has |
 //! |---|---|
 //! | `device` | what can be done to a device, and what is found of it |
+//! | `files` | what can be sent |
 //! | `script` | the actions of a seed |
 //! | `rules` | what must be true after each action |
-//! | `files` | what can be sent |
 //! | `play` | carries them out, and shortens those that break a rule |
 //! | `model` | the first device: the bootloader on the model of a flash |
 //!
@@ -13,6 +13,7 @@
 //! (an emulated board, a node without a chip) is another [`Device`](device::Device); another rule is one more line
 //! of [`RULES`](rules::RULES).
 
+#![allow(missing_docs, reason = "names say it")]
 #![forbid(unsafe_code)]
 
 pub mod device;

@@ -7,13 +7,13 @@ use boot_core::store::{Journal, ProgramRecord, RenewalRecord};
 use canopen::{BitRate, Instant, NodeId};
 use kit::model::{caught, ModelFlash, PowerCut, CHIP};
 use kit::renewal::{load, loads, HOME, PLACES, STAGING};
-use kit::rig::{crc32, words, Rig, Setup};
+use kit::rig::{crc32, Rig, Setup};
 use shared_abi::geometry::Region;
 use shared_abi::renewal::{Origin, Progress, State};
 use shared_abi::warm_start::{BootRequest, TrialStep};
 
-use crate::device::{Action, Answer, Device, Seen, Stored};
-use crate::files::{file, keys, plain, Content};
+use crate::device::{Action, Device, Seen, Stored, Trouble};
+use crate::files::{file, keys, OLD};
 
 /// More steps than any work takes.
 const ENDLESS: usize = 1_000_000;
@@ -33,7 +33,7 @@ impl Model {
     #[must_use]
     pub fn new(setup: &'static Setup) -> Self {
         let mut flash = ModelFlash::new(&CHIP);
-        flash.poke(HOME.base, &plain(setup, Content::OLD));
+        flash.poke(HOME.base, &file(setup, OLD).plain);
         if setup.takes_sealed {
             flash.poke(setup.layout.key_block().base, &keys());
         }
@@ -73,86 +73,65 @@ impl Model {
         self.rig.node.set_time(Instant::from_millis(self.now));
     }
 
-    fn progress(&mut self) -> Progress {
-        let bytes = words(&[self.rig.word(0x2007, 9)]);
-        Progress::from_bytes(bytes.try_into().expect("four bytes")).expect("known numbers")
-    }
-
-    fn perform(&mut self, action: &Action) -> Answer {
+    fn perform(&mut self, action: &Action) -> bool {
         let rig = &mut self.rig;
-        let at = |after: &u32| rig.chip.model().operations + after;
-        let taken = match action {
-            Action::Command { sub, value } => rig.command(*sub, *value),
-            Action::Password { sub } => rig.unlock(*sub),
+        let mut taken = Ok(());
+        match *action {
+            Action::Command { sub, value } => taken = rig.command(sub, value),
+            Action::Password { sub } => taken = rig.unlock(sub),
             Action::Send { sub, content, block, bytes } => {
-                let file = file(rig.setup, *content);
+                let file = file(rig.setup, content);
                 let all = block.map_or(&file.whole, |block| &file.blocks[block % file.blocks.len()]);
                 let part = &all[..bytes.unwrap_or(all.len()).min(all.len())];
-                self.sub = *sub;
-                let begun = rig.begin(*sub, Some(all.len() as u32), part);
-                begun.and_then(|()| if bytes.is_none() { rig.end(*sub) } else { Ok(()) })
-            }
-            _ => {
-                match action {
-                    Action::Cancel => rig.cancel(self.sub),
-                    Action::Store(id) => drop(rig.node.store(NodeId::new(*id), Some(BitRate::K250))),
-                    Action::Run(steps) => rig.steps(*steps),
-                    Action::Settle => rig.settle(),
-                    Action::Wait(ms) => self.pass(*ms),
-                    Action::ResetNode => {
-                        self.finish();
-                        self.reset(None);
-                    }
-                    Action::PowerOff => self.power_off(),
-                    Action::Cut(after, cut) => {
-                        let at = at(after);
-                        rig.chip.model().cut = Some((at, *cut));
-                    }
-                    Action::Dip(after) => {
-                        let at = at(after);
-                        rig.chip.model().low_from = Some(at);
-                    }
-                    Action::Supply => rig.chip.model().low_from = None,
-                    Action::Fail(after, fault) => {
-                        let at = at(after);
-                        rig.chip.model().fail = Some((at, *fault));
-                    }
-                    Action::Weak(after, seed) => {
-                        let at = at(after);
-                        rig.chip.model().weak = Some((at, *seed));
-                    }
-                    Action::Rot(at, bits) => self.rot(*at, *bits),
-                    _ => unreachable!("{action:?} is several"),
+                self.sub = sub;
+                taken = rig.begin(sub, Some(all.len() as u32), part);
+                if taken.is_ok() && bytes.is_none() {
+                    taken = rig.end(sub);
                 }
-                return self.leave(Answer::Nothing);
             }
-        };
-        let answer = if taken.is_ok() { Answer::Acknowledged } else { Answer::Refused };
-        self.leave(answer)
-    }
-
-    /// Carries out a request to leave the bootloader. A program that starts comes back.
-    fn leave(&mut self, answer: Answer) -> Answer {
+            Action::Cancel => rig.cancel(self.sub),
+            Action::Store(id) => drop(rig.node.store(NodeId::new(id), Some(BitRate::K250))),
+            Action::Run(steps) => rig.steps(steps),
+            Action::Settle => rig.settle(),
+            Action::Wait(ms) => self.pass(ms),
+            Action::ResetNode => {
+                self.finish();
+                self.reset(None);
+            }
+            Action::PowerOff => self.power_off(),
+            Action::Flash(after, trouble) => {
+                let mut flash = rig.chip.model();
+                let at = flash.operations + after;
+                match trouble {
+                    Trouble::Cut(cut) => flash.cut = Some((at, cut)),
+                    Trouble::Dip => flash.low_from = Some(at),
+                    Trouble::Fail(fault) => flash.fail = Some((at, fault)),
+                    Trouble::Weak(seed) => flash.weak = Some((at, seed)),
+                }
+            }
+            Action::Supply => rig.chip.model().low_from = None,
+            Action::Rot(at, bits) => self.rot(at, bits),
+            Action::Renew(_) => unreachable!("it is several"),
+        }
+        // A request to leave the bootloader. A program that starts comes back.
         if let Some(request) = self.rig.node.take_boot_request() {
             if request != BootRequest::Renewal(TrialStep::Late) {
                 self.finish();
             }
             self.reset(Some(request));
         }
-        answer
+        taken.is_ok()
     }
 
     /// One place rots where another image is certain.
     fn rot(&mut self, at: usize, bits: u8) {
-        let Seen { record, origin, is_certain, is_staged, .. } = self.look();
-        let place = match (record.map(|record| record.state), origin) {
-            (Some(State::Installed), Origin::Home) if is_staged && at % 2 == 0 => HOME,
-            (Some(State::Staged), Origin::Home | Origin::Trial) | (Some(State::Installed), Origin::Home) => {
-                STAGING
-            }
+        let seen = self.look();
+        let place = match (seen.state(), seen.origin) {
+            (State::Installed, Origin::Home) if seen.is_staged && at % 2 == 0 => HOME,
+            (State::Staged, Origin::Home | Origin::Trial) | (State::Installed, Origin::Home) => STAGING,
             _ => return,
         };
-        if is_certain && !self.rig.node.is_finishing() {
+        if seen.is_certain && !self.rig.node.is_finishing() {
             let at = place.base + (at / 2) as u32 % place.size;
             {
                 let mut flash = self.rig.chip.model();
@@ -169,20 +148,20 @@ impl Device for Model {
         self.rig.setup
     }
 
-    fn act(&mut self, action: &Action) -> Answer {
-        match caught(|| self.perform(action)) {
-            Ok(answer) => answer,
-            Err(cause) if cause.is::<PowerCut>() => {
-                self.power_off();
-                Answer::Nothing
+    fn act(&mut self, action: &Action) -> bool {
+        let answer = caught(|| self.perform(action));
+        answer.unwrap_or_else(|cause| {
+            if !cause.is::<PowerCut>() {
+                std::panic::resume_unwind(cause);
             }
-            Err(cause) => std::panic::resume_unwind(cause),
-        }
+            self.power_off();
+            false
+        })
     }
 
     fn look(&mut self) -> Seen {
         let setup = self.rig.setup;
-        let origin = self.progress().origin;
+        let progress = Progress::from_bytes(self.rig.word(0x2007, 9).to_le_bytes());
         self.rig.chip.model().touched.clear();
         let mut flash = self.rig.chip.model().clone();
         flash.power_on();
@@ -203,7 +182,7 @@ impl Device for Model {
         let staged = check(&flash, PLACES.staging, layout, host);
         Seen {
             starts: self.starts,
-            origin,
+            origin: progress.expect("known numbers").origin,
             loads: loads(&flash, layout, host, None).map(|(header, ..)| header.crc),
             home: load(&flash, PLACES.home, host).ok().map(|header| header.crc),
             record,

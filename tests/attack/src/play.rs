@@ -1,12 +1,13 @@
 //! Carries out the actions of a seed, and shortens those that break a rule.
 
+use std::collections::BTreeSet;
 use std::fmt;
 
 use kit::model::caught;
-use shared_abi::renewal::{Origin, State};
+use shared_abi::renewal::Origin;
 
 use crate::device::{Action, Device};
-use crate::files::{self, Content};
+use crate::files::{file, NEWEST};
 use crate::rules::{History, RULES};
 use crate::script;
 
@@ -14,13 +15,11 @@ use crate::script;
 #[derive(Clone, Debug)]
 pub struct Broken(pub &'static str, pub String);
 
-/// What an attack has met: the states of a renewal with the origin of the bootloader, and the starts.
+/// What attacks have met: the states of a renewal with the origin of the bootloader, and the lives of the device.
 #[derive(Default)]
 pub struct Met {
-    /// In the order of [`State`] and [`Origin`].
-    pub states: std::collections::BTreeSet<(u8, u8)>,
-    /// The lives of the device.
-    pub starts: u64,
+    pub states: BTreeSet<(u8, u8)>,
+    pub lives: u64,
 }
 
 struct Attack<'a, D> {
@@ -33,41 +32,41 @@ impl<D: Device> Attack<'_, D> {
     /// Carries out an action, and checks all rules.
     fn act(&mut self, action: &Action) -> Result<(), Broken> {
         if let Action::Renew(image) = action {
-            return script::renewal(&self.history.seen, self.device.setup(), *image)
-                .iter()
-                .try_for_each(|action| self.act(action));
+            return self.act_all(&script::renewal(&self.history.seen, self.device.setup(), *image));
         }
-        let (answer, seen) = caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
-            let text = cause.downcast_ref::<String>().map(String::as_str);
-            let text = text.or(cause.downcast_ref::<&str>().copied());
-            Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
-        })?;
-        self.history.permit(self.device.setup(), action, answer);
-        for rule in RULES {
-            (rule.check)(&self.history, &seen).map_err(|what| Broken(rule.name, what))?;
+        let (is_acknowledged, seen) =
+            caught(|| (self.device.act(action), self.device.look())).map_err(|cause| {
+                let text = cause.downcast_ref::<String>().map(String::as_str);
+                let text = text.or(cause.downcast_ref::<&str>().copied());
+                Broken("nothing panics, and all work ends", text.unwrap_or("?").to_owned())
+            })?;
+        self.history.permit(action, is_acknowledged);
+        if let Some(rule) = RULES.iter().find(|rule| !(rule.is_kept)(&self.history, &seen)) {
+            return Err(Broken(rule.name, format!("before: {:X?}\n  now: {seen:X?}", self.history.seen)));
         }
-        self.met.starts += u64::from(seen.starts - self.history.seen.starts);
-        let state = seen.record.map_or(State::None, |record| record.state);
-        self.met.states.insert((state as u8, seen.origin as u8));
+        self.met.lives += u64::from(seen.starts - self.history.seen.starts);
+        self.met.states.insert((seen.state() as u8, seen.origin as u8));
         self.history.update(seen);
         Ok(())
+    }
+
+    fn act_all(&mut self, actions: &[Action]) -> Result<(), Broken> {
+        actions.iter().try_for_each(|action| self.act(action))
     }
 
     /// Whatever was done: a tool that knows what it wants gets the newest image installed.
     fn repair(&mut self) -> Result<(), Broken> {
         let setup = self.device.setup();
-        self.act(&Action::PowerOff)?;
-        script::make_room(setup).iter().try_for_each(|action| self.act(action))?;
+        self.act_all(&script::make_room(setup))?;
         for _ in 0..8 {
-            self.act(&Action::Settle)?;
-            self.act(&Action::Password { sub: script::bootloader(setup) })?;
-            self.act(&Action::Renew(Content::NEWEST))?;
+            let sub = script::bootloader(setup);
+            self.act_all(&[Action::Settle, Action::Password { sub }, Action::Renew(NEWEST)])?;
         }
         let seen = &self.history.seen;
-        if seen.home == files::crc(setup, Content::NEWEST) && seen.origin == Origin::Home {
+        if seen.home == Some(file(setup, NEWEST).crc) && seen.origin == Origin::Home {
             return Ok(());
         }
-        Err(Broken("a tool gets a new bootloader installed afterwards", format!("{seen:?}")))
+        Err(Broken("a tool gets a new bootloader installed afterwards", format!("{seen:X?}")))
     }
 }
 
@@ -76,7 +75,7 @@ impl<D: Device> Attack<'_, D> {
 /// # Errors
 /// The number of the action that broke a rule, or of all if the tool failed at the end; with the rule.
 pub fn play<D: Device>(mut device: D, actions: &[Action], met: &mut Met) -> Result<(), (usize, Broken)> {
-    let history = History::new(device.look());
+    let history = History::new(device.setup(), device.look());
     let mut attack = Attack { device, history, met };
     for (n, action) in actions.iter().enumerate() {
         attack.act(action).map_err(|broken| (n, broken))?;
@@ -84,18 +83,17 @@ pub fn play<D: Device>(mut device: D, actions: &[Action], met: &mut Met) -> Resu
     attack.repair().map_err(|broken| (actions.len(), broken))
 }
 
-/// An attack that has broken a rule.
+/// An attack that has broken a rule, with the actions that are needed for it.
 pub struct Failure {
     seed: u64,
     actions: Vec<Action>,
-    /// The rule.
     pub broken: Broken,
 }
 
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Broken(rule, what) = &self.broken;
-        writeln!(f, "seed {}: not true that {rule}: {what}; the actions, shortened:", self.seed)?;
+        writeln!(f, "seed {}: not true that {rule}: {what}\n  the actions, shortened:", self.seed)?;
         self.actions.iter().enumerate().try_for_each(|(n, action)| writeln!(f, "  {n:>3} {action:?}"))
     }
 }
@@ -103,7 +101,7 @@ impl fmt::Display for Failure {
 /// The attack of a seed on a new device.
 ///
 /// # Errors
-/// The rule that it has broken, with the actions that are needed for it.
+/// The rule that it has broken.
 pub fn attack<D: Device>(new: impl Fn() -> D, seed: u64, met: &mut Met) -> Result<(), Box<Failure>> {
     let mut actions = script::of(new().setup(), seed);
     let Err((n, mut broken)) = play(new(), &actions, met) else { return Ok(()) };
