@@ -8,8 +8,8 @@ use canopen::Address;
 use coboot_tests::bench::{press, Bench, NODE};
 use coboot_tests::firmware;
 use coflash_core::update::{flash, FlashOptions};
-use crc::{Crc, CRC_32_ISO_HDLC};
 use emulator::machine::{ResetCause, Stop};
+use kit::rig::crc32;
 use object::elf::{FileHeader32, PT_LOAD};
 use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, Object, ObjectSection, ObjectSymbol};
@@ -25,10 +25,6 @@ const HEADER: usize = 64;
 
 fn words(bytes: &[u8]) -> Vec<u32> {
     bytes.chunks_exact(4).map(|word| u32::from_le_bytes(word.try_into().unwrap())).collect()
-}
-
-fn crc32(bytes: &[u8]) -> u32 {
-    Crc::<u32>::new(&CRC_32_ISO_HDLC).checksum(bytes)
 }
 
 /// A bootloader in flash: the resident part, and the RAM image with its header.

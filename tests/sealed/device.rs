@@ -19,14 +19,11 @@ use coflash_core::device::debugger::Debugger;
 use coflash_core::device::{Doing, Transfers};
 use coflash_core::file::block_file::emit;
 use coflash_core::file::sealed::{Kek, Sealer, SigningKey};
+use kit::rig::crc32;
 use seal::access::{event, right};
 
 const VERSION: Address = Address::new(0x100A, 0);
 const CRC_OF_PROGRAM: Address = Address::new(0x1F56, 1);
-
-fn crc32(bytes: &[u8]) -> u32 {
-    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
-}
 
 /// The four kinds of payload.
 fn kinds(counter: u32) -> [(&'static str, Sealer<'static>); 4] {

@@ -3,148 +3,29 @@
 
 use std::sync::OnceLock;
 
-use boot_core::bootloader::{entries, entry_count, Bootloader, Config, Everything, PasswordObject};
-use boot_core::canopen::device::Device as Identity;
-use boot_core::canopen::lss::LssDevice;
-use boot_core::canopen::od::{Address, Entry, Objects};
-use boot_core::canopen::{AbortCode, BitRate, Instant, NodeId};
-use boot_core::control::{Policy, SealedMemory, Step};
+use boot_core::bootloader::{Everything, PasswordObject};
+use boot_core::canopen::od::Address;
+use boot_core::canopen::{AbortCode, Instant};
+use boot_core::control::SealedMemory;
 use boot_core::crc::CrcKind;
 use boot_core::decision::{decide, BootDecision, Circumstances};
-use boot_core::flash::{run, Flash};
-use boot_core::policy::SealPolicy;
-use boot_core::profile::Profile;
+use boot_core::flash::run;
 use boot_core::program::{verify, Invalid, VerifiedProgram};
 use boot_core::store::{Journal, Key, NodeParameters, Parameters, ProgramRecord};
 use coflash_core::file::sealed::{hash, key_block, Certificate, Kek, Role, Sealer, SigningKey};
 use seal::access::{right, CHALLENGE, DOMAIN as ACCESS_DOMAIN, SIGNED_CHALLENGE};
 use seal::wire::{head_size, CERTIFICATE, DOMAIN, ED25519};
 use shared_abi::geometry::Region;
-use shared_abi::label::{self, Label};
-use shared_abi::layout::Layout;
 use shared_abi::warm_start::BootRequest;
 
 use crate::powercut::DECISION;
 use kit::boot::Boot;
-use kit::model::{Chip, ModelFlash, CHIP, ONE_PROGRAM, TWO_PROGRAMS};
+use kit::model::{Chip, ModelFlash, CHIP};
+use kit::rig::{go_on, program, Node, BOARD_NODE};
 
-// --- setups
-
-/// The configuration of a device.
-pub struct Setup {
-    /// Its name, for messages.
-    pub name: &'static str,
-    /// The memory layout: the owner of each address.
-    pub layout: &'static Layout,
-    /// The passwords and their objects.
-    pub profile: Profile,
-    config: Config,
-}
-
-/// 1018h/1.
-pub const VENDOR_ID: u32 = 0x0000_0319;
-/// 1018h/2.
-pub const PRODUCT_CODE: u32 = 0x0004_0001;
-/// 1018h/3: hardware revision 2.
-pub const REVISION: u32 = 0x0001_0002;
-/// Of the chip.
-pub const UNIQUE_ID: [u8; 12] = *b"unique id 96";
-
-static ONE: Layout = ONE_PROGRAM;
-static TWO: Layout = TWO_PROGRAMS;
-
-const SEAL: SealPolicy = SealPolicy {
-    vendor_id: VENDOR_ID,
-    product_code: PRODUCT_CODE,
-    revision: REVISION,
-    unique_id: || UNIQUE_ID,
-    ..SealPolicy::NONE
-};
-
-const fn config(
-    profile: &Profile,
-    layout: &'static Layout,
-    entries: &'static [Entry],
-    seal: SealPolicy,
-) -> Config {
-    Config {
-        entries,
-        device: Identity {
-            device_type: profile.device_type,
-            name: "sealed",
-            hardware_version: "0",
-            software_version: "0",
-            heartbeat_ms: 0,
-            vendor_id: VENDOR_ID,
-            product_code: PRODUCT_CODE,
-            revision: REVISION,
-            serial_number: 0,
-        },
-        node_id: profile.node_id,
-        layout,
-        supports: |_| true,
-        boot_up_emergency: false,
-        download: Policy {
-            identity: Some((VENDOR_ID, PRODUCT_CODE)),
-            seal: SealPolicy { data: profile.download.data, ..seal },
-            ..profile.download
-        },
-        password: profile.password,
-    }
-}
-
-/// The setup of a profile, with its own object dictionary.
-macro_rules! setup {
-    ($name:literal, $programs:literal, $layout:ident, $profile:expr, $seal:expr) => {{
-        const PROFILE: Profile = $profile;
-        static ENTRIES: [Entry; entry_count($programs, PROFILE.extras)] =
-            entries($programs, PROFILE.extras).entries();
-        Setup {
-            name: $name,
-            layout: &$layout,
-            profile: PROFILE,
-            config: config(&PROFILE, &$layout, &ENTRIES, $seal),
-        }
-    }};
-}
-
-/// The standard profile, one program.
-pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD, SEAL);
-/// The standard profile, two programs.
-pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD, SEAL);
-/// A product with a lowest counter of 6 in its bootloader.
-pub static CONSTANT_1: Setup =
-    setup!("CONSTANT_1", 1, ONE, Profile::STANDARD, SealPolicy { counter: 6, ..SEAL });
-/// A product that raises the counter at the confirmation of a program.
-pub static CONFIRMED_1: Setup =
-    setup!("CONFIRMED_1", 1, ONE, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
-/// The same with two programs.
-pub static CONFIRMED_2: Setup =
-    setup!("CONFIRMED_2", 2, TWO, Profile::STANDARD, SealPolicy { counter_with_confirmation: true, ..SEAL });
-/// A password for each program, which makes it invalid; the program starts by itself.
-pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY, SEAL);
-/// A password, and program 2 is data.
-pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT, SEAL);
-
-impl Setup {
-    /// The number of programs.
-    #[must_use]
-    pub fn programs(&self) -> u8 {
-        self.layout.programs.len() as u8
-    }
-
-    /// The flash of a program.
-    #[must_use]
-    pub fn region(&self, program: u8) -> Region {
-        self.layout.programs[usize::from(program) - 1]
-    }
-
-    /// Whether a program number is for data of the application.
-    #[must_use]
-    pub fn is_data(&self, program: u8) -> bool {
-        self.profile.download.data == Some(program)
-    }
-}
+pub use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE, START};
+pub use kit::rig::sealed::*;
+pub use kit::rig::{block, crc32, Setup, PRODUCT_CODE, REVISION, UNIQUE_ID, VENDOR_ID};
 
 // --- keys and files
 
@@ -233,30 +114,7 @@ pub fn seal(sealer: &Sealer<'_>, image: &[u8]) -> Vec<u8> {
 /// A program for this region: vectors, a label, and distinct bytes.
 #[must_use]
 pub fn image(region: Region, len: usize, seed: u8) -> Vec<u8> {
-    let mut bytes: Vec<u8> = (0..len).map(|i| (i as u8).wrapping_mul(31) ^ (i >> 8) as u8 ^ seed).collect();
-    bytes[..4].copy_from_slice(&0x2001_FFC0_u32.to_le_bytes());
-    bytes[4..8].copy_from_slice(&(region.base + 0x101).to_le_bytes());
-    let at = label::OFFSET as usize;
-    if len >= at + label::SIZE {
-        bytes[at..at + label::SIZE].copy_from_slice(&Label::new(VENDOR_ID, PRODUCT_CODE, seed.into()).emit());
-    }
-    bytes
-}
-
-/// The CRC-32 of the CRC catalogue (CRC-32/ISO-HDLC).
-#[must_use]
-pub fn crc32(bytes: &[u8]) -> u32 {
-    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
-}
-
-/// A block of a block file (SYS TEC manual L-1112d_10, chapter 5.1).
-#[must_use]
-pub fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
-    let header = [number, address, data.len() as u32];
-    let mut block: Vec<u8> = header.iter().flat_map(|word| word.to_le_bytes()).collect();
-    block.extend(data);
-    block.extend(crc32(&block).to_le_bytes());
-    block
+    program(region, PRODUCT_CODE, len, seed)
 }
 
 /// A sealed image in its parts, which tests can change.
@@ -372,44 +230,6 @@ impl Parts {
 }
 
 // --- the device
-
-/// What the rest of a device uses of its bootloader.
-pub trait Node: Objects + LssDevice {
-    /// Runs one bounded step; returns whether there was no work.
-    fn is_idle_after_step(&mut self) -> bool;
-    /// [`Bootloader::take_boot_request`].
-    fn take_boot_request(&mut self) -> Option<BootRequest>;
-    /// [`Bootloader::confirm`].
-    fn confirm(&mut self, program: u8);
-    /// [`Bootloader::is_finishing`].
-    fn is_finishing(&mut self) -> bool;
-    /// [`Bootloader::set_time`].
-    fn set_time(&mut self, now: Instant);
-}
-
-impl<F: Flash, P: Parameters, const PROGRAMS: usize> Node for Bootloader<'_, F, P, PROGRAMS> {
-    fn is_idle_after_step(&mut self) -> bool {
-        self.step() == Step::Idle
-    }
-
-    fn take_boot_request(&mut self) -> Option<BootRequest> {
-        Bootloader::take_boot_request(self)
-    }
-
-    fn confirm(&mut self, program: u8) {
-        Bootloader::confirm(self, program);
-    }
-
-    fn is_finishing(&mut self) -> bool {
-        Bootloader::is_finishing(self)
-    }
-
-    fn set_time(&mut self, now: Instant) {
-        Bootloader::set_time(self, now);
-    }
-}
-
-const BOARD_NODE: NodeParameters = NodeParameters { id: NodeId::new(5), bit_rate: BitRate::K125 };
 
 /// A device without power, or with power in [`run`](Self::run).
 pub struct Device {
@@ -555,15 +375,6 @@ impl Device {
     }
 }
 
-/// CLEAR of 1F51h.
-pub const CLEAR: u8 = 0x03;
-/// START of 1F51h.
-pub const START: u8 = 0x01;
-/// SET_SIGNATURE of 1F51h.
-pub const SET_SIGNATURE: u8 = 0x83;
-/// CLR_SIGNATURE of 1F51h.
-pub const CLR_SIGNATURE: u8 = 0x84;
-
 /// A host that talks to the bootloader.
 pub struct Host<'a> {
     /// The device.
@@ -653,17 +464,7 @@ impl Host<'_> {
     /// # Errors
     /// The abort.
     pub fn go_on(&mut self, program: u8, data: &[u8], piece: usize) -> Result<(), AbortCode> {
-        let at = Address::new(0x1F50, program);
-        for bytes in data.chunks(piece) {
-            while self.node.download_space(at, false) < bytes.len() {
-                assert!(!self.node.is_idle_after_step(), "there is never room");
-            }
-            if let Err(abort) = self.node.download_data(at, bytes) {
-                self.node.download_cancel(at);
-                return Err(abort);
-            }
-        }
-        Ok(())
+        go_on(&mut *self.node, program, data, piece)
     }
 
     /// Ends a download without waiting for the result.

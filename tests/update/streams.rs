@@ -8,6 +8,7 @@ use coflash_core::device::{Doing, Transfers};
 use emulator::machine::{FlashTimes, Options};
 use emulator::time::{Span, Time};
 use kit::ihex::intel_hex;
+use kit::rig::crc32;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
@@ -31,11 +32,6 @@ fn board_at_1_mbit(options: Options) -> Bench {
     bench.power_on();
     bench.run_ms(50);
     bench
-}
-
-/// CRC-32/ISO-HDLC, by the crate of that name.
-fn crc32(bytes: &[u8]) -> u32 {
-    crc::Crc::<u32>::new(&crc::CRC_32_ISO_HDLC).checksum(bytes)
 }
 
 /// A master that only supports CiA 302-3: clear, one download, and 1F51h = 2 directly after it,

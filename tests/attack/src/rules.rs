@@ -1,11 +1,11 @@
 //! The rules that a device keeps.
 
+use kit::bench::CLEAR;
 use kit::rig::Setup;
 use shared_abi::renewal::{Origin, State};
 
 use crate::device::{Action, Seen, Stored};
 use crate::files::{may_run, Content};
-use crate::script::CLEAR;
 
 /// What was before an action.
 pub struct History {

@@ -1,6 +1,7 @@
 //! The actions of an attack.
 
 use boot_core::flash::FlashFault;
+use kit::bench::{CLEAR, SET_SIGNATURE as CONFIRM, START};
 use kit::model::Cut;
 use kit::random::Random;
 use kit::rig::{crc32, Setup};
@@ -10,9 +11,6 @@ use crate::device::{Action, Seen, Trouble};
 use crate::files::{file, Content, Extent};
 
 /// Commands of 1F51h.
-pub const CLEAR: u8 = 3;
-const START: u8 = 1;
-const CONFIRM: u8 = 0x83;
 const COMMANDS: [u8; 9] = [0, START, 2, CLEAR, CLEAR, 0x80, CONFIRM, CONFIRM, 0x84];
 const IMAGES: [u8; 6] = [1, 1, 2, 2, 4, 5];
 const EXTENTS: [Extent; 4] = [Extent::Small, Extent::Small, Extent::Large, Extent::Untold];

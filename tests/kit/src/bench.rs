@@ -13,6 +13,9 @@ use shared_abi::geometry::Region;
 use shared_abi::layout::Layout;
 
 use crate::boot::{leaked, Boot};
+use crate::rig::go_on;
+pub use crate::rig::{block, crc32};
+
 use crate::model::{until_power_cut, Cut, ModelFlash, CHIP, ONE_PROGRAM};
 pub use crate::rig::{block, crc32};
 
@@ -83,12 +86,7 @@ impl<'f> Bench<'f> {
     }
 
     pub fn settle(&mut self) {
-        for _ in 0..1_000_000 {
-            if self.node.step() == Step::Idle {
-                return;
-            }
-        }
-        panic!("the work does not end");
+        assert!((0..1_000_000).any(|_| self.node.step() == Step::Idle), "the work does not end");
     }
 
     pub fn word(&mut self, at: Address) -> u32 {
@@ -108,12 +106,7 @@ impl<'f> Bench<'f> {
     /// The first bytes of a program, in segments.
     pub fn begin(&mut self, data: &[u8]) {
         self.node.download_start(DATA, None).unwrap();
-        for segment in data.chunks(7) {
-            while self.node.download_space(DATA, false) < segment.len() {
-                assert_ne!(self.node.step(), Step::Idle, "there is never room");
-            }
-            self.node.download_data(DATA, segment).unwrap();
-        }
+        go_on(&mut self.node, 1, data, 7).unwrap();
     }
 
     pub fn status(&mut self) -> u32 {
@@ -157,15 +150,7 @@ impl<'f> Bench<'f> {
     /// The same without the work that is left after the download.
     pub fn pour(&mut self, data: &[u8], size: Option<u32>, pieces: usize) -> Result<(), AbortCode> {
         self.node.download_start(DATA, size)?;
-        for segment in data.chunks(pieces) {
-            while self.node.download_space(DATA, false) < segment.len() {
-                assert_ne!(self.node.step(), Step::Idle, "there is never room");
-            }
-            if let Err(abort) = self.node.download_data(DATA, segment) {
-                self.node.download_cancel(DATA);
-                return Err(abort);
-            }
-        }
+        go_on(&mut self.node, 1, data, pieces)?;
         self.node.download_end(DATA)
     }
 
@@ -202,9 +187,13 @@ pub fn last(program: &[u8]) -> Vec<u8> {
 }
 
 pub fn block_file(program: &[u8], chunk: usize) -> Vec<Vec<u8>> {
+    block_file_at(program, PROGRAM.base, chunk)
+}
+
+pub fn block_file_at(program: &[u8], base: u32, chunk: usize) -> Vec<Vec<u8>> {
     let mut file = vec![block(0, 0, &[0; 8])];
     for (i, data) in program.chunks(chunk).enumerate() {
-        file.push(block(1 + i as u32, PROGRAM.base + (i * chunk) as u32, data));
+        file.push(block(1 + i as u32, base + (i * chunk) as u32, data));
     }
     file.push(last(program));
     file

@@ -38,7 +38,7 @@ pub struct Setup {
     pub layout: &'static Layout,
     /// Whether it takes sealed images: with the keys in its flash, these alone.
     pub takes_sealed: bool,
-    config: Config,
+    pub config: Config,
 }
 
 pub const VENDOR_ID: u32 = 0x0000_0319;
@@ -47,22 +47,31 @@ pub const PRODUCT_CODE: u32 = 0x0004_0001;
 static ONE: Layout = ONE_PROGRAM;
 static TWO: Layout = TWO_PROGRAMS;
 
-/// The setup of a profile, with its own object dictionary.
+/// 1018h/3 of a device with sealed images: hardware revision 2.
+pub const REVISION: u32 = 0x0001_0002;
+/// Of its chip.
+pub const UNIQUE_ID: [u8; 12] = *b"unique id 96";
+
+const SEAL: SealPolicy = SealPolicy {
+    vendor_id: VENDOR_ID,
+    product_code: PRODUCT_CODE,
+    revision: REVISION,
+    unique_id: || UNIQUE_ID,
+    ..SealPolicy::NONE
+};
+
+/// The setup of a profile, with its own object dictionary; for sealed images with the values for them.
 macro_rules! setup {
     ($name:literal, $programs:literal, $layout:expr, $profile:expr) => {
-        setup!($name, $programs, $layout, $profile, false)
+        setup!($name, $programs, $layout, $profile, SealPolicy::NONE)
     };
-    ($name:literal, $programs:literal, $layout:expr, $profile:expr, $sealed:literal) => {{
+    ($name:literal, $programs:literal, $layout:expr, $profile:expr, $seal:expr) => {{
         const PROFILE: Profile = $profile;
         static ENTRIES: [Entry; entry_count($programs, PROFILE.extras)] =
             entries($programs, PROFILE.extras).entries();
-        Setup {
-            name: $name,
-            profile: PROFILE,
-            layout: &$layout,
-            takes_sealed: $sealed,
-            config: config(&PROFILE, &$layout, &ENTRIES, $sealed),
-        }
+        let takes_sealed = $seal.vendor_id != 0;
+        let config = config(&PROFILE, &$layout, &ENTRIES, $seal);
+        Setup { name: $name, profile: PROFILE, layout: &$layout, takes_sealed, config }
     }};
 }
 
@@ -70,7 +79,7 @@ const fn config(
     profile: &Profile,
     layout: &'static Layout,
     entries: &'static [Entry],
-    takes_sealed: bool,
+    seal: SealPolicy,
 ) -> Config {
     Config {
         entries,
@@ -82,7 +91,7 @@ const fn config(
             heartbeat_ms: 0,
             vendor_id: VENDOR_ID,
             product_code: PRODUCT_CODE,
-            revision: 0,
+            revision: seal.revision,
             serial_number: 0,
         },
         node_id: profile.node_id,
@@ -91,19 +100,12 @@ const fn config(
         boot_up_emergency: false,
         download: Policy {
             identity: Some((VENDOR_ID, PRODUCT_CODE)),
-            renewal: if profile.extras.bootloader.is_none() {
-                None
-            } else if takes_sealed {
-                Some(&SEALED_RENEWAL)
-            } else {
-                Some(&RENEWAL)
+            renewal: match (profile.extras.bootloader, seal.vendor_id) {
+                (None, _) => None,
+                (Some(_), 0) => Some(&RENEWAL),
+                (Some(_), _) => Some(&SEALED_RENEWAL),
             },
-            seal: SealPolicy {
-                vendor_id: VENDOR_ID,
-                product_code: PRODUCT_CODE,
-                data: profile.download.data,
-                ..SealPolicy::NONE
-            },
+            seal: SealPolicy { data: profile.download.data, ..seal },
             ..profile.download
         },
         password: profile.password,
@@ -152,9 +154,28 @@ pub static RENEWALS: [Setup; 10] = [
     setup!("ESACADEMY_2", 2, renewal::TWO, renews(Profile::ESACADEMY, 3)),
     setup!("LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3)),
     setup!("LIFT_2", 2, renewal::TWO, renews(Profile::LIFT, 3)),
-    setup!("SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), true),
-    setup!("SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), true),
+    setup!("SEALED_STANDARD_2", 2, renewal::TWO, renews(Profile::STANDARD, 3), SEAL),
+    setup!("SEALED_LIFT_1", 1, renewal::LAYOUT, renews(Profile::LIFT, 3), SEAL),
 ];
+
+/// Devices with sealed images.
+pub mod sealed {
+    use super::*;
+
+    pub static STANDARD_1: Setup = setup!("STANDARD_1", 1, ONE, Profile::STANDARD, SEAL);
+    pub static STANDARD_2: Setup = setup!("STANDARD_2", 2, TWO, Profile::STANDARD, SEAL);
+    /// A product with a lowest counter of 6 in its bootloader.
+    pub static CONSTANT_1: Setup =
+        setup!("CONSTANT_1", 1, ONE, Profile::STANDARD, SealPolicy { counter: 6, ..SEAL });
+    const CONFIRMED: SealPolicy = SealPolicy { counter_with_confirmation: true, ..SEAL };
+    /// A product that raises the counter at the confirmation of a program.
+    pub static CONFIRMED_1: Setup = setup!("CONFIRMED_1", 1, ONE, Profile::STANDARD, CONFIRMED);
+    pub static CONFIRMED_2: Setup = setup!("CONFIRMED_2", 2, TWO, Profile::STANDARD, CONFIRMED);
+    /// A password for each program, which makes it invalid; the program starts by itself.
+    pub static ESACADEMY_2: Setup = setup!("ESACADEMY_2", 2, TWO, Profile::ESACADEMY, SEAL);
+    /// A password, and program 2 is data.
+    pub static LIFT_2: Setup = setup!("LIFT_2", 2, TWO, Profile::LIFT, SEAL);
+}
 
 impl Setup {
     /// What its resident part has for a RAM image.
@@ -205,6 +226,7 @@ pub trait Node: Objects + LssDevice {
     fn is_idle_after_step(&mut self) -> bool;
     fn is_finishing(&mut self) -> bool;
     fn take_boot_request(&mut self) -> Option<BootRequest>;
+    fn confirm(&mut self, program: u8);
     fn set_time(&mut self, now: Instant);
 }
 
@@ -221,9 +243,31 @@ impl<F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Node for Bootlo
         Bootloader::take_boot_request(self)
     }
 
+    fn confirm(&mut self, program: u8) {
+        Bootloader::confirm(self, program);
+    }
+
     fn set_time(&mut self, now: Instant) {
         Bootloader::set_time(self, now);
     }
+}
+
+/// Sends more bytes of a transfer to 1F50h in pieces of this size, and waits for room. An error ends the transfer,
+/// as in the SDO server.
+pub fn go_on(
+    node: &mut (impl Node + ?Sized),
+    program: u8,
+    data: &[u8],
+    piece: usize,
+) -> Result<(), AbortCode> {
+    let at = Address::new(0x1F50, program);
+    for bytes in data.chunks(piece) {
+        while node.download_space(at, false) < bytes.len() {
+            assert!(!node.is_idle_after_step(), "there is never room");
+        }
+        node.download_data(at, bytes).inspect_err(|_| node.download_cancel(at))?;
+    }
+    Ok(())
 }
 
 /// The stored state that would be found after a reset.
@@ -370,18 +414,8 @@ impl Rig {
 
     /// Begins a download and sends these bytes of it.
     pub fn begin(&mut self, program: u8, size: Option<u32>, data: &[u8]) -> Result<(), AbortCode> {
-        let at = Address::new(0x1F50, program);
-        self.node.download_start(at, size)?;
-        for segment in data.chunks(7) {
-            while self.node.download_space(at, false) < segment.len() {
-                assert!(!self.node.is_idle_after_step(), "there is never room");
-            }
-            if let Err(abort) = self.node.download_data(at, segment) {
-                self.node.download_cancel(at);
-                return Err(abort);
-            }
-        }
-        Ok(())
+        self.node.download_start(Address::new(0x1F50, program), size)?;
+        go_on(&mut *self.node, program, data, 7)
     }
 
     pub fn end(&mut self, program: u8) -> Result<(), AbortCode> {

@@ -21,6 +21,7 @@ use shared_abi::layout::Layout;
 
 use kit::boot::Boot;
 use kit::model::{ModelFlash, CHIP, TWO_PROGRAMS};
+use kit::rig::go_on;
 
 /// Seed of the program before an update.
 pub const OLD: u8 = 0xA3;
@@ -314,15 +315,7 @@ impl Host<'_, '_> {
     pub fn block(&mut self, program: u8, block: &[u8]) -> Result<(), String> {
         let at = Address::new(0x1F50, program);
         self.node.download_start(at, Some(block.len() as u32)).map_err(abort_text)?;
-        for segment in block.chunks(7) {
-            while self.node.download_space(at, false) < segment.len() {
-                self.node.step();
-            }
-            if let Err(abort) = self.node.download_data(at, segment) {
-                self.node.download_cancel(at);
-                return Err(abort_text(abort));
-            }
-        }
+        go_on(&mut self.node, program, block, 7).map_err(abort_text)?;
         self.node.download_end(at).map_err(abort_text)?;
         self.settle();
         self.ended(program)

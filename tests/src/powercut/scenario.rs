@@ -5,17 +5,15 @@ use boot_core::crc32;
 use boot_core::store::Key;
 use boot_core::store::NodeParameters;
 
+use kit::bench::{CLEAR, CLR_SIGNATURE, SET_SIGNATURE};
 use kit::ihex::intel_hex;
+use kit::rig::{block, words};
 
 use super::device::{image, Bug, Device, Outcome, BOARD_NODE, LAYOUT, NEW, OLD, PRODUCT_CODE, VENDOR_ID};
 
 const START_OLD: Outcome = Outcome::Runs(OLD);
 const START_NEW: Outcome = Outcome::Runs(NEW);
 const STAY: Outcome = Outcome::Bootloader;
-
-const CLEAR: u8 = 0x03;
-const SET_SIGNATURE: u8 = 0x83;
-const CLR_SIGNATURE: u8 = 0x84;
 
 /// The permitted states after the power returns.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -95,20 +93,6 @@ fn with_second(outcomes: &[Outcome], second: &[Option<(u8, bool)>]) -> Allowed {
 
 // --- block files
 // -----------------------------------------------------------------------------------------------------
-
-fn block(number: u32, address: u32, data: &[u8]) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    for word in [number, address, data.len() as u32] {
-        bytes.extend(word.to_le_bytes());
-    }
-    bytes.extend(data);
-    bytes.extend(crc32(&bytes).to_le_bytes());
-    bytes
-}
-
-fn words(words: &[u32]) -> Vec<u8> {
-    words.iter().flat_map(|word| word.to_le_bytes()).collect()
-}
 
 /// The blocks of a program; `crc` is the CRC in the last one.
 fn blocks(number: u8, image: &[u8], product_code: u32, crc: u32) -> Vec<Vec<u8>> {

@@ -386,6 +386,9 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             }
             Some(Event::Stored { program, ends }) => {
                 let (record, partial) = load(&self.parameters, flash, program, &self.rights);
+                if P::RENEWS {
+                    self.note_record(program, record);
+                }
                 if let Some(state) = find::<P>(&mut self.programs, program) {
                     state.record = record;
                     state.date = date(&self.parameters, flash, program, state.region, record);
@@ -399,9 +402,6 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
                     if ends && open && is_same {
                         state.session = Session::Idle;
                     }
-                }
-                if P::RENEWS {
-                    self.note_occupied();
                 }
                 if ends {
                     self.end(program, Ok(()));

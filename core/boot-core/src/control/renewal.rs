@@ -18,7 +18,7 @@ use crate::refusal::Refusal;
 use crate::renewal::{check, header, identification, Known, Places};
 use crate::resume::Partial;
 use crate::session::Session;
-use crate::store::{Parameters, RenewalRecord};
+use crate::store::{Parameters, ProgramRecord, RenewalRecord};
 
 /// Of a device without renewal.
 const NO_HOST: Host = Renewal::NONE.host(0, 0);
@@ -74,7 +74,8 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let host = policy.host(self.parameters.services(), self.parameters.facts());
         let layout = self.layout;
         self.programmer.renewing = Some(Renewing { layout, policy, host, record: None, is_occupied: false });
-        self.note_occupied();
+        let last = layout.programs.len() as u8;
+        self.note_record(last, load(&self.parameters, flash, last, &self.rights).0);
         let record = self.image_record(flash);
         self.set_record(record);
         let Some(record) = record else { return };
@@ -233,11 +234,12 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         Err(abort)
     }
 
-    /// Takes note whether the last program lies in staging: its record has changed.
-    pub(super) fn note_occupied(&mut self) {
-        let (program, _) = self.installed(self.layout.programs.len() as u8);
-        if let Some(renewing) = &mut self.programmer.renewing {
-            renewing.is_occupied = program.end() > renewing.places().staging.base;
+    /// Takes note whether the last program reaches into staging, from its record as stored.
+    pub(super) fn note_record(&mut self, program: u8, record: Option<ProgramRecord>) {
+        let Some(renewing) = &mut self.programmer.renewing else { return };
+        if let Some(region) = self.layout.program(program).filter(|_| program == renewing.last_program()) {
+            let size = record.map_or(0, |record| record.size);
+            renewing.is_occupied = region.base.saturating_add(size) > renewing.places().staging.base;
         }
     }
 
@@ -255,16 +257,18 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         known.origin == Origin::Trial && !is_confirmed
     }
 
-    /// The flash of staging is about to be erased for a new image: a download of the last program whose stored
-    /// progress has passed its start does not go on afterwards.
+    /// The flash of staging is about to be erased for a new image: the last program's open download ends, and does
+    /// not go on after a cut if its stored progress has passed the start of staging. Its record stays.
     pub(super) fn drop_partial<F: Flash>(&mut self, flash: &F) {
         let Some(Places { staging, .. }) = Places::of(self.layout) else { return };
         let last = self.layout.programs.len() as u8;
         let (_, stored) = load(&self.parameters, flash, last, &self.rights);
+        let Some(state) = find::<P>(&mut self.programs, last) else { return };
+        if matches!(state.session, Session::Open { .. }) {
+            state.session = Session::Failed;
+        }
         if stored.start() > staging.base {
-            if let Some(state) = find::<P>(&mut self.programs, last) {
-                state.partial = Partial::NONE;
-            }
+            state.partial = Partial::NONE;
             self.programmer.void(last);
         }
     }

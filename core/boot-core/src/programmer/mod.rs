@@ -336,11 +336,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             && program == BOOTLOADER
             && !self.is_installing()
             && self.renewing.as_ref().is_some_and(Renewing::is_confirmed);
-        if is_kept {
-            Err(FlashError::Busy)
-        } else {
-            Ok(())
-        }
+        (!is_kept).then_some(()).ok_or(FlashError::Busy)
     }
 
     /// The two places of a RAM image.

@@ -8,7 +8,8 @@ use boot_core::program::verify;
 use boot_core::store::{Journal, RenewalRecord};
 use canopen::od::{Address, Entry, Objects};
 use canopen::{AbortCode, Instant};
-use kit::bench::{self, block_file, node, program, DEVICE};
+use kit::bench::{self, block_file_at, node, program, CLEAR, DEVICE, START};
+use kit::bench::{CLR_SIGNATURE as WITHDRAW, SET_SIGNATURE as CONFIRM};
 use kit::boot::{leaked, Boot};
 use kit::ihex;
 use kit::model::{until_power_cut, Cut, ModelFlash, CHIP};
@@ -16,6 +17,7 @@ use kit::random::Random;
 use kit::renewal::{
     crc_of, image, image_of, loads, BOARD, HOME, HOST, LAYOUT, PROGRAM, RENEWAL, SOUND, STAGING,
 };
+use kit::rig::{go_on, Rig, RENEWALS};
 use shared_abi::abilities::Abilities;
 use shared_abi::boot_report::BootReport;
 use shared_abi::geometry::Region;
@@ -44,10 +46,6 @@ impl Choices for Renews {
 /// The journal of a device with renewal.
 type Store = kit::boot::Store<true, true>;
 
-const CLEAR: u8 = 3;
-const START: u8 = 1;
-const CONFIRM: u8 = 0x83;
-const WITHDRAW: u8 = 0x84;
 const BUSY: u32 = 0x86;
 const NOT_CLEARED: u32 = 0x08;
 const FORMAT: u32 = 0x04;
@@ -177,31 +175,12 @@ fn program_of(size: usize) -> Vec<u8> {
     image
 }
 
-/// A block file for another address than that of the model's program.
-fn block_file_at(image: &[u8], base: u32, chunk: usize) -> Vec<Vec<u8>> {
-    let mut file = block_file(image, chunk);
-    for block in &mut file {
-        let word = |at: usize| u32::from_le_bytes(block[at..at + 4].try_into().unwrap());
-        let (number, address) = (word(0), word(4));
-        if number != 0 && number != u32::MAX {
-            let data = block[12..block.len() - 4].to_vec();
-            *block = bench::block(number, address - bench::PROGRAM.base + base, &data);
-        }
-    }
-    file
-}
-
 /// A running bootloader.
-struct Node<'f, C: Choices = Renews>(Bootloader<'static, &'f mut ModelFlash, Store, 2, C>);
+struct Node<'f>(Bootloader<'static, &'f mut ModelFlash, Store, 2, Renews>);
 
-impl<C: Choices> Node<'_, C> {
+impl Node<'_> {
     fn settle(&mut self) {
-        for _ in 0..1_000_000 {
-            if self.0.step() == Step::Idle {
-                return;
-            }
-        }
-        panic!("the work does not end");
+        assert!((0..1_000_000).any(|_| self.0.step() == Step::Idle), "the work does not end");
     }
 
     fn read<const LEN: usize>(&mut self, index: u16, sub: u8) -> [u8; LEN] {
@@ -240,15 +219,7 @@ impl<C: Choices> Node<'_, C> {
     fn push(&mut self, program: u8, block: &[u8]) -> Result<(), AbortCode> {
         let at = Address::new(0x1F50, program);
         self.0.download_start(at, Some(block.len() as u32))?;
-        for segment in block.chunks(7) {
-            while self.0.download_space(at, false) < segment.len() {
-                assert_ne!(self.0.step(), Step::Idle, "there is never room");
-            }
-            if let Err(abort) = self.0.download_data(at, segment) {
-                self.0.download_cancel(at);
-                return Err(abort);
-            }
-        }
+        go_on(&mut self.0, program, block, 7)?;
         self.0.download_end(at)
     }
 
@@ -903,35 +874,20 @@ fn commands_by_themselves_change_nothing() {
 /// A device with a password takes a new bootloader after it, as it takes a program.
 #[test]
 fn a_password_opens_the_bootloader_too() {
-    use boot_core::profile::Profile;
-
-    const LOCKED: Extras = Extras { bootloader: Some(N), ..Profile::LIFT.extras };
-    struct Locked;
-    impl Choices for Locked {
-        const EXTRAS: Extras = LOCKED;
+    for setup in RENEWALS.iter().filter(|setup| setup.password(1).is_some() && !setup.takes_sealed) {
+        let number = setup.profile.extras.bootloader.unwrap();
+        let mut flash = ModelFlash::new(&CHIP);
+        flash.poke(HOME.base, &image(0x200, 1));
+        let mut rig = Rig::on(setup, 512, flash);
+        let blocks = block_file_at(&image(0x300, 2), HOME.base, 200);
+        assert_eq!(rig.send(number, &blocks[0]), Err(AbortCode::DEVICE_STATE), "{}", setup.name);
+        assert_eq!(rig.status(number), 0x84, "{}", setup.name);
+        rig.unlock(number).unwrap();
+        for block in blocks {
+            assert_eq!(rig.send(number, &block), Ok(()), "{}", setup.name);
+            rig.settle();
+        }
+        let [state, ..] = rig.word(0x2007, 9).to_le_bytes();
+        assert_eq!((rig.status(number), state), (0, State::Staged as u8), "{}", setup.name);
     }
-    static OBJECTS: [Entry; entry_count(1, LOCKED)] = entries(1, LOCKED).entries();
-    static LIFT: Config = Config {
-        entries: &OBJECTS,
-        download: Policy { renewal: Some(&RENEWAL), ..Profile::LIFT.download },
-        password: Profile::LIFT.password,
-        ..CONFIG_OF_LIFT
-    };
-    const CONFIG_OF_LIFT: Config = Config { layout: &LAYOUT, device: DEVICE, ..bench::CONFIG };
-    let (old, new) = (image(0x200, 1), image(0x300, 2));
-    let mut flash = ModelFlash::new(&CHIP);
-    flash.poke(HOME.base, &old);
-    let journal = kit::boot::Store(Journal::open(&flash, LAYOUT.parameters));
-    let (buffer, sealed) = leaked(512);
-    let boot = Boot::new(&LIFT, node()).with(journal, &mut flash, buffer, sealed);
-    let mut node = Node::<Locked>(boot);
-    node.settle();
-    let first = &block_file_at(&new, HOME.base, 200)[0];
-    assert_eq!(node.send(N, first), Err(AbortCode::DEVICE_STATE));
-    assert_eq!(node.word(0x1F57), 0x84);
-    node.0.write(Address::new(0x6005, 1), Profile::LIFT.password).unwrap();
-    for block in block_file_at(&new, HOME.base, 200) {
-        assert_eq!((node.send(N, &block), node.word(0x1F57)), (Ok(()), 0));
-    }
-    assert_eq!(node.progress().state, State::Staged);
 }
