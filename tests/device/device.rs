@@ -11,7 +11,7 @@ use coflash_core::update::{flash, Event, FlashOptions};
 use coflash_core::Error;
 use emulator::machine::{Options, ResetCause, Stop};
 use emulator::time::{Span, Time};
-use kit::rig::{block, crc32};
+use kit::rig::block;
 
 const DATA: Address = Address::new(0x1F50, 1);
 const CONTROL: Address = Address::new(0x1F51, 1);
