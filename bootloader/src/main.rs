@@ -310,7 +310,7 @@ mod app {
             return;
         }
         let status = can.lock(line::status);
-        let finishing = bootloader.lock(|bootloader| {
+        let (finishing, compacting) = bootloader.lock(|bootloader| {
             bootloader.set_time(now);
             debugger.with(bootloader, |device| {
                 slave.observe(status, now, device);
@@ -327,8 +327,15 @@ mod app {
                 while let Some(frame) = next {
                     log::received(&frame);
                     // The filters pass only NMT and frames for this device or for layer setting
-                    // services (LSS). All but NMT, and what is not answered, end the rescue window.
-                    if frame.cob_id() != Some(CobId::NMT) && !slave.ignores(&frame) {
+                    // services (LSS). All but NMT, and what is not answered, end the rescue window. A
+                    // master that greets each device after its boot-up must not keep the program from
+                    // starting: while the store is compacted, only 1F50h and 1F51h do.
+                    let is_window = held.is_some_and(|(_, ms)| ms > 0);
+                    let is_control = matches!(frame.exactly::<8>(), Some([_, 0x50 | 0x51, 0x1F, ..]));
+                    if frame.cob_id() != Some(CobId::NMT)
+                        && !slave.ignores(&frame)
+                        && (is_window || is_control)
+                    {
                         *held = None;
                     }
                     if slave.handle(&frame, now, device) {
@@ -344,11 +351,12 @@ mod app {
                 let ends = PRODUCT.renewal && request == BootRequest::Renewal(TrialStep::Late);
                 *pending_reset = PendingReset { wanted: true, request, at: ends.then_some(now) };
             }
-            bootloader.is_finishing()
+            (bootloader.is_finishing(), bootloader.is_compacting())
         });
         if let Some((program, window_ms)) = *held {
-            // An installation that a cut has left is completed first.
-            if now.has_reached(Instant::from_millis(window_ms.into())) && !finishing {
+            // An installation that a cut has left is completed first, and the store gets room.
+            let is_over = now.has_reached(Instant::from_millis(window_ms.into()));
+            if is_over && !finishing && !compacting {
                 // The program starts even if no other node acknowledges the boot-up.
                 *pending_reset =
                     PendingReset { wanted: true, request: BootRequest::Resume(program), at: Some(now) };

@@ -135,6 +135,11 @@ impl Parameters for Store {
         unsafe { (services().store)(&mut *self.0, key.0, &value) };
     }
 
+    fn compact(&mut self, used: u32) -> bool {
+        // SAFETY: the state comes from `open`.
+        unsafe { (services().compact)(&mut *self.0, used) != 0 }
+    }
+
     fn next<F: Flash>(&mut self, _flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
         let result = match outcome {
             Ok(()) => OperationResult::Done,

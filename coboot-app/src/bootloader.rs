@@ -71,9 +71,8 @@ impl Bootloader {
     /// reset on. The node-ID is 1 to 127, or `None` for a device that waits for layer setting
     /// services. The bit rate is in bit/s; 0 means that the device detects it by listening.
     ///
-    /// Writes flash. The whole chip waits some 100 µs for it. Once in several hundred stores a
-    /// sector of 16 KiB is erased, and the chip waits up to half a second (datasheet DS8626 table
-    /// 40).
+    /// Writes flash: each fetch from it waits for 16 µs at a time. While few places of the journal are free, it
+    /// is refused with [`Status::Full`]; the next start makes room.
     ///
     /// # Errors
     /// The error of the bootloader. A sealed device stores these values in the bootloader only, and

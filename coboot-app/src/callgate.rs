@@ -64,7 +64,7 @@ impl<E: Enter> Callgate<E> {
     /// Stores node-ID and bit rate; they take effect at the next reset.
     ///
     /// # Errors
-    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`] or
+    /// [`CallgateError::Refused`] with [`Status::BadArgument`], [`Status::Busy`], [`Status::Full`] or
     /// [`Status::Failed`].
     pub fn store_node(&self, mut node: NodeArgs) -> Result<(), CallgateError> {
         self.call(Selector::StoreNode, (&raw mut node).cast())

@@ -47,11 +47,13 @@ pub enum Reason {
     Renewal = 12,
     /// The NRST pin has reset the device twice within half a second.
     TwoResets = 13,
+    /// A program could start, and waits until the stored values are compacted.
+    Compaction = 14,
 }
 
 impl Reason {
     /// All reasons, in the order of their numbers.
-    pub const ALL: [Self; 14] = [
+    pub const ALL: [Self; 15] = [
         Self::Requested,
         Self::Strap,
         Self::CrashLoop,
@@ -66,6 +68,7 @@ impl Reason {
         Self::Forbidden,
         Self::Renewal,
         Self::TwoResets,
+        Self::Compaction,
     ];
 
     /// The reason with this number; `None` for a number from a later version.
@@ -87,9 +90,9 @@ pub struct BootReport {
     pub program_reset: u8,
     /// Resets in a row by which a program ended and that nobody requested; 255 for more.
     pub crash_resets: u8,
-    /// The program that starts when the rescue window is over; 0 for none.
+    /// The program that starts when the rescue window or the compaction is over; 0 for none.
     pub held_program: u8,
-    /// Length of the rescue window, in ms.
+    /// Length of the rescue window, in ms; 0 for none.
     pub window_ms: u16,
     /// The write of 1F51h that the application received and the bootloader answers; its node-ID is
     /// 0 if there is none.
@@ -220,7 +223,7 @@ mod tests {
         for (number, reason) in (0..).zip(Reason::ALL) {
             assert_eq!((reason as u8, Reason::from_byte(number)), (number, Some(reason)));
         }
-        assert_eq!(Reason::from_byte(14), None);
+        assert_eq!(Reason::from_byte(15), None);
     }
 
     #[test]

@@ -18,7 +18,7 @@ pub const MAGIC: u32 = u32::from_le_bytes(*b"CBI2");
 
 /// Version of the services that the resident part has ([`crate::services`]). It grows with each entry
 /// that is added to their table.
-pub const SERVICES_VERSION: u32 = 1;
+pub const SERVICES_VERSION: u32 = 2;
 
 /// What a device has for a RAM image.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -42,6 +42,10 @@ pub struct Services {
     pub sector_at: unsafe extern "C" fn(u32, *mut [u32; 3]) -> u32,
     /// What the resident part decides by.
     pub facts: &'static Facts,
+    /// Since version 2: begins to remove what is not current any more, if at least so many places are used.
+    /// Returns 1 if it begins, otherwise 0; [`next`](Self::next) carries it out. A value may be
+    /// [stored](Self::store) meanwhile: `next` then goes on with both.
+    pub compact: unsafe extern "C" fn(*mut StoreState, u32) -> u32,
 }
 
 /// Choices of the product that the resident part decides by, and that a RAM image has to share. The
@@ -213,6 +217,7 @@ const _: () = {
     assert!(offset_of!(Services, is_blank) == 8 + 5 * POINTER);
     assert!(offset_of!(Services, sector_at) == 8 + 6 * POINTER);
     assert!(offset_of!(Services, facts) == 8 + 7 * POINTER);
+    assert!(offset_of!(Services, compact) == 8 + 8 * POINTER);
     assert!(offset_of!(Facts, bit_rates) == 12 && size_of::<Facts>() == 20);
     assert!(size_of::<StoreState>() == 128);
 };

@@ -105,6 +105,7 @@ fn of_rust() -> BTreeMap<String, i64> {
         ("BAD_ARGUMENT", Status::BadArgument),
         ("NO_PROGRAM", Status::NoProgram),
         ("LOCKED", Status::Locked),
+        ("FULL", Status::Full),
     ];
     all.extend(codes.map(|(name, code)| (format!("STATUS_{name}"), (code as i32).into())));
     all.extend(structure!(

@@ -344,31 +344,6 @@ fn noise_in_the_ram_is_no_request() {
     }
 }
 
-/// The callgate works without the bootloader's RAM: all RAM that the application does not use
-/// contains garbage at the call.
-#[test]
-fn the_callgate_needs_nothing_of_the_bootloaders_ram() {
-    let mut bench = running_board();
-    let crc = bench.session().read_number(Address::new(0x1F56, 1)).unwrap();
-    let layout = firmware::board();
-    let program = layout.programs[0];
-    bench.power_off();
-    bench.power_on();
-    // Stop at the application's first instructions, and overwrite the RAM of the bootloader.
-    while !program.contains(bench.machine().pc(), 2) {
-        let next = bench.time() + Span::from_micros(10);
-        bench.world.run_until(next);
-        assert!(next < Time(30_000_000_000_000), "the application does not start");
-    }
-    // The application clears its own statics at the bottom; its stack is at the top.
-    let garbage: Vec<u8> =
-        (0..layout.ram.size - 0xFC0).map(|i| (i.wrapping_mul(0x9E37_79B1) >> 24) as u8).collect();
-    bench.machine().write_ram(layout.ram.base + 0x400, &garbage[0x400..]).unwrap();
-    bench.await_boot_up(1000);
-    assert_eq!(bench.session().read_number(Address::new(0x1F56, 1)).unwrap(), crc);
-    assert_eq!(crc, firmware::blocks(firmware::APP_V1).crc());
-}
-
 /// The proof of the test above: with eight bytes of code left in flash it fails. The CAN interrupt
 /// jumps through these bytes, as it would if its handler had not been copied to RAM.
 #[test]

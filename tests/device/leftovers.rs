@@ -253,7 +253,7 @@ fn plays_the_main_job_after(wrong: &Wrong, register: u32, bits: u32) {
     let program = program_of(image, &Options::default()).unwrap().program;
     flash(&mut bench.session(), &program, &FlashOptions::default().start(false), &mut |_| {}).unwrap();
     bench.run_ms(100);
-    bench.fill_journal();
+    bench.fill_journal(0);
     bench.session().command(1, ProgramControl::Start).unwrap();
     bench.await_boot_up(1_000);
     bench.run_ms(500);

@@ -179,36 +179,3 @@ fn an_application_with_the_data_cache_on_does_not_lose_a_value_to_a_worn_cell() 
         node = next;
     }
 }
-
-/// The HAL of the application switches the data cache on, whose lines outlive an erase (RM0090 section 3.6.4). The
-/// callgate changes over the journal, again and again, and each value is found after a power-on.
-#[test]
-fn an_application_with_the_data_cache_on_stores_in_a_full_journal() {
-    let mut bench = board_with_the_data_cache_on();
-    let mut node = NODE;
-    for next in [20, 21, 22, 23, 24] {
-        assert!(!bench.is_bootloader(node));
-        assert_ne!(bench.machine().register(FLASH_ACR).unwrap() & DATA_CACHE, 0);
-        bench.fill_journal();
-        let erased = bench.machine().counters().sectors_erased;
-        bench.post(LSS, &CONFIGURATION);
-        lss(&mut bench, [0x11, next, 0, 0, 0, 0, 0, 0]);
-        // The core stands still while a sector is erased.
-        let from = bench.time();
-        bench.post(LSS, &[0x17, 0, 0, 0, 0, 0, 0, 0]);
-        bench.run_ms(2_000);
-        let answers = bench.frames_since(from).into_iter().filter(|(_, id, _)| *id == 0x7E4);
-        let answers: Vec<_> = answers.map(|(_, _, data)| data).collect();
-        let stops = bench.events();
-        assert_eq!(answers, [[0x17, 0, 0, 0, 0, 0, 0, 0]], "node {next}: {stops:?}");
-        // The first time the other region is blank.
-        let is_first = node == NODE;
-        assert!(is_first || bench.machine().counters().sectors_erased > erased, "node {next}");
-        bench.power_off();
-        bench.run_ms(10);
-        bench.power_on();
-        bench.await_boot_up_of(next, 1_000);
-        bench.run_ms(50);
-        node = next;
-    }
-}

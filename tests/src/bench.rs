@@ -249,12 +249,11 @@ impl Bench {
         }
     }
 
-    /// Writes the last record of the journal into all of its free slots, as a debug probe could: the next value that
-    /// is stored makes it change over to its other region.
+    /// Writes the last record of the journal into its free slots but the last `left`, as a debug probe could.
     ///
     /// # Panics
     /// Never: the layout's parameters are in flash.
-    pub fn fill_journal(&mut self) {
+    pub fn fill_journal(&mut self, left: usize) {
         /// Seven words.
         const SLOT: usize = 28;
         for region in firmware::board().parameters {
@@ -265,7 +264,9 @@ impl Bench {
             // A header, and a record.
             if free >= 2 * SLOT {
                 let record = bytes[free - SLOT..free].to_vec();
-                bytes[free..].chunks_exact_mut(SLOT).for_each(|slot| slot.copy_from_slice(&record));
+                let slots = (bytes.len() - free) / SLOT;
+                let taken = bytes[free..].chunks_exact_mut(SLOT).take(slots.saturating_sub(left));
+                taken.for_each(|slot| slot.copy_from_slice(&record));
                 self.machine().load_bin(region.base, &bytes).expect("it is in flash");
             }
         }

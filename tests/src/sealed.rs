@@ -334,7 +334,8 @@ impl Device {
     /// The program that the boot stage starts.
     #[must_use]
     pub fn starts(&self, request: Option<BootRequest>) -> Option<u8> {
-        let circumstances = Circumstances { request, strap: false, crash_resets: 0, node_id: 5 };
+        let circumstances =
+            Circumstances { request, strap: false, crash_resets: 0, node_id: 5, nearly_full: false };
         match decide(&circumstances, &DECISION, |program| self.verified(program)) {
             BootDecision::Start { program, .. } => Some(program.number()),
             BootDecision::Stay { .. } | BootDecision::Hold { .. } => None,

@@ -84,7 +84,7 @@ fn a_running_device_gets_a_new_bootloader_and_runs_again() {
     let info = info(&mut bench.session()).unwrap();
     assert_eq!(info.programs.len(), firmware::board().programs.len(), "the bootloader is none of them");
     assert!(
-        info.to_string().contains("bootloader        version 9.1, services 1, renewed as program 2"),
+        info.to_string().contains("bootloader        version 9.1, services 2, renewed as program 2"),
         "{info}"
     );
     // The same again changes nothing.

@@ -1,7 +1,8 @@
 //! The callgate: the services that an application may call (`shared_abi::callgate`).
 //!
-//! The application may use the flash controller, the CRC unit and the caches of the flash itself.
-//! The callgate takes them when they are free, and leaves them as it found them.
+//! The application, and its interrupts, may use the CRC unit and the caches of the flash; the application
+//! the flash controller. The callgate takes them when they are free, and leaves them as it found them.
+//! It only adds values to the journal: an erase would stop the application for half a second.
 //!
 //! Before a sealed program starts, the boot stage locks the flash (`flash_lock.rs`): nothing can be
 //! stored then before the next reset, and a write of a key would be a bus error in the application.
@@ -13,7 +14,7 @@ use boot_core::canopen::{BitRate, NodeId};
 use boot_core::flash::Flash;
 use boot_core::renewal::{check, header, identification, Places};
 use boot_core::store::record::Seal;
-use boot_core::store::{Key, NodeParameters, ProgramRecord, RenewalRecord, Value};
+use boot_core::store::{Key, NodeParameters, Parameters as _, ProgramRecord, RenewalRecord, Value};
 use bsp::{pac, LAYOUT};
 use shared_abi::callgate::{
     Crc32Args, NodeArgs, ProgramArgs, Selector, Status, PROGRAM_INSTALLED, PROGRAM_SIGNED,
@@ -45,24 +46,19 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     if !is_in_ram(args as u32, size as u32) {
         return Status::BadPointer as i32;
     }
-    // This check comes before the CRC unit gets its clock.
     // SAFETY: it reads two registers, which has no effect on their owner.
     if unsafe { FlashController::steal() }.is_in_use() {
         return Status::Busy as i32;
     }
     // SAFETY: the application calls one service at a time and does not use the flash controller
     // during the call.
-    let rcc = unsafe { pac::RCC::steal() };
-    let crc_is_free = rcc.ahb1enr().read().crcen().is_disabled();
-    // SAFETY: as above; the CRC unit is taken only if its clock is off.
-    let mut flash = unsafe { ResidentFlash::steal(crc_is_free) };
-    if crc_is_free {
-        ResidentFlash::switch_crc_unit_on(&rcc);
-    }
+    let (rcc, mut flash) = unsafe { (pac::RCC::steal(), ResidentFlash::steal(false)) };
     // SAFETY: the caller guarantees the structure, and it lies in RAM, aligned.
     let outcome = unsafe {
         match selector {
             Selector::Crc32 => crc32(&flash, &mut *args.cast()),
+            // What is left of the journal is for what cannot wait: a confirmation, and the boot stage.
+            Selector::StoreNode if product::parameters(&flash).is_nearly_full() => Err(Status::Full),
             Selector::ReadNode | Selector::StoreNode => node(selector, &mut flash, &mut *args.cast()),
             Selector::ProgramInfo | Selector::Confirm | Selector::Invalidate => {
                 program(selector, &mut flash, &mut *args.cast())

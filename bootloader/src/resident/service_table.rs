@@ -20,6 +20,7 @@ pub const SERVICES: Services = Services {
     is_blank,
     sector_at,
     facts: &product::FACTS,
+    compact,
 };
 
 const _: () = assert!(
@@ -87,6 +88,13 @@ unsafe extern "C" fn next(state: *mut StoreState, result: u32, operation: *mut F
         }
     };
     step as u32
+}
+
+/// # Safety
+/// `state` must come from [`open`].
+unsafe extern "C" fn compact(state: *mut StoreState, used: u32) -> u32 {
+    // SAFETY: the caller guarantees it.
+    unsafe { (*state.cast::<Parameters>()).compact(used).into() }
 }
 
 extern "C" fn crc32(crc: u32, base: u32, size: u32) -> u32 {

@@ -9,7 +9,7 @@ use boot_core::canopen::program::Supply;
 use boot_core::canopen::NodeId;
 use boot_core::decision::{decide, fallback, BootDecision, Circumstances, PinReset};
 use boot_core::program::{verify, Invalid};
-use boot_core::store::{Key, ProgramRecord};
+use boot_core::store::{Key, Parameters as _, ProgramRecord};
 use bsp::clock::{Source, HSI};
 use bsp::{pac, LAYOUT};
 use cortex_m::peripheral::SCB;
@@ -94,7 +94,8 @@ pub unsafe extern "C" fn stage() -> ! {
             _ => verify(&flash, &parameters, LAYOUT, PRODUCT.crc, number),
         })
     };
-    let mut circumstances = Circumstances { request, strap, crash_resets, node_id };
+    let mut circumstances =
+        Circumstances { request, strap, crash_resets, node_id, nearly_full: parameters.is_nearly_full() };
     let mut trial_end = TrialEnd::None;
     if PRODUCT.renewal {
         trial_end = renewal::trial_end(&flash, &parameters, request, reset_cause);
@@ -224,6 +225,7 @@ fn await_second_reset(cell: &mut Cell) {
 fn boot_report(decision: &BootDecision, request: Option<BootRequest>, cause: ResetCause) -> BootReport {
     let (reason, refused, held_program, window_ms) = match *decision {
         BootDecision::Stay { reason, refused } => (reason, refused, 0, 0),
+        BootDecision::Hold { program, window_ms: 0 } => (Reason::Compaction, 0, program, 0),
         BootDecision::Hold { program, window_ms } => (Reason::Rescue, 0, program, window_ms),
         BootDecision::Start { program, .. } => (Reason::Rescue, 0, program.number(), 0),
     };

@@ -181,6 +181,10 @@ pub struct Everything;
 
 impl Choices for Everything {}
 
+/// So long after the start, or after the last work on the flash, the device is idle, in ms: a master that has
+/// something to do has begun with it.
+const IDLE_MS: u32 = 1000;
+
 /// The configuration of a bootloader.
 #[derive(Clone, Copy, Debug)]
 pub struct Config {
@@ -226,6 +230,8 @@ pub struct Bootloader<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Cho
     signatures: Lock,
     /// The last time from [`set_time`](Self::set_time).
     now: Instant,
+    /// From this time on the device is idle, unless there is work on the flash before it.
+    idle_at: Instant,
     stored_version: StoredVersion,
     choices: PhantomData<fn() -> C>,
 }
@@ -266,6 +272,7 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
             lock: Lock::new(config.password),
             signatures: Lock::new(b""),
             now: Instant::from_millis(0),
+            idle_at: Instant::from_millis(IDLE_MS),
             stored_version: StoredVersion::new(),
             choices: PhantomData,
         };
@@ -297,6 +304,11 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     pub fn step(&mut self) -> Step {
         let step = self.download.step(&mut self.flash);
         self.report_outcome();
+        if step != Step::Idle {
+            self.idle_at = self.now + IDLE_MS;
+        } else if self.now.has_reached(self.idle_at) && self.download.compact() {
+            return Step::Again;
+        }
         if C::EXTRAS.read_back && step == Step::Idle && self.config.download.read_back {
             return self.stored_version.step(&self.flash, self.download.installed(1));
         }
@@ -374,6 +386,12 @@ impl<'b, F: Flash, P: Parameters, const PROGRAMS: usize, C: Choices> Bootloader<
     /// without a rescue window.
     pub fn confirm(&mut self, program: u8) {
         self.download.confirm(program);
+    }
+
+    /// Whether the store is being compacted, or may have to be before a program starts.
+    #[must_use]
+    pub fn is_compacting(&self) -> bool {
+        self.download.is_compacting()
     }
 
     /// Whether a reset now would undo work that a host believes to be done or in progress.

@@ -23,6 +23,8 @@ pub struct Circumstances {
     pub crash_resets: u32,
     /// Node-ID of the device; a value outside 1 to 127 means that it has none.
     pub node_id: u8,
+    /// The store is nearly full ([`Parameters::is_nearly_full`](crate::store::Parameters::is_nearly_full)).
+    pub nearly_full: bool,
 }
 
 /// A reset by the NRST pin, for a product that two of them keep in the bootloader.
@@ -162,7 +164,7 @@ pub enum BootDecision {
     Hold {
         /// The program's number.
         program: u8,
-        /// The time in ms.
+        /// The time in ms; 0 to compact the store, whatever a client asks for.
         window_ms: u16,
     },
     /// Start a program.
@@ -269,6 +271,11 @@ fn start(
             // and this request would keep the device in the bootloader.
             if circumstances.request.is_none() && window_ms > 0 {
                 return Hold { program: program.number(), window_ms };
+            }
+            // The bootloader has just had its turn if it has left a request.
+            let resumed = matches!(circumstances.request, Some(BootRequest::Resume(_)));
+            if circumstances.nearly_full && !is_requested && !resumed {
+                return Hold { program: program.number(), window_ms: 0 };
             }
             Start { trial: trial && !program.signed(), program }
         }

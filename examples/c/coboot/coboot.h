@@ -284,8 +284,8 @@ static inline const struct coboot_nameplate *coboot_last_nameplate(const struct 
 /* ---- The callgate: services of the bootloader that an application calls like a function ----
  *
  * One at a time, from one priority, with the flash controller left alone meanwhile. It uses the caller's stack alone,
- * and no FPU. What stores keeps the core from its flash as long as that takes: some 100 us, and some hundred ms once in
- * several hundred times, when a sector is erased.
+ * and no FPU. What stores keeps the core from its flash for 16 us at a time; no call erases a sector. A CRC holds interrupts
+ * back for some 40 us at a time at 16 MHz, so they may use the CRC unit, too.
  */
 
 #define COBOOT_CALLGATE_MAGIC UINT32_C(0x47434243)
@@ -370,6 +370,7 @@ COBOOT_STATIC_ASSERT(offsetof(struct coboot_program_args, flags) == 16, "coboot_
 #define COBOOT_STATUS_BAD_ARGUMENT INT32_C(-6) /* a node-ID, bit rate or program number that does not exist here */
 #define COBOOT_STATUS_NO_PROGRAM INT32_C(-7) /* nothing is installed under this number */
 #define COBOOT_STATUS_LOCKED INT32_C(-8) /* the flash is locked: leave with COBOOT_REQUEST_CONFIRM or the like */
+#define COBOOT_STATUS_FULL INT32_C(-9) /* the journal is nearly full: the next start without a request makes room */
 
 /* Whether the application understands a callgate. */
 enum coboot_callgate_state {

@@ -17,6 +17,7 @@ fn numbers_are_those_of_the_header() {
         Status::BadArgument,
         Status::NoProgram,
         Status::Locked,
+        Status::Full,
     ];
     for (number, status) in statuses.into_iter().enumerate() {
         assert_eq!(status as i32, -(number as i32), "{status:?}");

@@ -283,11 +283,13 @@ impl<'b, const PROGRAMS: usize> Device<'b, PROGRAMS> {
             strap,
             crash_resets: self.crash_resets,
             node_id: node.id.map_or(NO_NODE_ID, NodeId::get),
+            // Its stand-ins may erase: no core stalls.
+            nearly_full: false,
         };
         let verified = |number| verify(&flash, &journal, config.layout, config.download.crc, number);
         let decision = decide(&circumstances, &POLICY, verified);
         match decision {
-            // A program that is delayed cannot occur: the policy has no rescue window.
+            // A program that is delayed cannot occur: no rescue window, no journal that is nearly full.
             BootDecision::Stay { .. } | BootDecision::Hold { .. } => {
                 let (reason, refused) = match decision {
                     BootDecision::Stay { reason, refused } => (reason, refused),

@@ -177,6 +177,7 @@ impl Device {
             strap: false,
             crash_resets: 0,
             node_id: node.id.map_or(255, NodeId::get),
+            nearly_full: false,
         };
         match decide(&circumstances, &DECISION, |n| {
             verify(&self.flash, &parameters, &LAYOUT, CrcKind::Crc32, n)

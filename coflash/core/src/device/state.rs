@@ -87,6 +87,7 @@ pub fn reason(number: u8) -> String {
         Some(Reason::Forbidden) => "the product forbids the start of its program at present",
         Some(Reason::Renewal) => "a new bootloader is on trial, or its trial has ended",
         Some(Reason::TwoResets) => "its reset pin (NRST) was pulled twice within half a second",
+        Some(Reason::Compaction) => "it compacts its stored values, and starts its program then",
         None => return format!("for a reason that this tool does not know ({number})"),
     }
     .to_string()

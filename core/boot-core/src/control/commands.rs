@@ -58,7 +58,7 @@ impl<P: Parameters, const PROGRAMS: usize> Downloader<'_, P, PROGRAMS> {
         let busy = match command {
             // Also not during the download of a sealed image, which changes the record itself.
             SetSignature | ClrSignature => {
-                self.programmer.is_busy() || self.programmer.source().unsealer.is_active()
+                !self.programmer.may_store() || self.programmer.source().unsealer.is_active()
             }
             _ => self.programmer.has_work(),
         };

@@ -48,6 +48,10 @@ pub use crate::policy::{AppInfo, Erase, Policy, Renewal, Verdict};
 pub use crate::programmer::Step;
 pub use sealed::{Sealed, SealedMemory};
 
+/// The used places of the store from which on it is compacted when the device is idle. An update stores some 20
+/// values at most.
+const USED: u32 = 64;
+
 /// One program in the form of the objects 1F50h–1F57h.
 #[derive(Clone, Copy, Debug)]
 struct Program {
@@ -301,12 +305,18 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
         programmer.finishing().is_some() || programmer.is_storing() || programmer.is_installing()
     }
 
+    /// Whether the store is being compacted, or may have to be before a program starts.
+    #[must_use]
+    pub fn is_compacting(&self) -> bool {
+        self.programmer.is_compacting()
+    }
+
     /// Stores node-ID and bit rate in the background.
     ///
     /// # Errors
     /// The device is busy with other work.
     pub fn store_node(&mut self, node: NodeParameters) -> Result<(), FlashError> {
-        if self.busy() || self.boot_request.is_some() {
+        if !self.programmer.may_store() || self.boot_request.is_some() {
             return Err(FlashError::Busy);
         }
         self.programmer.store_node(&mut self.parameters, node);
@@ -455,6 +465,13 @@ impl<'b, P: Parameters, const PROGRAMS: usize> Downloader<'b, P, PROGRAMS> {
             }
         }
         step
+    }
+
+    /// Compacts the store, unless there is other work or a download is open.
+    pub(crate) fn compact(&mut self) -> bool {
+        let is_open = |program: &Program| matches!(program.session, Session::Open { .. });
+        let waits = self.transfer.is_some() || self.boot_request.is_some() || self.programmer.has_work();
+        !waits && !self.programs.iter().any(is_open) && self.programmer.compact(&mut self.parameters, USED)
     }
 
     /// Compares the flash with the expected program; returns the program's version.

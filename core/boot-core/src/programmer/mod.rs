@@ -126,6 +126,24 @@ enum Change {
     Note,
     /// The record that permits an installation.
     Permit,
+    /// No value: the store is compacted.
+    Compact,
+}
+
+/// The used places of the store from which on it is compacted at once: a master that never leaves the device alone
+/// must not make its starts slow, and a program must find room in it.
+const AT_ONCE: u32 = 256;
+
+/// Whether the store is to be compacted. Each value that is stored makes it due again, so a compaction that
+/// fails is not repeated for ever.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Compaction {
+    /// At once from [`AT_ONCE`] on.
+    Due,
+    /// When the device is idle.
+    Later,
+    /// No more.
+    Done,
 }
 
 /// The flash half. It starts operations and polls them, but never waits for them. `P` is the store of the
@@ -145,6 +163,7 @@ pub(crate) struct Programmer<'b, P> {
     /// Whether the counter proved by the next of these programs is already stored.
     kept: bool,
     job: Option<Job>,
+    compaction: Compaction,
     /// The installation of a RAM image.
     install: Option<Phase>,
     /// `None` if the RAM image cannot be renewed.
@@ -167,6 +186,7 @@ impl<'b, P: Parameters> Programmer<'b, P> {
             detail: 0,
             kept: false,
             job: None,
+            compaction: Compaction::Due,
             install: None,
             renewing: None,
             running: None,
@@ -262,8 +282,8 @@ impl<'b, P: Parameters> Programmer<'b, P> {
     }
 
     /// Replaces the record of a program. With `confirms`, the change marks a program that has
-    /// returned the device; no host waits for it, and other work is accepted meanwhile. No value
-    /// may be in the process of being stored.
+    /// returned the device; no host waits for it, and other work is accepted meanwhile.
+    /// [`may_store`](Self::may_store) must be true.
     pub(crate) fn record(
         &mut self,
         parameters: &mut impl Parameters,
@@ -392,14 +412,35 @@ impl<'b, P: Parameters> Programmer<'b, P> {
         self.has_work() || self.is_storing()
     }
 
-    /// Whether a value is being stored.
+    /// Whether a value is being stored, or the store is being compacted.
     pub(crate) fn is_storing(&self) -> bool {
         matches!(self.job, Some(Job::Store(..)))
     }
 
+    /// Whether another value can be stored: only a compaction goes on, or nothing.
+    pub(crate) fn may_store(&self) -> bool {
+        !self.has_work() && (!self.is_storing() || matches!(self.job, Some(Job::Store(Change::Compact, _))))
+    }
+
+    /// Whether the store is being compacted, or may have to be at once.
+    pub(crate) fn is_compacting(&self) -> bool {
+        self.compaction == Compaction::Due || matches!(self.job, Some(Job::Store(Change::Compact, _)))
+    }
+
+    /// Compacts the store, if at least `used` of its places are used. Returns whether it begins.
+    pub(crate) fn compact(&mut self, parameters: &mut P, used: u32) -> bool {
+        if self.job.is_some() || self.compaction == Compaction::Done || !parameters.compact(used) {
+            return false;
+        }
+        self.compaction = Compaction::Done;
+        self.job = Some(Job::Store(Change::Compact, 0));
+        true
+    }
+
     /// Whether there is work that a command must wait for.
     pub(crate) fn has_work(&self) -> bool {
-        let confirming = matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note, _)));
+        let confirming =
+            matches!(self.job, Some(Job::Store(Change::Confirm | Change::Note | Change::Compact, _)));
         (self.job.is_some() || self.running.is_some()) && !confirming
             || self.voids != 0
             || self.is_installing()
@@ -467,6 +508,12 @@ impl<'b, P: Parameters> Programmer<'b, P> {
                 outcome = ended;
             }
             if self.job.is_none() {
+                if self.compaction == Compaction::Due {
+                    self.compaction = Compaction::Later;
+                    if self.compact(parameters, AT_ONCE) {
+                        return (Step::Again, None);
+                    }
+                }
                 return match self.choose(parameters, flash, note) {
                     Ok(None) => (Step::Idle, None),
                     Ok(job) => {
@@ -564,13 +611,19 @@ impl<'b, P: Parameters> Programmer<'b, P> {
 
     /// Ends the job.
     fn done(&mut self, result: Result<(), FlashError>) -> Option<Event> {
-        match (self.job.take()?, result) {
+        let job = self.job.take()?;
+        if matches!(job, Job::Store(change, _) if change != Change::Compact) {
+            self.compaction = Compaction::Due;
+        }
+        match (job, result) {
             (Job::Store(Change::Node, _), result) => Some(Event::NodeStored(result)),
             (Job::Store(Change::Permit, _), Ok(())) if P::RENEWS => {
                 let places = self.places();
                 self.install = Some(Phase::erase(places));
                 Some(Event::Stored { program: BOOTLOADER, ends: false })
             }
+            // A compaction that fails loses nothing.
+            (Job::Store(Change::Compact, _), _) => None,
             (Job::Store(Change::Value | Change::Note, _) | Job::Process | Job::Install, Ok(())) => None,
             (Job::Store(change, program), result) => {
                 // A record whose counter could not be stored stays, too.

@@ -15,6 +15,11 @@
 //!   values must not be lost with their region.
 //! - **A value that is stored already is not written again**: a command that changes nothing must
 //!   not wear the flash.
+//!
+//! Every start reads the journal. So a search looks at one word of a slot, its tag, and computes the CRC
+//! of those alone that it needs. Who may not wait for the erase of a sector (boot stage, callgate) lets
+//! the flash refuse it: then a full region refuses a value, and the RAM image compacts it
+//! ([`Parameters::compact`]) before that.
 
 use shared_abi::geometry::Region;
 
@@ -40,6 +45,9 @@ const HEADER_MAGIC: u32 = u32::from_le_bytes(*b"CBNV");
 const FORMAT: u32 = 1;
 /// How many times a store tries a further slot or region before it gives up.
 const ATTEMPTS: u8 = 8;
+/// With fewer free slots than these a region [is nearly full](Parameters::is_nearly_full). (A region of a
+/// model, smaller than any sector, keeps a 32nd part.)
+const KEPT_SLOTS: u32 = 16;
 
 /// The journal. It holds the addresses for reading and writing; the values stay in flash. A slot is
 /// identified by its address.
@@ -62,7 +70,7 @@ pub struct Journal {
 struct Storing {
     step: Step,
     attempts: u8,
-    /// The new record.
+    /// The new record. A compaction has none: its tag is that of erased flash.
     record: Slot,
     /// The slot that is being written, and its address.
     slot: Slot,
@@ -137,7 +145,15 @@ impl Journal {
                 core::mem::swap(&mut valid, &mut other);
             }
         }
-        let free = if header == Header::Absent { first_slot(&valid) } else { end_of(flash, &valid) };
+        let first = first_slot(&valid);
+        let mut free = first;
+        if header != Header::Absent {
+            free = valid.end() - valid.size % SLOT_SIZE;
+            // The tag of a slot is programmed first, and no tag reads as erased flash.
+            while free > first && flash.read_word(free - SLOT_SIZE) == ERASED {
+                free -= SLOT_SIZE;
+            }
+        }
         Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
     }
 
@@ -147,9 +163,9 @@ impl Journal {
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
-            match sound_slot(flash, at) {
-                Some(slot) if slot[0] == tag => return Some(slot),
-                _ => {}
+            let record = record_of(flash, at, tag);
+            if record.is_some() {
+                return record;
             }
         }
         None
@@ -163,9 +179,27 @@ impl Parameters for Journal {
     }
 
     fn store(&mut self, key: Key, value: Value) {
+        // A compaction goes on, and ends with the new record.
+        if self.storing.step == Step::Idle || self.storing.record[0] != ERASED {
+            self.storing.attempts = 0;
+            self.storing.step = Step::Begin;
+        }
         self.storing.record = slot(key.0, value);
+    }
+
+    fn is_nearly_full(&self) -> bool {
+        let kept = (KEPT_SLOTS * SLOT_SIZE).min(self.valid.size / 32);
+        self.header != Header::Absent && self.valid.end() - self.free < kept
+    }
+
+    fn compact(&mut self, used: u32) -> bool {
+        let is_small = (self.free - self.valid.base) / SLOT_SIZE < used;
+        if self.newer || self.header == Header::Absent || self.storing.step != Step::Idle || is_small {
+            return false;
+        }
+        self.storing.record[0] = ERASED;
         self.storing.attempts = 0;
-        self.storing.step = Step::Begin;
+        self.change_over().is_ok()
     }
 
     fn next<F: Flash>(&mut self, flash: &F, outcome: Result<(), FlashFault>) -> Next<StoreError> {
@@ -209,7 +243,7 @@ impl Journal {
                     self.sequence = self.sequence.wrapping_add(1);
                     self.free = self.storing.to;
                     self.header = Header::Firm;
-                    self.append()?;
+                    self.begin(flash)?;
                 }
                 (Ok(None), Step::Refresh) => {
                     self.header = Header::Firm;
@@ -236,7 +270,7 @@ impl Journal {
         if self.newer {
             return Err(StoreError::NewerFormat);
         }
-        if self.is_stored(flash) {
+        if self.storing.record[0] == ERASED || self.is_stored(flash) {
             self.storing.step = Step::Idle;
             return Ok(());
         }
@@ -285,19 +319,20 @@ impl Journal {
     /// previous one might be copied.
     fn collect<F: Flash>(&mut self, flash: &F) {
         while self.storing.from < self.free {
-            let sound = sound_slot(flash, self.storing.from);
+            let at = self.storing.from;
+            let tag = flash.read_word(at);
             self.storing.from += SLOT_SIZE;
-            // A slot that is no record is no reason to look for one: with many of them, as in a damaged
-            // region, a store would take minutes.
-            let Some([tag, ..]) = sound else { continue };
             let mut copy = first_slot(&self.other);
             while copy < self.storing.to && flash.read_word(copy) != tag {
                 copy += SLOT_SIZE;
             }
-            if copy == self.storing.to {
-                if let Some(slot) = self.latest(flash, tag) {
-                    return self.write(Step::Copy, self.storing.to, slot);
-                }
+            // A slot that is no record is no reason to look for one: with many of them, as in a damaged
+            // region, a store would take minutes.
+            if copy < self.storing.to || record_of(flash, at, tag).is_none() {
+                continue;
+            }
+            if let Some(slot) = self.latest(flash, tag) {
+                return self.write(Step::Copy, self.storing.to, slot);
             }
         }
         let header = header_slot(self.sequence.wrapping_add(1));
@@ -353,6 +388,14 @@ fn read_slot<F: Flash>(flash: &F, at: u32) -> Slot {
     found
 }
 
+/// The slot at an address, if it is a valid record of a tag. Most are of another one: the tag is read first.
+fn record_of<F: Flash>(flash: &F, at: u32, tag: u32) -> Option<Slot> {
+    if flash.read_word(at) != tag {
+        return None;
+    }
+    sound_slot(flash, at).filter(|slot| slot[0] == tag)
+}
+
 /// The slot at an address, if it is a valid record. It is read once: bits left between 0 and 1 by a
 /// power cut may read differently the next time.
 fn sound_slot<F: Flash>(flash: &F, at: u32) -> Option<Slot> {
@@ -364,22 +407,6 @@ fn sound_slot<F: Flash>(flash: &F, at: u32) -> Option<Slot> {
 
 const fn first_slot(region: &Region) -> u32 {
     region.base + SLOT_SIZE
-}
-
-/// The slot after the last one that is not blank, by binary search, because every start needs it.
-fn end_of<F: Flash>(flash: &F, region: &Region) -> u32 {
-    let end = region.end() - region.size % SLOT_SIZE;
-    let (mut used, mut free) = (first_slot(region), end);
-    while used < free {
-        let middle = used + (free - used) / SLOT_SIZE / 2 * SLOT_SIZE;
-        // Everything after `free` is known to be blank.
-        if flash.is_blank(Region::new(middle, free - middle)) {
-            free = middle;
-        } else {
-            used = middle + SLOT_SIZE;
-        }
-    }
-    free
 }
 
 fn slot(tag: u32, [a, b, c, d]: Value) -> Slot {

@@ -97,8 +97,21 @@ pub trait Parameters {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 
     /// Starts to store one value; [`next`](Self::next) carries it out. After a success the value is
-    /// certain, also if a power cut had left it between 0 and 1.
+    /// certain, also if a power cut had left it between 0 and 1. A compaction that goes on ends with it.
     fn store(&mut self, key: Key, value: Value);
+
+    /// Whether so few places are free that it must be compacted before a program starts: the program and the
+    /// boot stage may only add values. A store that is never compacted is never nearly full.
+    fn is_nearly_full(&self) -> bool {
+        false
+    }
+
+    /// Starts to remove what is not current any more, if at least `used` places are used;
+    /// [`next`](Self::next) carries it out. Returns whether there is something to carry out.
+    fn compact(&mut self, used: u32) -> bool {
+        let _ = used;
+        false
+    }
 
     /// The next operation of the store. `outcome` is the result of the previous one (`Ok` at
     /// first). After an error the old value still exists.

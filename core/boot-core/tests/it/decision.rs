@@ -15,7 +15,8 @@ use shared_abi::layout::stm32f407g_disc1::LAYOUT;
 use shared_abi::vectors::VectorFault;
 use shared_abi::warm_start::{BootRequest, Owed};
 
-const QUIET: Circumstances = Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5 };
+const QUIET: Circumstances =
+    Circumstances { request: None, strap: false, crash_resets: 0, node_id: 5, nearly_full: false };
 
 fn policy() -> Policy {
     Policy {
@@ -263,6 +264,22 @@ fn the_rescue_window_is_for_a_start_that_nobody_asked_for() {
     let policy = Policy { rescue_window_confirmed_ms: 0, ..policy };
     let start = BootDecision::Start { program: confirmed().unwrap(), trial: false };
     assert_eq!(decide(&QUIET, &policy, |_| confirmed()), start);
+}
+
+/// The store is compacted before a start that no bootloader has just left for; the fallback of a damaged RAM image
+/// is such a start, too: no loop.
+#[test]
+fn a_store_that_is_nearly_full_is_compacted_before_a_program_starts_by_itself() {
+    let compact = BootDecision::Hold { program: 1, window_ms: 0 };
+    let starts = BootDecision::Start { program: signed().unwrap(), trial: false };
+    let by_itself = [None, Some(BootRequest::Confirm(1)), Some(BootRequest::PowerOn)];
+    let left = [BootRequest::Resume(1), BootRequest::Start(1), BootRequest::Fresh(1)].map(Some);
+    for (requests, decision) in [(by_itself, compact), (left, starts)] {
+        for request in requests {
+            let full = Circumstances { nearly_full: true, request, ..QUIET };
+            assert_eq!(decide(&full, &policy(), |_| signed()), decision, "{request:?}");
+        }
+    }
 }
 
 #[test]

@@ -249,7 +249,7 @@ fn an_image_is_staged_tried_confirmed_and_installed() {
     assert_eq!(node.read(0x1F51, N), [1], "it runs");
     let places = [HOME.base, HOME.size].map(u32::to_le_bytes).concat();
     assert_eq!(node.read::<8>(0x2004, N).to_vec(), places);
-    assert_eq!(node.read::<8>(0x2007, 8).to_vec(), [0x0001_0002, 1_u32].map(u32::to_le_bytes).concat());
+    assert_eq!(node.read::<8>(0x2007, 8).to_vec(), [0x0001_0002, 2_u32].map(u32::to_le_bytes).concat());
     assert_eq!((node.progress(), node.word(0x1F56)), (Progress::default(), crc_of(&old)));
     assert_eq!(node.word(0x2005), SOUND.version);
     assert_eq!(node.command(N, START), NO_VALID_PROGRAM, "nothing is staged");
