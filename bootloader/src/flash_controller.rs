@@ -20,6 +20,11 @@ const HAS_PARTS: bool = FLASH_WIDTH < 4;
 /// The memory-mapped flash.
 pub const FLASH: Region = LAYOUT.chip.flash;
 
+/// Whether a word of the flash is at this address.
+const fn is_word(address: u32) -> bool {
+    address.wrapping_sub(FLASH.base) < FLASH.size && address.is_multiple_of(4)
+}
+
 /// The controller and the flash that it controls. The control register is locked unless an
 /// operation runs.
 pub struct FlashController {
@@ -93,7 +98,7 @@ impl FlashController {
 
     /// The byte at an address, FFh outside the flash.
     pub fn read_byte(&self, address: u32) -> u8 {
-        if FLASH.contains(address, 1) {
+        if address.wrapping_sub(FLASH.base) < FLASH.size {
             // SAFETY: the address is inside the memory-mapped flash, which is always readable. The
             // read is volatile, because the controller changes the memory without the compiler's
             // knowledge.
@@ -105,7 +110,7 @@ impl FlashController {
 
     /// The word at a word-aligned address, FFFFFFFFh for other addresses.
     pub fn read_word(&self, address: u32) -> u32 {
-        if FLASH.contains(address, 4) && address.is_multiple_of(4) {
+        if is_word(address) {
             // SAFETY: as above, and aligned.
             unsafe { (address as *const u32).read_volatile() }
         } else {
@@ -129,7 +134,7 @@ impl FlashController {
                 });
             }
             Operation::Program { address, word } => {
-                if !FLASH.contains(address, 4) || !address.is_multiple_of(4) {
+                if !is_word(address) {
                     return Err(FlashFault::Failed);
                 }
                 self.unlock();

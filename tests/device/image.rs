@@ -140,7 +140,7 @@ fn the_resident_part_has_its_facts() {
         let resident = Parts::of(image).resident;
         let (version, facts) =
             Facts::of_resident(&resident, board.bootloader.base, board.callgate() + OFFSET).unwrap();
-        assert_eq!((version, facts.size, facts.board), (1, 20, identity), "{image}");
+        assert_eq!((version, facts.size, facts.board), (2, 20, identity), "{image}");
         let sdo = [facts.sdo_request_base, facts.sdo_response_base];
         ([facts.autostart, facts.crc_bits, facts.node_ids, facts.bit_rates], sdo)
     };
@@ -366,6 +366,13 @@ fn a_damaged_image_does_not_run_and_the_program_does() {
     assert!(!bench.is_bootloader(NODE));
     assert_eq!(cell(&bench), Some((DAMAGED, damage)));
     press(bench.machine(), false);
+    bench.power_off();
+    // Nor does a journal without room, which nobody compacts.
+    bench.fill_journal(0);
+    bench.power_on();
+    bench.await_boot_up(1000);
+    assert!(!bench.is_bootloader(NODE));
+    assert_eq!(cell(&bench), Some((DAMAGED, damage)));
     bench.power_off();
     // The image itself, for comparison.
     load(&mut bench, &Parts::of(firmware::BOOTLOADER));

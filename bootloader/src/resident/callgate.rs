@@ -24,7 +24,7 @@ use shared_abi::handoff::Handoff;
 use shared_abi::renewal::BOOTLOADER;
 use shared_abi::warm_start::BootRequest;
 
-use crate::flash::ResidentFlash;
+use crate::flash::{CrcUnit, ResidentFlash};
 use crate::flash_controller::FlashController;
 use crate::ram_image::{home, HOST};
 use crate::storing::{crash_count, store};
@@ -52,14 +52,12 @@ pub unsafe extern "C" fn entry(selector: u32, args: *mut c_void) -> i32 {
     }
     // SAFETY: the application calls one service at a time and does not use the flash controller
     // during the call.
-    let (rcc, mut flash) = unsafe { (pac::RCC::steal(), ResidentFlash::steal(false)) };
+    let (rcc, mut flash) = unsafe { (pac::RCC::steal(), ResidentFlash::steal(CrcUnit::Shared)) };
     // SAFETY: the caller guarantees the structure, and it lies in RAM, aligned.
     let outcome = unsafe {
         match selector {
             Selector::Crc32 => crc32(&flash, &mut *args.cast()),
-            // What is left of the journal is for what cannot wait: a confirmation, and the boot stage.
-            Selector::StoreNode if product::parameters(&flash).is_nearly_full() => Err(Status::Full),
-            Selector::ReadNode | Selector::StoreNode => node(selector, &mut flash, &mut *args.cast()),
+            Selector::ReadNode | Selector::StoreNode => node(selector, &mut flash, &mut *args.cast(), false),
             Selector::ProgramInfo | Selector::Confirm | Selector::Invalidate => {
                 program(selector, &mut flash, &mut *args.cast())
             }
@@ -112,7 +110,7 @@ pub fn store_after_reset(flash: &mut ResidentFlash, request: Option<BootRequest>
             unlock();
             let node_id = node.node_id.into();
             let mut args = NodeArgs { node_id, bit_rate: node.bits_per_second() };
-            let _ = self::node(Selector::StoreNode, flash, &mut args);
+            let _ = self::node(Selector::StoreNode, flash, &mut args, true);
             return;
         }
         _ => return,
@@ -129,7 +127,14 @@ fn crc32(flash: &ResidentFlash, args: &mut Crc32Args) -> Result<(), Status> {
     Ok(())
 }
 
-fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> Result<(), Status> {
+/// Returns or stores node-ID and bit rate. The last places of the journal are for what cannot wait: a confirmation, and
+/// the boot stage (`to_the_last`).
+fn node(
+    selector: Selector,
+    flash: &mut ResidentFlash,
+    args: &mut NodeArgs,
+    to_the_last: bool,
+) -> Result<(), Status> {
     let mut parameters = product::parameters(flash);
     if selector == Selector::ReadNode {
         let node = product::node_parameters(&parameters, flash);
@@ -143,6 +148,9 @@ fn node(selector: Selector, flash: &mut ResidentFlash, args: &mut NodeArgs) -> R
     let id = u8::try_from(args.node_id).ok().filter(is_allowed).ok_or(Status::BadArgument)?;
     let bit_rate = BitRate::from_bits_per_second(args.bit_rate).filter(|rate| product::supports(*rate));
     let node = NodeParameters { id: NodeId::new(id), bit_rate: bit_rate.ok_or(Status::BadArgument)? };
+    if !to_the_last && parameters.is_nearly_full() && !is_locked(&parameters, flash) {
+        return Err(Status::Full);
+    }
     keep(&mut parameters, flash, Key::NODE, node.value())
 }
 

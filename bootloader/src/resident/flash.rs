@@ -10,23 +10,34 @@ use shared_abi::geometry::{Region, Sector};
 
 use crate::flash_controller::{FlashController, FLASH};
 
-/// The bytes whose CRC is computed while the interrupts of an application wait: some 40 us at 16 MHz.
-const SHARED_STEP: u32 = 256;
+/// Who has the CRC unit.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum CrcUnit {
+    /// The bootloader; its clock is on.
+    Own,
+    /// An application, whose interrupts may use it: it is taken for a moment, if it is free.
+    Shared,
+    /// Other code.
+    Taken,
+}
 
-/// The controller, and the CRC unit: its own one, or that of an application whose interrupts may use it.
+/// The bytes whose CRC is computed while the interrupts of an application wait: some 50 us at 16 MHz.
+const SHARED_STEP: u32 = 512;
+
+/// The controller, and the CRC unit if no other code uses it.
 pub struct ResidentFlash {
     controller: FlashController,
-    owns_crc_unit: bool,
+    crc_unit: CrcUnit,
 }
 
 impl ResidentFlash {
-    /// Takes the controller, and the CRC unit, which has its clock, if `owns_crc_unit` is true.
+    /// Takes the controller, and the CRC unit if it is [`CrcUnit::Own`].
     ///
     /// # Safety
     /// Nothing else may use what is taken until this value is dropped.
-    pub unsafe fn steal(owns_crc_unit: bool) -> Self {
+    pub unsafe fn steal(crc_unit: CrcUnit) -> Self {
         // SAFETY: the caller guarantees it.
-        Self { controller: unsafe { FlashController::steal() }, owns_crc_unit }
+        Self { controller: unsafe { FlashController::steal() }, crc_unit }
     }
 
     /// Switches the clock of the CRC unit on.
@@ -41,68 +52,32 @@ impl ResidentFlash {
 
     /// Leaves both in their reset state.
     pub fn release(self, rcc: &pac::RCC) {
-        if self.owns_crc_unit {
-            Self::switch_crc_unit_off(rcc);
+        if self.crc_unit == CrcUnit::Own {
+            // SAFETY: `steal` has taken the unit.
+            unsafe { pac::CRC::steal() }.cr().write(|w| w.reset().set_bit());
+            rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
         }
         self.controller.clear_flags();
     }
 
-    fn switch_crc_unit_off(rcc: &pac::RCC) {
-        // SAFETY: the caller has taken the unit.
-        unsafe { pac::CRC::steal() }.cr().write(|w| w.reset().set_bit());
-        rcc.ahb1enr().modify(|_, w| w.crcen().disabled());
-    }
-
-    /// The CRC unit computes whole words, software the rest. The unit has the right polynomial, but
-    /// it takes words with the most significant bit first and always starts from its initial value.
-    /// One additional word first brings it to the state of the previous CRC.
-    fn crc32_by_unit(&self, mut crc: u32, region: Region) -> u32 {
-        let (mut address, end) = (region.base, region.end());
-        // SAFETY: the caller has taken the unit, which has its clock.
-        let unit = unsafe { pac::CRC::steal() };
-        unit.cr().write(|w| w.reset().set_bit());
-        let data = unit.dr().as_ptr();
-        // SAFETY: every word may be written to DR. The caller has checked that the region is aligned
-        // and inside the memory-mapped flash, which is always readable.
-        unsafe {
-            if crc != 0 {
-                data.write_volatile(u32::MAX ^ word_before((!crc).reverse_bits()));
-            }
-            // The loop takes four words at a time and is in assembly: it takes most of the time
-            // from reset to a large program, and the compiler would move its body into a
-            // function.
-            while end - address >= 16 {
-                core::arch::asm!(
-                    "ldmia {from}!, {{r2, r3, r4, r5}}",
-                    "rbit r2, r2",
-                    "str r2, [{data}]",
-                    "rbit r3, r3",
-                    "str r3, [{data}]",
-                    "rbit r4, r4",
-                    "str r4, [{data}]",
-                    "rbit r5, r5",
-                    "str r5, [{data}]",
-                    from = inout(reg) address,
-                    data = in(reg) data,
-                    out("r2") _,
-                    out("r3") _,
-                    out("r4") _,
-                    out("r5") _,
-                    options(nostack, preserves_flags),
-                );
-            }
-            while end - address >= 4 {
-                data.write_volatile((address as *const u32).read_volatile().reverse_bits());
-                address += 4;
-            }
-            crc = !data.read_volatile().reverse_bits();
-        }
-        self.crc32_by_software(crc, Region::new(address, end - address))
-    }
-
-    fn crc32_by_software(&self, crc: u32, region: Region) -> u32 {
-        let bytes = region.base..region.end();
-        bytes.fold(crc, |crc, address| crc::resume(crc, &[self.controller.read_byte(address)]))
+    /// The CRC of words with the unit of an application. Its interrupts wait for each part: one that uses the unit,
+    /// or changes the register of its clock, finds and leaves both as they are.
+    fn crc32_by_parts(crc: u32, region: Region) -> u32 {
+        (region.base..region.end()).step_by(SHARED_STEP as usize).fold(crc, |crc, at| {
+            let part = Region::new(at, SHARED_STEP.min(region.end() - at));
+            let by_unit = cortex_m::interrupt::free(|_| {
+                // SAFETY: nothing interrupts this code, which reads the flash and takes a unit that has no clock.
+                let (rcc, flash) = unsafe { (pac::RCC::steal(), Self::steal(CrcUnit::Own)) };
+                rcc.ahb1enr().read().crcen().is_disabled().then(|| {
+                    Self::switch_crc_unit_on(&rcc);
+                    let crc = flash.crc32(crc, part);
+                    flash.release(&rcc);
+                    crc
+                })
+            });
+            // SAFETY: it only reads the flash.
+            by_unit.unwrap_or_else(|| unsafe { Self::steal(CrcUnit::Taken) }.crc32(crc, part))
+        })
     }
 }
 
@@ -134,31 +109,57 @@ impl Flash for ResidentFlash {
         (address..end).all(|address| self.controller.read_byte(address) == u8::MAX)
     }
 
-    fn crc32(&self, crc: u32, region: Region) -> u32 {
-        if !region.base.is_multiple_of(4) || !FLASH.contains(region.base, region.size) {
-            return self.crc32_by_software(crc, region);
+    /// The CRC unit computes whole words, software the rest. The unit has the right polynomial, but
+    /// it takes words with the most significant bit first and always starts from its initial value.
+    /// One additional word first brings it to the state of the previous CRC.
+    fn crc32(&self, mut crc: u32, region: Region) -> u32 {
+        let (mut address, end) = (region.base, region.end());
+        let is_fit = address.is_multiple_of(4) && FLASH.contains(address, region.size);
+        if is_fit && self.crc_unit == CrcUnit::Shared {
+            return Self::crc32_by_parts(crc, region);
         }
-        if self.owns_crc_unit {
-            return self.crc32_by_unit(crc, region);
-        }
-        // The interrupts of the application wait for each part: one that uses the unit, or changes the register
-        // of its clock, finds and leaves both as they are.
-        let parts = (region.base..region.end()).step_by(SHARED_STEP as usize);
-        parts.fold(crc, |crc, at| {
-            let part = Region::new(at, SHARED_STEP.min(region.end() - at));
-            let by_unit = cortex_m::interrupt::free(|_| {
-                // SAFETY: nothing interrupts this code.
-                let rcc = unsafe { pac::RCC::steal() };
-                if rcc.ahb1enr().read().crcen().is_enabled() {
-                    return None;
+        if is_fit && self.crc_unit == CrcUnit::Own {
+            // SAFETY: `steal` has taken the unit.
+            let unit = unsafe { pac::CRC::steal() };
+            unit.cr().write(|w| w.reset().set_bit());
+            let data = unit.dr().as_ptr();
+            // SAFETY: every word may be written to DR. The region was checked to be aligned and
+            // inside the memory-mapped flash, which is always readable.
+            unsafe {
+                if crc != 0 {
+                    data.write_volatile(u32::MAX ^ word_before((!crc).reverse_bits()));
                 }
-                Self::switch_crc_unit_on(&rcc);
-                let crc = self.crc32_by_unit(crc, part);
-                Self::switch_crc_unit_off(&rcc);
-                Some(crc)
-            });
-            by_unit.unwrap_or_else(|| self.crc32_by_software(crc, part))
-        })
+                // The loop takes four words at a time and is in assembly: it takes most of the time
+                // from reset to a large program, and the compiler would move its body into a
+                // function.
+                while end - address >= 16 {
+                    core::arch::asm!(
+                        "ldmia {from}!, {{r2, r3, r4, r5}}",
+                        "rbit r2, r2",
+                        "str r2, [{data}]",
+                        "rbit r3, r3",
+                        "str r3, [{data}]",
+                        "rbit r4, r4",
+                        "str r4, [{data}]",
+                        "rbit r5, r5",
+                        "str r5, [{data}]",
+                        from = inout(reg) address,
+                        data = in(reg) data,
+                        out("r2") _,
+                        out("r3") _,
+                        out("r4") _,
+                        out("r5") _,
+                        options(nostack, preserves_flags),
+                    );
+                }
+                while end - address >= 4 {
+                    data.write_volatile((address as *const u32).read_volatile().reverse_bits());
+                    address += 4;
+                }
+                crc = !data.read_volatile().reverse_bits();
+            }
+        }
+        (address..end).fold(crc, |crc, address| crc::resume(crc, &[self.controller.read_byte(address)]))
     }
 
     /// The resident part erases nothing: boot stage and application must not wait for it. What needs an erase

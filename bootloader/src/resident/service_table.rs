@@ -6,7 +6,7 @@ use shared_abi::geometry::Region;
 use shared_abi::ram_image::SERVICES_VERSION;
 use shared_abi::services::{FlashOperation, OperationResult, Services, Step, StoreState, ERASE, PROGRAM};
 
-use crate::flash::ResidentFlash;
+use crate::flash::{CrcUnit, ResidentFlash};
 use product::{self, Parameters};
 
 pub const SERVICES: Services = Services {
@@ -33,7 +33,7 @@ const _: () = assert!(
 fn flash() -> ResidentFlash {
     // SAFETY: the RAM image, which owns the chip, calls one service at a time from one priority,
     // while no operation runs. It does not use the controller or the CRC unit during the call.
-    unsafe { ResidentFlash::steal(true) }
+    unsafe { ResidentFlash::steal(CrcUnit::Own) }
 }
 
 /// # Safety

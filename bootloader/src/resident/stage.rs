@@ -20,7 +20,7 @@ use shared_abi::vectors::VectorTable;
 use shared_abi::warm_start::{BootRequest, Cell, Owed, TrialStep};
 
 use crate::caches::Caches;
-use crate::flash::ResidentFlash;
+use crate::flash::{CrcUnit, ResidentFlash};
 use crate::{renewal, storing};
 use product::{self, NO_NODE_ID, PRODUCT, SEALED};
 
@@ -41,7 +41,7 @@ pub unsafe extern "C" fn stage() -> ! {
     let (rcc, iwdg) = unsafe { (pac::RCC::steal(), pac::IWDG::steal()) };
 
     // SAFETY: as above.
-    let mut flash = unsafe { ResidentFlash::steal(true) };
+    let mut flash = unsafe { ResidentFlash::steal(CrcUnit::Own) };
     // A watchdog that the option bytes start could end the erase of a sector: it bites after 512 ms,
     // 349 at the fastest LSI.
     if flash.starts_watchdog() {

@@ -285,7 +285,7 @@ static inline const struct coboot_nameplate *coboot_last_nameplate(const struct 
  *
  * One at a time, from one priority, with the flash controller left alone meanwhile. It uses the caller's stack alone,
  * and no FPU. What stores keeps the core from its flash for 16 us at a time; no call erases a sector. A CRC holds interrupts
- * back for some 40 us at a time at 16 MHz, so they may use the CRC unit, too.
+ * back for some 50 us at a time at 16 MHz, so they may use the CRC unit, too.
  */
 
 #define COBOOT_CALLGATE_MAGIC UINT32_C(0x47434243)

@@ -60,6 +60,9 @@ pub struct Journal {
     /// A region has a header of a newer format: storing is refused.
     newer: bool,
     sequence: u32,
+    /// A power cut has ended a compaction when only its header was missing: the other region may be the valid one
+    /// later. Nothing is added to this one before the other is erased.
+    half_valid: bool,
     /// The first slot of the valid region after the last one that is not blank.
     free: u32,
     storing: Storing,
@@ -154,7 +157,10 @@ impl Journal {
                 free -= SLOT_SIZE;
             }
         }
-        Self { valid, other, header, newer, sequence, free, storing: Storing::default() }
+        // The second word of a header is its sequence number, which its CRC follows.
+        let next = sequence.wrapping_add(1);
+        let half_valid = header != Header::Absent && flash.read_word(other.base + 4) == next;
+        Self { valid, other, header, newer, sequence, half_valid, free, storing: Storing::default() }
     }
 
     /// The latest valid record of a tag.
@@ -189,12 +195,12 @@ impl Parameters for Journal {
 
     fn is_nearly_full(&self) -> bool {
         let kept = (KEPT_SLOTS * SLOT_SIZE).min(self.valid.size / 32);
-        self.header != Header::Absent && self.valid.end() - self.free < kept
+        self.half_valid || self.header != Header::Absent && self.valid.end() - self.free < kept
     }
 
     fn compact(&mut self, used: u32) -> bool {
-        let is_small = (self.free - self.valid.base) / SLOT_SIZE < used;
-        if self.newer || self.header == Header::Absent || self.storing.step != Step::Idle || is_small {
+        // Without a valid region, the slot of the header alone is used.
+        if self.newer || self.free - self.valid.base < used * SLOT_SIZE && !self.half_valid {
             return false;
         }
         self.storing.record[0] = ERASED;
@@ -242,12 +248,13 @@ impl Journal {
                     core::mem::swap(&mut self.valid, &mut self.other);
                     self.sequence = self.sequence.wrapping_add(1);
                     self.free = self.storing.to;
+                    self.half_valid = false;
                     self.header = Header::Firm;
-                    self.begin(flash)?;
+                    self.storing.step = Step::Begin;
                 }
                 (Ok(None), Step::Refresh) => {
                     self.header = Header::Firm;
-                    self.append()?;
+                    self.storing.step = Step::Begin;
                 }
                 (Ok(None), Step::Append) => {
                     self.free += SLOT_SIZE;
@@ -300,12 +307,11 @@ impl Journal {
         let mut at = self.free;
         while at > first {
             at -= SLOT_SIZE;
-            let found = read_slot(flash, at);
-            if found[MARK_WORD] == ERASED {
+            if flash.read_word(at + 4 * MARK_WORD as u32) == ERASED {
                 return false;
             }
-            if found[0] == self.storing.record[0] {
-                return found[..MARK_WORD] == self.storing.record[..MARK_WORD];
+            if flash.read_word(at) == self.storing.record[0] {
+                return read_slot(flash, at)[..MARK_WORD] == self.storing.record[..MARK_WORD];
             }
         }
         false
@@ -341,7 +347,7 @@ impl Journal {
 
     /// Continues with the first free slot, or with a region that has free slots.
     fn append(&mut self) -> Result<(), StoreError> {
-        if self.free + SLOT_SIZE > self.valid.end() {
+        if self.half_valid || self.free + SLOT_SIZE > self.valid.end() {
             return self.change_over();
         }
         self.write(Step::Append, self.free, self.storing.record);
