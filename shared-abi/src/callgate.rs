@@ -101,8 +101,8 @@ pub enum Status {
     /// ([`BootRequest::Confirm`](crate::warm_start::BootRequest::Confirm) and the two requests
     /// after it).
     Locked = -8,
-    /// The journal is nearly full, and what is left is for confirmations. The next start without a request,
-    /// or the bootloader when it is called, makes room.
+    /// The journal is nearly full, and its last places are for confirmations; or these are used, too. The next
+    /// start without a request makes room, and so does the bootloader when it is called.
     Full = -9,
 }
 

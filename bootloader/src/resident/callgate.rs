@@ -83,7 +83,8 @@ fn keep(
     if is_locked(parameters, flash) {
         return Err(Status::Locked);
     }
-    store(parameters, flash, key, value).map_err(|_| Status::Failed)
+    let is_full = parameters.is_nearly_full();
+    store(parameters, flash, key, value).map_err(|_| if is_full { Status::Full } else { Status::Failed })
 }
 
 /// Whether the boot stage locked the flash before it started the running program.
@@ -127,8 +128,8 @@ fn crc32(flash: &ResidentFlash, args: &mut Crc32Args) -> Result<(), Status> {
     Ok(())
 }
 
-/// Returns or stores node-ID and bit rate. The last places of the journal are for what cannot wait: a confirmation, and
-/// the boot stage (`to_the_last`).
+/// Returns or stores node-ID and bit rate. The last places of the journal are for what cannot wait: confirmations, and
+/// what the boot stage stores (`to_the_last`).
 fn node(
     selector: Selector,
     flash: &mut ResidentFlash,

@@ -16,10 +16,10 @@
 //! - **A value that is stored already is not written again**: a command that changes nothing must
 //!   not wear the flash.
 //!
-//! Every start reads the journal. So a search looks at one word of a slot, its tag, and computes the CRC
-//! of those alone that it needs. Who may not wait for the erase of a sector (boot stage, callgate) lets
-//! the flash refuse it: then a full region refuses a value, and the RAM image compacts it
-//! ([`Parameters::compact`]) before that.
+//! Every start reads the journal. So a search reads one word of each slot, its tag, and the rest of a slot
+//! only if the tag is the wanted one. Boot stage and callgate must not wait for the erase of a sector: their
+//! flash refuses it, and so does a region without a free slot. The RAM image compacts the journal before
+//! that ([`Parameters::compact`]).
 
 use shared_abi::geometry::Region;
 

@@ -97,7 +97,7 @@ pub trait Parameters {
     fn get<F: Flash>(&self, flash: &F, key: Key) -> Option<Value>;
 
     /// Starts to store one value; [`next`](Self::next) carries it out. After a success the value is
-    /// certain, also if a power cut had left it between 0 and 1. A compaction that goes on ends with it.
+    /// certain, also if a power cut had left it between 0 and 1. During a compaction it follows after it.
     fn store(&mut self, key: Key, value: Value);
 
     /// Whether so few places are free that it must be compacted before a program starts: the program and the
