@@ -593,18 +593,33 @@ fn what_a_product_does_without_is_not_there() {
     let node = NodeId::new(5).unwrap();
     let mut server = SdoServer::new(node, ServerConfig { unknown_request, ..ServerConfig::DEFAULT });
     let now = canopen::Instant::from_millis(0);
-    // CiA 301 section 7.2.4.3.13: initiate of 1008h, start, acknowledge; section 7.2.4.3.9: initiate of
-    // 1F50h/1, end.
-    for request in [
-        [0xA4, 0x08, 0x10, 0, 127, 0, 0, 0],
-        [0xA3, 0, 0, 0, 0, 0, 0, 0],
-        [0xA2, 1, 127, 0, 0, 0, 0, 0],
-        [0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0],
-        [0xC1, 0, 0, 0, 0, 0, 0, 0],
-    ] {
+    let mut ask = |request| {
         server.handle(&canopen::Frame::full(canopen::CobId::sdo_request(node), request), now, &mut least);
-        let answer = server.poll(now, &mut least).unwrap();
-        assert_eq!(answer.exactly::<8>(), Some(&[0x80, 0, 0, 0, 0, 0, 0, 8]), "{request:02X?}");
+        *server.poll(now, &mut least).unwrap().exactly::<8>().unwrap()
+    };
+    // An abort has the multiplexor of its request (CiA 301 clause 7.2.4.3.17): clause 7.2.4.3.13, initiate of
+    // 1018h/1, and clause 7.2.4.3.9, of 1F50h/1. The start, acknowledgement and end of a block transfer and
+    // an unknown command have none: then that of the open transfer, or none.
+    let [none, name] = [[0; 3], [0x08, 0x10, 0]];
+    for (before, at_before) in
+        [([0x40, 0x18, 0x10, 2, 0, 0, 0, 0], none), ([0x40, 0x08, 0x10, 0, 0, 0, 0, 0], name)]
+    {
+        for (request, [low, high, sub]) in [
+            ([0xA4, 0x18, 0x10, 1, 127, 0, 0, 0], [0x18, 0x10, 1]),
+            ([0xC6, 0x50, 0x1F, 1, 100, 0, 0, 0], [0x50, 0x1F, 1]),
+            ([0xA3, 0, 0, 0, 0, 0, 0, 0], at_before),
+            ([0xA2, 1, 127, 0, 0, 0, 0, 0], at_before),
+            ([0xA1, 0, 0, 0, 0, 0, 0, 0], at_before),
+            ([0xC1, 1, 2, 0, 0, 0, 0, 0], at_before),
+            ([0xE0, 0x57, 0x1F, 1, 0, 0, 0, 0], at_before),
+        ] {
+            assert_ne!(ask(before)[0], 0x80);
+            assert_eq!(
+                ask(request),
+                [0x80, low, high, sub, 0, 0, 0, 8],
+                "{request:02X?} after {before:02X?}"
+            );
+        }
     }
 }
 

@@ -254,10 +254,12 @@ fn commands_out_of_place_or_unknown_abort() {
         let [low, high] = index.to_le_bytes();
         [0x80, low, high, sub, 0x01, 0x00, 0x04, 0x05]
     };
-    // ccs 7 is undefined; segments without a transfer.
-    breaks(&[([0xE0, 1, 2, 3, 4, 5, 6, 7], unknown(0, 0))], &[]);
-    breaks(&[([0x00, 1, 2, 3, 4, 5, 6, 7], unknown(0, 0))], &[]);
-    breaks(&[([0x60, 0, 0, 0, 0, 0, 0, 0], unknown(0, 0))], &[]);
+    // ccs 7 is undefined; segments without a transfer. The abort has the multiplexor of its request (CiA 301
+    // clause 7.2.4.3.17), and these have none: not that of the transfer before, which has ended.
+    let read = ([0x40, 0x18, 0x10, 1, 0, 0, 0, 0], [0x43, 0x18, 0x10, 1, 0x04, 0x03, 0x02, 0x01]);
+    for command in [0xE0, 0x00, 0x60, 0xA1, 0xA2, 0xA3, 0xC1] {
+        breaks(&[read, ([command, 1, 2, 3, 4, 5, 6, 7], unknown(0, 0))], &[]);
+    }
     // The segment of the other direction.
     let cancelled = [Event::Start(Some(9)), Event::Cancel];
     breaks(&[START_9, ([0x60, 0, 0, 0, 0, 0, 0, 0], unknown(0x1F50, 1))], &cancelled);

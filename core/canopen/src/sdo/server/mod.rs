@@ -153,7 +153,8 @@ pub struct SdoServer {
     config: Config,
     /// The COB-ID of answers: the client's of the last request.
     response: CobId,
-    /// The object of the running transfer, or of the last one.
+    /// The object of the running transfer, or of the last request. An abort has it (CiA 301 clause
+    /// 7.2.4.3.17): 0000h/00 after a request without an object that belongs to no transfer.
     at: Address,
     state: State,
     /// The time of the transfer's last progress: the time-out counts from here.
@@ -376,6 +377,9 @@ impl SdoServer {
 
     /// A request outside the sub-blocks of a block download.
     fn request<O: Objects>(&mut self, bytes: &[u8; 8], objects: &mut O) -> Result<(), AbortCode> {
+        if matches!(self.state, State::Idle) {
+            self.at = Address::new(0, 0);
+        }
         match fields::specifier(bytes[0]) {
             ccs::INITIATE_DOWNLOAD => self.initiate_download(bytes, objects),
             ccs::DOWNLOAD_SEGMENT => self.download_segment(bytes, objects),
@@ -384,6 +388,8 @@ impl SdoServer {
             ccs::INITIATE_BLOCK_DOWNLOAD if O::has_block_download() => {
                 self.initiate_block_download(bytes, objects)
             }
+            ccs::INITIATE_BLOCK_DOWNLOAD => self.leave_out(bytes, objects),
+            ccs::INITIATE_BLOCK_UPLOAD if !O::has_block_upload() => self.leave_out(bytes, objects),
             ccs::END_BLOCK_DOWNLOAD if O::has_block_download() => self.end_block_download(bytes, objects),
             fields::ABORT => {
                 self.reset(objects);
@@ -392,6 +398,12 @@ impl SdoServer {
             specifier if O::has_block_upload() => self.block_upload(specifier, bytes, objects),
             _ => Err(self.config.unknown_request),
         }
+    }
+
+    /// Refuses the initiate of a service that this device leaves out.
+    fn leave_out(&mut self, bytes: &[u8; 8], objects: &mut impl Objects) -> Result<(), AbortCode> {
+        let _ = self.begin(fields::address(bytes), objects);
+        Err(self.config.unknown_request)
     }
 
     /// Starts a transfer and ends the previous one. An abort from here on names this object.
