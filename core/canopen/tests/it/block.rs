@@ -506,6 +506,23 @@ fn client_falls_back_to_segments_where_it_may() {
     sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
     hears(&mut client, 0, &[unknown]);
     sends(&mut client, 0, &[[0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
+    // A server that names the object of the transfer before: 100 ms after its abort, if no answer comes.
+    let misnamed = [0x80, 0x08, 0x10, 0, 0x01, 0x00, 0x04, 0x05];
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    sends(&mut client, 0, &[INITIATE_9]);
+    hears(&mut client, 30, &[misnamed]);
+    assert_eq!(client.poll(at(129)), Step::Wait(at(130)));
+    sends(&mut client, 130, &[[0x21, 0x50, 0x1F, 1, 9, 0, 0, 0]]);
+    let mut client = Upload::as_blocks(node(), PROGRAM, Vec::new(), CONFIG, BLOCK);
+    sends(&mut client, 0, &[[0xA4, 0x50, 0x1F, 1, 127, 0, 0, 0]]);
+    hears(&mut client, 30, &[misnamed]);
+    hears(&mut client, 90, &[misnamed]);
+    sends(&mut client, 130, &[[0x40, 0x50, 0x1F, 1, 0, 0, 0, 0]]);
+    // If the answer comes, it was the abort of the transfer before.
+    let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, BLOCK);
+    sends(&mut client, 0, &[INITIATE_9]);
+    hears(&mut client, 0, &[misnamed, granted(127)]);
+    sends(&mut client, 101, &[FIRST, LAST_OF_9]);
     // Not if the caller forbids it, and not for other reasons.
     let strict = Block { fallback: false, ..BLOCK };
     let mut client = Download::as_blocks(node(), PROGRAM, nine(), CONFIG, strict);

@@ -74,8 +74,7 @@ impl<D: AsRef<[u8]>> Download<D> {
     /// Whether the transfer has ended because the server does not support block transfer, as far as
     /// its abort of the initiate tells.
     pub fn refuses_blocks(&self) -> bool {
-        let refused = matches!(self.link.result, Some(Err(SdoError::Server(code))) if means_unknown(code));
-        refused && matches!(self.state, State::InitiatingBlock { .. })
+        self.link.refused_as_unknown() && matches!(self.state, State::InitiatingBlock { .. })
     }
 
     fn answer(&mut self, bytes: &[u8; 8]) -> Result<Next, SdoError> {
@@ -129,7 +128,8 @@ impl<D: AsRef<[u8]>> Download<D> {
             // The server repeats its acknowledgement.
             (Some(Response::AckBlockDownload(_)), State::EndingBlock) => Ok(Next::Ignore),
             (Some(Response::EndBlockDownload), State::EndingBlock) => Ok(Next::Done(None)),
-            (response, State::Initiating | State::InitiatingBlock { .. }) => self.link.too_early(response),
+            (response, State::Initiating) => self.link.too_early(response, false),
+            (response, State::InitiatingBlock { .. }) => self.link.too_early(response, true),
             (response, _) => self.link.unexpected(response),
         }
     }
@@ -233,6 +233,10 @@ impl<D: AsRef<[u8]>> Transfer for Download<D> {
     }
 
     fn poll(&mut self, now: Instant) -> Step {
+        if let Some(bytes) = self.link.abort_of_blocks(now) {
+            let next = self.answer(&bytes);
+            self.link.advance(next, now);
+        }
         let data = self.data.as_ref();
         match &mut self.state {
             State::Blocks(sub_block) if self.link.result.is_none() && !sub_block.is_sent(data) => {

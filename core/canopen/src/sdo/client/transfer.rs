@@ -112,7 +112,17 @@ pub(super) struct Link {
     pub(super) progress: u32,
     /// Whether an answer was ignored that no server gives to the initiate of this transfer.
     odd: bool,
+    /// An abort that was ignored, since it names another object; and the time at which it is taken for the
+    /// answer to the initiate of a block transfer, if none comes.
+    misnamed: Option<(AbortCode, Instant)>,
 }
+
+/// How long the answer to an initiate is awaited after an abort that names another object, in milliseconds.
+///
+/// Some servers abort the initiate of a block transfer that they do not support with the object of the
+/// transfer before (CANopenNode, without its option for block transfer). A late abort of that transfer looks
+/// the same, but after it comes the answer to the initiate: a server answers in the order of the requests.
+pub(super) const MISNAMED_MS: u32 = 100;
 
 /// The consequence of an answer.
 pub(super) enum Next {
@@ -121,6 +131,9 @@ pub(super) enum Next {
     /// The frame is ignored. It does not restart the time-out, because answers to another client
     /// could otherwise keep this transfer waiting forever.
     Ignore,
+    /// The same for an abort that names another object, in the initiate of a block transfer: the server may
+    /// not support them.
+    Doubt(AbortCode),
     /// The transfer was successful; with a last request to the server, if the protocol has one.
     Done(Option<Request>),
 }
@@ -136,6 +149,7 @@ impl Link {
             result: None,
             progress: 0,
             odd: false,
+            misnamed: None,
         }
     }
 
@@ -147,12 +161,23 @@ impl Link {
         frame.exactly()
     }
 
+    pub(super) fn refused_as_unknown(&self) -> bool {
+        matches!(self.result, Some(Err(SdoError::Server(code))) if means_unknown(code))
+    }
+
     pub(super) fn awaits_answer(&self) -> bool {
         self.result.is_none() && self.request.is_none()
     }
 
     pub(super) fn deadline(&self) -> Instant {
-        self.moved + self.timeout_ms
+        let timeout = self.moved + self.timeout_ms;
+        self.misnamed.map_or(timeout, |(_, until)| timeout.earlier(until))
+    }
+
+    /// The abort of the initiate of a block transfer, as its server should have sent it.
+    pub(super) fn abort_of_blocks(&mut self, now: Instant) -> Option<[u8; 8]> {
+        let (code, _) = self.misnamed.take_if(|(_, until)| now.has_reached(*until))?;
+        Some(Request::Abort(self.at, code).emit())
     }
 
     pub(super) fn poll(&mut self, now: Instant) -> Step {
@@ -180,12 +205,14 @@ impl Link {
 
     /// Carries out the consequence of an answer.
     pub(super) fn advance(&mut self, next: Result<Next, SdoError>, now: Instant) {
-        if !matches!(next, Ok(Next::Ignore)) {
+        if !matches!(next, Ok(Next::Ignore | Next::Doubt(_))) {
             self.moved = now;
+            self.misnamed = None;
         }
         match next {
             Ok(Next::Send(request)) => self.request = Some(request),
             Ok(Next::Wait | Next::Ignore) => {}
+            Ok(Next::Doubt(code)) => self.misnamed = self.misnamed.or(Some((code, now + MISNAMED_MS))),
             Ok(Next::Done(farewell)) => {
                 self.request = farewell;
                 self.result = Some(Ok(()));
@@ -221,13 +248,20 @@ impl Link {
     /// An answer before the server has answered the initiate. The server answers in the order of
     /// the requests, so one that does not fit answers the transfer before, which this side has given
     /// up. It is ignored; if nothing else comes, it is the error at the time-out.
-    pub(super) fn too_early(&mut self, response: Option<Response>) -> Result<Next, SdoError> {
-        match self.unexpected(response) {
-            Err(SdoError::Client(_)) => {
+    pub(super) fn too_early(
+        &mut self,
+        response: Option<Response>,
+        of_blocks: bool,
+    ) -> Result<Next, SdoError> {
+        match (response, self.unexpected(response)) {
+            (_, Err(SdoError::Client(_))) => {
                 self.odd = true;
                 Ok(Next::Ignore)
             }
-            next => next,
+            (Some(Response::Abort(_, code)), Ok(_)) if of_blocks && means_unknown(code) => {
+                Ok(Next::Doubt(code))
+            }
+            (_, next) => next,
         }
     }
 }

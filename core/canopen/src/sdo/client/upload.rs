@@ -123,6 +123,12 @@ impl<S: Sink> Upload<S> {
         upload
     }
 
+    /// Whether the transfer has ended because the server does not support block transfer, as far as
+    /// its abort of the initiate tells.
+    pub fn refuses_blocks(&self) -> bool {
+        self.link.refused_as_unknown() && matches!(self.state, State::InitiatingBlock)
+    }
+
     /// The target: it contains all data after the transfer has ended without an error.
     pub fn sink(&self) -> &S {
         &self.sink
@@ -184,7 +190,8 @@ impl<S: Sink> Upload<S> {
             }
             // The answer to the initiate of the same read before, which was given up.
             (Some(Response::InitiateUpload(..)), State::Segments { .. }) => Ok(Next::Ignore),
-            (response, State::Initiating | State::InitiatingBlock) => self.link.too_early(response),
+            (response, State::Initiating) => self.link.too_early(response, false),
+            (response, State::InitiatingBlock) => self.link.too_early(response, true),
             (response, _) => self.link.unexpected(response),
         }
     }
@@ -261,6 +268,10 @@ impl<S: Sink> Transfer for Upload<S> {
     }
 
     fn poll(&mut self, now: Instant) -> Step {
+        if let Some(bytes) = self.link.abort_of_blocks(now) {
+            let next = self.answer(&bytes);
+            self.link.advance(next, now);
+        }
         // A sub-block that stopped early: its end was lost.
         if let State::Blocks(receiver) = &mut self.state {
             if self.link.awaits_answer() && receiver.is_within() {
