@@ -304,14 +304,16 @@ impl Responder {
             Ok(answer) => answer?,
             Err(Abort(code)) => (0x80, code.to_le_bytes()),
         };
-        // Only an initiate names an object: of the block transfers, that has a subcommand of 0.
+        // Only an initiate names an object: of the block transfers, that has a subcommand of 0. An abort of
+        // another request has that of the transfer it ends (CiA 301 section 7.2.4.3.17).
         let names_object = match bytes[0] >> 5 {
             1 | 2 => true,
             5 => bytes[0] & 3 == 0,
             6 => bytes[0] & 1 == 0,
             _ => false,
         };
-        let (index, sub) = if names_object { (index, sub) } else { (0, 0) };
+        let of_transfer = (sending.map_or(0, |sending| sending.index), 0);
+        let (index, sub) = if names_object { (index, sub) } else { of_transfer };
         Some(answer(command, index, sub, data))
     }
 
@@ -675,6 +677,13 @@ mod tests {
         for command in [0x00, 0x10, 0x60, 0x70, 0xA1, 0xA2, 0xA3, 0xC1, 0xE0, 0xFF] {
             let answer = ask(&mut responder(), [command, 1, 2, 3, 4, 5, 6, 7]);
             assert_eq!(answer, Some([0x80, 0, 0, 0, 1, 0, 4, 5]), "{command:02X}h");
+        }
+        // In a transfer, they end it.
+        for command in [0x00, 0xA1, 0xA2, 0xA3, 0xC1, 0xE0] {
+            let mut responder = responder();
+            ask(&mut responder, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]);
+            let answer = ask(&mut responder, [command, 1, 2, 3, 4, 5, 6, 7]);
+            assert_eq!(answer, Some([0x80, 0x08, 0x10, 0, 1, 0, 4, 5]), "{command:02X}h");
         }
     }
 

@@ -3,7 +3,7 @@
 #include "objects.h"
 
 /* Command specifiers of the client, and the specifier of an abort. */
-enum { DOWNLOAD = 1, UPLOAD = 2, ABORT = 4 };
+enum { DOWNLOAD = 1, UPLOAD = 2, ABORT = 4, BLOCK_UPLOAD = 5, BLOCK_DOWNLOAD = 6 };
 
 static uint32_t word_at(const uint8_t *bytes)
 {
@@ -24,6 +24,21 @@ static uint32_t download(uint16_t index, uint8_t sub, const uint8_t *request)
     return object_write(index, sub, word_at(&request[4]), !expedited ? SIZE_MAX : size_indicated ? 4 - unused : 0);
 }
 
+static bool names_object(uint8_t command)
+{
+    switch (command >> 5) {
+    case DOWNLOAD:
+    case UPLOAD:
+        return true;
+    case BLOCK_UPLOAD:
+        return (command & 3) == 0;
+    case BLOCK_DOWNLOAD:
+        return (command & 1) == 0;
+    default:
+        return false;
+    }
+}
+
 bool sdo_answer(const uint8_t request[8], uint8_t answer[8])
 {
     const uint16_t index = (uint16_t)(request[1] | request[2] << 8);
@@ -31,8 +46,10 @@ bool sdo_answer(const uint8_t request[8], uint8_t answer[8])
     uint32_t abort_code = ABORT_COMMAND, value = 0;
     uint8_t size = 0;
 
+    /* Of the requests that are aborted here, only the initiate of a block transfer names an object (CiA 301
+     * section 7.2.4.3): a subcommand of 0. */
     for (unsigned i = 1; i <= 3; i++) {
-        answer[i] = request[i];
+        answer[i] = names_object(request[0]) ? request[i] : 0;
     }
     switch (request[0] >> 5) {
     case DOWNLOAD:
