@@ -47,6 +47,8 @@ pub struct Session<'a> {
     transfers: Transfers,
     /// Whether the node has taken a sub-block of a block transfer.
     takes_blocks: bool,
+    /// Whether the node has refused to be read by block transfer.
+    lacks_block_upload: bool,
     sharing: u32,
     cancelled: Option<Arc<AtomicBool>>,
     answer: Option<fn(&Frame) -> Option<Frame>>,
@@ -89,6 +91,7 @@ impl<'a> Session<'a> {
             timing,
             transfers: Transfers::default(),
             takes_blocks: false,
+            lacks_block_upload: false,
             sharing: 1,
             cancelled: None,
             answer: None,
@@ -108,7 +111,20 @@ impl<'a> Session<'a> {
         };
         let (watch, on_silence, sharing) = (self.watch.clone(), self.on_silence, self.sharing);
         let takes_blocks = self.takes_blocks;
-        Session { way, node, timing, transfers, takes_blocks, sharing, cancelled, answer, watch, on_silence }
+        let lacks_block_upload = self.lacks_block_upload && node == self.node;
+        Session {
+            way,
+            node,
+            timing,
+            transfers,
+            takes_blocks,
+            lacks_block_upload,
+            sharing,
+            cancelled,
+            answer,
+            watch,
+            on_silence,
+        }
     }
 
     /// Says that so many sessions share the bus: a long value may have to wait for those of all
@@ -119,6 +135,7 @@ impl<'a> Session<'a> {
 
     /// Continues with another node.
     pub fn talk_to(&mut self, node: NodeId) {
+        self.lacks_block_upload &= node == self.node;
         self.node = node;
     }
 

@@ -112,12 +112,20 @@ impl Session<'_> {
         if !self.hears_the_bus() {
             return self.upload_there(at, progress);
         }
-        let (sink, config) = (Grown(Vec::new()), self.config());
-        let mut upload = match self.transfers {
-            Transfers::Blocks => Upload::as_blocks(self.node, at, sink, config, Block::default()),
-            Transfers::Segments => Upload::new(self.node, at, sink, config),
-        };
-        self.run(&mut upload, Doing::Read(at), Patience::ForEachStep, progress)?;
+        let (sink, config, doing) = (|| Grown(Vec::new()), self.config(), Doing::Read(at));
+        let by_blocks = self.transfers == Transfers::Blocks && !self.lacks_block_upload;
+        if by_blocks {
+            let block = Block { fallback: false, ..Block::default() };
+            let mut upload = Upload::as_blocks(self.node, at, sink(), config, block);
+            match self.run(&mut upload, doing, Patience::ForEachStep, progress) {
+                Err(Error::Refused { .. }) if upload.refuses_blocks() => {}
+                result => return result.map(|()| upload.into_sink().0),
+            }
+        }
+        let mut upload = Upload::new(self.node, at, sink(), config);
+        self.run(&mut upload, doing, Patience::ForEachStep, progress)?;
+        // The object can be read, so it was the service that the device refused: it is not asked again.
+        self.lacks_block_upload |= by_blocks;
         Ok(upload.into_sink().0)
     }
 
