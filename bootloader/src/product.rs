@@ -66,7 +66,7 @@ pub struct Product {
     /// `BLCOP_APP_START_INDEX` = 0 is program 1 here.
     pub autostart: Autostart,
     /// The number of unrequested resets of the application in a row after which the device stays in
-    /// the bootloader; at least 1.
+    /// the bootloader, 1 to 255.
     pub max_crash_resets: u32,
     /// How long a program that was never confirmed is held back before it starts by itself, in ms.
     /// In this time an SDO request to the node or any layer setting service keeps the device in the
@@ -91,11 +91,11 @@ pub struct Product {
     pub boot_up_message: bool,
     /// What the device does when its crystal fails, and the clock of its CAN controller may be wrong.
     pub crystal_failure: CrystalFailure,
-    /// Base of the COB-ID of SDO requests; the node-ID is added. At most 780h
-    /// (`BLCOP_BASE_REQUEST`).
+    /// Base of the COB-ID of SDO requests; the node-ID is added (`BLCOP_BASE_REQUEST`). With each of
+    /// `node_ids` it must be a COB-ID that the predefined connection set has for nothing else than SDO or PDOs
+    /// (CiA 301 clause 7.3.3): no node of the bus may then use that PDO.
     pub sdo_request_base: u16,
-    /// Base of the COB-ID of SDO answers; the node-ID is added. At most 780h
-    /// (`BLCOP_BASE_RESPONSE`).
+    /// Base of the COB-ID of SDO answers; the node-ID is added (`BLCOP_BASE_RESPONSE`). The same applies.
     pub sdo_response_base: u16,
     /// Whether the device may detect the bit rate by listening, if none is stored or set; on boards with the
     /// split map alone.
@@ -158,7 +158,7 @@ pub struct Product {
     pub start_allowed: fn(program: u8) -> bool,
     /// The CRC of blocks and programs (`BLCOP_USE_CRC16`).
     pub crc: CrcKind,
-    /// Bytes of flash that one step of a CRC covers, at least 64. Other work of the same priority
+    /// Bytes of flash that one step of a CRC covers, 64 to 65536. Other work of the same priority
     /// waits for one step at most (`BLCOP_MAX_CRC_STEP_SIZE`).
     pub crc_step: u32,
     /// Size of the buffer for blocks that wait for the flash, in bytes: 1024 up to the free RAM
@@ -172,7 +172,7 @@ pub struct Product {
     /// The time within which a program must feed the independent watchdog, from its first
     /// instruction on, in ms, 1 to 4000; `None` to start programs without the watchdog.
     pub program_watchdog_ms: Option<u16>,
-    /// How long the device waits for its reset after the answer is on the bus, in ms, at least 10:
+    /// How long the device waits for its reset after the answer is on the bus, in ms, 10 to 1000:
     /// clients expect to see the answer first. With 15 the bus is silent for less than 25 ms in a restart.
     pub answer_to_reset_ms: u32,
     /// The lowest accepted security counter of a sealed image, whatever is stored (feature
@@ -322,6 +322,10 @@ impl Product {
         );
         assert!(self.receive_queue >= 8, "product: receive_queue must be 8 or more");
         assert!(self.max_crash_resets >= 1, "product: max_crash_resets must be 1 or more");
+        assert!(
+            self.max_crash_resets <= 255,
+            "product: max_crash_resets must be 255 or less: each crash is counted in the flash"
+        );
         let window = if self.rescue_window_ms > self.rescue_window_confirmed_ms {
             self.rescue_window_ms
         } else {
@@ -358,7 +362,22 @@ impl Product {
             request.abs_diff(0x700) >= 0x80 && response.abs_diff(0x700) >= 0x80,
             "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"
         );
+        assert!(
+            !is_taken(request, 0x600, &self),
+            "product: sdo_request_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
+             580h to 67Fh, 700h to 7FFh): take 600h, or a base from 180h to 500h or of 680h"
+        );
+        assert!(
+            !is_taken(response, 0x580, &self),
+            "product: sdo_response_base plus one of node_ids is a COB-ID of another service (CiA 301: 000h to 180h, \
+             580h to 67Fh, 700h to 7FFh): take 580h, or a base from 180h to 500h or of 680h"
+        );
+        self.check_board_node();
         assert!(self.crc_step >= 64, "product: crc_step must be 64 bytes or more");
+        assert!(
+            self.crc_step <= 64 * 1024,
+            "product: crc_step must be 65536 bytes or less: the watchdog waits for a step"
+        );
         assert!(
             self.block_buffer >= 1024 && self.block_buffer < LAYOUT.ram.size as usize,
             "product: block_buffer must be 1024 bytes or more, and fit the RAM"
@@ -372,6 +391,10 @@ impl Product {
         assert!(
             self.answer_to_reset_ms >= 10,
             "product: answer_to_reset_ms must be 10 or more (SYS TEC manual L-1112d_10, 4.5)"
+        );
+        assert!(
+            self.answer_to_reset_ms <= 1000,
+            "product: answer_to_reset_ms must be 1000 or less: until its reset the device is silent"
         );
         assert!(
             !self.renewal || LAYOUT.staging.is_some(),
@@ -400,6 +423,38 @@ impl Product {
             "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off"
         );
         self
+    }
+
+    /// A device without stored values has the node-ID and the bit rate of the profile or the board: they must be
+    /// among those that the product takes.
+    const fn check_board_node(&self) {
+        let (node_id, bit_rate) = match self.profile.default_node {
+            Some((id, bit_rate)) => (id.get(), Some(bit_rate)),
+            None => (NODE_ID, BitRate::from_bits_per_second(BIT_RATE)),
+        };
+        let index = match bit_rate {
+            // For the first one the product needs `auto_bit_rate`; the second one is the board's mistake.
+            Some(BitRate::Auto) | None => *self.bit_rates.start(),
+            Some(bit_rate) => bit_rate as u8,
+        };
+        assert!(
+            index >= *self.bit_rates.start() && index <= *self.bit_rates.end(),
+            "product: bit_rates is without the bit rate of a new device (bit_rate of the board, or that of the \
+             profile): add its index, or change the board's"
+        );
+        if matches!(self.node_source, NodeSource::Function(_)) {
+            return;
+        }
+        assert!(
+            node_id == NO_NODE_ID || node_id >= *self.node_ids.start() && node_id <= *self.node_ids.end(),
+            "product: node_ids is without the node-ID of a new device (node_id of the board, or that of the \
+             profile): add it, or set the board's to one of them, or to 255 for none"
+        );
+        assert!(
+            node_id != NO_NODE_ID || self.lss || self.profile.node_id.is_some(),
+            "product: without lss a new device never gets a node-ID (node_id of the board is 255): set lss, or the \
+             board's node_id"
+        );
     }
 
     /// The policy for downloads to a device of this identity: the profile's rules with the product's
@@ -480,6 +535,25 @@ impl Product {
 /// Whether the dialect is ESAcademy's, whose tools send Intel HEX.
 const fn sends_hex(profile: &Profile) -> bool {
     matches!(profile.extras.password, PasswordObject::EnableFlash)
+}
+
+/// Whether this base and a node-ID of the product make a COB-ID that the predefined connection set has for another
+/// service (CiA 301 clauses 7.3.3 and 7.3.5; CiA 305 for LSS). `own` is the base of SDO there. PDOs do not count:
+/// their COB-IDs can be configured.
+const fn is_taken(base: u16, own: u16, product: &Product) -> bool {
+    const fn is_free(base: u16, node_id: u8) -> bool {
+        matches!(base + node_id as u16, 0x181..=0x57F | 0x680..=0x6FF)
+    }
+    let mut free = match product.profile.node_id {
+        Some(id) => is_free(base, id.get()),
+        None => true,
+    };
+    let mut node_id = *product.node_ids.start();
+    while node_id <= *product.node_ids.end() {
+        free &= is_free(base, node_id);
+        node_id += 1;
+    }
+    base != own && !free
 }
 
 /// The source of the device's identity.

@@ -686,6 +686,57 @@ const MISTAKES: &[Mistake] = &[
         "Product { sdo_request_base: 0x680, sdo_response_base: 0x701, ..Product::DEFAULT }",
         "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)",
     ),
+    // CiA 301 table 39 (predefined connection set): EMCY has 081h to 0FFh, SDO of other nodes 581h to 67Fh; CiA
+    // 305: LSS has 7E4h and 7E5h. The board has node-ID 1 and 125 kbit/s.
+    product(
+        "Product { sdo_response_base: 0x80, ..Product::DEFAULT }",
+        "product: sdo_response_base plus one of node_ids is a COB-ID of another service",
+    ),
+    product(
+        "Product { sdo_request_base: 0x780, ..Product::DEFAULT }",
+        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
+    ),
+    product(
+        "Product { sdo_request_base: 0x501, sdo_response_base: 0x680, ..Product::DEFAULT }",
+        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
+    ),
+    // The bootloader of a lift is node 126.
+    product(
+        "Product { profile: Profile::LIFT, node_ids: 1..=10, sdo_request_base: 0x510, sdo_response_base: 0x480, ..Product::DEFAULT }",
+        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
+    ),
+    product(
+        "Product { node_ids: 10..=20, ..Product::DEFAULT }",
+        "product: node_ids is without the node-ID of a new device",
+    ),
+    product(
+        "Product { bit_rates: 0..=2, ..Product::DEFAULT }",
+        "product: bit_rates is without the bit rate of a new device",
+    ),
+    // Its new devices have node-ID 64 at 125 kbit/s.
+    product(
+        "Product { profile: Profile::ESACADEMY, node_ids: 1..=63, ..Product::DEFAULT }",
+        "product: node_ids is without the node-ID of a new device",
+    ),
+    Mistake {
+        file: BOARD,
+        right: " node_id: 1",
+        wrong: " node_id: 255",
+        by: By::Product(Some("least")),
+        says: "product: without lss a new device never gets a node-ID",
+    },
+    product(
+        "Product { max_crash_resets: 256, ..Product::DEFAULT }",
+        "product: max_crash_resets must be 255 or less",
+    ),
+    product(
+        "Product { crc_step: 65537, ..Product::DEFAULT }",
+        "product: crc_step must be 65536 bytes or less",
+    ),
+    product(
+        "Product { answer_to_reset_ms: 1001, ..Product::DEFAULT }",
+        "product: answer_to_reset_ms must be 1000 or less",
+    ),
     product(
         "Product { program_watchdog_ms: Some(0), ..Product::DEFAULT }",
         "product: program_watchdog_ms must be 1 to 4000",

@@ -27,7 +27,7 @@ const FIELDS: [(&str, &[&str]); 49] = [
     ("autostart", &["Autostart::InOrder", "Autostart::List(&[])", "Autostart::Function(|| &[1])"]),
     ("rescue_window_ms", &["300", "0"]),
     ("rescue_window_confirmed_ms", &["0", "100"]),
-    ("node_ids", &["1..=127", "2..=100"]),
+    ("node_ids", &["1..=127", "1..=100"]),
     ("bit_rates", &["0..=8", "2..=6"]),
     ("node_source", &["NodeSource::Stored", "NodeSource::Constant", SWITCHES]),
     ("boot_up_message", &["true", "false"]),

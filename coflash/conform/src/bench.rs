@@ -70,6 +70,8 @@ pub struct Bench<'a> {
     /// Whether the answers of layer setting services can be judged, or why not; `None` until this
     /// was looked at.
     pub(super) lss: Option<Result<(), String>>,
+    /// The multiplexor that an abort must have.
+    at: [u8; 3],
     means: Means<'a>,
     cancelled: &'a Arc<AtomicBool>,
 }
@@ -93,6 +95,27 @@ pub(super) fn abort_of(answer: &[u8; 8]) -> Option<u32> {
     (answer[0] == 0x80).then(|| u32::from_le_bytes([answer[4], answer[5], answer[6], answer[7]]))
 }
 
+/// The multiplexor of an abort to a request that has none and belongs to no transfer.
+const NONE: [u8; 3] = [0; 3];
+
+/// Whether a request has a multiplexor (CiA 301 clause 7.2.4.3): the initiates of all services.
+const fn initiates(command: u8) -> bool {
+    matches!(command >> 5, 1 | 2) || matches!(command & 0xE3, 0xA0 | 0xC0 | 0xC2)
+}
+
+/// Whether a transfer has ended with this answer: it was the last segment, all data were in the initiate, or
+/// it is the end of a block transfer.
+const fn ends(asked: u8, answer: u8) -> bool {
+    match asked >> 5 {
+        1 => asked & 2 != 0,
+        2 => answer & 2 != 0,
+        3 => answer & 1 != 0,
+        0 | 6 => asked & 1 != 0,
+        5 => answer & 0xE2 == 0x42,
+        _ => false,
+    }
+}
+
 impl<'a> Bench<'a> {
     pub(super) fn new(
         adapter: &'a mut dyn Adapter,
@@ -100,7 +123,7 @@ impl<'a> Bench<'a> {
         means: Means<'a>,
         cancelled: &'a Arc<AtomicBool>,
     ) -> Self {
-        Self { adapter, node, lss: None, means, cancelled }
+        Self { adapter, node, lss: None, at: NONE, means, cancelled }
     }
 
     /// Does something with the client of updates; its error is the device's failure.
@@ -140,6 +163,7 @@ impl<'a> Bench<'a> {
         self.adapter.send(&Frame::full(CobId::LSS_REQUEST, [4, 0, 0, 0, 0, 0, 0, 0]))?;
         let abort = request(0x80, 0, 0, 0x0800_0000_u32.to_le_bytes());
         self.adapter.send(&Frame::full(CobId::sdo_request(self.node), abort))?;
+        self.at = NONE;
         let response = CobId::sdo_response(self.node);
         let begun = self.adapter.now();
         let mut quiet = begun;
@@ -175,6 +199,10 @@ impl<'a> Bench<'a> {
     }
 
     pub(super) fn send(&mut self, frame: &Frame) -> Result<(), Stop> {
+        // A reset of the communication ends a transfer.
+        if frame.has_cob_id(CobId::NMT) {
+            self.at = NONE;
+        }
         Ok(self.adapter.send(frame)?)
     }
 
@@ -217,21 +245,45 @@ impl<'a> Bench<'a> {
     pub(super) fn heard(&mut self) -> Result<[u8; 8], Stop> {
         match self.hear(CobId::sdo_response(self.node), self.means.answer)? {
             Some(frame) => match frame.exactly::<8>() {
-                Some(data) => Ok(*data),
+                Some(data) => self.names_its_object(*data),
                 None => failed(format!("the SDO answer has not 8 bytes: {frame}")),
             },
             None => failed(format!("no SDO answer within {} ms", self.means.answer.as_millis())),
         }
     }
 
+    /// An answer; an abort must have the multiplexor of its request, or of the transfer that the request
+    /// belongs to (CiA 301 clause 7.2.4.3.17).
+    pub(super) fn names_its_object(&mut self, answer: [u8; 8]) -> Result<[u8; 8], Stop> {
+        if answer[0] == 0x80 {
+            let right = std::mem::replace(&mut self.at, NONE);
+            let [[i, j, sub], [k, l, other]] = [right, [answer[1], answer[2], answer[3]]];
+            if [k, l, other] != right {
+                return failed(format!(
+                    "the abort names {l:02X}{k:02X}h/{other} in place of {j:02X}{i:02X}h/{sub}"
+                ));
+            }
+        }
+        Ok(answer)
+    }
+
     /// Sends an SDO request and returns the answer.
     pub(super) fn ask(&mut self, data: [u8; 8]) -> Result<[u8; 8], Stop> {
-        self.send(&Frame::full(CobId::sdo_request(self.node), data))?;
-        self.heard()
+        self.tell(data)?;
+        let answer = self.heard()?;
+        if ends(data[0], answer[0]) {
+            self.at = NONE;
+        }
+        Ok(answer)
     }
 
     /// Sends a frame of the SDO client that has no answer.
     pub(super) fn tell(&mut self, data: [u8; 8]) -> Result<(), Stop> {
+        if initiates(data[0]) {
+            self.at = [data[1], data[2], data[3]];
+        } else if matches!(data[0], 0x80 | 0xA1) {
+            self.at = NONE;
+        }
         self.send(&Frame::full(CobId::sdo_request(self.node), data))
     }
 

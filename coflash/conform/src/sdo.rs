@@ -58,14 +58,15 @@ pub(super) const CHECKS: &[Check] = &[
         let node = b.node;
         b.ignores(&Frame::full(CobId::sdo_request(node), abort), CobId::sdo_response(node))
     }),
-    Check::new("SDO-011", "an abort answer names the object of the request", ABORT, |b| {
-        let asked = up(0x1018, 0xC8);
-        let answer = b.ask(asked)?;
-        if answer[1..4] == asked[1..4] {
-            Ok(())
-        } else {
-            failed("the abort is for another object")
+    Check::new("SDO-011", "each service is aborted with the object of its request, and not of the one before", ABORT, |b| {
+        for command in [UP, 0x23, 0x21, 0xA4, 0xC6] {
+            b.works()?;
+            let answer = b.ask(request(command, 0x1018, 0xC8, [127, 0, 0, 0]))?;
+            if abort_of(&answer).is_none() {
+                return failed(format!("{command:02X}h is answered with {:02X}h in place of an abort", answer[0]));
+            }
         }
+        Ok(())
     }),
     refused("SDO-012", "upload of 1001h/1: 06090011h", up(0x1001, 1), NO_SUB_INDEX),
     refused("SDO-013", "upload of index 0000h: 06020000h", up(0, 0), NO_OBJECT),
@@ -144,9 +145,9 @@ pub(super) const CHECKS: &[Check] = &[
         let id = CobId::sdo_response(b.node);
         match b.hear(id, ABANDONED)? {
             None => skipped("the server waits for longer than 5 s, as it may"),
-            Some(frame) => match frame.exactly().and_then(abort_of) {
-                Some(TIME_OUT) => Ok(()),
-                _ => failed(format!("{frame}")),
+            Some(frame) => match frame.exactly().filter(|answer| abort_of(answer) == Some(TIME_OUT)) {
+                Some(answer) => b.names_its_object(*answer).map(drop),
+                None => failed(format!("{frame}")),
             },
         }
     }),

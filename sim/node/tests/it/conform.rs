@@ -103,8 +103,15 @@ const FAULTS: &[Fault] = &[
         sdo(f, |data| if asked[0] == 0x70 && data[4..] == [0, 0, 3, 5] { data[4..].copy_from_slice(&[1, 0, 4, 5]) })
     }),
     // The abort names another object.
-    answers(&["SDO-011"], |asked, f| {
+    answers(&["SDO-002", "SDO-011"], |asked, f| {
         sdo(f, |data| if asked.starts_with(&[0x40, 0x18, 0x10, 0xC8]) { data[3] = 0 })
+    }),
+    // One service is aborted with the object of another request; a segment with none in place of its transfer's.
+    answers(&["SDO-011", "PRG-034", "PRG-035"], |asked, f| {
+        sdo(f, |data| if asked[0] == 0xC6 && data[0] == 0x80 { data[1..4].copy_from_slice(&[0x18, 0x10, 4]) })
+    }),
+    answers(&["SEG-006"], |asked, f| {
+        sdo(f, |data| if asked[0] == 0 && data[..4] == [0x80, 0x08, 0x10, 0] { data[1..3].fill(0) })
     }),
     // The CRC of a block upload.
     answers(&["BLK-003", "BLK-005"], |asked, f| {
