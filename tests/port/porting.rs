@@ -320,6 +320,7 @@ fn assert_formatted(copy: &Copy, files: &[&str]) {
 }
 
 /// One mistake in an otherwise good port, and the message of the build.
+#[derive(Clone, Copy)]
 struct Mistake {
     file: &'static str,
     right: &'static str,
@@ -349,7 +350,9 @@ const LAYOUT: &str = "shared-abi/src/layout/boards/nucleo_f446re.rs";
 const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 
 /// A mistake in the choices of a product.
-const fn product(wrong: &'static str, says: &'static str) -> Mistake {
+fn product(&(choices, says): &(&str, &'static str)) -> Mistake {
+    let rest = if choices.contains("..Product::") { "" } else { ", ..Product::DEFAULT" };
+    let wrong = format!("Product {{ {choices}{rest} }}").leak();
     let file = "bootloader/products/default.rs";
     Mistake { file, right: "Product { ..Product::DEFAULT }", wrong, by: By::Product(None), says }
 }
@@ -610,114 +613,6 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "board: the clock of the UART cannot make uart_bit_rate",
     },
-    // Choices that contradict each other, or the layout, which has only one program.
-    product(
-        "Product { autostart: Autostart::List(&[2]), ..Product::DEFAULT }",
-        "product: autostart names a program that the layout has not",
-    ),
-    product(
-        "Product { second_server: true, block_download: false, ..Product::DEFAULT }",
-        "product: second_server needs block_download, by which a group gets its data",
-    ),
-    product(
-        "Product { auto_bit_rate: true, ..Product::DEFAULT }",
-        "product: block_upload, second_server, resume, read_back, program_date and auto_bit_rate need the \
-         split map: the compact one has no room for them",
-    ),
-    product(
-        "Product { lss: true, ..Product::of(Profile::LIFT) }",
-        "product: lss needs the split map in a profile with a password",
-    ),
-    product(
-        "Product { intel_hex: true, ..Product::DEFAULT }",
-        "product: intel_hex needs the split map, or ESAcademy's profile",
-    ),
-    product(
-        "Product { segments_per_sub_block: 128, ..Product::DEFAULT }",
-        "product: segments_per_sub_block must be 1 to 127",
-    ),
-    product("Product { receive_queue: 7, ..Product::DEFAULT }", "product: receive_queue must be 8 or more"),
-    product(
-        "Product { max_crash_resets: 0, ..Product::DEFAULT }",
-        "product: max_crash_resets must be 1 or more",
-    ),
-    product(
-        "Product { autostart: Autostart::List(&[0]), ..Product::DEFAULT }",
-        "product: autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1",
-    ),
-    product(
-        "Product { autostart: Autostart::List(&[1, 1]), ..Product::DEFAULT }",
-        "product: autostart names a program twice",
-    ),
-    product(
-        "Product { autostart: Autostart::List(&[]), ..Product::DEFAULT }",
-        "product: a rescue window needs autostart: without it no program starts by itself",
-    ),
-    product(
-        "Product { rescue_window_confirmed_ms: 1000, ..Product::DEFAULT }",
-        "product: the rescue window must be shorter than the heartbeat period",
-    ),
-    product(
-        "Product { node_ids: 1..=128, ..Product::DEFAULT }",
-        "product: node_ids must be a range within 1 to 127",
-    ),
-    product("Product { crc_step: 63, ..Product::DEFAULT }", "product: crc_step must be 64 bytes or more"),
-    product(
-        "Product { block_buffer: 1023, ..Product::DEFAULT }",
-        "product: block_buffer must be 1024 bytes or more, and fit the RAM",
-    ),
-    product(
-        "Product { watchdog_ms: Some(4001), ..Product::DEFAULT }",
-        "product: watchdog_ms must be 250 to 4000",
-    ),
-    product(
-        "Product { bit_rates: 3..=9, ..Product::DEFAULT }",
-        "product: bit_rates must be a range within 0 to 8",
-    ),
-    product(
-        "Product { sdo_request_base: 0x781, ..Product::DEFAULT }",
-        "product: sdo_request_base and sdo_response_base must be 80h to 780h",
-    ),
-    product(
-        "Product { sdo_request_base: 0x5FF, ..Product::DEFAULT }",
-        "product: sdo_request_base and sdo_response_base must be 80h or more apart",
-    ),
-    product(
-        "Product { sdo_request_base: 0x680, sdo_response_base: 0x701, ..Product::DEFAULT }",
-        "product: the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)",
-    ),
-    // CiA 301 table 39 (predefined connection set): EMCY has 081h to 0FFh, SDO of other nodes 581h to 67Fh; CiA
-    // 305: LSS has 7E4h and 7E5h. The board has node-ID 1 and 125 kbit/s.
-    product(
-        "Product { sdo_response_base: 0x80, ..Product::DEFAULT }",
-        "product: sdo_response_base plus one of node_ids is a COB-ID of another service",
-    ),
-    product(
-        "Product { sdo_request_base: 0x780, ..Product::DEFAULT }",
-        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
-    ),
-    product(
-        "Product { sdo_request_base: 0x501, sdo_response_base: 0x680, ..Product::DEFAULT }",
-        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
-    ),
-    // The bootloader of a lift is node 126.
-    product(
-        "Product { profile: Profile::LIFT, node_ids: 1..=10, sdo_request_base: 0x510, sdo_response_base: 0x480, ..Product::DEFAULT }",
-        "product: sdo_request_base plus one of node_ids is a COB-ID of another service",
-    ),
-    product(
-        "Product { node_ids: 10..=20, ..Product::DEFAULT }",
-        "product: node_ids is without the node-ID of a new device",
-    ),
-    product(
-        "Product { bit_rates: 0..=2, ..Product::DEFAULT }",
-        "product: bit_rates is without the bit rate of a new device",
-    ),
-    // Its new devices have node-ID 64 at 125 kbit/s.
-    product(
-        "Product { profile: Profile::ESACADEMY, node_ids: 1..=63, ..Product::DEFAULT }",
-        "product: node_ids is without the node-ID of a new device",
-    ),
     Mistake {
         file: BOARD,
         right: " node_id: 1",
@@ -725,41 +620,6 @@ const MISTAKES: &[Mistake] = &[
         by: By::Product(Some("least")),
         says: "product: without lss a new device never gets a node-ID",
     },
-    product(
-        "Product { max_crash_resets: 256, ..Product::DEFAULT }",
-        "product: max_crash_resets must be 255 or less",
-    ),
-    product(
-        "Product { crc_step: 65537, ..Product::DEFAULT }",
-        "product: crc_step must be 65536 bytes or less",
-    ),
-    product(
-        "Product { answer_to_reset_ms: 1001, ..Product::DEFAULT }",
-        "product: answer_to_reset_ms must be 1000 or less",
-    ),
-    product(
-        "Product { program_watchdog_ms: Some(0), ..Product::DEFAULT }",
-        "product: program_watchdog_ms must be 1 to 4000",
-    ),
-    product(
-        "Product { answer_to_reset_ms: 9, ..Product::DEFAULT }",
-        "product: answer_to_reset_ms must be 10 or more",
-    ),
-    product(
-        "Product {
-            profile: Profile {
-                download: Policy { data: Some(1), ..Policy::DEFAULT },
-                ..Profile::STANDARD
-            },
-            autostart: Autostart::List(&[1]),
-            ..Product::DEFAULT
-        }",
-        "product: autostart names the profile's data, which are no program",
-    ),
-    product(
-        "Product { profile: Profile { password: b\"\", ..Profile::LIFT }, ..Product::DEFAULT }",
-        "product: a profile that locks 1F50h needs a password, and only such a profile has one",
-    ),
     // The product does not detect the bit rate.
     Mistake {
         file: BOARD,
@@ -775,6 +635,49 @@ const MISTAKES: &[Mistake] = &[
         by: By::Drivers,
         says: "board: the PAC has 082 interrupt lines, the chip 097",
     },
+];
+
+/// Choices of a product that contradict each other, the standards or the layout, which has only one program; and
+/// what the build says of it.
+const PRODUCTS: &[(&str, &str)] = &[
+    ("autostart: Autostart::List(&[2])", "autostart names a program that the layout has not"),
+    ("second_server: true, block_download: false", "second_server needs block_download, by which a group gets its data"),
+    ("auto_bit_rate: true", "read_back, program_date and auto_bit_rate need the split map"),
+    ("lss: true, ..Product::of(Profile::LIFT)", "lss needs the split map in a profile with a password"),
+    ("intel_hex: true", "intel_hex needs the split map, or ESAcademy's profile"),
+    ("segments_per_sub_block: 128", "segments_per_sub_block must be 1 to 127"),
+    ("receive_queue: 7", "receive_queue must be 8 or more"),
+    ("max_crash_resets: 0", "max_crash_resets must be 1 or more"),
+    ("autostart: Autostart::List(&[0])", "autostart counts programs from 1; BLCOP_APP_START_INDEX = 0 is program 1"),
+    ("autostart: Autostart::List(&[1, 1])", "autostart names a program twice"),
+    ("autostart: Autostart::List(&[])", "a rescue window needs autostart: without it no program starts by itself"),
+    ("rescue_window_confirmed_ms: 1000", "the rescue window must be shorter than the heartbeat period"),
+    ("node_ids: 1..=128", "node_ids must be a range within 1 to 127"),
+    ("crc_step: 63", "crc_step must be 64 bytes or more"),
+    ("block_buffer: 1023", "block_buffer must be 1024 bytes or more, and fit the RAM"),
+    ("watchdog_ms: Some(4001)", "watchdog_ms must be 250 to 4000"),
+    ("bit_rates: 3..=9", "bit_rates must be a range within 0 to 8"),
+    ("sdo_request_base: 0x781", "sdo_request_base and sdo_response_base must be 80h to 780h"),
+    ("sdo_request_base: 0x5FF", "sdo_request_base and sdo_response_base must be 80h or more apart"),
+    ("sdo_request_base: 0x680, sdo_response_base: 0x701", "the COB-IDs of SDO must not be those of boot-up and heartbeat (700h)"),
+    // CiA 301 table 39 (predefined connection set): EMCY has 081h to 0FFh, SDO of other nodes 581h to 67Fh; CiA
+    // 305: LSS has 7E4h and 7E5h. The board has node-ID 1 and 125 kbit/s.
+    ("sdo_response_base: 0x80", "sdo_response_base plus one of node_ids is a COB-ID of another service"),
+    ("sdo_request_base: 0x780", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    ("sdo_request_base: 0x501, sdo_response_base: 0x680", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    // The bootloader of a lift is node 126.
+    ("profile: Profile::LIFT, node_ids: 1..=10, sdo_request_base: 0x510, sdo_response_base: 0x480", "sdo_request_base plus one of node_ids is a COB-ID of another service"),
+    ("node_ids: 10..=20", "node_ids is without the node-ID of a new device"),
+    ("bit_rates: 0..=2", "bit_rates is without the bit rate of a new device"),
+    // Its new devices have node-ID 64 at 125 kbit/s.
+    ("profile: Profile::ESACADEMY, node_ids: 1..=63", "node_ids is without the node-ID of a new device"),
+    ("max_crash_resets: 256", "max_crash_resets must be 255 or less"),
+    ("crc_step: 65537", "crc_step must be 65536 bytes or less"),
+    ("answer_to_reset_ms: 1001", "answer_to_reset_ms must be 1000 or less"),
+    ("program_watchdog_ms: Some(0)", "program_watchdog_ms must be 1 to 4000"),
+    ("answer_to_reset_ms: 9", "answer_to_reset_ms must be 10 or more"),
+    ("profile: Profile { download: Policy { data: Some(1), ..Policy::DEFAULT }, ..Profile::STANDARD }, autostart: Autostart::List(&[1])", "autostart names the profile's data, which are no program"),
+    ("profile: Profile { password: b\"\", ..Profile::LIFT }", "a profile that locks 1F50h needs a password, and only such a profile has one"),
 ];
 
 /// The lines of the guide for a chip whose flash has two banks, and for CAN2: they compile as printed.
@@ -840,7 +743,7 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
         let output = look(by);
         assert!(output.status.success(), "{}", text(&output));
     }
-    for mistake in MISTAKES {
+    for mistake in PRODUCTS.iter().map(product).chain(MISTAKES.iter().copied()) {
         let before = copy.edit(mistake.file, mistake.right, mistake.wrong);
         let output = look(mistake.by);
         fs::write(copy.root.join(mistake.file), before).expect("the file can be written");
