@@ -1,6 +1,7 @@
 //! Updates: program download in each dialect, what ends one, and what happens then.
 
 mod attacker;
+mod choices;
 mod coflash_dialects;
 mod conform;
 mod dialects;

@@ -1,0 +1,291 @@
+//! Our client against our server with each value of a choice that `cargo xtask pairs` varies, in virtual time.
+//! The transfers have the frames of CiA 301 clause 7.2.4.3, none of them twice, and nobody waits for a
+//! time-out. A service that a product leaves out costs one request.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use boot_core::bootloader::{entries, Bootloader, Choices, Config};
+use boot_core::control::{Sealed, Step};
+use boot_core::store::{Journal, NodeParameters};
+use bsp::{IDENTITY, LAYOUT};
+use canopen::device::Device;
+use canopen::sdo::server::Config as SdoConfig;
+use canopen::slave::{self, Output, Slave};
+use canopen::{node, Address, CobId, Frame, Instant};
+use coboot_can::{Adapter, AdapterError, SdoIds};
+use coflash_core::device::{Session, Timing, Transfers};
+use coflash_core::file::checksum::Checksum;
+use coflash_core::file::convert::{program_of, Options};
+use coflash_core::file::raw;
+use coflash_core::file::read::Firmware;
+use coflash_core::update::{flash, FlashOptions, Password};
+use kit::model::ModelFlash;
+use product::*;
+use shared_abi::boot_report::{BootReport, Reason};
+use shared_abi::label::{Label, OFFSET, SIZE};
+
+/// Each value but the default ones, with what else it needs. (A test of `pairs` compares them with its table.)
+macro_rules! rows {
+    ($({ $($choices:tt)* })*) => {
+        [$((stringify!($($choices)*), Product { $($choices)*, ..Product::DEFAULT })),*]
+    };
+}
+
+#[rustfmt::skip]
+fn rows() -> Vec<(&'static str, Product)> {
+    rows! {
+        { heartbeat_ms: 1000 } // the default
+        { profile: Profile::PAULUS } { profile: Profile::ESACADEMY } { profile: Profile::LIFT }
+        { autostart: Autostart::List(&[]), rescue_window_ms: 0 } { autostart: Autostart::Function(|| &[1]) }
+        { rescue_window_confirmed_ms: 100 } { node_ids: 1..=100 } { bit_rates: 2..=6 }
+        { node_source: NodeSource::Constant } { boot_up_message: false }
+        { crystal_failure: CrystalFailure::RunFromHsi, lss: false }
+        { sdo_request_base: 0x680 } { sdo_response_base: 0x480 } { auto_bit_rate: false }
+        { boot_up_emergency: false } { heartbeat_ms: 0 } { lss_start_in_configuration: true }
+        { lss_announce: true } { lss_store: false } { block_download: false, second_server: false }
+        { segments_per_sub_block: 1 } { receive_queue: 8 } { block_upload: false }
+        { block_download: false, second_server: false, block_upload: false }
+        { identity_check: false } { check: |_, _| Verdict::Accept } { erase: Some(|_| Erase::AtOnce) }
+        { crc: CrcKind::Crc16 } { crc_step: 64 * 1024 } { block_buffer: 1024 } { watchdog_ms: None, renewal: false }
+        { program_watchdog_ms: Some(1000) } { answer_to_reset_ms: 50 } { max_crash_resets: 1 }
+        { security_counter: 5 } { counter_with_confirmation: true } { resume: false } { read_back: false }
+        { program_date: false } { intel_hex: false } { renewal_s: 1 } { bootloader_counter: 3 }
+        { bootloader_revisions: 1 } { two_resets: LAYOUT.home.is_some() } { rom_loader: LAYOUT.home.is_some() }
+        { identity: if LAYOUT.home.is_some() { IdentitySource::Otp } else { IdentitySource::Board } }
+    }
+    .into()
+}
+
+/// What the code of a bootloader has; for its other choices, its dictionary and its values decide.
+struct Blocks<const DOWNLOAD: bool, const UPLOAD: bool>;
+
+impl<const DOWNLOAD: bool, const UPLOAD: bool> Choices for Blocks<DOWNLOAD, UPLOAD> {
+    const BLOCK_DOWNLOAD: bool = DOWNLOAD;
+    const BLOCK_UPLOAD: bool = UPLOAD;
+}
+
+const PROGRAMS: usize = LAYOUT.programs.len();
+/// 1008h: four segments, more than a server may send without blocks (the protocol switch threshold of 21).
+const NAME: &str = "a device with a long name";
+const STEP: Duration = Duration::from_micros(200);
+
+/// What answers at once takes: less than any time-out.
+const NO_TIME: Duration = Duration::from_millis(50);
+
+/// SDO frames: of the client, of the server.
+type Frames = [u32; 2];
+
+/// A device on its bus, on which a frame takes no time; and the frames of its SDO server.
+struct Bus<C: Choices> {
+    device: Bootloader<'static, &'static mut ModelFlash, Journal, PROGRAMS, C>,
+    slave: Slave,
+    ids: [CobId; 2],
+    now: Duration,
+    sent: VecDeque<Frame>,
+    all: Frames,
+    /// Those of transfers with 1F50h, and what CiA 301 has for the sizes that the client announced.
+    data: Frames,
+    expected: Frames,
+    /// The segments that the last initiate of a download to 1F50h announced.
+    announced: Option<u32>,
+    is_in_blocks: bool,
+    /// Aborts of an initiate of 1F50h.
+    refused: u32,
+    blksize: u32,
+}
+
+impl<C: Choices> Bus<C> {
+    fn new(product: &Product) -> Self {
+        let table = entries::<256>(PROGRAMS as u8, product.extras());
+        let config = Config {
+            entries: table.parts().to_vec().leak(),
+            device: Device {
+                device_type: product.profile.device_type,
+                name: NAME,
+                hardware_version: "0",
+                software_version: "0",
+                heartbeat_ms: product.heartbeat_ms,
+                vendor_id: IDENTITY.vendor_id,
+                product_code: IDENTITY.product_code,
+                revision: IDENTITY.revision,
+                serial_number: 0,
+            },
+            node_id: product.profile.node_id,
+            layout: LAYOUT,
+            supports: |_| true,
+            boot_up_emergency: product.boot_up_emergency,
+            download: product.download(&BOARD, Box::leak(Box::new(renewal(&BOARD)))),
+            password: product.profile.password,
+        };
+        let flash = Box::leak(Box::new(ModelFlash::new(LAYOUT.chip)));
+        let journal = Journal::open(flash, LAYOUT.parameters);
+        let (id, bit_rate) = product.profile.default_node.unwrap_or((NodeId::MIN, BitRate::K1000));
+        let report = BootReport { reason: Reason::Requested as u8, ..BootReport::NONE };
+        let parameters = NodeParameters { id: Some(id), bit_rate };
+        let buffer = vec![0; product.block_buffer].leak();
+        let config = Box::leak(Box::new(config));
+        let device = Bootloader::new(config, 1, parameters, &report, journal, flash, buffer, Sealed::NONE);
+        let sdo = SdoConfig {
+            unknown_request: product.profile.unknown_request,
+            request_base: product.sdo_request_base,
+            response_base: product.sdo_response_base,
+            blksize: product.segments_per_sub_block,
+            ..SdoConfig::DEFAULT
+        };
+        let node = node::Config { heartbeat_ms: product.heartbeat_ms, sdo, ..node::Config::default() };
+        let id = device.node_id().expect("it has one");
+        let slave = slave::Config { node, ..slave::Config::default() };
+        Self {
+            slave: Slave::new(device.lss_address(), Some(id), BitRate::K1000, slave),
+            device,
+            ids: [sdo.request(id), sdo.response(id)],
+            now: Duration::ZERO,
+            sent: VecDeque::new(),
+            all: [0; 2],
+            data: [0; 2],
+            expected: [0; 2],
+            announced: None,
+            is_in_blocks: false,
+            refused: 0,
+            blksize: product.segments_per_sub_block.into(),
+        }
+    }
+
+    fn instant(&self) -> Instant {
+        Instant::from_millis(self.now.as_millis() as u32)
+    }
+
+    fn expect(&mut self, client: u32, server: u32) {
+        self.expected = [self.expected[0] + client, self.expected[1] + server];
+    }
+
+    fn count_request(&mut self, bytes: &[u8; 8]) {
+        let is_initiate = matches!(bytes[0] >> 5, 1 | 2 | 5) || bytes[0] & 0xE1 == 0xC0;
+        if !self.is_in_blocks && is_initiate {
+            let segments = u32::from_le_bytes([bytes[4], bytes[5], bytes[6], bytes[7]]).div_ceil(7);
+            self.announced = (bytes[1..3] == [0x50, 0x1F]).then_some(segments);
+            match (self.announced, bytes[0]) {
+                (Some(segments), 0x21) => self.expect(1 + segments, 1 + segments),
+                (Some(_), 0xC6) | (None, _) => {}
+                other => panic!("{other:X?}"),
+            }
+        }
+        self.all[0] += 1;
+        self.data[0] += u32::from(self.announced.is_some());
+    }
+
+    fn count_answer(&mut self, bytes: &[u8; 8]) {
+        match (self.announced, bytes[0]) {
+            // The initiate, the segments and the end; two answers, and one for each sub-block.
+            (Some(segments), 0xA4) if !self.is_in_blocks => {
+                self.is_in_blocks = true;
+                self.expect(segments + 2, segments.div_ceil(self.blksize) + 2);
+            }
+            (Some(_), 0x80) => {
+                self.refused += 1;
+                self.expect(1, 1);
+            }
+            (_, 0xA1) => self.is_in_blocks = false,
+            _ => {}
+        }
+        self.all[1] += 1;
+        self.data[1] += u32::from(self.announced.is_some());
+    }
+}
+
+impl<C: Choices> Adapter for Bus<C> {
+    fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
+        if let Some(bytes) = frame.exactly().filter(|_| frame.has_cob_id(self.ids[0])) {
+            self.count_request(bytes);
+        }
+        let now = self.instant();
+        self.slave.handle(frame, now, &mut self.device);
+        Ok(())
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<Frame>, AdapterError> {
+        let until = self.now + timeout;
+        loop {
+            let now = self.instant();
+            self.device.set_time(now);
+            (0..1000).take_while(|_| self.device.step() == Step::Again).count();
+            while let Some(output) = self.slave.poll(now, true, &mut self.device) {
+                if let Output::Send(frame) = output {
+                    self.sent.push_back(frame);
+                }
+            }
+            if let Some(frame) = self.sent.pop_front() {
+                if let Some(bytes) = frame.exactly().filter(|_| frame.has_cob_id(self.ids[1])) {
+                    self.count_answer(bytes);
+                }
+                return Ok(Some(frame));
+            }
+            if self.now >= until {
+                return Ok(None);
+            }
+            self.now += STEP;
+        }
+    }
+
+    fn now(&self) -> Duration {
+        self.now
+    }
+}
+
+/// Reads and flashes a device of this product; the time of the latter.
+fn run<C: Choices>(choices: &str, product: &Product) -> Duration {
+    println!("{choices}");
+    let timing = Timing::default();
+    let mut bus = Bus::<C>::new(product);
+    let id = bus.device.node_id().expect("it has one");
+    let mut adapter = SdoIds::new(&mut bus, product.sdo_request_base, product.sdo_response_base);
+    let mut session = Session::new(&mut adapter, id, timing);
+    for index in [0x1000, 0x1008, 0x1008] {
+        session.upload(Address::new(index, 0), &mut |_| {}).expect("it can be read");
+    }
+    // 1000h is expedited. 1008h by blocks: initiate, start, acknowledgement and end; two answers and four
+    // segments. In segments: an initiate and four requests, as many answers; and the refused initiate, once.
+    assert_eq!(bus.all, if product.block_upload { [1 + 2 * 4, 1 + 2 * 6] } else { [1 + 1 + 2 * 5; 2] });
+    assert!(bus.now < NO_TIME, "read in {:?}", bus.now);
+
+    let base = LAYOUT.programs[0].base;
+    let mut image: Vec<u8> = (0..8000_u32).map(|at| (at * 7 + at / 256) as u8).collect();
+    image[..8].copy_from_slice(&[[0, 0, 1, 0x20], (base + 0x201).to_le_bytes()].concat());
+    let label = Label::new(IDENTITY.vendor_id, IDENTITY.product_code, 1).emit();
+    image[OFFSET as usize..][..SIZE].copy_from_slice(&label);
+    let checksum = if product.crc == CrcKind::Crc16 { Checksum::Crc16 } else { Checksum::Crc32 };
+    let image = Firmware::Image(raw::read(&image, Some(base)).expect("an image"));
+    let file = program_of(image, &Options::default().checksum(checksum)).expect("a program").program;
+    let began = bus.now;
+    let mut adapter = SdoIds::new(&mut bus, product.sdo_request_base, product.sdo_response_base);
+    let mut session = Session::new(&mut adapter, id, timing);
+    // That of the profile of lifts; ESAcademy's is the tool's default.
+    let password = product.profile.node_id.and_then(|_| Password::new("coboot"));
+    let options = FlashOptions::default().start(false).unlock(password);
+    let report = flash(&mut session, &file, &options, &mut |_| {}).expect("an update");
+    let form = if product.block_download { Transfers::Blocks } else { Transfers::Segments };
+    assert_eq!((report.transfers, report.repeats), (form, 0));
+    assert_eq!((bus.data, bus.refused), (bus.expected, u32::from(!product.block_download)));
+    assert!(bus.data[0] > 8000 / 7, "{:?}", bus.data);
+    bus.now - began
+}
+
+#[test]
+fn the_client_and_the_server_need_no_time_out_with_any_choice() {
+    let mut of_default = None;
+    for (choices, mut product) in rows() {
+        // How the bootloader renews itself needs a chip.
+        product.renewal = false;
+        let took = match (product.block_download, product.block_upload) {
+            (true, true) => run::<Blocks<true, true>>(choices, &product),
+            (true, false) => run::<Blocks<true, false>>(choices, &product),
+            (false, true) => run::<Blocks<false, true>>(choices, &product),
+            (false, false) => run::<Blocks<false, false>>(choices, &product),
+        };
+        let of_default = *of_default.get_or_insert(took);
+        // The procedure of a lift has pauses of its own.
+        let is_lift = product.profile.node_id.is_some();
+        assert!(is_lift || took < of_default + NO_TIME, "{took:?} in place of {of_default:?}");
+    }
+}
