@@ -209,7 +209,7 @@ impl<C: Choices> Adapter for Bus<C> {
         loop {
             let now = self.instant();
             self.device.set_time(now);
-            (0..1000).take_while(|_| self.device.step() == Step::Again).count();
+            (0..1000).take_while(|_| self.device.step() != Step::Idle).count();
             while let Some(output) = self.slave.poll(now, true, &mut self.device) {
                 if let Output::Send(frame) = output {
                     self.sent.push_back(frame);

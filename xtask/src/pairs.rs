@@ -239,6 +239,19 @@ mod tests {
         assert!((12..=28).contains(&rows.len()), "{} rows", rows.len());
     }
 
+    /// Our client meets our server with each value. One that reads a pin needs a chip, as the renewal of a
+    /// bootloader does.
+    #[test]
+    fn the_client_meets_each_value() {
+        let bare = |text: &str| text.split_whitespace().collect::<String>();
+        let rows = bare(include_str!("../../tests/update/choices.rs"));
+        for (name, values) in FIELDS.iter().filter(|(name, _)| ![SEALED, "renewal"].contains(name)) {
+            for value in values.iter().skip(1).filter(|value| !value.contains("bsp::")) {
+                assert!(rows.contains(&bare(&format!("{name}: {value}"))), "{name}: {value}");
+            }
+        }
+    }
+
     /// The names are those of the struct, so that a new field of the product is varied, too.
     #[test]
     fn the_fields_are_those_of_the_product() {
