@@ -319,16 +319,9 @@ fn assert_formatted(copy: &Copy, files: &[&str]) {
     assert!(output.status.success(), "{}", text(&output));
 }
 
-/// One mistake in an otherwise good port, and the message of the build.
-#[derive(Clone, Copy)]
-struct Mistake {
-    file: &'static str,
-    right: &'static str,
-    wrong: &'static str,
-    /// The check that finds it.
-    by: By,
-    says: &'static str,
-}
+/// One mistake in an otherwise good port: the file, what is right, what is wrong, the check that finds it, and the
+/// message of the build.
+type Mistake = (&'static str, &'static str, &'static str, By, &'static str);
 
 /// The checks that find mistakes.
 #[derive(Clone, Copy)]
@@ -353,288 +346,60 @@ const BOARD: &str = "bsp/src/boards/nucleo_f446re.rs";
 fn product(&(choices, says): &(&str, &'static str)) -> Mistake {
     let rest = if choices.contains("..Product::") { "" } else { ", ..Product::DEFAULT" };
     let wrong = format!("Product {{ {choices}{rest} }}").leak();
-    let file = "bootloader/products/default.rs";
-    Mistake { file, right: "Product { ..Product::DEFAULT }", wrong, by: By::Product(None), says }
+    ("bootloader/products/default.rs", "Product { ..Product::DEFAULT }", wrong, By::Product(None), says)
 }
 
+#[rustfmt::skip]
 const MISTAKES: &[Mistake] = &[
-    Mistake {
-        file: LAYOUT,
-        right: "Region::new(0x0801_0000, 448 * 1024)",
-        wrong: "Region::new(0x0800_C000, 464 * 1024)",
-        by: By::Layout,
-        says: "a program overlaps a parameter region",
-    },
-    Mistake {
-        file: LAYOUT,
-        right: "448 * 1024",
-        wrong: "440 * 1024",
-        by: By::Layout,
-        says: "a program must start and end at sector borders",
-    },
-    Mistake {
-        file: LAYOUT,
-        right: "callgate_offset: 0x40",
-        wrong: "callgate_offset: 0x3C",
-        by: By::Layout,
-        says: "the callgate overlaps the bootloader's vector table",
-    },
-    Mistake {
-        file: LAYOUT,
-        right: "0x0801_0000",
-        wrong: "0x0801_0080",
-        by: By::Layout,
-        says: "a program must start and end at sector borders",
-    },
-    Mistake {
-        file: LAYOUT,
-        right: "warm_start: Region::new(0x2001_FFF0",
-        wrong: "warm_start: Region::new(0x2002_0000",
-        by: By::Layout,
-        says: "the warm-start cell must be the last RAM cell of the chip",
-    },
-    Mistake {
-        file: LAYOUT,
-        right: "128 * 1024 - 64",
-        wrong: "192 * 1024 - 64",
-        by: By::Layout,
-        says: "the RAM of the images lies outside the chip's SRAM",
-    },
-    Mistake {
-        file: "shared-abi/src/geometry/chip.rs",
-        right: "bank(3) }, None)",
-        wrong: "bank(4) }, None)",
-        by: By::Layout,
-        says: "the sectors do not add up to the flash",
-    },
-    Mistake {
-        file: BOARD,
-        right: "pll_n: 160",
-        wrong: "pll_n: 163",
-        by: By::Board,
-        says: "board: the clock of the CAN controller (APB1) cannot make bit_rate",
-    },
-    Mistake {
-        file: BOARD,
-        right: "pll_n: 160",
-        wrong: "pll_n: 180",
-        by: By::Board,
-        says: "board: the core is too fast: 168 MHz at most, without over-drive",
-    },
-    Mistake {
-        file: BOARD,
-        right: "apb1: 4",
-        wrong: "apb1: 2",
-        by: By::Board,
-        says: "board: APB1 is too fast: 42 MHz at most, without over-drive",
-    },
-    Mistake {
-        file: BOARD,
-        right: "apb2: 2",
-        wrong: "apb2: 1",
-        by: By::Board,
-        says: "board: APB2 is too fast: 84 MHz at most, without over-drive",
-    },
+    (LAYOUT, "Region::new(0x0801_0000, 448 * 1024)", "Region::new(0x0800_C000, 464 * 1024)", By::Layout, "a program overlaps a parameter region"),
+    (LAYOUT, "448 * 1024", "440 * 1024", By::Layout, "a program must start and end at sector borders"),
+    (LAYOUT, "callgate_offset: 0x40", "callgate_offset: 0x3C", By::Layout, "the callgate overlaps the bootloader's vector table"),
+    (LAYOUT, "0x0801_0000", "0x0801_0080", By::Layout, "a program must start and end at sector borders"),
+    (LAYOUT, "warm_start: Region::new(0x2001_FFF0", "warm_start: Region::new(0x2002_0000", By::Layout, "the warm-start cell must be the last RAM cell of the chip"),
+    (LAYOUT, "128 * 1024 - 64", "192 * 1024 - 64", By::Layout, "the RAM of the images lies outside the chip's SRAM"),
+    ("shared-abi/src/geometry/chip.rs", "bank(3) }, None)", "bank(4) }, None)", By::Layout, "the sectors do not add up to the flash"),
+    (BOARD, "pll_n: 160", "pll_n: 163", By::Board, "board: the clock of the CAN controller (APB1) cannot make bit_rate"),
+    (BOARD, "pll_n: 160", "pll_n: 180", By::Board, "board: the core is too fast: 168 MHz at most, without over-drive"),
+    (BOARD, "apb1: 4", "apb1: 2", By::Board, "board: APB1 is too fast: 42 MHz at most, without over-drive"),
+    (BOARD, "apb2: 2", "apb2: 1", By::Board, "board: APB2 is too fast: 84 MHz at most, without over-drive"),
     // The slower class of chips: DS11139 and DS11581, general operating conditions.
-    Mistake {
-        file: "bsp/src/boards/an_f412.rs",
-        right: "pll_n: 96",
-        wrong: "pll_n: 104",
-        by: By::BoardOf("an-f412"),
-        says: "board: the core is too fast: 100 MHz at most on this chip",
-    },
-    Mistake {
-        file: "bsp/src/boards/an_f412.rs",
-        right: "apb1: 2",
-        wrong: "apb1: 1",
-        by: By::BoardOf("an-f412"),
-        says: "board: APB1 is too fast: 50 MHz at most on this chip",
-    },
-    Mistake {
-        file: "bsp/src/boards/an_f413.rs",
-        right: "wait_states: 3",
-        wrong: "wait_states: 2",
-        by: By::BoardOf("an-f413"),
-        says: "board: the flash of this chip needs a wait state for every 25 MHz",
-    },
-    Mistake {
-        file: BOARD,
-        right: "wait_states: 5",
-        wrong: "wait_states: 4",
-        by: By::Board,
-        says: "board: the flash needs a wait state for every 30 MHz",
-    },
+    ("bsp/src/boards/an_f412.rs", "pll_n: 96", "pll_n: 104", By::BoardOf("an-f412"), "board: the core is too fast: 100 MHz at most on this chip"),
+    ("bsp/src/boards/an_f412.rs", "apb1: 2", "apb1: 1", By::BoardOf("an-f412"), "board: APB1 is too fast: 50 MHz at most on this chip"),
+    ("bsp/src/boards/an_f413.rs", "wait_states: 3", "wait_states: 2", By::BoardOf("an-f413"), "board: the flash of this chip needs a wait state for every 25 MHz"),
+    (BOARD, "wait_states: 5", "wait_states: 4", By::Board, "board: the flash needs a wait state for every 30 MHz"),
     // DS10693: HSE 4 to 26 MHz with a crystal, 1 to 50 MHz with a clock on OSC_IN.
-    Mistake {
-        file: BOARD,
-        right: "hse: 8_000_000",
-        wrong: "hse: 80_000_000",
-        by: By::Board,
-        says: "board: a clock on OSC_IN (hse_bypass) has 1 to 50 MHz",
-    },
-    Mistake {
-        file: BOARD,
-        right: "hse: 8_000_000,\n        hse_bypass: true",
-        wrong: "hse: 0,\n        hse_bypass: false",
-        by: By::Board,
-        says: "board: hse must be a crystal of 4 to 26 MHz",
-    },
-    Mistake {
-        file: BOARD,
-        right: "hse: 8_000_000",
-        wrong: "hse: 2_000_000",
-        by: By::Board,
-        says: "board: the crystal is divided by 2 to 63 for the PLL (PLLM)",
-    },
+    (BOARD, "hse: 8_000_000", "hse: 80_000_000", By::Board, "board: a clock on OSC_IN (hse_bypass) has 1 to 50 MHz"),
+    (BOARD, "hse: 8_000_000,\n        hse_bypass: true", "hse: 0,\n        hse_bypass: false", By::Board, "board: hse must be a crystal of 4 to 26 MHz"),
+    (BOARD, "hse: 8_000_000", "hse: 2_000_000", By::Board, "board: the crystal is divided by 2 to 63 for the PLL (PLLM)"),
     // DS10693: 1.8 to 3.6 V (1.7 V at reduced temperatures); RM0390 table 5: 24 MHz for each wait state below
     // 2.7 V.
-    Mistake {
-        file: BOARD,
-        right: "supply_mv: 3_200",
-        wrong: "supply_mv: 1_700",
-        by: By::Board,
-        says: "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)",
-    },
-    Mistake {
-        file: BOARD,
-        right: "supply_mv: 3_200",
-        wrong: "supply_mv: 5_000",
-        by: By::Board,
-        says: "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)",
-    },
-    Mistake {
-        file: BOARD,
-        right: "supply_mv: 3_200",
-        wrong: "supply_mv: 2_400",
-        by: By::Board,
-        says: "board: at this supply (supply_mv) the flash needs a wait state for every 24 MHz",
-    },
-    Mistake {
-        file: BOARD,
-        right: "node_id: 1",
-        wrong: "node_id: 200",
-        by: By::Board,
-        says: "board: node_id must be 1 to 127, or 255",
-    },
+    (BOARD, "supply_mv: 3_200", "supply_mv: 1_700", By::Board, "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)"),
+    (BOARD, "supply_mv: 3_200", "supply_mv: 5_000", By::Board, "board: supply_mv, the lowest supply of the chip, is 1800 to 3600 (mV)"),
+    (BOARD, "supply_mv: 3_200", "supply_mv: 2_400", By::Board, "board: at this supply (supply_mv) the flash needs a wait state for every 24 MHz"),
+    (BOARD, "node_id: 1", "node_id: 200", By::Board, "board: node_id must be 1 to 127, or 255"),
     // RM0390, SWJ debug port pins.
-    Mistake {
-        file: BOARD,
-        right: "port: 'C', pin: 13",
-        wrong: "port: 'A', pin: 13",
-        by: By::Board,
-        says: "board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)",
-    },
-    Mistake {
-        file: BOARD,
-        right: "port: 'C', pin: 13",
-        wrong: "port: 'B', pin: 8",
-        by: By::Board,
-        says: "board: entry_strap is a pin of the CAN controller",
-    },
-    Mistake {
-        file: BOARD,
-        right: "port: 'C', pin: 13",
-        wrong: "port: 'A', pin: 5",
-        by: By::Board,
-        says: "board: entry_strap is the pin of the LED",
-    },
-    Mistake {
-        file: BOARD,
-        right: "led: ('A', 5)",
-        wrong: "led: ('B', 3)",
-        by: By::Board,
-        says: "board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)",
-    },
-    Mistake {
-        file: BOARD,
-        right: "led: ('A', 5)",
-        wrong: "led: ('B', 9)",
-        by: By::Board,
-        says: "board: led is a pin of the CAN controller",
-    },
+    (BOARD, "port: 'C', pin: 13", "port: 'A', pin: 13", By::Board, "board: entry_strap is a pin of the debugger (PA13 to PA15, PB3, PB4)"),
+    (BOARD, "port: 'C', pin: 13", "port: 'B', pin: 8", By::Board, "board: entry_strap is a pin of the CAN controller"),
+    (BOARD, "port: 'C', pin: 13", "port: 'A', pin: 5", By::Board, "board: entry_strap is the pin of the LED"),
+    (BOARD, "led: ('A', 5)", "led: ('B', 3)", By::Board, "board: led is a pin of the debugger (PA13 to PA15, PB3, PB4)"),
+    (BOARD, "led: ('A', 5)", "led: ('B', 9)", By::Board, "board: led is a pin of the CAN controller"),
     // RM0390, register boundary addresses: ports A to H.
-    Mistake {
-        file: BOARD,
-        right: "port: 'C'",
-        wrong: "port: 'I'",
-        by: By::Board,
-        says: "board: the chip has no such pin as entry_strap names",
-    },
-    Mistake {
-        file: BOARD,
-        right: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None })",
-        wrong: "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::Down })",
-        by: By::Board,
-        says: "board: the chip's resistor pulls entry_strap to `pressed`",
-    },
+    (BOARD, "port: 'C'", "port: 'I'", By::Board, "board: the chip has no such pin as entry_strap names"),
+    (BOARD, "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::None })", "Some(Strap { port: 'C', pin: 13, pressed: false, pull: Pull::Down })", By::Board, "board: the chip's resistor pulls entry_strap to `pressed`"),
     // DS10693 table 11: PB7 has no CAN1.
-    Mistake {
-        file: BOARD,
-        right: "transmit: ('B', 9)",
-        wrong: "transmit: ('B', 7)",
-        by: By::Board,
-        says: "board: `transmit` of can_pins is no transmit pin of this CAN controller",
-    },
+    (BOARD, "transmit: ('B', 9)", "transmit: ('B', 7)", By::Board, "board: `transmit` of can_pins is no transmit pin of this CAN controller"),
     // DS10693 table 10: the package with 64 pins has no PB11.
-    Mistake {
-        file: BOARD,
-        right: "led: ('A', 5)",
-        wrong: "led: ('B', 11)",
-        by: By::Board,
-        says: "board: the chip has no such pin as led names",
-    },
-    Mistake {
-        file: BOARD,
-        right: "led: ('A', 5)",
-        wrong: "led: ('A', 2)",
-        by: By::Board,
-        says: "board: led is a pin of the UART",
-    },
-    Mistake {
-        file: BOARD,
-        right: "can_controller!(CAN1)",
-        wrong: "can_controller!(CAN2)",
-        by: By::Board,
-        says: "board: `transmit` of can_pins is no transmit pin of this CAN controller",
-    },
+    (BOARD, "led: ('A', 5)", "led: ('B', 11)", By::Board, "board: the chip has no such pin as led names"),
+    (BOARD, "led: ('A', 5)", "led: ('A', 2)", By::Board, "board: led is a pin of the UART"),
+    (BOARD, "can_controller!(CAN1)", "can_controller!(CAN2)", By::Board, "board: `transmit` of can_pins is no transmit pin of this CAN controller"),
     // DS10693, alternate functions: PA4 is the clock of USART2.
-    Mistake {
-        file: BOARD,
-        right: "transmit: ('A', 2)",
-        wrong: "transmit: ('A', 4)",
-        by: By::Drivers,
-        says: "usart2::Tx: From<stm32f4xx_hal::gpio::Pin<'A', 4>>",
-    },
+    (BOARD, "transmit: ('A', 2)", "transmit: ('A', 4)", By::Drivers, "usart2::Tx: From<stm32f4xx_hal::gpio::Pin<'A', 4>>"),
     // 40 MHz and at least 16 cycles a bit.
-    Mistake {
-        file: BOARD,
-        right: "uart_bit_rate: 115_200",
-        wrong: "uart_bit_rate: 3_000_000",
-        by: By::Drivers,
-        says: "board: the clock of the UART cannot make uart_bit_rate",
-    },
-    Mistake {
-        file: BOARD,
-        right: " node_id: 1",
-        wrong: " node_id: 255",
-        by: By::Product(Some("least")),
-        says: "product: without lss a new device never gets a node-ID",
-    },
+    (BOARD, "uart_bit_rate: 115_200", "uart_bit_rate: 3_000_000", By::Drivers, "board: the clock of the UART cannot make uart_bit_rate"),
+    (BOARD, " node_id: 1", " node_id: 255", By::Product(Some("least")), "product: without lss a new device never gets a node-ID"),
     // The product does not detect the bit rate.
-    Mistake {
-        file: BOARD,
-        right: " bit_rate: 125_000",
-        wrong: " bit_rate: 0",
-        by: By::Product(Some("least")),
-        says: "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off",
-    },
-    Mistake {
-        file: "bsp/Cargo.toml",
-        right: "stm32f4xx-hal/stm32f446",
-        wrong: "stm32f4xx-hal/stm32f407",
-        by: By::Drivers,
-        says: "board: the PAC has 082 interrupt lines, the chip 097",
-    },
+    (BOARD, " bit_rate: 125_000", " bit_rate: 0", By::Product(Some("least")), "product: the board leaves the bit rate to be found out (0), and auto_bit_rate is off"),
+    ("bsp/Cargo.toml", "stm32f4xx-hal/stm32f446", "stm32f4xx-hal/stm32f407", By::Drivers, "board: the PAC has 082 interrupt lines, the chip 097"),
 ];
 
 /// Choices of a product that contradict each other, the standards or the layout, which has only one program; and
@@ -743,16 +508,16 @@ fn a_mistake_in_a_port_fails_the_build_and_is_named() {
         let output = look(by);
         assert!(output.status.success(), "{}", text(&output));
     }
-    for mistake in PRODUCTS.iter().map(product).chain(MISTAKES.iter().copied()) {
-        let before = copy.edit(mistake.file, mistake.right, mistake.wrong);
-        let output = look(mistake.by);
-        fs::write(copy.root.join(mistake.file), before).expect("the file can be written");
+    for (file, right, wrong, by, says) in PRODUCTS.iter().map(product).chain(MISTAKES.iter().copied()) {
+        let before = copy.edit(file, right, wrong);
+        let output = look(by);
+        fs::write(copy.root.join(file), before).expect("the file can be written");
         let said = text(&output);
-        assert!(!output.status.success(), "built with {} in {}", mistake.wrong, mistake.file);
+        assert!(!output.status.success(), "built with {wrong} in {file}");
         // Types appear with or without their paths, and lines may be broken anywhere.
         let flat = |text: &str| {
             text.replace("stm32f4xx_hal::gpio::", "").split_whitespace().collect::<Vec<_>>().join(" ")
         };
-        assert!(flat(&said).contains(&flat(mistake.says)), "{}, not told by:\n{said}", mistake.says);
+        assert!(flat(&said).contains(&flat(says)), "{says}, not told by:\n{said}");
     }
 }
