@@ -6,8 +6,8 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use boot_core::bootloader::{entries, Bootloader, Choices, Config};
-use boot_core::control::{Sealed, Step};
-use boot_core::store::{Journal, NodeParameters};
+use boot_core::control::Step;
+use boot_core::store::Journal;
 use bsp::{IDENTITY, LAYOUT};
 use canopen::device::Device;
 use canopen::sdo::server::Config as SdoConfig;
@@ -20,9 +20,10 @@ use coflash_core::file::convert::{program_of, Options};
 use coflash_core::file::raw;
 use coflash_core::file::read::Firmware;
 use coflash_core::update::{flash, FlashOptions, Password};
+use kit::bench::DEVICE;
+use kit::boot::{leaked, Boot};
 use kit::model::ModelFlash;
 use product::*;
-use shared_abi::boot_report::{BootReport, Reason};
 use shared_abi::label::{Label, OFFSET, SIZE};
 
 /// Each value but the default ones, with what else it needs. (A test of `pairs` compares them with its table.)
@@ -87,10 +88,10 @@ struct Bus<C: Choices> {
     /// Those of transfers with 1F50h, and what CiA 301 has for the sizes that the client announced.
     data: Frames,
     expected: Frames,
-    /// The segments that the last initiate of a download to 1F50h announced.
+    /// The segments that the last initiate announced, if it was one of 1F50h.
     announced: Option<u32>,
     is_in_blocks: bool,
-    /// Aborts of an initiate of 1F50h.
+    /// Aborts of transfers with 1F50h.
     refused: u32,
     blksize: u32,
 }
@@ -103,13 +104,9 @@ impl<C: Choices> Bus<C> {
             device: Device {
                 device_type: product.profile.device_type,
                 name: NAME,
-                hardware_version: "0",
-                software_version: "0",
-                heartbeat_ms: product.heartbeat_ms,
                 vendor_id: IDENTITY.vendor_id,
                 product_code: IDENTITY.product_code,
-                revision: IDENTITY.revision,
-                serial_number: 0,
+                ..DEVICE
             },
             node_id: product.profile.node_id,
             layout: LAYOUT,
@@ -120,12 +117,9 @@ impl<C: Choices> Bus<C> {
         };
         let flash = Box::leak(Box::new(ModelFlash::new(LAYOUT.chip)));
         let journal = Journal::open(flash, LAYOUT.parameters);
-        let (id, bit_rate) = product.profile.default_node.unwrap_or((NodeId::MIN, BitRate::K1000));
-        let report = BootReport { reason: Reason::Requested as u8, ..BootReport::NONE };
-        let parameters = NodeParameters { id: Some(id), bit_rate };
-        let buffer = vec![0; product.block_buffer].leak();
-        let config = Box::leak(Box::new(config));
-        let device = Bootloader::new(config, 1, parameters, &report, journal, flash, buffer, Sealed::NONE);
+        let (buffer, sealed) = leaked(product.block_buffer);
+        let device = Boot::new(Box::leak(Box::new(config)), kit::bench::node());
+        let device = device.with(journal, flash, buffer, sealed);
         let sdo = SdoConfig {
             unknown_request: product.profile.unknown_request,
             request_base: product.sdo_request_base,
@@ -133,7 +127,12 @@ impl<C: Choices> Bus<C> {
             blksize: product.segments_per_sub_block,
             ..SdoConfig::DEFAULT
         };
-        let node = node::Config { heartbeat_ms: product.heartbeat_ms, sdo, ..node::Config::default() };
+        let node = node::Config {
+            boot_up: product.boot_up_message,
+            heartbeat_ms: product.heartbeat_ms,
+            sdo,
+            ..node::Config::default()
+        };
         let id = device.node_id().expect("it has one");
         let slave = slave::Config { node, ..slave::Config::default() };
         Self {

@@ -44,6 +44,8 @@ impl<A: Adapter> Adapter for SdoIds<A> {
     fn send(&mut self, frame: &Frame) -> Result<(), AdapterError> {
         match moved(frame, REQUEST, self.request) {
             Some(request) => self.adapter.send(&request),
+            // It is for a group, and would be a request to one node here.
+            None if moved(frame, self.request, self.request).is_some() => Ok(()),
             None => self.adapter.send(frame),
         }
     }
@@ -120,6 +122,8 @@ mod tests {
         let mut adapter = SdoIds::new(Script { coming, ..Script::default() }, 0x680, 0x480);
         adapter.send(&frame(0x62A, &[0x40, 0, 0x10, 0, 0, 0, 0, 0])).unwrap();
         adapter.send(&frame(0x000, &[0x81, 0x2A])).unwrap();
+        // To a group, if node 95 had no request there.
+        adapter.send(&frame(0x6DF, &[0xC6, 0x50, 0x1F, 1, 9, 0, 0, 0])).unwrap();
         assert_eq!(adapter.adapter.sent, [CobId::new(0x6AA), CobId::new(0x000)]);
         let mut received = || adapter.receive(Duration::ZERO).unwrap().and_then(|frame| frame.cob_id());
         let all = [received(), received(), received(), received()];

@@ -57,13 +57,15 @@ impl SecondServer {
     ///
     /// # Errors
     /// [`AbortCode::INVALID_VALUE`] for a COB-ID that no configurable object may use (CiA 301
-    /// clause 7.3.5, restricted CAN-IDs), and for another COB-ID while this one is valid.
+    /// clause 7.3.5, restricted CAN-IDs), for the other one's (an answer would be a request to the
+    /// group), and for another COB-ID while this one is valid.
     pub fn write(&mut self, sub: u8, value: u32) -> Result<(), AbortCode> {
-        let own = &mut self.0[usize::from(sub == RESPONSE)];
+        let [request, response] = &mut self.0;
+        let (own, other) = if sub == RESPONSE { (response, request) } else { (request, response) };
         // The identifiers of PDOs of other nodes, and those between SDO and boot-up, which the
         // predefined connection set does not use.
         let usable = matches!(value, 0x181..=0x57F | 0x680..=0x6DF) && *own & INVALID != 0;
-        if value != *own && value & INVALID == 0 && !usable {
+        if value != *own && value & INVALID == 0 && (!usable || value == *other) {
             return Err(AbortCode::INVALID_VALUE);
         }
         *own = value;

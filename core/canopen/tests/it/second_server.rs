@@ -54,6 +54,7 @@ fn a_server_exists_while_both_cob_ids_are_valid_and_changes_only_when_it_does_no
     assert_eq!(second.channel(), Channel::NONE);
     assert_eq!(second.write(REQUEST, GROUP.into()), Ok(()));
     assert_eq!(second.channel(), Channel::NONE);
+    assert_eq!(second.write(RESPONSE, GROUP.into()), Err(AbortCode::INVALID_VALUE), "the group's own");
     assert_eq!(second.write(RESPONSE, OWN.into()), Ok(()));
     assert_eq!(second.channel(), Channel { request: id(GROUP), response: id(OWN) });
     // CiA 301: bits 0 to 29 must not change while the object is valid.

@@ -122,7 +122,7 @@ pub(super) struct Link {
 /// Some servers abort the initiate of a block transfer that they do not support with the object of the
 /// transfer before (CANopenNode, without its option for block transfer). A late abort of that transfer looks
 /// the same, but after it comes the answer to the initiate: a server answers in the order of the requests.
-pub(super) const MISNAMED_MS: u32 = 100;
+const MISNAMED_MS: u32 = 100;
 
 /// The consequence of an answer.
 pub(super) enum Next {
@@ -161,6 +161,7 @@ impl Link {
         frame.exactly()
     }
 
+    /// Whether the server has refused the transfer as one that it does not support.
     pub(super) fn refused_as_unknown(&self) -> bool {
         matches!(self.result, Some(Err(SdoError::Server(code))) if means_unknown(code))
     }
