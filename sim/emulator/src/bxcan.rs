@@ -132,8 +132,6 @@ mod ir {
     pub const IDE: u32 = 1 << 2;
 }
 
-/// A frame becomes one of at most eight bytes, whatever the DLC says (ISO 11898-1:2015, table 5).
-const MAX_DLC: u32 = 8;
 /// CAN_TDTxR.TGT.
 const TGT: u32 = 1 << 8;
 /// Recessive sequences on the way out of bus-off.
@@ -205,7 +203,7 @@ enum MailboxState {
 
 impl Mailbox {
     fn frame(&self) -> Frame {
-        let dlc = (self.tdtr & 0xF).min(MAX_DLC) as u8;
+        let dlc = (self.tdtr & 0xF) as u8;
         let id = if self.tir & ir::IDE == 0 {
             StandardId::new((self.tir >> 21) as u16).map(Id::Standard)
         } else {
@@ -217,11 +215,12 @@ impl Mailbox {
             let mut data = [0; 8];
             data[..4].copy_from_slice(&self.tdlr.to_le_bytes());
             data[4..].copy_from_slice(&self.tdhr.to_le_bytes());
-            Frame::data_frame(id, &data[..usize::from(dlc)])
+            let data = &data[..usize::from(dlc).min(data.len())];
+            Frame::data_frame(id, data).and_then(|frame| frame.with_dlc(dlc))
         } else {
             Frame::remote_frame(id, dlc)
         };
-        frame.expect("the DLC is at most 8")
+        frame.expect("the DLC has four bits")
     }
 
     fn order(&self) -> Option<u64> {
@@ -239,7 +238,7 @@ impl Mailbox {
 }
 
 /// A received frame as its four registers show it.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct RxMailbox {
     rir: u32,
     rdtr: u32,
@@ -247,14 +246,23 @@ struct RxMailbox {
     rdhr: u32,
 }
 
+impl Default for RxMailbox {
+    /// After a reset: undefined (RM0090, 32.9.3).
+    fn default() -> Self {
+        const ANY: u32 = 0xA5A5_A5A5;
+        Self { rir: ANY, rdtr: ANY, rdlr: ANY, rdhr: ANY }
+    }
+}
+
 impl RxMailbox {
-    fn new(frame: &Frame, filter_index: u8, stamp: u32) -> Self {
+    /// A frame after another one, of which the data registers keep the bytes that this one does not have.
+    fn new(frame: &Frame, filter_index: u8, stamp: u32, before: &Self) -> Self {
         let id = match frame.id() {
             Id::Standard(id) => u32::from(id.as_raw()) << 21,
             Id::Extended(id) => id.as_raw() << 3 | ir::IDE,
         };
-        let word = |at: usize| {
-            let mut bytes = [0; 4];
+        let word = |at: usize, before: u32| {
+            let mut bytes = before.to_le_bytes();
             for (to, from) in bytes.iter_mut().zip(frame.data().iter().skip(at)) {
                 *to = *from;
             }
@@ -263,8 +271,8 @@ impl RxMailbox {
         Self {
             rir: id | if frame.is_remote() { ir::RTR } else { 0 },
             rdtr: stamp | u32::from(filter_index) << 8 | u32::from(frame.dlc()),
-            rdlr: word(0),
-            rdhr: word(4),
+            rdlr: word(0, before.rdlr),
+            rdhr: word(4, before.rdhr),
         }
     }
 }
@@ -298,6 +306,10 @@ impl Fifo {
         if let Some(frame) = self.frames.pop_front() {
             self.stale = frame;
         }
+    }
+
+    fn newest(&self) -> &RxMailbox {
+        self.frames.back().unwrap_or(&self.stale)
     }
 
     fn output(&self) -> &RxMailbox {
@@ -808,7 +820,9 @@ impl BxCan {
         if let Some(found) = self.filters.accept(self.share, frame) {
             let locked = self.mcr & mcr::RFLM != 0;
             let stamp = self.time_stamp();
-            self.fifos[found.fifo].store(RxMailbox::new(frame, found.index, stamp), locked);
+            let fifo = &mut self.fifos[found.fifo];
+            let received = RxMailbox::new(frame, found.index, stamp, fifo.newest());
+            fifo.store(received, locked);
         }
     }
 
@@ -1141,7 +1155,7 @@ impl BusNode for BxCan {
                 for mailbox in &mut self.mailboxes {
                     if matches!(mailbox.state, MailboxState::Transmit { .. }) {
                         mailbox.flags = tsr::TXOK;
-                        mailbox.tdtr |= stamp;
+                        mailbox.tdtr = mailbox.tdtr & 0xFFFF | stamp;
                         mailbox.complete();
                     }
                 }

@@ -15,11 +15,18 @@ pub const INTERMISSION_BITS: u32 = 3;
 /// A sixth equal bit in a row never leaves a transmitter: it inserts the opposite bit after five.
 pub const STUFF_WIDTH: u32 = 5;
 
+/// The most data bytes of a frame: a data length code of 9 to 15 means eight, too (ISO 11898-1:2015,
+/// table 5).
+const MOST_DATA: u8 = 8;
+/// The data length code has four bits.
+const MOST_DLC: u8 = 15;
+
 /// A data or remote frame with 11- or 29-bit identifier.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Frame {
     id: Id,
     remote: bool,
+    /// As on the wire, 0 to 15.
     dlc: u8,
     data: [u8; 8],
 }
@@ -33,10 +40,18 @@ impl Frame {
         Some(frame)
     }
 
-    /// A remote frame that asks for `dlc` bytes; `None` for more than eight.
+    /// A remote frame with this data length code; `None` for more than 15.
     #[must_use]
     pub fn remote_frame(id: Id, dlc: u8) -> Option<Self> {
-        (dlc <= 8).then_some(Self { id, remote: true, dlc, data: [0; 8] })
+        (dlc <= MOST_DLC).then_some(Self { id, remote: true, dlc, data: [0; 8] })
+    }
+
+    /// The same frame with another data length code; `None` for more than 15, or if that means another
+    /// number of data bytes.
+    #[must_use]
+    pub fn with_dlc(self, dlc: u8) -> Option<Self> {
+        let same = self.remote || usize::from(dlc.min(MOST_DATA)) == self.data().len();
+        (dlc <= MOST_DLC && same).then_some(Self { dlc, ..self })
     }
 
     /// A data frame with an 11-bit identifier; `None` if the identifier needs more bits, or for
@@ -80,7 +95,7 @@ impl Frame {
         self.remote
     }
 
-    /// The data length code, 0 to 8.
+    /// The data length code as on the wire, 0 to 15.
     #[must_use]
     pub fn dlc(&self) -> u8 {
         self.dlc
@@ -89,7 +104,7 @@ impl Frame {
     /// The data; empty in a remote frame.
     #[must_use]
     pub fn data(&self) -> &[u8] {
-        let len = if self.remote { 0 } else { usize::from(self.dlc) };
+        let len = if self.remote { 0 } else { usize::from(self.dlc.min(MOST_DATA)) };
         &self.data[..len]
     }
 
@@ -217,7 +232,7 @@ pub fn ack_delimiter(wire_len: u32) -> u32 {
 
 impl fmt::Display for Frame {
     /// As candump's log writes it: `601#4000100000000000`, `00000123#` with 29 bits, `601#R8` for a
-    /// remote frame.
+    /// remote frame; `_F` at the end is a data length code above 8.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.id {
             Id::Standard(id) => write!(f, "{:03X}#", id.as_raw())?,
@@ -226,10 +241,14 @@ impl fmt::Display for Frame {
         if self.remote {
             f.write_str("R")?;
             if self.dlc > 0 {
-                write!(f, "{}", self.dlc)?;
+                write!(f, "{}", self.dlc.min(MOST_DATA))?;
             }
         }
-        self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))
+        self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))?;
+        if self.dlc > MOST_DATA {
+            write!(f, "_{:X}", self.dlc)?;
+        }
+        Ok(())
     }
 }
 
@@ -256,7 +275,7 @@ impl embedded_can::Frame for Frame {
         self.id
     }
     fn dlc(&self) -> usize {
-        usize::from(self.dlc)
+        usize::from(self.dlc.min(MOST_DATA))
     }
     fn data(&self) -> &[u8] {
         self.data()
@@ -300,6 +319,10 @@ mod tests {
         assert_eq!((sync.crc15(), sync.wire_len()), (0x1C05, 48));
         let long = Frame::extended(0x1FFF_FFFF, &[0xFF; 8]).unwrap();
         assert_eq!((long.crc15(), long.wire_len()), (0x1B69, 146));
+        for (dlc, crc, wire_len) in [(9, 0x3244, 121), (15, 0x0C19, 122)] {
+            let frame = read_1000.with_dlc(dlc).unwrap();
+            assert_eq!((frame.crc15(), frame.wire_len(), frame.data()), (crc, wire_len, read_1000.data()));
+        }
     }
 
     #[test]
@@ -388,6 +411,10 @@ mod tests {
         let id = Id::Standard(StandardId::new(0x701).unwrap());
         assert_eq!(Frame::remote_frame(id, 0).unwrap().to_string(), "701#R");
         assert_eq!(Frame::remote_frame(id, 1).unwrap().to_string(), "701#R1");
+        // can-utils, lib.h: `123#R8_E`, `333#1122334455667788_E`.
+        assert_eq!(Frame::remote_frame(id, 14).unwrap().to_string(), "701#R8_E");
+        let long = Frame::standard(0x333, &[0x11; 8]).unwrap().with_dlc(14).unwrap();
+        assert_eq!(long.to_string(), "333#1111111111111111_E");
     }
 
     #[test]
@@ -395,7 +422,10 @@ mod tests {
         assert!(Frame::standard(0x800, &[]).is_none());
         assert!(Frame::extended(0x2000_0000, &[]).is_none());
         assert!(Frame::standard(1, &[0; 9]).is_none());
-        assert!(Frame::remote_frame(Id::Standard(StandardId::ZERO), 9).is_none());
+        assert!(Frame::remote_frame(Id::Standard(StandardId::ZERO), 16).is_none());
+        let eight = Frame::standard(1, &[0; 8]).unwrap();
+        assert_eq!((eight.with_dlc(16), eight.with_dlc(7)), (None, None));
+        assert_eq!(Frame::standard(1, &[0; 7]).unwrap().with_dlc(9), None);
         assert!(Frame::standard(1, &[0; 300]).is_none());
     }
 }

@@ -256,7 +256,7 @@ fn extended_and_remote_frames_and_a_long_dlc() {
     bench.write(TI0R + 12, 0x8877_6655);
     bench.write(TI0R, 0x1234_5678 << 3 | 4 | 1);
     let frame = bench.can.request(bench.now).unwrap();
-    assert_eq!(frame.to_string(), "12345678#1122334455667788", "DLC 15 is eight bytes");
+    assert_eq!(frame.to_string(), "12345678#1122334455667788_F", "DLC 15 is sent, with eight bytes");
     bench.write(TI0R + 0x10 + 4, 2);
     bench.write(TI0R + 0x10, 0x701 << 21 | 2 | 1);
     // 12345678h begins with the 11 bits 48Dh: it is stronger than 701h.
@@ -351,7 +351,7 @@ fn fifo_fills_and_overruns_both_ways() {
         for (n, id) in kept.into_iter().enumerate() {
             assert_eq!(bench.read(RI0R), id << 21);
             assert_eq!(bench.read(RI0R + 4), 1, "DLC 1, filter 0");
-            assert_eq!(bench.read(RI0R + 8), id);
+            assert_eq!(bench.read(RI0R + 8) & 0xFF, id);
             bench.write(RF0R, 0x20);
             assert_eq!(bench.read(RF0R) & 3, 2 - n as u32);
         }
@@ -369,11 +369,19 @@ fn receive_registers() {
     bench.event(BusEvent::Received(Frame::extended(0x1ABC_DEF0, &[1, 2, 3, 4, 5, 6]).unwrap()));
     assert_eq!(bench.read(RI0R), 0x1ABC_DEF0 << 3 | 4);
     assert_eq!(bench.read(RI0R + 4), 6);
-    assert_eq!((bench.read(RI0R + 8), bench.read(RI0R + 12)), (0x0403_0201, 0x0605));
+    assert_eq!((bench.read(RI0R + 8), bench.read(RI0R + 12) & 0xFFFF), (0x0403_0201, 0x0605));
     bench.write(RF0R, 0x20);
     let id = Id::Standard(StandardId::new(0x7FF).unwrap());
     bench.event(BusEvent::Received(Frame::remote_frame(id, 3).unwrap()));
     assert_eq!((bench.read(RI0R), bench.read(RI0R + 4)), (0x7FF << 21 | 2, 3));
+    assert_eq!(bench.read(RI0R + 8), 0x0403_0201, "a frame without data leaves what was there");
+    for dlc in 8_u8..=15 {
+        bench.write(RF0R, 0x20);
+        let frame = Frame::standard(0x601, &[8, 7, 6, 5, 4, 3, 2, 1]).unwrap().with_dlc(dlc).unwrap();
+        bench.event(BusEvent::Received(frame));
+        assert_eq!(bench.read(RI0R + 4), u32::from(dlc), "RDTR has the DLC of the wire");
+        assert_eq!((bench.read(RI0R + 8), bench.read(RI0R + 12)), (0x0506_0708, 0x0102_0304));
+    }
 }
 
 #[test]

@@ -203,10 +203,13 @@ fn parse_id(word: &str) -> Result<Id, String> {
 }
 
 fn parse_dlc(word: &str) -> Result<u8, String> {
-    match word.as_bytes() {
-        [digit @ b'0'..=b'8'] => Ok(digit - b'0'),
-        _ => Err("the data length is not a number from 0 to 8".into()),
-    }
+    // In decimal as in the daemon, or one hexadecimal digit as from python-can.
+    let dlc = match word.as_bytes() {
+        [_] => u8::from_str_radix(word, 16).ok(),
+        [b'1', digit @ b'0'..=b'5'] => Some(10 + digit - b'0'),
+        _ => None,
+    };
+    dlc.ok_or_else(|| "the data length is not a number from 0 to 15".into())
 }
 
 fn parse_byte(word: &str) -> Result<u8, String> {
@@ -222,18 +225,16 @@ fn parse_data_frame(words: &[&str]) -> Result<Frame, String> {
         return Err("send needs an identifier, a data length and the data: send 601 2 40 00".into());
     };
     let (id, dlc) = (parse_id(id)?, parse_dlc(dlc)?);
-    if data.len() != usize::from(dlc) {
-        return Err(format!("the data length says {dlc} bytes, there are {}", data.len()));
-    }
-    let data = data.iter().map(|word| parse_byte(word)).collect::<Result<Vec<u8>, _>>()?;
-    Frame::data_frame(id, &data).ok_or_else(|| "more than eight data bytes".into())
+    let other = || format!("the data length says {} bytes, there are {}", dlc.min(8), data.len());
+    let bytes = data.iter().map(|word| parse_byte(word)).collect::<Result<Vec<u8>, _>>()?;
+    Frame::data_frame(id, &bytes).and_then(|frame| frame.with_dlc(dlc)).ok_or_else(other)
 }
 
 fn parse_remote_frame(words: &[&str]) -> Result<Frame, String> {
     let [id, dlc] = words else {
         return Err("sendrtr needs an identifier and a data length: sendrtr 701 0".into());
     };
-    Frame::remote_frame(parse_id(id)?, parse_dlc(dlc)?).ok_or_else(|| "more than eight data bytes".into())
+    Frame::remote_frame(parse_id(id)?, parse_dlc(dlc)?).ok_or_else(|| "a data length above 15".into())
 }
 
 /// A frame as a client in raw mode gets it. Data bytes are adjacent, as the daemon writes them
@@ -246,7 +247,7 @@ pub fn frame_element(at: Time, frame: &Frame) -> String {
         Id::Extended(id) => format!("{:08X}", id.as_raw()),
     };
     if frame.is_remote() {
-        return format!("< rtr {id} {at} {} >", frame.dlc());
+        return format!("< rtr {id} {at} {} >", frame.dlc().min(8));
     }
     let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
     format!("< frame {id} {at} {data} >")
@@ -308,6 +309,8 @@ mod tests {
             talk(&mut raw(), b"< send 601 8 40 0 10 0 0 0 0 0 >< send 080 0  >< send 00000080 1 a >");
         assert_eq!(answers, Vec::<String>::new());
         assert_eq!(sent, ["601#4000100000000000", "080#", "00000080#0A"]);
+        let (_, sent) = talk(&mut raw(), b"< send 601 15 1 2 3 4 5 6 7 8 >< send 601 F 1 2 3 4 5 6 7 8 >");
+        assert_eq!(sent, ["601#0102030405060708_F"; 2], "a DLC of 9 to 15 is eight bytes");
     }
 
     #[test]
@@ -347,8 +350,9 @@ mod tests {
             (b"< send 601 >", "send needs"),
             (b"< send 601 1 >", "says 1 bytes, there are 0"),
             (b"< send 601 1 40 00 >", "there are 2"),
-            (b"< send 601 9 1 2 3 4 5 6 7 8 9 >", "0 to 8"),
-            (b"< send 601 -1 >", "0 to 8"),
+            (b"< send 601 9 1 2 3 4 5 6 7 8 9 >", "says 8 bytes, there are 9"),
+            (b"< send 601 16 1 2 3 4 5 6 7 8 >", "0 to 15"),
+            (b"< send 601 -1 >", "0 to 15"),
             (b"< send 601 1 100 >", "data byte"),
             (b"< send 601 1 +1 >", "data byte"),
             (b"< send 800 0 >", "11 bits"),
@@ -356,7 +360,7 @@ mod tests {
             (b"< send 123456789 0 >", "hexadecimal"),
             (b"< send +1 0 >", "hexadecimal"),
             (b"< send xyz 0 >", "hexadecimal"),
-            (b"< sendrtr 1 9 >", "0 to 8"),
+            (b"< sendrtr 1 16 >", "0 to 15"),
             (b"< sendrtr 1 >", "sendrtr needs"),
             (b"< subscribe 0 0 123 >", "not supported"),
             (b"< s\xE9nd 601 0 >", "ASCII"),
