@@ -1,9 +1,10 @@
 //! The bxCAN driver for all boards: bit timing, filters, frames, and the state of the controller
 //! (RM0090 section 32).
 
-use bxcan::{Can, Data, Instance, Interrupts, OverrunError, RegisterBlock, StandardId};
+use bxcan::{Can, Data, Instance, Interrupts, RegisterBlock, StandardId};
 use embedded_can::Frame;
 pub use shared_abi::bit_timing::BitTiming;
+use shared_abi::bxcan::receive;
 
 pub use crate::can_modes::Mode;
 use crate::can_modes::Modes;
@@ -167,16 +168,12 @@ impl<I: Controller> Port<I> {
         change(FMR, FINIT, 0);
     }
 
-    /// The next frame from the FIFO, `None` when it is empty.
+    /// The next frame from the FIFO, `None` when it is empty. The filters pass only data frames with
+    /// identifiers of 11 bits. (A frame of `bxcan` is not read: with a data length code above 8 it panics.)
     pub fn receive<F: Frame>(&mut self) -> Option<F> {
-        loop {
-            match self.can.rx0().receive() {
-                Ok(frame) => return received(&frame),
-                Err(nb::Error::WouldBlock) => return None,
-                // The frames in the FIFO are still good.
-                Err(nb::Error::Other(OverrunError { .. })) => self.lost.in_controller = true,
-            }
-        }
+        // SAFETY: `Instance` promises the registers, and this port has the controller.
+        let frame = unsafe { receive(I::REGISTERS.cast()) }?;
+        F::new(embedded_can::StandardId::new(frame.id())?, frame.data())
     }
 
     /// Records that the receiver of frames had no room for one.
@@ -255,13 +252,6 @@ impl<I: Controller> Port<I> {
         }
         core::mem::take(&mut self.lost)
     }
-}
-
-/// A frame from the FIFO in another crate's type. The filters pass only data frames with
-/// identifiers of 11 bits.
-fn received<F: Frame>(frame: &bxcan::Frame) -> Option<F> {
-    let bxcan::Id::Standard(id) = frame.id() else { return None };
-    F::new(embedded_can::StandardId::new(id.as_raw())?, frame.data()?)
 }
 
 /// The identifier of this value; only its 11 bits count.

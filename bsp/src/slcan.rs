@@ -6,6 +6,7 @@
 //! commands for these are refused.
 
 use embedded_can::{ExtendedId, Frame, Id, StandardId};
+use shared_abi::bxcan::data_length;
 
 use crate::ring::LOST;
 
@@ -193,7 +194,7 @@ fn parse<F: Frame>(line: &[u8]) -> Option<F> {
         _ => return None,
     };
     let (&dlc, data) = rest.split_first()?;
-    let dlc = dlc.checked_sub(b'0').filter(|dlc| *dlc <= 8)?.into();
+    let dlc = data_length(number(&[dlc])? as u8);
     if matches!(kind, b'r' | b'R') {
         return data.is_empty().then(|| F::new_remote(id, dlc))?;
     }

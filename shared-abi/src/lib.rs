@@ -12,6 +12,7 @@
 //! | [`handoff`] | information from the bootloader to the application about the start |
 //! | [`label`] | the target, version and date in a program image |
 //! | [`date`] | the creation date of a program |
+//! | [`bxcan`] | a received frame, and how many data bytes it has |
 //! | [`nameplate`] | the identity of the device in the one-time programmable bytes of its chip |
 //! | [`vectors`] | the proof that a vector table may be jumped to, and the jump |
 //! | [`callgate`] | the bootloader's services for the application, at a fixed address |
@@ -32,6 +33,7 @@ pub mod abilities;
 pub mod bit_timing;
 pub mod block_file;
 pub mod boot_report;
+pub mod bxcan;
 pub mod callgate;
 pub mod clock_tree;
 pub mod date;

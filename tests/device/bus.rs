@@ -144,7 +144,8 @@ fn foreign(n: usize) -> Frame {
         5 => Frame::standard(0x77F, &[0x05]),
         // Answers of LSS slaves.
         6 => Frame::standard(0x7E4, &data),
-        _ => Frame::standard(0x6FF, &data),
+        // Each data length code that means eight bytes.
+        _ => Frame::standard(0x6FF, &data).and_then(|frame| frame.with_dlc(8 + byte / 8 % 8)),
     };
     frame.expect("an identifier and its data")
 }

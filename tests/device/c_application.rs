@@ -165,6 +165,7 @@ fn it_is_a_node_like_any_other() {
     assert_eq!((of_application[0], of_application[1]), (of_bootloader[0], of_bootloader[1]));
     assert_eq!(of_application[3], of_bootloader[3], "from the handoff");
 
+    bench.assert_takes_every_dlc();
     // Requests byte for byte, and the answers that CiA 301 gives them.
     for (request, answer) in [
         ([0x40, 0x00, 0x10, 0, 0, 0, 0, 0], [0x43, 0x00, 0x10, 0, 0, 0, 0, 0]),

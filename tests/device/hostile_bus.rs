@@ -3,6 +3,8 @@
 //! 11898-1 and in the waits of the device (`core/canopen/src/line.rs`).
 
 use coboot_tests::bench::{Bench, BIT_RATE, NODE, REQUEST, RESPONSE};
+use coboot_tests::firmware;
+use coflash_core::update::{flash, FlashOptions};
 use emulator::bus::fault::{Fault, FaultAction, FrameMatch, When};
 use emulator::bus::Outcome;
 use emulator::frame::Frame;
@@ -63,6 +65,19 @@ fn flood(bench: &mut Bench, port: PortId, frames: &[Frame], count: usize) {
     for frame in frames.iter().cycle().take(count) {
         bench.world.send(port, *frame);
     }
+}
+
+/// One such frame reset every node of the bus: bxCAN hands the data length code on as it was on the bus
+/// (ST's HAL and Linux limit it), and a driver took it for a length.
+#[test]
+fn a_data_length_code_above_8_is_eight_bytes_to_bootloader_and_program() {
+    let mut bench = board();
+    bench.assert_takes_every_dlc();
+    let options = FlashOptions::default().trial_run(false);
+    flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
+        .expect("it is installed");
+    assert!(!bench.is_bootloader(NODE));
+    bench.assert_takes_every_dlc();
 }
 
 /// Frames of higher priority than the heartbeat and lower priority than the request keep the bus

@@ -57,6 +57,8 @@ fn the_text_on_the_line() {
     assert_eq!(told, "t701100\rt081800FF00424F4F5406\r");
     assert_eq!(ask(&mut bench, b"C\rS4\rO\r", 20), "\r\r\r");
     assert_eq!(ask(&mut bench, b"t60184000100000000000\r", 20), "z\rt58184300100000000010\r");
+    // A data length code above 8, as on a bus (ISO 11898-1:2015, table 5).
+    assert_eq!(ask(&mut bench, b"t601F4000100000000000\r", 20), "z\rt58184300100000000010\r");
     // A frame for another node, NMT for another node, a remote frame and one with 29 bits: they are
     // acknowledged, as by any node of a bus.
     assert_eq!(

@@ -387,10 +387,15 @@ impl Bench {
     /// If the frame is invalid.
     pub fn ask(&mut self, id: u16, data: &[u8], answer: u32) -> Option<Vec<u8>> {
         self.post(id, data);
+        self.answer(answer)
+    }
+
+    /// The next frame with this identifier, within 100 ms.
+    fn answer(&mut self, id: u32) -> Option<Vec<u8>> {
         let deadline = self.time() + Span::from_millis(100);
         loop {
             let (_, frame) = self.world.run_until_frame_or(self.port, deadline)?;
-            if frame.raw_id() == answer {
+            if frame.raw_id() == id {
                 return Some(frame.data().to_vec());
             }
         }
@@ -421,6 +426,30 @@ impl Bench {
         let options = FlashOptions::default().trial_run(false);
         let installed = flash(&mut self.session(), &firmware::blocks(image), &options, &mut |_| {});
         installed.expect("it is installed");
+    }
+
+    /// Sends frames of eight bytes with each data length code that means eight (ISO 11898-1:2015, table 5), to
+    /// all nodes and to the SDO server, and remote frames. They are as good as those with 8: a request of SDO
+    /// is answered; an NMT command has two bytes (CiA 301 section 7.2.8.3.1), so these are none.
+    ///
+    /// # Panics
+    /// If the board with [`NODE`] has another answer, or is reset.
+    pub fn assert_takes_every_dlc(&mut self) {
+        const READ: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
+        let answer = self.ask(REQUEST, &READ, RESPONSE).expect("an answer");
+        self.events();
+        for dlc in 9..=15 {
+            for (id, data) in [(0x000, [0x81; 8]), (0x7E5, [0x5E, 0, 0, 0, 0, 0, 0, 0]), (REQUEST, READ)] {
+                let frame = Frame::standard(id, &data).and_then(|frame| frame.with_dlc(dlc));
+                let remote = frame.and_then(|frame| Frame::remote_frame(frame.id(), dlc));
+                for frame in [remote, frame] {
+                    self.world.send(self.port, frame.expect("four bits"));
+                }
+            }
+            assert_eq!(self.answer(RESPONSE).as_ref(), Some(&answer), "DLC {dlc}");
+        }
+        self.run_ms(100);
+        assert_eq!(self.events(), [], "it is reset");
     }
 
     /// Configures a board as in the factory: sets its node-ID (255 for none) and bit rate by layer
