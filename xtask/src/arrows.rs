@@ -44,7 +44,7 @@ const RULES: &[(&str, &str)] = &[
     ("app-template-v2", "app-template canopen coboot-app coboot-linker bsp"),
     ("test-app", "app-template canopen coboot-app coboot-linker bsp shared-abi"),
     ("vendor-can", ""),
-    ("coboot-can", "canopen vendor-can"),
+    ("coboot-can", "canopen shared-abi vendor-can"),
     ("coflash-core", "canopen coboot-can coboot-linker seal shared-abi kit"),
     ("coflash-conform", "canopen coboot-can coflash-core shared-abi"),
     ("coflash-agent", "canopen coboot-can coflash-core shared-abi kit"),

@@ -61,7 +61,8 @@ fn parse_time(text: &str) -> Option<Duration> {
     Some(Duration::new(seconds, nanos))
 }
 
-/// `601#4000100000000000`, `12345678#`, `601#R`, `601#R8`.
+/// `601#4000100000000000`, `12345678#`, `601#R`, `601#R8`; after eight bytes, or `R8`, there may be a data
+/// length code above 8: `601#R8_C` (can-utils, `lib.h`).
 fn parse_frame(text: &str) -> Result<Option<Frame>, &'static str> {
     const NO_FRAME: &str = "it has no frame, like 601#4000100000000000";
     let (id, data) = text.split_once('#').ok_or(NO_FRAME)?;
@@ -75,11 +76,11 @@ fn parse_frame(text: &str) -> Result<Option<Frame>, &'static str> {
         8 => ExtendedId::new(number & 0x1FFF_FFFF).ok_or(NO_FRAME)?.into(),
         _ => return Err("its identifier has neither 3 nor 8 digits"),
     };
+    let data = data.split('_').next().unwrap_or_default();
     if let Some(dlc) = data.strip_prefix('R') {
         let dlc = if dlc.is_empty() { 0 } else { dlc.parse().map_err(|_| NO_FRAME)? };
         return Frame::new_remote(id, dlc).map(Some).ok_or("a frame has at most 8 bytes");
     }
-    let data = data.split('_').next().unwrap_or_default();
     let bytes = hex_bytes(data).ok_or("its data are not pairs of hexadecimal digits")?;
     Frame::new(id, &bytes).map(Some).ok_or("a frame has at most 8 bytes")
 }
@@ -104,6 +105,13 @@ mod tests {
             assert_eq!(Line::parse(same).unwrap().unwrap().to_string(), same);
         }
         assert!(Line::parse("(1.5) can0 601#R T").unwrap().unwrap().frame.is_remote_frame());
+        // Examples of can-utils' lib.h.
+        for (long, eight) in [
+            ("(1.5) can0 123#R8_E", "(0000000001.500000) can0 123#R8"),
+            ("(1.5) can0 333#1122334455667788_E", "(0000000001.500000) can0 333#1122334455667788"),
+        ] {
+            assert_eq!(Line::parse(long).unwrap().unwrap().to_string(), eight);
+        }
         for none in
             ["", "   ", "# a comment", "(1.0) can0 123##1112233", "(1.0) can0 20000004#0000000000000000"]
         {

@@ -12,9 +12,17 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
+use shared_abi::bxcan::data_length;
 
 use super::adapter::{Adapter, AdapterError};
 use super::health::Health;
+
+/// The data of a frame with the data length code that a driver reports, as it was on the bus: any node may
+/// send 9 to 15. `None` for more.
+pub(crate) fn data_of(dlc: u32, bytes: &[u8]) -> Option<&[u8]> {
+    let dlc = u8::try_from(dlc).ok().filter(|dlc| *dlc <= 15)?;
+    bytes.get(..data_length(dlc))
+}
 
 /// The interface between the thread and the hardware.
 pub(super) trait Driver {

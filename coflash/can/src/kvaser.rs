@@ -10,7 +10,7 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::canlib::{Canlib, Message};
 
 use super::adapter::{AdapterError, Obstacle, ABSENT};
-use super::driven::{Driven, Driver, Fault, Sent};
+use super::driven::{data_of, Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 
@@ -202,8 +202,7 @@ impl Driver for Kvaser {
 /// The frame in a message.
 fn frame_of(message: &Message) -> Result<Frame, Fault> {
     let nonsense = |what: String| Fault::Nonsense(format!("CANlib reports a frame {what}"));
-    let data = usize::try_from(message.len).ok().and_then(|len| message.data.get(..len));
-    let Some(data) = data else {
+    let Some(data) = data_of(message.len, &message.data) else {
         return Err(nonsense(format!("of {} bytes", message.len)));
     };
     let id: Option<Id> = if message.flags & flag::EXTENDED != 0 {
@@ -268,8 +267,13 @@ mod tests {
     fn a_message_that_is_no_frame_is_nonsense_and_named() {
         let message = |id, flags, len| Message { id, flags, len, data: [1, 2, 3, 4, 5, 6, 7, 8] };
         assert_eq!(frame_of(&message(0x585, flag::STANDARD, 2)).unwrap().to_string(), "585#0102");
+        assert_eq!(
+            frame_of(&message(0x585, flag::STANDARD, 15)).unwrap().to_string(),
+            "585#0102030405060708"
+        );
+        assert_eq!(frame_of(&message(0x585, flag::REMOTE, 9)).unwrap().to_string(), "585#R8");
         for (message, words) in [
-            (message(0x585, flag::STANDARD, 9), "of 9 bytes"),
+            (message(0x585, flag::STANDARD, 16), "of 16 bytes"),
             (message(0x585, flag::STANDARD, u32::MAX), "of 4294967295 bytes"),
             (message(-1, flag::STANDARD, 0), "with identifier"),
             (message(0x2000_0000, flag::EXTENDED, 0), "with identifier 20000000h"),

@@ -11,7 +11,7 @@ use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use vendor_can::pcan::{Message, Pcan};
 
 use super::adapter::{AdapterError, Obstacle, ABSENT};
-use super::driven::{Driven, Driver, Fault, Sent};
+use super::driven::{data_of, Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 
@@ -253,9 +253,8 @@ impl Driver for Peak {
 /// The frame in a message.
 fn frame_of(message: &Message) -> Result<Frame, Fault> {
     let nonsense = |what: String| Fault::Nonsense(format!("its library reports a frame {what}"));
-    let len = usize::from(message.len);
-    let Some(data) = message.data.get(..len) else {
-        return Err(nonsense(format!("of {len} bytes")));
+    let Some(data) = data_of(message.len.into(), &message.data) else {
+        return Err(nonsense(format!("of {} bytes", message.len)));
     };
     let id: Option<Id> = if message.kind & kind::EXTENDED != 0 {
         ExtendedId::new(message.id).map(Id::from)
@@ -264,7 +263,7 @@ fn frame_of(message: &Message) -> Result<Frame, Fault> {
     };
     let frame = id.and_then(|id| match message.kind & kind::REMOTE {
         0 => Frame::new(id, data),
-        _ => Frame::new_remote(id, len),
+        _ => Frame::new_remote(id, data.len()),
     });
     frame.ok_or_else(|| nonsense(format!("with identifier {:X}h", message.id)))
 }
@@ -347,8 +346,10 @@ mod tests {
         let frame = frame_of(&message(0x585, 0, 2)).unwrap();
         assert_eq!((frame.to_string(), frame.data()), ("585#0102".to_string(), &[1, 2][..]));
         assert!(frame_of(&message(0x1FFF_FFFF, kind::EXTENDED, 8)).is_ok());
+        assert_eq!(frame_of(&message(0x585, 0, 15)).unwrap().data().len(), 8);
+        assert_eq!(frame_of(&message(0x585, kind::REMOTE, 9)).unwrap().to_string(), "585#R8");
         for (message, words) in [
-            (message(0x585, 0, 9), "of 9 bytes"),
+            (message(0x585, 0, 16), "of 16 bytes"),
             (message(0x585, 0, 255), "of 255 bytes"),
             (message(0x585, kind::REMOTE, 200), "of 200 bytes"),
             (message(0x800, 0, 0), "with identifier 800h"),

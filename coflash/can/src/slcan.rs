@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
+use shared_abi::bxcan::data_length;
 
 use super::adapter::{Adapter, AdapterError};
 use super::echo::Echoes;
@@ -341,7 +342,8 @@ fn parse_frame(text: &[u8]) -> Option<Frame> {
     } else {
         ExtendedId::new(number)?.into()
     };
-    let dlc: usize = text.get(digits + 1..digits + 2)?.parse().ok().filter(|dlc| *dlc <= 8)?;
+    // An adapter may hand on a data length code above 8, in hexadecimal.
+    let dlc = data_length(hex_number(text.get(digits + 1..digits + 2)?)? as u8);
     let is_remote = kind.eq_ignore_ascii_case(&'r');
     let rest = text.get(digits + 2..)?;
     let (data, time) = rest.split_at_checked(if is_remote { 0 } else { 2 * dlc })?;

@@ -253,7 +253,8 @@ pub fn frame_message(frame: &Frame, time: Duration) -> String {
     format!("< frame {} {}.{:06} {data} >", identifier(frame), time.as_secs(), time.subsec_micros())
 }
 
-/// The frame in a client's message `send 605 8 40 0 10 0 0 0 0 0`, passed without the brackets.
+/// The frame in a client's message `send 605 8 40 0 10 0 0 0 0 0`, passed without the brackets. A data length
+/// code of 9 to 15 is one of eight bytes (ISO 11898-1:2015, table 5).
 /// `None` for any other message.
 #[must_use]
 pub fn parse_send(message: &str) -> Option<Frame> {
@@ -262,7 +263,8 @@ pub fn parse_send(message: &str) -> Option<Frame> {
         return None;
     };
     let data = words.map(|word| u8::try_from(hex_number(word)?).ok()).collect::<Option<Vec<u8>>>()?;
-    (dlc == data.len().to_string()).then(|| Frame::new(id, &data)).flatten()
+    let is_long = data.len() == 8 && matches!(dlc.parse(), Ok(9..=15_u8));
+    (is_long || dlc == data.len().to_string()).then(|| Frame::new(id, &data)).flatten()
 }
 
 /// Three digits for an identifier of 11 bits, eight for 29 bits.
@@ -383,6 +385,8 @@ mod tests {
         assert_eq!(parse_send("send 123 0"), Some(frame(0x123, &[])));
         assert_eq!(parse_send("send 123 4 11 22 33 44"), Some(frame(0x123, &[0x11, 0x22, 0x33, 0x44])));
         assert_eq!(parse_send("send 1 1 5"), Some(frame(1, &[5])));
+        let eight = Some(frame(0x601, &[1, 2, 3, 4, 5, 6, 7, 8]));
+        assert_eq!([9, 15].map(|dlc| parse_send(&format!("send 601 {dlc} 1 2 3 4 5 6 7 8"))), [eight; 2]);
         let extended = Frame::new(ExtendedId::new(0x1AAA_AAAA).unwrap(), &[0x11, 0xF1]).unwrap();
         assert_eq!(parse_send("send 1AAAAAAA 2 11 F1"), Some(extended));
         for bad in [
@@ -392,6 +396,7 @@ mod tests {
             "send 123 1",
             "send 123 1 11 22",
             "send 123 9 1 2 3 4 5 6 7 8 9",
+            "send 123 16 1 2 3 4 5 6 7 8",
             "send 123 01 11",
             "send 123 1 111",
             "send 123 1 +1",

@@ -6,6 +6,8 @@
 use canopen::Frame;
 use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 
+use crate::driven::data_of;
+
 /// Requests (`enum gs_usb_breq`), vendor type, to the interface.
 pub mod request {
     /// `GS_USB_BREQ_HOST_FORMAT`.
@@ -188,7 +190,7 @@ pub enum Said {
 pub fn parse(bytes: &[u8], channel: u8) -> Result<Said, String> {
     let short = || format!("a transfer of {} bytes", bytes.len());
     let (echo, id) = (word(bytes, 0).ok_or_else(short)?, word(bytes, 4).ok_or_else(short)?);
-    let Some(&[len, of, flags, _, ref data @ ..]) = bytes.get(8..FRAME) else { return Err(short()) };
+    let Some(&[dlc, of, flags, _, ref data @ ..]) = bytes.get(8..FRAME) else { return Err(short()) };
     if of != channel {
         return Ok(Said::Other);
     }
@@ -202,8 +204,8 @@ pub fn parse(bytes: &[u8], channel: u8) -> Result<Said, String> {
         let data = data.try_into().map_err(|_| short())?;
         return Ok(Said::Error(id & 0x1FFF_FFFF, data));
     }
-    let Some(payload) = data.get(..usize::from(len)) else {
-        return Err(format!("a frame of {len} bytes"));
+    let Some(payload) = data_of(dlc.into(), data) else {
+        return Err(format!("a frame of {dlc} bytes"));
     };
     let number = id & 0x1FFF_FFFF;
     let identifier: Option<Id> = if id & EXTENDED != 0 {
@@ -282,9 +284,18 @@ mod tests {
         // CAN_ERR_FLAG and CAN_ERR_ACK.
         let error = [0xFF, 0xFF, 0xFF, 0xFF, 0x20, 0, 0, 0x20, 8, 0, 0, 0, 0, 0x20, 0, 0, 0, 0, 128, 0];
         assert_eq!(parse(&error, 0), Ok(Said::Error(0x20, [0, 0x20, 0, 0, 0, 0, 128, 0])));
+        // Any node may send a data length code of 9 to 15, also in a remote frame (ISO 11898-1:2015, table 5).
+        for dlc in 9..=15 {
+            let mut long = received;
+            long[8] = dlc;
+            assert_eq!(parse(&long, 0), Ok(Said::Frame(answer)), "{dlc}");
+            long[7] = 0x40;
+            let remote = Frame::new_remote(answer.id(), 8).unwrap();
+            assert_eq!(parse(&long, 0), Ok(Said::Frame(remote)), "{dlc}");
+        }
         let mut long = received;
-        long[8] = 9;
-        assert_eq!(parse(&long, 0), Err("a frame of 9 bytes".to_string()));
+        long[8] = 16;
+        assert_eq!(parse(&long, 0), Err("a frame of 16 bytes".to_string()));
         assert_eq!(parse(&received[..19], 0), Err("a transfer of 19 bytes".to_string()));
         assert_eq!(parse(&[], 0), Err("a transfer of 0 bytes".to_string()));
         assert_eq!(channels(&[0, 0, 0, 1, 2, 0, 0, 0, 1, 0, 0, 0]), Some(2));

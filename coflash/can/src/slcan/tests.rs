@@ -26,6 +26,13 @@ fn messages_are_those_of_the_protocol() {
     let remote = Frame::new_remote(StandardId::new(0x100).unwrap(), 2).unwrap();
     assert_eq!(parse_frame(b"r10020A1B"), Some(remote));
     assert_eq!((parse_frame(b"r1002"), text_of(&remote)), (Some(remote), "r1002\r".to_string()));
+    // Codes above 8, which the manual does not have and the bus does (ISO 11898-1:2015, table 5).
+    let eight = frame(0x100, &[1, 2, 3, 4, 5, 6, 7, 8]);
+    for dlc in ["8", "9", "A", "f"] {
+        assert_eq!(parse_frame(format!("t100{dlc}0102030405060708").as_bytes()), Some(eight), "{dlc}");
+        assert_eq!(parse_frame(format!("t100{dlc}01020304050607080A1B").as_bytes()), Some(eight), "{dlc}");
+        assert_eq!(parse_frame(format!("r100{dlc}").as_bytes()), Frame::new_remote(eight.id(), 8), "{dlc}");
+    }
     for bad in [
         &b""[..],
         b"z",
