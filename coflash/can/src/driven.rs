@@ -12,16 +12,36 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use canopen::Frame;
+use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
 use shared_abi::bxcan::data_length;
 
 use super::adapter::{Adapter, AdapterError};
 use super::health::Health;
 
-/// The data of a frame with the data length code that a driver reports, as it was on the bus: any node may
-/// send 9 to 15. `None` for more.
-pub(crate) fn data_of(dlc: u32, bytes: &[u8]) -> Option<&[u8]> {
-    let dlc = u8::try_from(dlc).ok().filter(|dlc| *dlc <= 15)?;
-    bytes.get(..data_length(dlc))
+/// The frame that a driver reports, with the data length code of the bus: any node may send 9 to 15.
+///
+/// # Errors
+/// What is wrong with it.
+pub(crate) fn frame_of(
+    id: i64,
+    extended: bool,
+    remote: bool,
+    dlc: u32,
+    data: &[u8],
+) -> Result<Frame, String> {
+    let code = u8::try_from(dlc).ok().filter(|code| *code <= 15);
+    let data = code.and_then(|code| data.get(..data_length(code)));
+    let data = data.ok_or_else(|| format!("a frame of {dlc} bytes"))?;
+    let identifier: Option<Id> = if extended {
+        u32::try_from(id).ok().and_then(ExtendedId::new).map(Id::from)
+    } else {
+        u16::try_from(id).ok().and_then(StandardId::new).map(Id::from)
+    };
+    let frame = identifier.and_then(|identifier| match remote {
+        false => Frame::new(identifier, data),
+        true => Frame::new_remote(identifier, data.len()),
+    });
+    frame.ok_or_else(|| format!("a frame with identifier {id:X}h"))
 }
 
 /// The interface between the thread and the hardware.

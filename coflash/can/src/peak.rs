@@ -7,11 +7,11 @@ use std::thread;
 use std::time::Duration;
 
 use canopen::Frame;
-use embedded_can::{ExtendedId, Frame as _, Id, StandardId};
+use embedded_can::{Frame as _, Id};
 use vendor_can::pcan::{Message, Pcan};
 
 use super::adapter::{AdapterError, Obstacle, ABSENT};
-use super::driven::{data_of, Driven, Driver, Fault, Sent};
+use super::driven::{frame_of, Driven, Driver, Fault, Sent};
 use super::found::{shown, Found, Kind, Missing};
 use super::health::{Controller, Health};
 
@@ -234,7 +234,7 @@ impl Driver for Peak {
         if message.kind & (kind::STATUS | kind::ECHO | kind::FD) != 0 {
             return Ok(None);
         }
-        frame_of(&message).map(Some)
+        frame_in(&message).map(Some)
     }
 
     fn health(&mut self) -> Health {
@@ -251,21 +251,15 @@ impl Driver for Peak {
 }
 
 /// The frame in a message.
-fn frame_of(message: &Message) -> Result<Frame, Fault> {
-    let nonsense = |what: String| Fault::Nonsense(format!("its library reports a frame {what}"));
-    let Some(data) = data_of(message.len.into(), &message.data) else {
-        return Err(nonsense(format!("of {} bytes", message.len)));
-    };
-    let id: Option<Id> = if message.kind & kind::EXTENDED != 0 {
-        ExtendedId::new(message.id).map(Id::from)
-    } else {
-        u16::try_from(message.id).ok().and_then(StandardId::new).map(Id::from)
-    };
-    let frame = id.and_then(|id| match message.kind & kind::REMOTE {
-        0 => Frame::new(id, data),
-        _ => Frame::new_remote(id, data.len()),
-    });
-    frame.ok_or_else(|| nonsense(format!("with identifier {:X}h", message.id)))
+fn frame_in(message: &Message) -> Result<Frame, Fault> {
+    let frame = frame_of(
+        message.id.into(),
+        message.kind & kind::EXTENDED != 0,
+        message.kind & kind::REMOTE != 0,
+        message.len.into(),
+        &message.data,
+    );
+    frame.map_err(|what| Fault::Nonsense(format!("its library reports {what}")))
 }
 
 /// The message for the error in a status.
@@ -343,19 +337,18 @@ mod tests {
     #[test]
     fn a_message_that_is_no_frame_is_nonsense_and_named() {
         let message = |id, kind, len| Message { id, kind, len, data: [1, 2, 3, 4, 5, 6, 7, 8] };
-        let frame = frame_of(&message(0x585, 0, 2)).unwrap();
+        let frame = frame_in(&message(0x585, 0, 2)).unwrap();
         assert_eq!((frame.to_string(), frame.data()), ("585#0102".to_string(), &[1, 2][..]));
-        assert!(frame_of(&message(0x1FFF_FFFF, kind::EXTENDED, 8)).is_ok());
-        assert_eq!(frame_of(&message(0x585, 0, 15)).unwrap().data().len(), 8);
-        assert_eq!(frame_of(&message(0x585, kind::REMOTE, 9)).unwrap().to_string(), "585#R8");
+        assert!(frame_in(&message(0x1FFF_FFFF, kind::EXTENDED, 8)).is_ok());
+        assert_eq!(frame_in(&message(0x585, 0, 15)).unwrap().data().len(), 8);
+        assert_eq!(frame_in(&message(0x585, kind::REMOTE, 9)).unwrap().to_string(), "585#R8");
         for (message, words) in [
             (message(0x585, 0, 16), "of 16 bytes"),
-            (message(0x585, 0, 255), "of 255 bytes"),
             (message(0x585, kind::REMOTE, 200), "of 200 bytes"),
             (message(0x800, 0, 0), "with identifier 800h"),
             (message(0xFFFF_FFFF, kind::EXTENDED, 0), "with identifier FFFFFFFFh"),
         ] {
-            match frame_of(&message) {
+            match frame_in(&message) {
                 Err(Fault::Nonsense(said)) => assert!(said.contains(words), "{said}"),
                 other => panic!("{other:?}"),
             }
