@@ -201,7 +201,8 @@ impl<I: Controller> Port<I> {
         };
         self.heartbeat_waits = id.as_raw() & 0x780 == BOOT_UP;
         self.boot_up = self.heartbeat_waits && data[..] == [0];
-        self.waiting = Some(bxcan::Frame::new_data(standard_id(id.as_raw()), data));
+        let id = StandardId::new(id.as_raw()).unwrap_or(StandardId::MAX);
+        self.waiting = Some(bxcan::Frame::new_data(id, data));
         self.put_waiting();
     }
 
@@ -252,9 +253,4 @@ impl<I: Controller> Port<I> {
         }
         core::mem::take(&mut self.lost)
     }
-}
-
-/// The identifier of this value; only its 11 bits count.
-fn standard_id(raw: u16) -> StandardId {
-    StandardId::new(raw & 0x7FF).unwrap_or(StandardId::MAX)
 }

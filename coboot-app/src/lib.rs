@@ -8,6 +8,7 @@
 //! | [`departure`] | the way back to the bootloader: when the device may leave |
 //! | [`bootloader`] | the services of the bootloader underneath, and the reset itself |
 //! | [`callgate`] | how these services are called: finds the callgate's table and enters it |
+//! | [`bxcan`] | the receive FIFO of bxCAN: frames with every data length code |
 //! | [`label!`](label!) | whom the image is for, at its place in the image |
 //! | [`layout!`](layout!) | the memory map of the board, as the build script has written it |
 //! | `responder` | a small SDO server for applications without a CANopen stack (feature `responder`) |
@@ -43,7 +44,7 @@ pub use program_control::{Answer, ProgramControl};
 pub use start::{Defaults, Start};
 
 pub use shared_abi::bit_timing::BitTiming;
-pub use shared_abi::{geometry, handoff, layout, nameplate, renewal, warm_start};
+pub use shared_abi::{bxcan, geometry, handoff, layout, nameplate, renewal, warm_start};
 
 /// The memory map of the board as the build script has written it
 /// (`coboot_linker::Application::emit`), for a `static` of the program:

@@ -28,6 +28,7 @@
 use core::fmt::{self, Write as _};
 
 use shared_abi::block_file::ProgramVersion;
+pub use shared_abi::bxcan::Frame;
 use shared_abi::label::Label;
 use shared_abi::warm_start::BootRequest;
 
@@ -42,36 +43,6 @@ use crate::program_control::{
 const DEVICE_NAME: u16 = 0x1008;
 const SOFTWARE_VERSION: u16 = 0x100A;
 const PROGRAM_VERSION: u16 = 0x2005;
-
-/// A CAN data frame with an identifier of 11 bits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Frame {
-    id: u16,
-    len: u8,
-    bytes: [u8; 8],
-}
-
-impl Frame {
-    /// A frame; `None` for an identifier of more than 11 bits or more than 8 bytes.
-    #[must_use]
-    pub fn new(id: u16, data: &[u8]) -> Option<Self> {
-        let mut bytes = [0; 8];
-        bytes.get_mut(..data.len())?.copy_from_slice(data);
-        (id < 0x800).then_some(Self { id, len: data.len() as u8, bytes })
-    }
-
-    /// The identifier, 0 to 7FFh.
-    #[must_use]
-    pub const fn id(&self) -> u16 {
-        self.id
-    }
-
-    /// Its 0 to 8 bytes.
-    #[must_use]
-    pub fn data(&self) -> &[u8] {
-        &self.bytes[..usize::from(self.len)]
-    }
-}
 
 /// The values by which the device identifies itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -224,7 +195,7 @@ impl Responder {
         if self.silent || self.nmt == Nmt::BootUp {
             return None;
         }
-        match (frame.id, frame.data()) {
+        match (frame.id(), frame.data()) {
             (0, &[command, node]) if node == 0 || node == self.node_id => {
                 self.command(command, now);
                 None
@@ -233,7 +204,7 @@ impl Responder {
                 if id == self.control.sdo().request + u16::from(self.node_id) && self.nmt != Nmt::Stopped =>
             {
                 let bytes = self.request([a, b, c, d, e, f, g, h], now, services)?;
-                Some(Frame { id: self.control.sdo().response + u16::from(self.node_id), len: 8, bytes })
+                Frame::new(self.control.sdo().response + u16::from(self.node_id), &bytes)
             }
             _ => None,
         }

@@ -12,15 +12,23 @@ pub const fn data_length(dlc: u8) -> usize {
     }
 }
 
-/// A data frame with an identifier of 11 bits.
+/// A CAN data frame with an identifier of 11 bits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Received {
+pub struct Frame {
     id: u16,
-    dlc: u8,
+    len: u8,
     bytes: [u8; 8],
 }
 
-impl Received {
+impl Frame {
+    /// A frame; `None` for an identifier of more than 11 bits or more than 8 bytes.
+    #[must_use]
+    pub fn new(id: u16, data: &[u8]) -> Option<Self> {
+        let mut bytes = [0; 8];
+        bytes.get_mut(..data.len())?.copy_from_slice(data);
+        (id < 0x800).then_some(Self { id, len: data.len() as u8, bytes })
+    }
+
     /// The identifier, 0 to 7FFh.
     #[must_use]
     pub const fn id(&self) -> u16 {
@@ -30,14 +38,15 @@ impl Received {
     /// Its 0 to 8 bytes.
     #[must_use]
     pub fn data(&self) -> &[u8] {
-        &self.bytes[..data_length(self.dlc)]
+        &self.bytes[..usize::from(self.len)]
     }
 
     /// The frame in `CAN_RIxR`, `CAN_RDTxR`, `CAN_RDLxR` and `CAN_RDHxR`; `None` for a remote frame and an
     /// identifier of 29 bits.
-    fn of([rir, rdtr, rdlr, rdhr]: [u32; 4]) -> Option<Self> {
+    fn received([rir, rdtr, rdlr, rdhr]: [u32; 4]) -> Option<Self> {
         let bytes = (u64::from(rdhr) << 32 | u64::from(rdlr)).to_le_bytes();
-        (rir & (IDE | RTR) == 0).then_some(Self { id: (rir >> 21) as u16, dlc: rdtr as u8 & 0xF, bytes })
+        let id = Some((rir >> 21) as u16).filter(|_| rir & (IDE | RTR) == 0)?;
+        Self::new(id, &bytes[..data_length(rdtr as u8 & 0xF)])
     }
 }
 
@@ -57,11 +66,11 @@ const RTR: u32 = 1 << 1;
 ///
 /// # Safety
 /// `registers` is the base of CAN1 or CAN2, which has its clock, and nobody else reads its FIFO 0 meanwhile.
-pub unsafe fn receive(registers: *mut u32) -> Option<Received> {
+pub unsafe fn receive(registers: *mut u32) -> Option<Frame> {
     // SAFETY: the caller promises the registers, and the offsets are in them. Reading has no effect.
     let read = |offset: usize| unsafe { registers.add(offset).read_volatile() };
     while read(RF0R) & FMP0 != 0 {
-        let frame = Received::of([0, 1, 2, 3].map(|word| read(RI0R + word)));
+        let frame = Frame::received([0, 1, 2, 3].map(|word| read(RI0R + word)));
         // SAFETY: as above. The FIFO is this caller's, and the frame has been read.
         unsafe { registers.add(RF0R).write_volatile(RFOM0) };
         if frame.is_some() {
@@ -78,14 +87,12 @@ mod tests {
     /// ISO 11898-1:2015, table 5, and RM0090 section 32.9.3.
     #[test]
     fn every_data_length_code_of_the_bus_is_a_frame() {
-        let data = [8, 7, 6, 5, 4, 3, 2, 1];
         for (dlc, len) in (0..=15).zip([0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8, 8, 8, 8, 8, 8]) {
             // With a time stamp and the index of a filter.
-            let registers = [0x601 << 21, 0x1234_5600 | dlc, 0x0506_0708, 0x0102_0304];
-            let frame = Received::of(registers).unwrap();
-            assert_eq!((frame.id(), frame.data()), (0x601, &data[..len]), "{dlc}");
-            assert_eq!(Received::of([0x601 << 21 | 2, dlc, 0, 0]), None, "a remote frame");
-            assert_eq!(Received::of([0x601 << 21 | 4, dlc, 0, 0]), None, "29 bits");
+            let received = |rir| Frame::received([rir, 0x1234_5600 | dlc, 0x0506_0708, 0x0102_0304]);
+            let data = [8, 7, 6, 5, 4, 3, 2, 1];
+            assert_eq!(received(0x601 << 21), Frame::new(0x601, &data[..len]), "{dlc}");
+            assert_eq!((received(0x601 << 21 | 2), received(0x601 << 21 | 4)), (None, None), "RTR, 29 bits");
         }
     }
 }

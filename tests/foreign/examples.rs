@@ -98,6 +98,7 @@ fn install_and_update(versions: [&str; 2]) {
         let mut session = endpoint.bench.session();
         assert_eq!(session.read_number(Address::new(0x1F51, 1)).unwrap(), 1, "{name} runs");
         crcs.push(session.read_number(CRC).unwrap());
+        endpoint.bench.assert_takes_every_dlc();
     }
     assert_ne!(crcs[0], crcs[1], "another program");
     let bench = &mut endpoint.bench;

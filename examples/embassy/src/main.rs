@@ -5,6 +5,7 @@
 
 use core::panic::PanicInfo;
 
+use coboot_app::bxcan::data_length;
 use coboot_app::layout::Layout;
 use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
@@ -154,10 +155,12 @@ fn data_frames(id: u16) -> ListEntry16 {
 }
 
 /// The frame as the responder takes it; `None` for one that is none of CANopen's. The filter lets
-/// data frames through, and no remote frames.
+/// data frames through, and no remote frames. (`data` of a frame panics at a data length code of 9 to 15, which
+/// any node may send.)
 fn read(frame: &Frame) -> Option<responder::Frame> {
     let Id::Standard(id) = frame.id() else { return None };
-    responder::Frame::new(id.as_raw(), frame.data())
+    let data = frame.raw_data().get(..data_length(frame.header().len()))?;
+    responder::Frame::new(id.as_raw(), data)
 }
 
 fn send(can: &mut Can<'static>, frame: &responder::Frame) {

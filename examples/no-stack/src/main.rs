@@ -7,7 +7,7 @@ use core::panic::PanicInfo;
 use core::sync::atomic::{AtomicU32, Ordering};
 
 use bxcan::filter::{BankConfig, ListEntry16};
-use bxcan::{Can, Fifo, Frame, Id, StandardId};
+use bxcan::{Can, Fifo, Frame, StandardId};
 use coboot_app::layout::Layout;
 use coboot_app::responder::{self, Device, Responder};
 use coboot_app::warm_start::BootRequest;
@@ -93,8 +93,7 @@ fn main() -> ! {
     loop {
         let now = NOW.load(Ordering::Relaxed);
         // An overrun has lost a frame: the client asks again.
-        while let Ok(frame) = can.receive() {
-            let Some(request) = read(&frame) else { continue };
+        while let Some(request) = receive(&mut can) {
             if let Some(answer) = responder.handle(&request, now, &mut bootloader) {
                 send(&mut can, &answer);
             }
@@ -132,10 +131,11 @@ fn data_frames(id: u16) -> ListEntry16 {
     ListEntry16::data_frames_with_id(StandardId::new(id).unwrap_or(StandardId::ZERO))
 }
 
-/// The frame as the responder takes it; `None` for one that is none of CANopen's.
-fn read(frame: &Frame) -> Option<responder::Frame> {
-    let Id::Standard(id) = frame.id() else { return None };
-    responder::Frame::new(id.as_raw(), frame.data()?)
+/// The next frame from the FIFO. (`receive` of `bxcan` gives frames that panic when they are read, if they have
+/// a data length code of 9 to 15, which any node may send.)
+fn receive<I: bxcan::Instance>(_: &mut Can<I>) -> Option<responder::Frame> {
+    // SAFETY: `Instance` promises the registers, and nobody else has the controller.
+    unsafe { coboot_app::bxcan::receive(I::REGISTERS.cast()) }
 }
 
 fn send(can: &mut Can<impl bxcan::Instance>, frame: &responder::Frame) {

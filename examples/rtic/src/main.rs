@@ -12,8 +12,8 @@ mod stack;
 use core::panic::PanicInfo;
 
 use bxcan::filter::{BankConfig, ListEntry16};
-use bxcan::{Can, Data, Fifo, Frame, Id, StandardId};
-use coboot_app::{Bootloader, Next, ReentryPath};
+use bxcan::{Can, Data, Fifo, Frame, Instance, StandardId};
+use coboot_app::{bxcan as fifo, Bootloader, Next, ReentryPath};
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::{exception, ExceptionFrame};
 use rtic_monotonics::systick::prelude::*;
@@ -152,7 +152,7 @@ impl Bus {
                 }
             }
             // An overrun has lost a frame: the client asks again.
-            let Ok(frame) = self.can.receive() else { return };
+            let Some(frame) = receive(&mut self.can) else { return };
             // A device that is about to leave takes no request.
             if serves {
                 self.handle(&frame);
@@ -160,9 +160,8 @@ impl Bus {
         }
     }
 
-    fn handle(&mut self, frame: &Frame) {
-        let (Id::Standard(id), Some(data)) = (frame.id(), frame.data()) else { return };
-        match self.node.handle(id.as_raw(), data, &mut self.objects) {
+    fn handle(&mut self, frame: &fifo::Frame) {
+        match self.node.handle(frame.id(), frame.data(), &mut self.objects) {
             Some(Event::Answer(id, answer)) => self.send(id, &answer),
             Some(Event::Reset) => self.objects.reset(),
             None => {}
@@ -182,6 +181,13 @@ impl Bus {
 fn start_crystal(rcc: &RCC) -> bool {
     rcc.cr().modify(|_, w| w.hseon().set_bit());
     (0..PATIENCE).any(|_| rcc.cr().read().hserdy().bit_is_set())
+}
+
+/// The next frame from the FIFO. (`receive` of `bxcan` gives frames that panic when they are read, if they have
+/// a data length code of 9 to 15, which any node may send.)
+fn receive<I: Instance>(_: &mut Can<I>) -> Option<fifo::Frame> {
+    // SAFETY: `Instance` promises the registers, and nobody else has the controller.
+    unsafe { fifo::receive(I::REGISTERS.cast()) }
 }
 
 /// A filter for data frames with this identifier of 11 bits.
