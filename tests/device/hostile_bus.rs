@@ -75,7 +75,7 @@ fn a_data_length_code_above_8_is_eight_bytes_to_bootloader_and_program() {
     bench.assert_takes_every_dlc();
     let options = FlashOptions::default().trial_run(false);
     flash(&mut bench.session(), &firmware::blocks(firmware::APP_V1), &options, &mut |_| {})
-        .expect("it is installed");
+        .expect("installed");
     assert!(!bench.is_bootloader(NODE));
     bench.assert_takes_every_dlc();
 }

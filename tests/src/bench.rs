@@ -436,7 +436,7 @@ impl Bench {
     /// If the board with [`NODE`] has another answer, or is reset.
     pub fn assert_takes_every_dlc(&mut self) {
         const READ: [u8; 8] = [0x40, 0x00, 0x10, 0, 0, 0, 0, 0];
-        let answer = self.ask(REQUEST, &READ, RESPONSE).expect("an answer");
+        let answer = self.ask(REQUEST, &READ, RESPONSE);
         self.events();
         for dlc in 9..=15 {
             for (id, data) in [(0x000, [0x81; 8]), (0x7E5, [0x5E, 0, 0, 0, 0, 0, 0, 0]), (REQUEST, READ)] {
@@ -446,7 +446,7 @@ impl Bench {
                     self.world.send(self.port, frame.expect("four bits"));
                 }
             }
-            assert_eq!(self.answer(RESPONSE).as_ref(), Some(&answer), "DLC {dlc}");
+            assert!(answer.is_some() && self.answer(RESPONSE) == answer, "DLC {dlc}");
         }
         self.run_ms(100);
         assert_eq!(self.events(), [], "it is reset");

@@ -308,10 +308,6 @@ impl Fifo {
         }
     }
 
-    fn newest(&self) -> &RxMailbox {
-        self.frames.back().unwrap_or(&self.stale)
-    }
-
     fn output(&self) -> &RxMailbox {
         self.frames.front().unwrap_or(&self.stale)
     }
@@ -821,7 +817,8 @@ impl BxCan {
             let locked = self.mcr & mcr::RFLM != 0;
             let stamp = self.time_stamp();
             let fifo = &mut self.fifos[found.fifo];
-            let received = RxMailbox::new(frame, found.index, stamp, fifo.newest());
+            let before = fifo.frames.back().unwrap_or(&fifo.stale);
+            let received = RxMailbox::new(frame, found.index, stamp, before);
             fifo.store(received, locked);
         }
     }

@@ -18,8 +18,6 @@ pub const STUFF_WIDTH: u32 = 5;
 /// The most data bytes of a frame: a data length code of 9 to 15 means eight, too (ISO 11898-1:2015,
 /// table 5).
 const MOST_DATA: u8 = 8;
-/// The data length code has four bits.
-const MOST_DLC: u8 = 15;
 
 /// A data or remote frame with 11- or 29-bit identifier.
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
@@ -43,7 +41,7 @@ impl Frame {
     /// A remote frame with this data length code; `None` for more than 15.
     #[must_use]
     pub fn remote_frame(id: Id, dlc: u8) -> Option<Self> {
-        (dlc <= MOST_DLC).then_some(Self { id, remote: true, dlc, data: [0; 8] })
+        (dlc <= 15).then_some(Self { id, remote: true, dlc, data: [0; 8] })
     }
 
     /// The same frame with another data length code; `None` for more than 15, or if that means another
@@ -51,7 +49,7 @@ impl Frame {
     #[must_use]
     pub fn with_dlc(self, dlc: u8) -> Option<Self> {
         let same = self.remote || usize::from(dlc.min(MOST_DATA)) == self.data().len();
-        (dlc <= MOST_DLC && same).then_some(Self { dlc, ..self })
+        (dlc <= 15 && same).then_some(Self { dlc, ..self })
     }
 
     /// A data frame with an 11-bit identifier; `None` if the identifier needs more bits, or for
@@ -423,9 +421,9 @@ mod tests {
         assert!(Frame::extended(0x2000_0000, &[]).is_none());
         assert!(Frame::standard(1, &[0; 9]).is_none());
         assert!(Frame::remote_frame(Id::Standard(StandardId::ZERO), 16).is_none());
-        let eight = Frame::standard(1, &[0; 8]).unwrap();
-        assert_eq!((eight.with_dlc(16), eight.with_dlc(7)), (None, None));
-        assert_eq!(Frame::standard(1, &[0; 7]).unwrap().with_dlc(9), None);
+        for (len, dlc) in [(8, 16), (8, 7), (7, 9)] {
+            assert_eq!(Frame::standard(1, &[0; 8][..len]).unwrap().with_dlc(dlc), None);
+        }
         assert!(Frame::standard(1, &[0; 300]).is_none());
     }
 }

@@ -19,6 +19,8 @@ pub struct Board {
     masters: [PortId; 2],
     /// Events of the machine that belong between frames.
     cuts: u64,
+    /// Frames of the masters so far.
+    sent: u64,
 }
 
 /// One us.
@@ -35,8 +37,13 @@ impl Board {
         bench.machine().load_bin(layout.key_block().base, keys).expect("it is in flash");
         let masters = [0; 2].map(|_| bench.world.add_host_port(BIT_RATE));
         bench.power_on();
-        Self { bench, layout, masters, cuts: 0 }
+        Self { bench, layout, masters, cuts: 0, sent: 0 }
     }
+}
+
+/// A data length code that means eight bytes (ISO 11898-1:2015, table 5), each of them in turn.
+pub(super) const fn long_dlc(sent: u64) -> u8 {
+    8 + (sent % 8) as u8
 }
 
 fn micros(at: Time) -> u64 {
@@ -53,9 +60,10 @@ impl Target for Board {
     }
 
     fn send(&mut self, master: usize, frame: &Frame) {
-        if let Some(frame) = convert(frame) {
-            self.bench.world.send(self.masters[master], frame);
-        }
+        let Some(frame) = convert::<_, emulator::frame::Frame>(frame) else { return };
+        self.sent += 1;
+        let long = frame.with_dlc(long_dlc(self.sent)).filter(|_| frame.dlc() == 8);
+        self.bench.world.send(self.masters[master], long.unwrap_or(frame));
     }
 
     fn is_drained(&mut self) -> bool {

@@ -10,7 +10,7 @@ use emulator::machine::Usart;
 use emulator::time::Span;
 use shared_abi::layout::Layout;
 
-use super::board::Board;
+use super::board::{long_dlc, Board};
 use super::target::{Event, Happened, PowerCut, Target};
 use kit::random::Random;
 
@@ -104,8 +104,9 @@ impl SerialBoard {
     }
 }
 
-/// The text of a frame (CAN232 manual).
-fn text(frame: &Frame) -> String {
+/// The text of a frame (CAN232 manual); if it has eight bytes, with any data length code that means eight.
+fn text(frame: &Frame, sent: u64) -> String {
+    let dlc = if frame.dlc() == 8 { long_dlc(sent) } else { frame.dlc() as u8 };
     let kind = match (frame.is_extended(), frame.is_remote_frame()) {
         (false, false) => 't',
         (false, true) => 'r',
@@ -113,8 +114,8 @@ fn text(frame: &Frame) -> String {
         (true, true) => 'R',
     };
     let mut text = match frame.id() {
-        Id::Standard(id) => format!("{kind}{:03X}{}", id.as_raw(), frame.dlc()),
-        Id::Extended(id) => format!("{kind}{:08X}{}", id.as_raw(), frame.dlc()),
+        Id::Standard(id) => format!("{kind}{:03X}{dlc:X}", id.as_raw()),
+        Id::Extended(id) => format!("{kind}{:08X}{dlc:X}", id.as_raw()),
     };
     for byte in frame.data() {
         // Writing into a string cannot fail.
@@ -151,7 +152,7 @@ impl Target for SerialBoard {
 
     fn send(&mut self, _master: usize, frame: &Frame) {
         // The first CR ends whatever is on the line.
-        let line = format!("\r{}\r", text(frame));
+        let line = format!("\r{}\r", text(frame, self.ordered));
         self.order(line.as_bytes());
         self.frames.push_back((self.ordered, *frame));
     }
