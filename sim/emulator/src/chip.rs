@@ -6,7 +6,7 @@ use shared_abi::geometry::{Geometry, Region, SYSTEM_MEMORY};
 use crate::bus::node::Pins;
 use crate::bxcan::{self, BxCan};
 use crate::clock::CycleClock;
-use crate::cortex::debug::Debug;
+use crate::cortex::debug::{Debug, COMPARATORS};
 use crate::cortex::exceptions::SYS_TICK;
 use crate::cortex::scs::{Effect, Scs};
 use crate::costs::CRC_WORD;
@@ -59,6 +59,8 @@ const DBGMCU: u32 = 0xE004_2000;
 
 /// Where loads from hidden sectors of the flash go (PCROP); an address of external memory, which no chip here has.
 pub const HIDDEN: Region = Region::new(0x9000_0000, 0x0020_0000);
+/// Where the pages are whose words the FPB replaces, one for each comparator; another such address.
+pub const PATCHED: Region = Region::new(0x9100_0000, COMPARATORS as u32 * PAGE);
 /// What a bank of the flash has, on a chip whose banks can be swapped.
 const BANK: u32 = 0x0010_0000;
 
@@ -262,6 +264,8 @@ pub struct Chip {
     pub system: HostMemory,
     /// The page with the option bytes.
     pub options: HostMemory,
+    /// Pages with words that the FPB replaces.
+    pub patched: HostMemory,
     /// The reports of accesses that went wrong.
     pub reports: Reports,
     /// The counters.
@@ -323,6 +327,7 @@ impl Chip {
             ccm: HostMemory::new(geometry.ccm.size.max(PAGE), 0),
             system,
             options: HostMemory::new(OPTION_PAGE.size, 0xFF),
+            patched: HostMemory::new(PATCHED.size, 0),
             reports: Reports::default(),
             counters: Counters {
                 instructions: 0,
@@ -492,7 +497,6 @@ impl Chip {
     fn lose_power(&mut self) {
         self.rcc = Rcc::new(self.variant, self.hse_hz, self.silicon);
         self.pwr.lose_supply();
-        self.dbgmcu = [0; 3];
     }
 
     /// Follows VDD.
@@ -572,8 +576,12 @@ impl Chip {
         let option_bytes = self.flash.option_bytes();
         self.options.bytes_mut()[..option_bytes.len()].copy_from_slice(&option_bytes);
         self.apply_clocks();
+        // A power reset, which brown-out and the end of Standby are, too (RM0090 section 7.1.2), resets all of it.
         let debug = match cause {
-            ResetCause::PowerOn => Debug::default(),
+            ResetCause::PowerOn | ResetCause::BrownOut | ResetCause::Standby => {
+                self.dbgmcu = [0; 3];
+                Debug::default()
+            }
             _ => self.scs.debug.after_reset(),
         };
         self.scs = Scs::new(self.geometry.interrupts, self.clock.hz(), self.silicon.systick_value);
@@ -1015,6 +1023,7 @@ impl Chip {
             Place::Dwt(offset) => self.scs.write_dwt(offset, value, self.cycle_of_access()),
             Place::Fpb(offset) => {
                 self.slice.breakpoints_changed = true;
+                self.slice.flush_tlb = true;
                 self.slice.leave = true;
                 self.scs.debug.write_fpb(offset, value)
             }

@@ -26,7 +26,7 @@ use unicorn_engine::unicorn_const::{uc_error, Arch, HookType, MemType, Mode, Pro
 use unicorn_engine::{ArmCpuModel, RegisterARM, UcHookId, Unicorn};
 
 use crate::chip::{
-    counts_cycles, Chip, BOOT_ALIAS, HIDDEN, OPTION_PAGE, OTP, PERIPHERALS, PERIPHERALS_AHB2,
+    counts_cycles, Chip, BOOT_ALIAS, HIDDEN, OPTION_PAGE, OTP, PATCHED, PERIPHERALS, PERIPHERALS_AHB2,
     PERIPHERAL_ALIAS, PRIVATE, SRAM_ALIAS, SYSTEM,
 };
 use crate::cortex::debug::{DFSR_BKPT, DFSR_HALTED};
@@ -228,6 +228,7 @@ impl Cpu {
             (ccm_base, pointer(&chip.ccm), Prot::READ | Prot::WRITE),
             (SYSTEM.base, pointer(&chip.system), Prot::READ | Prot::EXEC),
             (OPTION_PAGE.base, pointer(&chip.options), Prot::READ),
+            (PATCHED.base, pointer(&chip.patched), Prot::READ | Prot::EXEC),
         ];
         let with_ccm = chip.geometry.ccm.size > 0;
         for (base, (memory, len), perms) in blocks {
@@ -475,8 +476,8 @@ impl Cpu {
             self.set(register, 0);
         }
         let table = self.chip_mut().dual_bank_boot().unwrap_or(BOOT_ALIAS);
-        let sp = self.peek(table).unwrap_or(0) & !3;
-        let entry = self.peek(table + 4).unwrap_or(0);
+        let sp = self.vector(table).unwrap_or(0) & !3;
+        let entry = self.vector(table + 4).unwrap_or(0);
         self.set(R::MSP, sp);
         self.set(R::XPSR_NZCVQG, if entry & 1 != 0 { XPSR_T } else { 0 });
         self.set(R::PC, entry);
@@ -562,6 +563,14 @@ impl Cpu {
             }
             None => false,
         }
+    }
+
+    /// A word of the vector table. The FPB replaces it as a load or as a fetch: the manuals leave it open.
+    fn vector(&self, address: u32) -> Option<u32> {
+        let debug = &self.chip().scs.debug;
+        let mut patches = debug.patches(address, true).chain(debug.patches(address, false));
+        let patch = patches.find(|&(_, at, _)| at == (address % PAGE) as usize);
+        self.peek(patch.map_or(address, |(.., new)| new))
     }
 
     fn peek(&self, address: u32) -> Option<u32> {
@@ -1500,6 +1509,26 @@ fn is_flash_busy(chip: &mut Chip) -> bool {
     until > now
 }
 
+/// Whether the FPB replaces words in the page of an address.
+fn has_patches(chip: &Chip, address: u32) -> bool {
+    [true, false].iter().any(|&code| chip.scs.debug.patches(address, code).next().is_some())
+}
+
+/// Makes the copy of a page of the flash with the words that the FPB replaces, and returns the address in it.
+/// The words are those of this moment.
+fn replace_words(chip: &mut Chip, address: u32, code: bool) -> Option<u32> {
+    let patches: Vec<_> = chip.scs.debug.patches(address, code).collect();
+    let slot = patches.first()?.0 * PAGE;
+    let (memory, offset) = Cpu::memory(chip, address & !(PAGE - 1))?;
+    let mut page = memory.bytes()[offset..offset + PAGE as usize].to_vec();
+    for (_, at, new) in patches {
+        let (memory, offset) = Cpu::memory(chip, new)?;
+        page[at..at + 4].copy_from_slice(&memory.bytes()[offset..offset + 4]);
+    }
+    chip.patched.bytes_mut()[slot as usize..][..page.len()].copy_from_slice(&page);
+    Some(PATCHED.base + slot + address % PAGE)
+}
+
 /// Unicorn asks for the mapping of a page. Memory is mapped to its own address, and flash also to
 /// address 0. A RAM page becomes executable with the first fetch from it, because stores to
 /// executable pages are slow.
@@ -1515,7 +1544,7 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
         state.notes.asked_again += 1;
     }
     let paddr = chip.behind_alias(address).unwrap_or(address);
-    if HIDDEN.contains(address, 1) {
+    if HIDDEN.contains(address, 1) || PATCHED.contains(address, 1) {
         return entry(NOWHERE, Prot::READ | Prot::WRITE);
     }
     if SYSTEM_MEMORY.contains(paddr, 1) {
@@ -1540,6 +1569,13 @@ fn on_tlb_miss(uc: &mut Unicorn<'_, State>, address: u32, kind: MemType) -> Opti
                 None
             }
             MemType::READ if is_hidden => entry(HIDDEN.base + offset, Prot::READ),
+            MemType::READ | MemType::FETCH if has_patches(chip, address) => {
+                // Separate entries: fetches and loads are patched separately.
+                let is_fetch = kind == MemType::FETCH;
+                state.notes.flash_executed[(offset / PAGE) as usize] |= is_fetch;
+                let place = replace_words(chip, address, is_fetch).unwrap_or(paddr);
+                entry(place, if is_fetch { Prot::EXEC } else { Prot::READ })
+            }
             _ => {
                 // As for RAM: the first fetch from a page that was only read so far must come here,
                 // so that the page is recorded as executed.

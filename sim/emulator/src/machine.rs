@@ -529,6 +529,7 @@ impl Machine {
             return false;
         }
         chip.slice.flush_tlb = true;
+        chip.scs.debug.is_attached = true;
         self.debugger = Debugger::attached();
         true
     }
@@ -545,6 +546,7 @@ impl Machine {
     pub fn detach_debugger(&mut self) {
         self.debugger = Debugger::default();
         let chip = self.cpu.chip_mut();
+        chip.scs.debug.is_attached = false;
         chip.slice.stops.clear();
         chip.slice.breakpoints_changed = true;
     }

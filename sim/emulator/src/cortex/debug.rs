@@ -1,9 +1,11 @@
 //! The parts of the debug architecture that a program reaches without a debugger (DDI 0403E section
-//! C1): the breakpoint comparators of the FPB, and what the DebugMonitor exception needs.
+//! C1): breakpoints and patches of the FPB, the registers of the DWT's comparators, and what the
+//! DebugMonitor exception needs. All of it is in the debug power domain: a reset of the core leaves it
+//! (Cortex-M4 technical reference manual, "Power-on reset" and "System reset").
 //!
-//! **What is missing.** Flash patches (remapping), literal comparators, watchpoints, vector
-//! catches.
+//! **What is missing.** Matches of the DWT's comparators, vector catches.
 
+use crate::memory::PAGE;
 use crate::peripheral::Unmodelled;
 
 /// `DFSR` (C1.6): a step is done.
@@ -17,6 +19,8 @@ const DEMCR_MON_PEND: u32 = 1 << 17;
 const DEMCR_MON_STEP: u32 = 1 << 18;
 const DEMCR_MON_REQ: u32 = 1 << 19;
 const DEMCR_TRCENA: u32 = 1 << 24;
+/// The vector catches.
+const DEMCR_VC: u32 = 0x7F1;
 /// The bits that a system reset clears (C1.6): all bits of the monitor. Only a power-on reset
 /// clears the rest.
 const DEMCR_MON: u32 = DEMCR_MON_EN | DEMCR_MON_STEP | DEMCR_MON_REQ;
@@ -26,10 +30,15 @@ const FP_CTRL_KEY: u32 = 1 << 1;
 /// The Cortex-M4's (its technical reference manual, FPB): six code comparators, two literal ones.
 const FP_CTRL_SIZE: u32 = 0x260;
 const CODE_COMPARATORS: usize = 6;
-const COMPARATORS: usize = 8;
+/// The comparators of the FPB.
+pub const COMPARATORS: usize = 8;
 /// Remapping is there: `RMPSPT`.
 const FP_REMAP_SUPPORTED: u32 = 1 << 29;
 const FP_REMAP_MASK: u32 = 0x1FFF_FFE0;
+/// The table of the new words is in SRAM: bits 31 to 29 of its address.
+const SRAM: u32 = 0x2000_0000;
+/// The registers of the DWT's four comparators, COMP, MASK and FUNCTION (C1.8).
+const WATCHPOINTS: std::ops::RangeInclusive<u32> = 0x20..=0x5C;
 const COMP_MASK: u32 = 0x1FFF_FFFC;
 const COMP_REPLACE: u32 = 0b11 << 30;
 
@@ -43,6 +52,9 @@ pub struct Debug {
     enabled: bool,
     remap: u32,
     comparators: [u32; COMPARATORS],
+    watchpoints: [u32; 16],
+    /// DHCSR.C_DEBUGEN: only a debug probe can write it.
+    pub is_attached: bool,
 }
 
 impl Debug {
@@ -88,7 +100,7 @@ impl Debug {
 
     /// Writes `DEMCR`; whether the exception is to be pending.
     pub fn write_demcr(&mut self, value: u32) -> bool {
-        self.demcr = value & (DEMCR_MON | DEMCR_TRCENA);
+        self.demcr = value & (DEMCR_MON | DEMCR_TRCENA | DEMCR_VC);
         value & DEMCR_MON_PEND != 0
     }
 
@@ -103,6 +115,34 @@ impl Debug {
                 .filter(move |(half, _)| comparator & half != 0)
                 .map(|(_, address)| address)
         })
+    }
+
+    /// The words that the FPB replaces in the page of an address, for fetches of `code` or for loads: the number
+    /// of the comparator, where the word is in the page, and the address of the new one. An enabled comparator
+    /// of code without a half-word is such a patch, and each of literals.
+    pub fn patches(&self, address: u32, code: bool) -> impl Iterator<Item = (u32, usize, u32)> + '_ {
+        let kind = if code { 0..CODE_COMPARATORS } else { CODE_COMPARATORS..COMPARATORS };
+        kind.filter_map(move |n| {
+            let value = self.comparators[n];
+            let at = (value & COMP_MASK).wrapping_sub(address & !(PAGE - 1));
+            let is_patch = self.enabled && value & ENABLE != 0 && value & COMP_REPLACE == 0 && at < PAGE;
+            is_patch.then_some((n as u32, at as usize, SRAM + self.remap + 4 * n as u32))
+        })
+    }
+
+    /// Reads a register of the DWT's comparators, `offset` from E000_1000.
+    #[must_use]
+    pub fn read_watchpoint(&self, offset: u32) -> Option<u32> {
+        WATCHPOINTS.contains(&offset).then(|| self.watchpoints[(offset as usize - 0x20) / 4])
+    }
+
+    /// Writes one of them; whether it is one. Without TRCENA the write is ignored (C1.6.5 leaves it to the chip).
+    pub fn write_watchpoint(&mut self, offset: u32, value: u32) -> bool {
+        let is_one = WATCHPOINTS.contains(&offset);
+        if is_one && self.demcr & DEMCR_TRCENA != 0 {
+            self.watchpoints[(offset as usize - 0x20) / 4] = value;
+        }
+        is_one
     }
 
     /// Reads the word at `offset` from E000_2000, the FPB.
@@ -128,9 +168,6 @@ impl Debug {
                 let is_code = n < CODE_COMPARATORS;
                 let replace = if is_code { COMP_REPLACE } else { 0 };
                 self.comparators[n] = value & (replace | COMP_MASK | ENABLE);
-                if value & ENABLE != 0 && value & replace == 0 {
-                    return Err(Unmodelled("the FPB is to replace what is read: it is not modelled".into()));
-                }
             }
             _ => return Err(unknown()),
         }
@@ -158,8 +195,14 @@ mod tests {
         assert_eq!(debug.read_fpb(0x000), Ok(0x0000_0261), "the key reads as 0");
         debug.write_fpb(0x008, 0xFFFF_FFFF).unwrap();
         assert_eq!(debug.read_fpb(0x008), Ok(0xDFFF_FFFD), "bits 29 and 1 do not exist");
-        assert!(debug.write_fpb(0x024, 0x0800_0001).is_err(), "a literal comparator");
-        assert!(debug.write_fpb(0x00C, 0x0800_0001).is_err(), "a remap");
+        // Comparator 7 is one of literals, 1 of code; the table is at 2000_0140h (C1.11.4).
+        debug.write_fpb(0x004, 0x0000_015F).unwrap();
+        debug.write_fpb(0x024, 0xC800_0101).unwrap();
+        debug.write_fpb(0x00C, 0x0800_0FFD).unwrap();
+        let patches = |at, code| debug.patches(at, code).collect::<Vec<_>>();
+        assert_eq!(patches(0x0800_0200, false), [(7, 0x100, 0x2000_015C)]);
+        assert_eq!(patches(0x0800_0200, true), [(1, 0xFFC, 0x2000_0144)]);
+        assert_eq!(patches(0x0800_1000, true), []);
         assert!(debug.read_fpb(0x028).is_err() && debug.write_fpb(0x028, 0).is_err());
     }
 
@@ -182,11 +225,13 @@ mod tests {
         debug.write_fpb(8, 0x4800_0201).unwrap();
         assert!(!debug.write_demcr(0x010D_0000));
         assert!(debug.write_demcr(0x0107_07FF));
-        assert_eq!(debug.read_demcr(true), 0x0107_0000);
+        assert_eq!(debug.read_demcr(true), 0x0107_07F1);
+        assert!(debug.write_watchpoint(0x28, 7) && !debug.write_watchpoint(0x60, 7));
         assert!(debug.steps());
         debug.note(DFSR_BKPT | DFSR_HALTED);
         let mut debug = debug.after_reset();
-        assert_eq!(debug.read_demcr(false), 0x0100_0000);
+        assert_eq!(debug.read_demcr(false), 0x0100_07F1);
+        assert_eq!(debug.read_watchpoint(0x28), Some(7));
         assert_eq!(debug.breakpoints().collect::<Vec<_>>(), [0x0800_0200]);
         assert_eq!(debug.read_dfsr(), 3);
         debug.write_dfsr(1);

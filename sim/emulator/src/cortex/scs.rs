@@ -307,7 +307,8 @@ impl Scs {
             // MPU_TYPE says eight regions; MPU_CTRL says off.
             0xD90 => 0x0000_0800,
             0xD94 => 0,
-            0xDF0 => 0,
+            // DHCSR.C_DEBUGEN.
+            0xDF0 => u32::from(self.debug.is_attached),
             0xDF8 => self.debug.dcrdr,
             0xDFC => self.debug.read_demcr(self.exceptions.is_pending(DEBUG_MONITOR)),
             0xF34 => self.fpccr,
@@ -383,7 +384,7 @@ impl Scs {
             // Four comparators; profiling counters are not there.
             0x000 => Ok(0x4000_0000 | self.dwt_ctrl),
             0x004 => Ok(self.cyccnt(cycles)),
-            _ => Err(Unmodelled("only CTRL and CYCCNT of the DWT are modelled".into())),
+            _ => self.debug.read_watchpoint(offset).ok_or_else(unknown_dwt),
         }
     }
 
@@ -402,7 +403,7 @@ impl Scs {
             }
             // The lock access register: nothing is locked for the CPU.
             0xFB0 => Ok(()),
-            _ => Err(Unmodelled("only CTRL and CYCCNT of the DWT are modelled".into())),
+            _ => self.debug.write_watchpoint(offset, value).then_some(()).ok_or_else(unknown_dwt),
         }
     }
 
@@ -518,6 +519,10 @@ impl Scs {
 
 fn line_of(offset: u32) -> u16 {
     u16::try_from(offset & !3).unwrap_or(0)
+}
+
+fn unknown_dwt() -> Unmodelled {
+    Unmodelled("only CTRL, CYCCNT and the comparators of the DWT are modelled".into())
 }
 
 fn unknown(offset: u32) -> Unmodelled {
